@@ -1,0 +1,76 @@
+"""What the environments look like: shapes with materials, and which body of which env wears which.
+
+A viewer needs three things that ManiSkill keeps in three places: the list of bodies (actors,
+links, merged views of them), the meshes and materials that hang on each, and one array of poses a
+frame. The idea is to settle the first two once, when a scene is built, so that a frame is nothing
+but one array: ``poses[env, body] = [x, y, z, qw, qx, qy, qz]`` in the env's own world frame
+(metres, z up, quaternion wxyz). A body that an env does not have (``scene_idxs``) holds NaN there.
+
+Shapes that are equal (same triangles, same material) are one `Visual` with many instances, because
+a browser draws a thousand instances of one mesh as quickly as one, and is unusable with one node a
+body.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+BodyKind = Literal["link", "dynamic", "kinematic", "static"]
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles in the frame of the body that wears them (local pose and scale are applied)."""
+
+    vertices: NDArray[np.float32]
+    """(V, 3) metres."""
+    faces: NDArray[np.uint32]
+    """(F, 3) indices into `vertices`, counter-clockwise seen from outside."""
+    normals: NDArray[np.float32] | None = None
+    """(V, 3), or None where the source gave none."""
+    uvs: NDArray[np.float32] | None = None
+    """(V, 2), or None where there is no texture."""
+
+
+@dataclass(frozen=True)
+class Material:
+    """A SAPIEN ``RenderMaterial`` as far as a browser can show it."""
+
+    base_color: tuple[float, float, float, float]
+    """RGBA in 0..1."""
+    metallic: float = 0.0
+    roughness: float = 1.0
+    texture: NDArray[np.uint8] | None = None
+    """(H, W, 4) RGBA base colour texture, first row on top."""
+
+
+@dataclass(frozen=True)
+class Visual:
+    """One mesh with one material, and every (env, body) that wears it."""
+
+    name: str
+    """Readable and unique in the scene, for example ``panda/panda_hand/0``."""
+    mesh: Mesh
+    material: Material
+    envs: NDArray[np.int32]
+    """(K,) env index of each instance."""
+    bodies: NDArray[np.int32]
+    """(K,) body index of each instance."""
+
+
+@dataclass(frozen=True)
+class SceneGeometry:
+    """Everything about a scene that does not change from frame to frame."""
+
+    num_envs: int
+    body_names: tuple[str, ...]
+    """(B,) an actor's name, or ``articulation/link``. Merged actors go by the merged name."""
+    body_kinds: tuple[BodyKind, ...]
+    """(B,)"""
+    body_hidden: tuple[bool, ...]
+    """(B,) True for what the task hides from sensors (goal markers: ``_hidden_objects``)."""
+    visuals: tuple[Visual, ...]

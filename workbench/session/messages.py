@@ -1,0 +1,238 @@
+"""The words that the server and its worker say to each other: plain dataclasses over one pipe.
+
+The worker owns the env; the server owns the page. Requests go one way and are handled in order,
+between control steps; events come back. Nothing here may hold a torch tensor or a SAPIEN object:
+whatever crosses is numpy and plain data, so that a dying worker can take nothing with it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.authoring.problem import Problem
+from workbench.core.geometry import SceneGeometry
+from workbench.core.pictures import CameraInfo, CameraKind, Picture
+from workbench.core.step import StepResult
+
+Backend = Literal["auto", "cpu", "gpu"]
+ActionSource = Literal["hold", "zero", "random", "sliders", "policy"]
+EpisodeEnd = Literal["reset", "continue", "pause"]
+"""What the player does with an env whose episode ends: reset that env, let it run on, or pause."""
+
+
+@dataclass(frozen=True)
+class TaskOptions:
+    """How a task is made; the same for the page, the recorder and the benchmarks."""
+
+    num_envs: int = 16
+    backend: Backend = "auto"
+    seed: int = 0
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Further keyword arguments of the task class (``robot_uids``, ``obs_mode`` ...)."""
+
+
+@dataclass(frozen=True)
+class ActionDimension:
+    """One number of the action of one env."""
+
+    name: str
+    """For example ``arm/panda_joint1`` or ``gripper``."""
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class TaskDescription:
+    """What the page must know of a task that was loaded."""
+
+    env_id: str
+    """Registered id, or the class name of an unregistered task."""
+    class_name: str
+    file: str | None
+    """Source file of the class."""
+    source_files: tuple[str, ...]
+    """The task's file and the modules beside it that it imported: what the watcher follows."""
+    source_hash: str
+    """sha256 over `source_files`, 12 hex digits."""
+    source: dict[str, str]
+    """Path to text of `source_files`."""
+    backend: str
+    """For example ``cpu (batched)`` or ``gpu``."""
+    device: str
+    """For example ``cpu`` or ``cuda:0``; with the render device's name."""
+    num_envs: int
+    max_episode_steps: int | None
+    obs_mode: str
+    reward_mode: str
+    control_mode: str | None
+    control_dt: float
+    """Seconds of simulated time in one control step."""
+    actions: tuple[ActionDimension, ...]
+    geometry: SceneGeometry
+    cameras: tuple[CameraInfo, ...]
+    segmentation: dict[int, str]
+    """Segmentation id to body name."""
+    can_render: bool
+
+
+# --- requests: server to worker ------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Load:
+    """Import and build the task, replacing the one that runs if (and only if) all goes well."""
+
+    task: str
+    """A path, ``path:ClassName``, or a registered env id."""
+    options: TaskOptions
+    source: dict[str, str] | None = None
+    """Text to use in place of what is on disk: how the last good version comes back."""
+
+
+@dataclass(frozen=True)
+class Play:
+    playing: bool
+
+
+@dataclass(frozen=True)
+class SingleStep:
+    """One control step, also while paused."""
+
+
+@dataclass(frozen=True)
+class Reset:
+    env_idx: tuple[int, ...] | None = None
+    """None resets all."""
+    seed: int | None = None
+    """None goes on with the task's own random numbers."""
+
+
+@dataclass(frozen=True)
+class SetSpeed:
+    speed: float
+    """Simulated seconds per second; ``inf`` runs as fast as the machine can."""
+
+
+@dataclass(frozen=True)
+class SetEpisodeEnd:
+    rule: EpisodeEnd
+
+
+@dataclass(frozen=True)
+class SetActionSource:
+    source: ActionSource
+    policy: str | None = None
+    """``module:function`` or ``file.py:function`` when `source` is ``policy``."""
+
+
+@dataclass(frozen=True)
+class SetSliders:
+    """The action that every env is given while the source is ``sliders``."""
+
+    action: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class CameraRequest:
+    name: str
+    kind: CameraKind
+    modalities: tuple[str, ...] = ("rgb",)
+
+
+@dataclass(frozen=True)
+class WatchCameras:
+    """Which pictures to keep making, of which env. Empty: none are made."""
+
+    env: int
+    cameras: tuple[CameraRequest, ...]
+
+
+@dataclass(frozen=True)
+class SetCapture:
+    """While on, every step comes back whole (poses, and pictures of every camera), to be recorded."""
+
+    env_idx: tuple[int, ...]
+    """Empty turns it off."""
+    with_pictures: bool = True
+
+
+@dataclass(frozen=True)
+class Quit:
+    pass
+
+
+Request = (
+    Load | Play | SingleStep | Reset | SetSpeed | SetEpisodeEnd | SetActionSource | SetSliders
+    | WatchCameras | SetCapture | Quit
+)
+
+
+# --- events: worker to server --------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Loading:
+    """What a load is doing now, for the status line."""
+
+    activity: str
+
+
+@dataclass(frozen=True)
+class Loaded:
+    task: TaskDescription
+    first: StepResult
+    milliseconds: dict[str, float]
+    """Time of each part of the load: import, build, reset, probe, geometry."""
+
+
+@dataclass(frozen=True)
+class Failed:
+    """Something of the author's raised. `kept` says that the version before still runs."""
+
+    problem: Problem
+    kept: bool
+
+
+@dataclass(frozen=True)
+class Stepped:
+    """One reset or control step of the batch, always sent, in order."""
+
+    step: StepResult
+    reset_mask: NDArray[np.bool_]
+    """(N,) True where this result is the first of a new episode."""
+    captured: tuple[Picture, ...] = ()
+    """Pictures that belong to exactly this step (only while capturing)."""
+    seeds: NDArray[np.int64] | None = None
+    """(N,) episode seed of each env, where a reset was part of this."""
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """The newest pictures of the cameras that are watched."""
+
+    pictures: tuple[Picture, ...]
+    milliseconds: float
+
+
+@dataclass(frozen=True)
+class Status:
+    playing: bool
+    steps_per_second: float
+    """Control steps of the whole batch per second of wall time."""
+    real_time_factor: float
+    """Simulated seconds per wall second; below the asked speed the machine is the limit."""
+
+
+@dataclass(frozen=True)
+class Printed:
+    """A line that the author's code wrote to stdout or stderr."""
+
+    stream: Literal["stdout", "stderr"]
+    text: str
+
+
+Event = Loading | Loaded | Failed | Stepped | Pictures | Status | Printed

@@ -1,0 +1,84 @@
+"""What the page reads: one immutable snapshot of the session, taken as often as it likes.
+
+The page is redrawn by one loop that compares this snapshot with the last one it drew. Counters
+(``serial``) say cheaply whether a part is new, so nothing is drawn or sent twice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.authoring.problem import Problem
+from workbench.core.pictures import CameraKind, Picture
+from workbench.core.step import StepResult
+from workbench.session.messages import ActionSource, EpisodeEnd, TaskDescription
+
+State = Literal["starting", "loading", "running", "paused", "error", "stopped"]
+"""``starting``: the worker process is coming up. ``loading``: a task is being imported or built.
+``error``: a problem stands (see `SessionView.problem`); ``stopped``: the worker is gone."""
+
+
+@dataclass(frozen=True)
+class Curves:
+    """The past of the batch, oldest first, bounded in length; kept over env selection."""
+
+    serial: int
+    tick: NDArray[np.int64]
+    """(T,) control steps of the session, counting up."""
+    reward: NDArray[np.float32]
+    """(T, N)"""
+    success: NDArray[np.float32]
+    """(T, N) 0 or 1; NaN for a task that has no ``success``."""
+    started: NDArray[np.bool_]
+    """(T, N) True where an env began a new episode."""
+
+
+@dataclass(frozen=True)
+class RecordingStatus:
+    active: bool
+    env_idx: tuple[int, ...]
+    steps: int
+    """Steps captured of the episodes under way."""
+    episodes_written: int
+    folder: str
+    last_file: str | None
+    problem: str | None
+    """Why the last file could not be written."""
+
+
+@dataclass(frozen=True)
+class SessionView:
+    state: State
+    activity: str
+    """What is being done while starting or loading, else empty."""
+    stale: bool
+    """The file on disk is newer than (or failed to become) the version that is shown."""
+    task: TaskDescription | None
+    task_serial: int
+    """Grows with every load that succeeded."""
+    load_milliseconds: dict[str, float]
+    step: StepResult | None
+    step_serial: int
+    pictures: dict[tuple[CameraKind, str], Picture]
+    pictures_serial: int
+    picture_milliseconds: float
+    problem: Problem | None
+    problem_serial: int
+    curves: Curves | None
+    selected_env: int
+    playing: bool
+    speed: float
+    seed: int
+    episode_end: EpisodeEnd
+    action_source: ActionSource
+    policy: str | None
+    sliders: tuple[float, ...]
+    steps_per_second: float
+    real_time_factor: float
+    recording: RecordingStatus
+    printed: tuple[str, ...]
+    """The last lines that the author's code printed."""
