@@ -1,0 +1,522 @@
+"""N CPU physics systems behind the interface of one GPU system.
+
+ManiSkill's GPU code never touches CUDA itself. It talks to one object, ``scene.px``, through
+tensors (``cuda_rigid_body_data``, ``cuda_articulation_qpos`` ...) that it reads after
+``gpu_fetch_*`` and writes before ``gpu_apply_*``. `BatchedCpuSystem` has that interface over N
+separate ``PhysxCpuSystem``s with CPU tensors, so every task runs batched on the CPU through the code
+path that the GPU uses: partial resets, reset masks and all. Each env has its own PhysX scene, so env
+i is exactly what ManiSkill's single CPU env would be, whatever its neighbours do.
+
+What makes it quick:
+
+* A fetch is ``PhysxCpuSystem.pack()`` and ``sapien.Scene.pack_poses()`` of each env (about 3 us)
+  and one gather by index over all envs; a Python getter costs 2 us *a body*. The layout of those
+  bytes is not documented, so it is checked against the getters when the scene is built.
+* An apply writes only what differs from the last fetch: a partial reset touches the bodies of the
+  envs that are reset and wakes nobody else.
+* What few tasks read (link velocities, joint accelerations, joint forces) is fetched when asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import sapien
+import sapien.physx as physx
+import torch
+from numpy.typing import NDArray
+
+from workbench.core.contacts import BodyImpulseQuery, ContactReader, CpuArray, PairImpulseQuery
+
+_BODY = 13
+"""Floats of a body in ``pack()``: quaternion wxyz, position, linear and angular velocity."""
+_FROM_PACKED_BODY = np.array([4, 5, 6, 0, 1, 2, 3, 7, 8, 9, 10, 11, 12])
+"""Where ManiSkill's row [p, q, v, w] finds its columns in a packed body [q, p, v, w]."""
+_FROM_PACKED_POSE = np.array([4, 5, 6, 0, 1, 2, 3])
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where everything lies: rows of the tensors, and positions in the concatenated packs."""
+
+    bodies: list[physx.PhysxRigidDynamicComponent]
+    body_rows: NDArray[np.int64]
+    links: list[physx.PhysxArticulationLinkComponent]
+    link_rows: NDArray[np.int64]
+    articulations: list[physx.PhysxArticulation]
+    root_rows: NDArray[np.int64]
+    dofs: NDArray[np.int64]
+    body_at: NDArray[np.int64]
+    root_at: NDArray[np.int64]
+    qpos_at: NDArray[np.int64]
+    qvel_at: NDArray[np.int64]
+    target_qpos_at: NDArray[np.int64]
+    target_qvel_at: NDArray[np.int64]
+    link_pose_at: NDArray[np.int64]
+    row_of: dict[int, int]
+    index_of: dict[int, int]
+    row_count: int
+
+
+def _lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Scene]) -> _Layout:
+    bodies: list[Any] = []
+    links: list[Any] = []
+    articulations: list[Any] = []
+    body_rows, link_rows, root_rows, dofs = [], [], [], []
+    body_at, root_at, link_pose_at = [], [], []
+    joint_at: list[tuple[int, int]] = []
+    row = packed = posed = 0
+    for system, scene in zip(systems, scenes, strict=True):
+        entity_at = {id(entity): posed + 7 * i for i, entity in enumerate(scene.entities)}
+        posed += 7 * len(entity_at)
+        for body in system.rigid_dynamic_components:
+            bodies.append(body)
+            body_rows.append(row)
+            body_at.append(packed + _FROM_PACKED_BODY)
+            row, packed = row + 1, packed + _BODY
+        seen: set[int] = set()
+        env_articulations = []
+        for link in system.articulation_link_components:
+            links.append(link)
+            link_rows.append(row)
+            link_pose_at.append(entity_at[id(link.entity)] + _FROM_PACKED_POSE)
+            articulation = link.articulation
+            if id(articulation) not in seen:
+                seen.add(id(articulation))
+                env_articulations.append(articulation)
+                articulations.append(articulation)
+                root_rows.append(row)
+                dofs.append(articulation.dof)
+            row += 1
+        for articulation in env_articulations:
+            root_at.append(packed + _FROM_PACKED_BODY)
+            packed += _BODY
+            joint_at.append((packed, articulation.dof))
+            packed += 4 * articulation.dof
+    width = max(dofs, default=0)
+    nothing = packed  # one zero behind all packs: what the padding of shorter articulations reads
+
+    def joint_columns(offset: Callable[[int, int], NDArray[np.int64]]) -> NDArray[np.int64]:
+        columns = np.full((len(joint_at), width), nothing, dtype=np.int64)
+        for i, (start, dof) in enumerate(joint_at):
+            columns[i, :dof] = offset(start, dof)
+        return columns
+
+    def stacked(rows: list[NDArray[np.int64]], columns: int) -> NDArray[np.int64]:
+        return np.stack(rows) if rows else np.zeros((0, columns), dtype=np.int64)
+
+    every_body = bodies + links
+    return _Layout(
+        bodies=bodies,
+        body_rows=np.array(body_rows, dtype=np.int64),
+        links=links,
+        link_rows=np.array(link_rows, dtype=np.int64),
+        articulations=articulations,
+        root_rows=np.array(root_rows, dtype=np.int64),
+        dofs=np.array(dofs, dtype=np.int64),
+        body_at=stacked(body_at, _BODY),
+        root_at=stacked(root_at, _BODY),
+        qpos_at=joint_columns(lambda start, dof: start + np.arange(dof)),
+        qvel_at=joint_columns(lambda start, dof: start + dof + np.arange(dof)),
+        target_qpos_at=joint_columns(lambda start, dof: start + 2 * dof + 2 * np.arange(dof)),
+        target_qvel_at=joint_columns(lambda start, dof: start + 2 * dof + 2 * np.arange(dof) + 1),
+        link_pose_at=stacked(link_pose_at, 7),
+        row_of={id(b): r for b, r in zip(every_body, [*body_rows, *link_rows], strict=True)},
+        index_of={id(a): i for i, a in enumerate(articulations)},
+        row_count=row,
+    )
+
+
+class BatchedCpuSystem:
+    """What ManiSkill calls ``scene.px``, over N CPU systems.
+
+    Shapes: R bodies (dynamic and kinematic actors, then links, env after env), A articulations,
+    D the largest number of degrees of freedom. Poses are world poses of each env's own frame.
+    """
+
+    def __init__(self, scenes: Sequence[sapien.Scene]) -> None:
+        self.scenes = list(scenes)
+        self.systems: list[physx.PhysxCpuSystem] = [scene.physx_system for scene in scenes]  # pyright: ignore
+        self.contacts = ContactReader(self.systems)
+        self._layout: _Layout | None = None
+        self._packed: NDArray[np.float32] | None = None
+        self._posed: NDArray[np.float32] | None = None
+        self._steps = 0
+        self._links_fetched_at = self._qacc_fetched_at = self._forces_fetched_at = -1
+
+    # `Actor.create_from_entities` and `Link.create` ask isinstance(scene.px, PhysxGpuSystem) to decide
+    # whether a body has a row in the tensors. It has one here; a real subclass would want CUDA.
+    __class__ = property(lambda self: physx.PhysxGpuSystem)  # type: ignore[assignment]
+
+    # --- what sapien's systems have --------------------------------------------------------------
+
+    @property
+    def timestep(self) -> float:
+        return self.systems[0].timestep
+
+    @timestep.setter
+    def timestep(self, value: float) -> None:
+        for system in self.systems:
+            system.timestep = value
+
+    @property
+    def rigid_dynamic_components(self) -> list[physx.PhysxRigidDynamicComponent]:
+        return [c for system in self.systems for c in system.rigid_dynamic_components]
+
+    @property
+    def rigid_static_components(self) -> list[physx.PhysxRigidStaticComponent]:
+        return [c for system in self.systems for c in system.rigid_static_components]
+
+    @property
+    def articulation_link_components(self) -> list[physx.PhysxArticulationLinkComponent]:
+        return [c for system in self.systems for c in system.articulation_link_components]
+
+    def get_scene_offset(self, scene: sapien.Scene) -> NDArray[np.float32]:
+        """(3,) always zero: every env stands at its own origin."""
+        return np.zeros(3, dtype=np.float32)
+
+    def get_contacts(self) -> list[physx.PhysxContact]:
+        raise NotImplementedError(
+            "scene.get_contacts() does not exist in batched simulation (nor on the GPU). Use "
+            "scene.get_pairwise_contact_impulses(a, b) or actor.get_net_contact_impulses()."
+        )
+
+    def step(self) -> None:
+        """One substep of every env."""
+        for system in self.systems:
+            system.step()
+        self._steps += 1
+        self._forget()
+
+    def sync_poses_gpu_to_cpu(self) -> None:
+        """Nothing to do: SAPIEN's entities are the simulation here."""
+
+    # --- building ----------------------------------------------------------------------------------
+
+    def gpu_init(self) -> None:
+        """Lay out the tensors over the bodies that were built; called once a scene is complete."""
+        layout = self._layout = _lay_out(self.systems, self.scenes)
+        width = layout.qpos_at.shape[1]
+        self._data, self._data_seen = _twin((layout.row_count, _BODY))
+        self._qpos, self._qpos_seen = _twin(layout.qpos_at.shape)
+        self._qvel, self._qvel_seen = _twin(layout.qpos_at.shape)
+        self._qf, self._qf_seen = _twin(layout.qpos_at.shape)
+        self._target_qpos, self._target_qpos_seen = _twin(layout.qpos_at.shape)
+        self._target_qvel, self._target_qvel_seen = _twin(layout.qpos_at.shape)
+        self._qacc = np.zeros((len(layout.articulations), width), dtype=np.float32)
+        most_links = max((len(a.links) for a in layout.articulations), default=0)
+        self._joint_forces = np.zeros((len(layout.articulations), most_links, 6), dtype=np.float32)
+        self._force = np.zeros((layout.row_count, 3), dtype=np.float32)
+        self._torque = np.zeros((layout.row_count, 3), dtype=np.float32)
+        joints = [list(a.active_joints) for a in layout.articulations]
+        self._set_target = [[j.set_drive_target for j in row] for row in joints]
+        self._set_velocity_target = [[j.set_drive_velocity_target for j in row] for row in joints]
+        self._driven = np.zeros(len(layout.articulations), dtype=bool)
+        self._velocity_driven = np.zeros(len(layout.articulations), dtype=bool)
+        self.cuda_rigid_body_data = _array(self._data)
+        self.cuda_rigid_dynamic_data = self.cuda_rigid_body_data
+        self.cuda_articulation_link_data = self.cuda_rigid_body_data
+        self.cuda_articulation_qpos = _array(self._qpos)
+        self.cuda_articulation_qvel = _array(self._qvel)
+        self.cuda_articulation_qf = _array(self._qf)
+        self.cuda_articulation_target_qpos = _array(self._target_qpos)
+        self.cuda_articulation_target_qvel = _array(self._target_qvel)
+        self.cuda_rigid_body_force = _array(self._force)
+        self.cuda_rigid_body_torque = _array(self._torque)
+        self._check_layout()
+        self._fetch_bodies()
+        self._fetch_links()
+        self._fetch_joints()
+        self._fetch_targets()
+
+    def row_of(self, body: physx.PhysxRigidBodyComponent) -> int:
+        """Row of a dynamic or kinematic body, or of a link, in the (R, 13) tensor."""
+        return self._laid_out.row_of[id(body)]
+
+    def index_of(self, articulation: physx.PhysxArticulation) -> int:
+        """Row of an articulation in the (A, D) tensors."""
+        return self._laid_out.index_of[id(articulation)]
+
+    @property
+    def _laid_out(self) -> _Layout:
+        if self._layout is None:
+            raise RuntimeError(
+                "The simulation is not initialised yet: in _load_agent and _load_scene only initial poses "
+                "may be set. Read and write state (poses, qpos, velocities) in _initialize_episode."
+            )
+        return self._layout
+
+    def _check_layout(self) -> None:
+        """Compare the packs with the getters, since SAPIEN documents neither their order nor their size."""
+        layout, packed = self._laid_out, self._pack()
+        expected = _BODY * (len(layout.bodies) + len(layout.articulations)) + 4 * int(layout.dofs.sum())
+        agrees = len(packed) == expected + 1
+        if agrees:
+            for body, at in zip(layout.bodies, layout.body_at, strict=True):
+                pose = body.entity.pose
+                agrees &= np.allclose(packed[at[:7]], [*pose.p, *pose.q], atol=1e-5)
+            for i, articulation in enumerate(layout.articulations):
+                dof = articulation.dof
+                agrees &= np.allclose(packed[layout.qpos_at[i, :dof]], articulation.qpos, atol=1e-5)
+            poses = self._pack_poses()
+            for link, at in zip(layout.links, layout.link_pose_at, strict=True):
+                pose = link.entity.pose
+                agrees &= np.allclose(poses[at], [*pose.p, *pose.q], atol=1e-5)
+        if not agrees:
+            raise RuntimeError(
+                f"sapien {sapien.__version__} packs its state in another order than the batched CPU core "
+                "was written for (3.0.3): install the pinned version."
+            )
+
+    # --- reading: gpu_fetch_* ----------------------------------------------------------------------
+
+    def gpu_fetch_rigid_dynamic_data(self) -> None:
+        self._fetch_bodies()
+
+    def gpu_fetch_articulation_link_pose(self) -> None:
+        self._fetch_links()
+
+    def gpu_fetch_articulation_link_velocity(self) -> None:
+        """The root's comes with `gpu_fetch_articulation_link_pose`; see `fetch_link_velocities`."""
+
+    def gpu_fetch_articulation_qpos(self) -> None:
+        self._fetch_joints()
+
+    def gpu_fetch_articulation_qvel(self) -> None:
+        """Comes with `gpu_fetch_articulation_qpos`."""
+
+    def gpu_fetch_articulation_qacc(self) -> None:
+        """Fetched when `cuda_articulation_qacc` is read."""
+
+    def gpu_fetch_articulation_target_qpos(self) -> None:
+        self._fetch_targets()
+
+    def gpu_fetch_articulation_target_qvel(self) -> None:
+        """Comes with `gpu_fetch_articulation_target_qpos`."""
+
+    def gpu_fetch_articulation_link_incoming_joint_forces(self) -> None:
+        """Fetched when `cuda_articulation_link_incoming_joint_forces` is read."""
+
+    def gpu_update_articulation_kinematics(self) -> None:
+        """Nothing to do: on the CPU, links follow when qpos or the root pose is set."""
+
+    @property
+    def cuda_articulation_qacc(self) -> CpuArray:
+        if self._qacc_fetched_at != self._steps:
+            for i, articulation in enumerate(self._laid_out.articulations):
+                self._qacc[i, : articulation.dof] = articulation.qacc
+            self._qacc_fetched_at = self._steps
+        return _array(self._qacc)
+
+    @property
+    def cuda_articulation_link_incoming_joint_forces(self) -> CpuArray:
+        if self._forces_fetched_at != self._steps:
+            for i, articulation in enumerate(self._laid_out.articulations):
+                forces = articulation.get_link_incoming_joint_forces()
+                self._joint_forces[i, : len(forces)] = forces
+            self._forces_fetched_at = self._steps
+        return _array(self._joint_forces)
+
+    def fetch_link_velocities(self) -> None:
+        """Velocities of all links into columns 7 to 12; two getters a link, so only when asked for."""
+        if self._links_fetched_at == self._steps:
+            return
+        layout = self._laid_out
+        for row, link in zip(layout.link_rows, layout.links, strict=True):
+            self._data[row, 7:10] = link.linear_velocity
+            self._data[row, 10:13] = link.angular_velocity
+        self._data_seen[layout.link_rows] = self._data[layout.link_rows]
+        self._links_fetched_at = self._steps
+
+    def _pack(self) -> NDArray[np.float32]:
+        if self._packed is None:
+            joined = b"".join([system.pack() for system in self.systems])
+            self._packed = np.empty(len(joined) // 4 + 1, dtype=np.float32)
+            self._packed[:-1] = np.frombuffer(joined, dtype=np.float32)
+            self._packed[-1] = 0.0
+        return self._packed
+
+    def _pack_poses(self) -> NDArray[np.float32]:
+        if self._posed is None:
+            self._posed = np.frombuffer(
+                b"".join([scene.pack_poses() for scene in self.scenes]), dtype=np.float32
+            )
+        return self._posed
+
+    def _forget(self) -> None:
+        self._packed = self._posed = None
+        self.contacts.invalidate()
+
+    def _fetch_bodies(self) -> None:
+        layout = self._laid_out
+        rows = self._pack()[layout.body_at]
+        self._data[layout.body_rows] = rows
+        self._data_seen[layout.body_rows] = rows
+
+    def _fetch_links(self) -> None:
+        layout = self._laid_out
+        poses = self._pack_poses()[layout.link_pose_at]
+        self._data[layout.link_rows, :7] = poses
+        self._data_seen[layout.link_rows, :7] = poses
+        velocities = self._pack()[layout.root_at[:, 7:]]
+        self._data[layout.root_rows, 7:] = velocities
+        self._data_seen[layout.root_rows, 7:] = velocities
+
+    def _fetch_joints(self) -> None:
+        layout, packed = self._laid_out, self._pack()
+        self._qpos[:] = self._qpos_seen[:] = packed[layout.qpos_at]
+        self._qvel[:] = self._qvel_seen[:] = packed[layout.qvel_at]
+
+    def _fetch_targets(self) -> None:
+        layout, packed = self._laid_out, self._pack()
+        self._target_qpos[:] = self._target_qpos_seen[:] = packed[layout.target_qpos_at]
+        self._target_qvel[:] = self._target_qvel_seen[:] = packed[layout.target_qvel_at]
+
+    # --- writing: gpu_apply_* ----------------------------------------------------------------------
+
+    def apply_changes(self) -> None:
+        """Everything that ``ManiSkillScene._gpu_apply_all`` applies, but only what differs."""
+        self.gpu_apply_rigid_dynamic_data()
+        self.gpu_apply_articulation_qpos()
+        self.gpu_apply_articulation_qvel()
+        self.gpu_apply_articulation_qf()
+        self.gpu_apply_articulation_root_pose()
+        self.gpu_apply_articulation_root_velocity()
+        self._apply_targets(self._target_qpos, self._target_qpos_seen, self._set_target, self._driven, False)
+        self._apply_targets(
+            self._target_qvel, self._target_qvel_seen, self._set_velocity_target, self._velocity_driven, False
+        )
+
+    def gpu_apply_rigid_dynamic_data(self) -> None:
+        layout = self._laid_out
+        now, seen = self._data[layout.body_rows], self._data_seen[layout.body_rows]
+        differs = now != seen
+        for i in np.flatnonzero(differs.any(axis=1)):
+            body, row = layout.bodies[i], now[i]
+            _refuse_nan(row, body.entity.name)
+            if differs[i, :7].any():
+                body.entity.pose = sapien.Pose(row[:3], row[3:7])
+            if differs[i, 7:].any() and not body.kinematic:
+                body.linear_velocity = row[7:10]
+                body.angular_velocity = row[10:13]
+            self._forget()
+        self._data_seen[layout.body_rows] = now
+
+    def gpu_apply_articulation_root_pose(self) -> None:
+        layout = self._laid_out
+        now, seen = self._data[layout.root_rows, :7], self._data_seen[layout.root_rows, :7]
+        for i in np.flatnonzero((now != seen).any(axis=1)):
+            _refuse_nan(now[i], layout.articulations[i].name)
+            layout.articulations[i].links[0].pose = sapien.Pose(now[i, :3], now[i, 3:7])
+            self._forget()
+        self._data_seen[layout.root_rows, :7] = now
+
+    def gpu_apply_articulation_root_velocity(self) -> None:
+        layout = self._laid_out
+        now, seen = self._data[layout.root_rows, 7:], self._data_seen[layout.root_rows, 7:]
+        for i in np.flatnonzero((now != seen).any(axis=1)):
+            _refuse_nan(now[i], layout.articulations[i].name)
+            layout.articulations[i].set_root_linear_velocity(now[i, :3])
+            layout.articulations[i].set_root_angular_velocity(now[i, 3:])
+            self._forget()
+        self._data_seen[layout.root_rows, 7:] = now
+
+    def gpu_apply_articulation_qpos(self) -> None:
+        self._apply_joints(self._qpos, self._qpos_seen, "set_qpos")
+
+    def gpu_apply_articulation_qvel(self) -> None:
+        self._apply_joints(self._qvel, self._qvel_seen, "set_qvel")
+
+    def gpu_apply_articulation_qf(self) -> None:
+        self._apply_joints(self._qf, self._qf_seen, "set_qf")
+
+    def gpu_apply_articulation_target_position(self) -> None:
+        self._apply_targets(self._target_qpos, self._target_qpos_seen, self._set_target, self._driven, True)
+
+    def gpu_apply_articulation_target_velocity(self) -> None:
+        self._apply_targets(
+            self._target_qvel, self._target_qvel_seen, self._set_velocity_target, self._velocity_driven, True
+        )
+
+    def gpu_apply_rigid_dynamic_force(self) -> None:
+        self._apply_forces(self._force, "force")
+
+    def gpu_apply_rigid_dynamic_torque(self) -> None:
+        self._apply_forces(self._torque, "torque")
+
+    def _apply_joints(self, now: NDArray[np.float32], seen: NDArray[np.float32], setter: str) -> None:
+        for i in np.flatnonzero((now != seen).any(axis=1)):
+            articulation = self._laid_out.articulations[i]
+            _refuse_nan(now[i], articulation.name)
+            getattr(articulation, setter)(now[i, : articulation.dof])
+            self._forget()
+        seen[:] = now
+
+    def _apply_targets(
+        self,
+        now: NDArray[np.float32],
+        seen: NDArray[np.float32],
+        setters: list[list[Callable[[float], None]]],
+        driven: NDArray[np.bool_],
+        keep_awake: bool,
+    ) -> None:
+        """Write drive targets (A, D).
+
+        A target that is set wakes a sleeping articulation even when its value stays, and ManiSkill's
+        CPU controllers set theirs on every control step; with `keep_awake` all targets of what was
+        ever driven are therefore written, or a robot at rest would fall asleep here and not there.
+        """
+        changed = (now != seen).any(axis=1)
+        driven |= changed
+        for i in np.flatnonzero(driven if keep_awake else changed):
+            _refuse_nan(now[i], self._laid_out.articulations[i].name)
+            for set_target, value in zip(setters[i], now[i].tolist(), strict=False):
+                set_target(value)
+        if changed.any():
+            self._forget()
+        seen[:] = now
+
+    def _apply_forces(self, values: NDArray[np.float32], kind: str) -> None:
+        layout, zero = self._laid_out, np.zeros(3, dtype=np.float32)
+        every = [*zip(layout.body_rows, layout.bodies, strict=True)]
+        every += [*zip(layout.link_rows, layout.links, strict=True)]
+        for row, body in every:
+            if values[row].any():
+                _refuse_nan(values[row], body.entity.name)
+                if kind == "force":
+                    body.add_force_torque(values[row], zero)
+                else:
+                    body.add_force_torque(zero, values[row])
+        # PhysX takes a force for one substep; a row left standing would push again at the next apply.
+        values[:] = 0.0
+
+    # --- contacts ----------------------------------------------------------------------------------
+
+    def gpu_create_contact_body_impulse_query(self, bodies: Sequence[Any]) -> BodyImpulseQuery:
+        return self.contacts.create_body_query(bodies)
+
+    def gpu_create_contact_pair_impulse_query(self, body_pairs: Sequence[Any]) -> PairImpulseQuery:
+        return self.contacts.create_pair_query(body_pairs)
+
+    def gpu_query_contact_body_impulses(self, query: BodyImpulseQuery) -> None:
+        self.contacts.query_bodies(query)
+
+    def gpu_query_contact_pair_impulses(self, query: PairImpulseQuery) -> None:
+        self.contacts.query_pairs(query)
+
+
+def _twin(shape: tuple[int, ...]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    return np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
+
+
+def _array(values: NDArray[np.float32]) -> CpuArray:
+    return CpuArray(torch.from_numpy(values))
+
+
+def _refuse_nan(values: NDArray[np.float32], name: str) -> None:
+    # PhysX does not check: a NaN pose spreads to everything it touches and may crash the process.
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name}: the state to be set holds NaN or infinity: {values}")
