@@ -56,6 +56,8 @@ class _Layout:
     target_qpos_at: NDArray[np.int64]
     target_qvel_at: NDArray[np.int64]
     link_pose_at: NDArray[np.int64]
+    """Within the poses of the link's own env; see `_pack_poses`."""
+    link_env: NDArray[np.int64]
     row_of: dict[int, int]
     index_of: dict[int, int]
     row_count: int
@@ -67,11 +69,12 @@ def _lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Sc
     articulations: list[Any] = []
     body_rows, link_rows, root_rows, dofs = [], [], [], []
     body_at, root_at, link_pose_at = [], [], []
+    link_env: list[int] = []
     joint_at: list[tuple[int, int]] = []
-    row = packed = posed = 0
-    for system, scene in zip(systems, scenes, strict=True):
-        entity_at = {id(entity): posed + 7 * i for i, entity in enumerate(scene.entities)}
-        posed += 7 * len(entity_at)
+    row = packed = 0
+    for env, (system, scene) in enumerate(zip(systems, scenes, strict=True)):
+        entities = scene.entities  # held, because an id is unique only among objects that are alive
+        entity_at = {id(entity): 7 * i for i, entity in enumerate(entities)}
         for body in system.rigid_dynamic_components:
             bodies.append(body)
             body_rows.append(row)
@@ -83,6 +86,7 @@ def _lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Sc
             links.append(link)
             link_rows.append(row)
             link_pose_at.append(entity_at[id(link.entity)] + _FROM_PACKED_POSE)
+            link_env.append(env)
             articulation = link.articulation
             if id(articulation) not in seen:
                 seen.add(id(articulation))
@@ -124,6 +128,7 @@ def _lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Sc
         target_qpos_at=joint_columns(lambda start, dof: start + 2 * dof + 2 * np.arange(dof)),
         target_qvel_at=joint_columns(lambda start, dof: start + 2 * dof + 2 * np.arange(dof) + 1),
         link_pose_at=stacked(link_pose_at, 7),
+        link_env=np.array(link_env, dtype=np.int64),
         row_of={id(b): r for b, r in zip(every_body, [*body_rows, *link_rows], strict=True)},
         index_of={id(a): i for i, a in enumerate(articulations)},
         row_count=row,
@@ -144,7 +149,10 @@ class BatchedCpuSystem:
         self._layout: _Layout | None = None
         self._packed: NDArray[np.float32] | None = None
         self._posed: NDArray[np.float32] | None = None
-        self._steps = 0
+        self._pose_lengths: list[int] = []
+        self._link_pose_at = np.zeros((0, 7), dtype=np.int64)
+        self._version = 0
+        """Grows whenever the simulation may hold other values than were fetched."""
         self._links_fetched_at = self._qacc_fetched_at = self._forces_fetched_at = -1
 
     # `Actor.create_from_entities` and `Link.create` ask isinstance(scene.px, PhysxGpuSystem) to decide
@@ -188,7 +196,6 @@ class BatchedCpuSystem:
         """One substep of every env."""
         for system in self.systems:
             system.step()
-        self._steps += 1
         self._forget()
 
     def sync_poses_gpu_to_cpu(self) -> None:
@@ -261,10 +268,9 @@ class BatchedCpuSystem:
             for i, articulation in enumerate(layout.articulations):
                 dof = articulation.dof
                 agrees &= np.allclose(packed[layout.qpos_at[i, :dof]], articulation.qpos, atol=1e-5)
-            poses = self._pack_poses()
-            for link, at in zip(layout.links, layout.link_pose_at, strict=True):
+            for link, packed_pose in zip(layout.links, self._link_poses(), strict=True):
                 pose = link.entity.pose
-                agrees &= np.allclose(poses[at], [*pose.p, *pose.q], atol=1e-5)
+                agrees &= np.allclose(packed_pose, [*pose.p, *pose.q], atol=1e-5)
         if not agrees:
             raise RuntimeError(
                 f"sapien {sapien.__version__} packs its state in another order than the batched CPU core "
@@ -305,31 +311,31 @@ class BatchedCpuSystem:
 
     @property
     def cuda_articulation_qacc(self) -> CpuArray:
-        if self._qacc_fetched_at != self._steps:
+        if self._qacc_fetched_at != self._version:
             for i, articulation in enumerate(self._laid_out.articulations):
                 self._qacc[i, : articulation.dof] = articulation.qacc
-            self._qacc_fetched_at = self._steps
+            self._qacc_fetched_at = self._version
         return _array(self._qacc)
 
     @property
     def cuda_articulation_link_incoming_joint_forces(self) -> CpuArray:
-        if self._forces_fetched_at != self._steps:
+        if self._forces_fetched_at != self._version:
             for i, articulation in enumerate(self._laid_out.articulations):
                 forces = articulation.get_link_incoming_joint_forces()
                 self._joint_forces[i, : len(forces)] = forces
-            self._forces_fetched_at = self._steps
+            self._forces_fetched_at = self._version
         return _array(self._joint_forces)
 
     def fetch_link_velocities(self) -> None:
         """Velocities of all links into columns 7 to 12; two getters a link, so only when asked for."""
-        if self._links_fetched_at == self._steps:
+        if self._links_fetched_at == self._version:
             return
         layout = self._laid_out
         for row, link in zip(layout.link_rows, layout.links, strict=True):
             self._data[row, 7:10] = link.linear_velocity
             self._data[row, 10:13] = link.angular_velocity
         self._data_seen[layout.link_rows] = self._data[layout.link_rows]
-        self._links_fetched_at = self._steps
+        self._links_fetched_at = self._version
 
     def _pack(self) -> NDArray[np.float32]:
         if self._packed is None:
@@ -339,15 +345,23 @@ class BatchedCpuSystem:
             self._packed[-1] = 0.0
         return self._packed
 
-    def _pack_poses(self) -> NDArray[np.float32]:
+    def _link_poses(self) -> NDArray[np.float32]:
+        """(L, 7) poses of all links: position, quaternion wxyz."""
+        layout = self._laid_out
         if self._posed is None:
-            self._posed = np.frombuffer(
-                b"".join([scene.pack_poses() for scene in self.scenes]), dtype=np.float32
-            )
-        return self._posed
+            packs = [scene.pack_poses() for scene in self.scenes]
+            lengths = [len(pack) // 4 for pack in packs]
+            if lengths != self._pose_lengths:
+                # Cameras are added after the scene is laid out: each makes its env's pack longer.
+                starts = np.cumsum([0, *lengths[:-1]])
+                self._link_pose_at = layout.link_pose_at + starts[layout.link_env][:, None]
+                self._pose_lengths = lengths
+            self._posed = np.frombuffer(b"".join(packs), dtype=np.float32)
+        return self._posed[self._link_pose_at]
 
     def _forget(self) -> None:
         self._packed = self._posed = None
+        self._version += 1
         self.contacts.invalidate()
 
     def _fetch_bodies(self) -> None:
@@ -358,7 +372,7 @@ class BatchedCpuSystem:
 
     def _fetch_links(self) -> None:
         layout = self._laid_out
-        poses = self._pack_poses()[layout.link_pose_at]
+        poses = self._link_poses()
         self._data[layout.link_rows, :7] = poses
         self._data_seen[layout.link_rows, :7] = poses
         velocities = self._pack()[layout.root_at[:, 7:]]

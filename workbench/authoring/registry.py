@@ -1,0 +1,177 @@
+"""ManiSkill's and gymnasium's tables of names, while an author's file is being executed.
+
+`@register_env` keeps the *old* class when an id exists: it logs "already registered. Skip" and
+returns. For a file that is executed on every save this means that the first version stays for ever
+in the tables, and that a file which takes a built-in id is not looked at at all. So while a file
+is executed, the two decorators are replaced by ones that note what they were asked, clear the
+name, and hand over to ManiSkill's own. What stood under a name before is kept, slot by slot, so
+that a load that fails, or a new version that no longer uses the name, leaves the tables as if it
+had never been.
+
+Only registrations made from the author's files are treated so. A library that the file imports
+for the first time registers as it always does, and stays registered when the load fails, because
+it stays imported.
+
+This is the only module of `workbench.authoring` that relies on names of mani_skill which it does
+not document; tests/authoring/test_registry.py fails when one of them moves (mani_skill 3.0.1).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import mani_skill.agents
+import mani_skill.agents.registration
+import mani_skill.envs  # noqa: F401  (registers the built-in tasks, which a file may replace)
+import mani_skill.utils.registration
+from gymnasium.envs.registration import registry as gymnasium_registry
+from mani_skill.agents.registration import REGISTERED_AGENTS
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.assets import DATA_GROUPS
+from mani_skill.utils.registration import REGISTERED_ENVS, EnvSpec
+
+_TABLES: tuple[dict[str, Any], ...] = (REGISTERED_ENVS, gymnasium_registry, REGISTERED_AGENTS, DATA_GROUPS)
+_NOTHING = object()
+
+Slot = tuple[Any, ...]
+"""What the four tables hold under one name."""
+
+
+class DuplicateName(Exception):
+    """One load registers the same id twice: the author's mistake, whose second place raises."""
+
+
+@dataclass(frozen=True)
+class Registration:
+    name: str
+    cls: type
+    file: str
+    line: int
+
+
+@dataclass
+class Registrations:
+    """What one load put into the tables."""
+
+    made: list[Registration] = field(default_factory=list)
+    """In order; environments and agents."""
+    displaced: dict[str, Slot] = field(default_factory=dict)
+    """Name to what stood there before."""
+    placed: dict[str, Slot] = field(default_factory=dict)
+    """Name to what this load put there."""
+
+    def undo(self) -> None:
+        """Put back what stood under each name, unless somebody took the name since."""
+        for name, before in self.displaced.items():
+            if name not in self.placed or _same(_take(name), self.placed[name]):
+                _put(name, before)
+
+    def redo(self) -> None:
+        """Put this load's entries in again."""
+        for name, slot in self.placed.items():
+            self.displaced[name] = _take(name)
+            _put(name, slot)
+
+    def replaced_names(self) -> tuple[str, ...]:
+        """Names that belonged to somebody else: built-in tasks, say."""
+        return tuple(
+            name
+            for name, slot in self.displaced.items()
+            if any(value is not _NOTHING for value in slot[:3])
+        )
+
+
+def environment(env_id: str) -> EnvSpec | None:
+    """ManiSkill's entry for `env_id`: ``cls``, ``max_episode_steps``, ``default_kwargs``."""
+    return REGISTERED_ENVS.get(env_id)
+
+
+def environment_ids() -> list[str]:
+    return sorted(REGISTERED_ENVS)
+
+
+def is_other_gymnasium_id(env_id: str) -> bool:
+    """True for ids that gymnasium knows and ManiSkill does not (``CartPole-v1``)."""
+    return env_id in gymnasium_registry and env_id not in REGISTERED_ENVS
+
+
+def is_task(value: object) -> bool:
+    return isinstance(value, type) and issubclass(value, BaseEnv) and value is not BaseEnv
+
+
+@contextmanager
+def registering(is_own: Callable[[str], bool]) -> Iterator[Registrations]:
+    """Note and let through what files for which `is_own` holds register meanwhile.
+
+    Leaves the tables as they are afterwards, whether the body raises or not: see `Registrations.undo`.
+    """
+    registrations = Registrations()
+    registration = mani_skill.utils.registration
+    agents = mani_skill.agents.registration
+    register_env, register_agent = registration.register_env, agents.register_agent
+
+    def noting(name: str, cls: type, override: bool, caller: tuple[str, int], register: Callable[[], Any]) -> Any:
+        file, line = caller
+        earlier = next((made for made in registrations.made if made.name == name), None)
+        if earlier is not None and not override:
+            # ManiSkill would keep the first and say so in one log line, which nobody sees.
+            raise DuplicateName(
+                f"{name!r} is registered twice: in line {earlier.line} ({earlier.cls.__name__}) of "
+                f"{earlier.file} and in line {line} ({getattr(cls, '__name__', cls)})"
+                f"{'' if file == earlier.file else f' of {file}'}. Give one of them another id."
+            )
+        registrations.displaced.setdefault(name, _take(name))
+        _put(name, (_NOTHING,) * len(_TABLES))
+        result = register()
+        registrations.made.append(Registration(name, cls, file, line))
+        registrations.placed[name] = _take(name)
+        return result
+
+    def own_register_env(*args: Any, **kwargs: Any) -> Callable[[type], type]:
+        caller = _caller()
+        decorator = register_env(*args, **kwargs)
+        if not is_own(caller[0]):
+            return decorator
+        uid, override = arguments(register_env, args, kwargs)
+        return lambda cls: noting(uid, cls, override, caller, lambda: decorator(cls))
+
+    def own_register_agent(*args: Any, **kwargs: Any) -> Callable[[type], type]:
+        caller = _caller()
+        decorator = register_agent(*args, **kwargs)
+        if not is_own(caller[0]):
+            return decorator
+        override = bool(kwargs.get("override", len(args) > 1 and args[1]))
+        return lambda cls: noting(cls.uid, cls, override, caller, lambda: decorator(cls))
+
+    registration.register_env = own_register_env
+    agents.register_agent = mani_skill.agents.register_agent = own_register_agent
+    try:
+        yield registrations
+    finally:
+        registration.register_env = register_env
+        agents.register_agent = mani_skill.agents.register_agent = register_agent
+
+
+def _caller() -> tuple[str, int]:
+    frame = sys._getframe(2)
+    return frame.f_code.co_filename, frame.f_lineno
+
+
+def _take(name: str) -> Slot:
+    return tuple(table.get(name, _NOTHING) for table in _TABLES)
+
+
+def _put(name: str, slot: Slot) -> None:
+    for table, value in zip(_TABLES, slot, strict=True):
+        if value is _NOTHING:
+            table.pop(name, None)
+        else:
+            table[name] = value
+
+
+def _same(left: Slot, right: Slot) -> bool:
+    return all(a is b for a, b in zip(left, right, strict=True))

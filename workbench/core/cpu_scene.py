@@ -1,0 +1,151 @@
+"""A ManiSkill task class made to run N envs on the CPU.
+
+ManiSkill 3.0.1 refuses ``num_envs > 1`` on the CPU, and its refusal is four small things: the name of
+the simulation backend, one ``is_cuda()``, the scene that ``_setup_scene`` builds, and how cameras are
+grouped. `batched_class` puts a mixin in front of the task class that answers those four, so the
+author's class is used as it is, and stock ``gym.make`` stays stock.
+
+Each env gets its own ``PhysxCpuSystem`` and its own ``RenderSystem``: exact (nothing of a neighbour can
+reach it), and a picture of env i renders env i alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import sapien
+import sapien.physx as physx
+import sapien.render
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.scene import ManiSkillScene
+from mani_skill.envs.utils.system.backend import BackendInfo
+from mani_skill.render.utils import can_render
+
+from workbench.core.contacts import CpuArray
+from workbench.core.cpu_system import BatchedCpuSystem
+from workbench.core.seams import install_index_seams
+
+SIM_BACKEND = "physx_cpu_batched"
+"""Not among ManiSkill's ``CPU_SIM_BACKENDS``, the names for which it refuses more than one env."""
+
+
+class BatchedSimDevice:
+    """Stands for ``sapien.Device("cpu")`` where ManiSkill asks ``_sim_device.is_cuda()``.
+
+    It asks in order to know whether drive targets must be applied after an action: here they must.
+    """
+
+    def is_cuda(self) -> bool:
+        return True
+
+    def __repr__(self) -> str:
+        return "BatchedSimDevice(cpu)"
+
+
+class CpuCameraGroup:
+    """One camera of every env, with the interface of SAPIEN's ``RenderCameraGroup``."""
+
+    def __init__(self, cameras: list[sapien.render.RenderCameraComponent]) -> None:
+        self._cameras = cameras
+
+    def take_picture(self) -> None:
+        for camera in self._cameras:
+            camera.take_picture()
+
+    def get_picture_cuda(self, name: str) -> CpuArray:
+        """(N, H, W, C) texture `name` of every env, on the CPU."""
+        pictures = [torch.from_numpy(camera.get_picture(name)) for camera in self._cameras]
+        return CpuArray(torch.stack(pictures))
+
+
+class BatchedCpuScene(ManiSkillScene):
+    """N sub-scenes, each with its own CPU physics and render system, as one ManiSkill scene."""
+
+    def __init__(self, sub_scenes: list[sapien.Scene], **kwargs: Any) -> None:
+        super().__init__(sub_scenes, **kwargs)
+        self.px = BatchedCpuSystem(sub_scenes)  # type: ignore[assignment]
+        self.gpu_sim_enabled = True
+
+    def _sapien_add_camera(self, *args: Any, **kwargs: Any) -> Any:
+        # A camera on a link is given a GPU pose index in GPU simulation; a CPU body has none, and the
+        # camera is moved with its entity anyway.
+        self.gpu_sim_enabled = False
+        try:
+            return super()._sapien_add_camera(*args, **kwargs)
+        finally:
+            self.gpu_sim_enabled = True
+
+    def _sapien_update_render(
+        self, update_sensors: bool = True, update_human_render_cameras: bool = True
+    ) -> None:
+        chosen = [self.sensors] * update_sensors + [self.human_render_cameras] * update_human_render_cameras
+        for cameras in chosen:
+            for name, sensor in cameras.items():
+                if sensor.camera.camera_group is None:
+                    group = CpuCameraGroup(sensor.camera._render_cameras)
+                    sensor.camera.camera_group = self.camera_groups[name] = group
+        for sub_scene in self.sub_scenes:
+            sub_scene.update_render()
+
+    def _gpu_apply_all(self) -> None:
+        self.px.apply_changes()  # type: ignore[union-attr]
+        self._needs_fetch = True
+
+    def step(self) -> None:
+        self.px.step()
+
+
+class BatchedCpuMixin:
+    """Goes in front of a task class; see the module's text."""
+
+    num_envs: int
+    _sim_freq: int
+    _set_scene_config: Any
+    sim_config: Any
+    render_mode: str | None
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        if kwargs.get("parallel_in_single_scene"):
+            raise ValueError("parallel_in_single_scene is not possible with the batched CPU core: the page "
+                             "shows all envs side by side without it.")
+        kwargs["sim_backend"] = "physx_cpu"
+        super().__init__(*args, **kwargs)
+
+    @property
+    def backend(self) -> BackendInfo:
+        return self._backend
+
+    @backend.setter
+    def backend(self, value: BackendInfo) -> None:
+        # BaseEnv.__init__ compares this name with those for which it refuses num_envs > 1.
+        self._backend = replace(value, sim_backend=SIM_BACKEND)
+
+    @property
+    def _sim_device(self) -> BatchedSimDevice:
+        return BatchedSimDevice()
+
+    @_sim_device.setter
+    def _sim_device(self, value: sapien.Device) -> None:
+        """BaseEnv sets the device that it parsed from the backend: the CPU, as asked in __init__."""
+
+    def _setup_scene(self) -> None:
+        self._set_scene_config()
+        sub_scenes = []
+        for _ in range(self.num_envs):
+            systems: list[Any] = [physx.PhysxCpuSystem()]
+            if can_render(self.backend.render_device):
+                systems.append(sapien.render.RenderSystem(self.backend.render_device))
+            sub_scenes.append(sapien.Scene(systems))
+        self.scene = BatchedCpuScene(
+            sub_scenes, sim_config=self.sim_config, device=self.device, backend=self.backend  # type: ignore
+        )
+        self.scene.px.timestep = 1.0 / self._sim_freq
+
+
+def batched_class(task: type[BaseEnv]) -> type[BaseEnv]:
+    """`task` with the batched CPU simulation in front of it; `task` itself is left as it is."""
+    install_index_seams()
+    namespace = {"__module__": task.__module__, "__doc__": task.__doc__, "__qualname__": task.__qualname__}
+    return type(task.__name__, (BatchedCpuMixin, task), namespace)

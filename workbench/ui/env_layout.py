@@ -1,0 +1,186 @@
+"""Where env i of the batch stands in the page's 3-D view.
+
+Every env has its own world frame and all of them sit on top of each other at its origin; a person
+wants to see them side by side. So each env is given an offset on a grid whose spacing comes from
+what stands in one env (its table and robot, not its endless floor), and a pose in the page is the
+env's own pose plus that offset. Floors are wide enough for the whole grid and are drawn once:
+sixteen overlapping floors would flicker where they meet and cost sixteen times the triangles.
+
+Plain arrays and pure functions: nothing here knows of a browser.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.core.geometry import Mesh, SceneGeometry, Visual
+
+FLOOR_WIDTH = 8.0
+"""Metres. A flat static thing wider than this in both directions is a floor: ManiSkill's ground is
+40 to 100 m wide, the largest table 2.4 m."""
+FLOOR_THICKNESS = 0.05
+MARGIN = 0.35
+"""Metres between two envs at rest; a robot that reaches out uses some of it."""
+
+
+@dataclass(frozen=True)
+class EnvLayout:
+    """One env's box and where each of them stands, in metres, z up."""
+
+    offsets: NDArray[np.float32]
+    """(N, 3) added to an env's own coordinates."""
+    low: NDArray[np.float32]
+    """(3,) lowest corner of what stands in one env, floor left out, in the env's frame."""
+    high: NDArray[np.float32]
+    """(3,)"""
+    floor_height: float
+    """z on which the envs stand: the floor's, or the lowest point of the env."""
+    has_floor: bool
+
+    def box_of_all(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Lowest and highest corner of the whole grid."""
+        return self.low + self.offsets.min(axis=0), self.high + self.offsets.max(axis=0)
+
+
+def rotate(wxyz: NDArray, points: NDArray) -> NDArray:
+    """Turn points by unit quaternions; both broadcast over leading dimensions, last ones 4 and 3."""
+    w, axis = wxyz[..., :1], wxyz[..., 1:]
+    across = 2.0 * np.cross(axis, points)
+    return points + w * across + np.cross(axis, across)
+
+
+def is_floor(visual: Visual, geometry: SceneGeometry) -> bool:
+    """True for a flat, very wide thing that never moves: drawn once for all envs."""
+    if any(geometry.body_kinds[b] not in ("static", "kinematic") for b in np.unique(visual.bodies)):
+        return False
+    size = np.sort(_extent(visual.mesh))
+    return bool(size[0] < FLOOR_THICKNESS and size[1] > FLOOR_WIDTH)
+
+
+def lay_out(geometry: SceneGeometry, poses: NDArray[np.float32]) -> EnvLayout:
+    """The grid for these envs.
+
+    Args:
+        geometry: The scene.
+        poses: (N, B, 7) of a moment, normally right after a reset; rows of absent bodies are NaN.
+    """
+    lows, highs = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    floors = []
+    for visual in geometry.visuals:
+        if not len(visual.mesh.vertices):
+            continue
+        corners = _corners_in_env(visual, poses)
+        if not len(corners):
+            continue
+        if is_floor(visual, geometry):
+            floors.append(float(corners[..., 2].max()))
+        else:
+            lows.append(corners.min(axis=1))
+            highs.append(corners.max(axis=1))
+    low, high = np.concatenate(lows), np.concatenate(highs)
+    if len(low):
+        low, high = low.min(axis=0), high.max(axis=0)
+    else:
+        low, high = np.full(3, -0.5), np.full(3, 0.5)
+    floor = max(floors) if floors else float(low[2])
+    return EnvLayout(
+        offsets=grid_offsets(geometry.num_envs, high[:2] - low[:2] + MARGIN),
+        low=low.astype(np.float32),
+        high=high.astype(np.float32),
+        floor_height=floor,
+        has_floor=bool(floors),
+    )
+
+
+def grid_offsets(num_envs: int, spacing: NDArray) -> NDArray[np.float32]:
+    """(N, 3) offsets of a grid about the origin, env 0 in front on the left as seen from +x.
+
+    Rows run along y and are filled from +x (nearest to where the camera starts) backwards. Their
+    number is chosen so that the whole takes up a square as nearly as whole rows allow.
+    """
+    width, depth = float(spacing[1]), float(spacing[0])
+    columns = max(1, min(num_envs, round((num_envs * depth / width) ** 0.5)))
+    rows = -(-num_envs // columns)
+    row, column = np.divmod(np.arange(num_envs), columns)
+    x = ((rows - 1) / 2 - row) * depth
+    y = (column - (columns - 1) / 2) * width
+    return np.stack([x, y, np.zeros(num_envs)], axis=1).astype(np.float32)
+
+
+def env_under_ray(layout: EnvLayout, origin: NDArray, direction: NDArray) -> int | None:
+    """The env whose box a ray of the view meets first, or None.
+
+    A ray against one box an env (the slab test) answers a click without a search tree over every
+    triangle in the browser, which clickable meshes would have to rebuild at every frame.
+    """
+    origin, direction = np.asarray(origin, np.float64), np.asarray(direction, np.float64)
+    if not (np.isfinite(origin).all() and np.isfinite(direction).all()):
+        return None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        near = (layout.low + layout.offsets - origin) / direction
+        far = (layout.high + layout.offsets - origin) / direction
+    enters = np.nanmax(np.minimum(near, far), axis=1)
+    leaves = np.nanmin(np.maximum(near, far), axis=1)
+    hit = (enters <= leaves) & (leaves >= 0)
+    if not hit.any():
+        return None
+    return int(np.where(hit, enters, np.inf).argmin())
+
+
+def flat_as_quad(mesh: Mesh) -> Mesh:
+    """A level rectangle cut into many triangles, as two; anything else comes back as it is.
+
+    ManiSkill's ground is 20,000 triangles of one plane, more than all the robots of a batch that
+    was simplified for the browser. Two are enough where height is constant, the outline is the
+    bounding rectangle and texture coordinates are linear in x and y.
+    """
+    points = mesh.vertices
+    if len(mesh.faces) <= 2 or not len(points) or np.ptp(points[:, 2]) > 1e-6:
+        return mesh
+    low, high = points.min(axis=0), points.max(axis=0)
+    a, b, c = (points[mesh.faces[:, i], :2].astype(np.float64) for i in range(3))
+    ab, ac = b - a, c - a
+    signed = 0.5 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
+    rectangle = float(np.prod((high - low)[:2].astype(np.float64)))
+    if abs(abs(signed.sum()) - rectangle) > 1e-3 * rectangle:
+        return mesh
+    corners = np.array(
+        [[x, y, low[2]] for x, y in ((low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1]))],
+        np.float32,
+    )
+    uvs = None
+    if mesh.uvs is not None:
+        design = np.column_stack([points[:, :2], np.ones(len(points))])
+        linear, *_ = np.linalg.lstsq(design, mesh.uvs, rcond=None)
+        if np.abs(design @ linear - mesh.uvs).max() > 1e-3:
+            return mesh
+        uvs = np.column_stack([corners[:, :2], np.ones(4)]) @ linear
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
+    up = 1.0
+    if signed.sum() < 0:
+        faces, up = faces[:, ::-1].copy(), -1.0
+    return Mesh(
+        vertices=corners,
+        faces=faces,
+        normals=np.tile(np.array([0, 0, up], np.float32), (4, 1)),
+        uvs=None if uvs is None else uvs.astype(np.float32),
+    )
+
+
+def _extent(mesh: Mesh) -> NDArray:
+    if not len(mesh.vertices):
+        return np.zeros(3)
+    return np.ptp(mesh.vertices, axis=0)
+
+
+def _corners_in_env(visual: Visual, poses: NDArray) -> NDArray:
+    """(K', 8, 3) corners of each instance's box in its env's frame; absent instances left out."""
+    low, high = visual.mesh.vertices.min(axis=0), visual.mesh.vertices.max(axis=0)
+    picks = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
+    corners = np.where(picks == 0, low, high)
+    worn = poses[visual.envs, visual.bodies].astype(np.float64)
+    worn = worn[np.isfinite(worn).all(axis=1)]
+    return rotate(worn[:, None, 3:], corners[None]) + worn[:, None, :3]

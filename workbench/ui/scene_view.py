@@ -1,0 +1,118 @@
+"""The bodies of the envs in the page: built once a scene, moved once a frame.
+
+One viser node a body is unusable in a browser from a hundred bodies on (measured: 1 frame a second
+at 3,840), one batched node a shape is not (30 a second). So the scene is a handful of batched nodes,
+and a frame is two arrays a node: world positions and quaternions, each env's own pose plus its place
+in the grid. World poses and not parent frames, because viser's batches bypass its scene graph and a
+parent that moves in the same frame makes them shake.
+
+Showing one env alone really sends one env: the arrays of a batch may change their length, the
+browser then keeps that many instances. Bodies that an env lacks (NaN) are left out the same way.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.core.geometry import SceneGeometry
+from workbench.ui.env_layout import EnvLayout, flat_as_quad, is_floor
+from workbench.ui.meshes_as_glb import WornTogether, as_glb, group_by_wearers
+
+
+class SceneView:
+    """The batched nodes of one scene under ``/envs``."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._drawn: list[_DrawnGroup] = []
+        self._floor_grid: viser.GridHandle | None = None
+
+    def build(self, geometry: SceneGeometry, layout: EnvLayout, poses: NDArray[np.float32]) -> None:
+        """Replace whatever was shown by this scene, at these poses ((N, B, 7), env frames)."""
+        self.clear()
+        for number, group in enumerate(group_by_wearers(geometry)):
+            floor = all(is_floor(visual, geometry) for visual in group.visuals)
+            self._drawn.append(_DrawnGroup(self._server, number, group, floor))
+        if not layout.has_floor:
+            low, high = layout.box_of_all()
+            self._floor_grid = self._server.scene.add_grid(
+                "/floor",
+                width=float(high[0] - low[0]) + 4.0,
+                height=float(high[1] - low[1]) + 4.0,
+                cell_size=0.5,
+                section_size=1.0,
+                position=(0.0, 0.0, layout.floor_height),
+                cell_color=(150, 150, 150),
+                section_color=(120, 120, 120),
+            )
+        self.move(poses, layout, only_env=None)
+
+    def move(self, poses: NDArray[np.float32], layout: EnvLayout, only_env: int | None) -> None:
+        """Put every body where it is now.
+
+        Args:
+            poses: (N, B, 7) in env frames.
+            layout: Where each env stands.
+            only_env: Show this env alone, at the origin; None shows all, on the grid.
+        """
+        for group in self._drawn:
+            group.move(poses, layout, only_env)
+
+    def clear(self) -> None:
+        for group in self._drawn:
+            group.handle.remove()
+        self._drawn.clear()
+        if self._floor_grid is not None:
+            self._floor_grid.remove()
+            self._floor_grid = None
+
+    @property
+    def handles(self) -> tuple[viser.BatchedGlbHandle, ...]:
+        return tuple(group.handle for group in self._drawn)
+
+
+class _DrawnGroup:
+    def __init__(
+        self, server: viser.ViserServer, number: int, group: WornTogether, floor: bool
+    ) -> None:
+        self._group = group
+        self._floor = floor
+        parts = [
+            (flat_as_quad(visual.mesh) if floor else visual.mesh, visual.material) for visual in group.visuals
+        ]
+        # Instance 0 starts far below the ground: the first move follows in the same batch.
+        self.handle = server.scene.add_batched_glb(
+            f"/envs/{number:03d} {group.name.replace('/', ' ')}",
+            as_glb(parts),
+            batched_wxyzs=np.array([[1, 0, 0, 0]], np.float32),
+            batched_positions=np.array([[0, 0, -1000]], np.float32),
+            # viser's levels of detail leave holes in open meshes and pop while one looks.
+            lod="off",
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+
+    def move(self, poses: NDArray[np.float32], layout: EnvLayout, only_env: int | None) -> None:
+        envs, bodies = self._group.envs, self._group.bodies
+        if self._floor:
+            # One floor for all: the first wearer's, under the middle of the grid.
+            envs, bodies = envs[:1], bodies[:1]
+            worn = poses[envs, bodies]
+            positions = worn[:, :3]
+        elif only_env is None:
+            worn = poses[envs, bodies]
+            positions = worn[:, :3] + layout.offsets[envs]
+        else:
+            mine = envs == only_env
+            worn = poses[envs[mine], bodies[mine]]
+            positions = worn[:, :3]
+        there = np.isfinite(worn).all(axis=1)
+        if not there.all():
+            worn, positions = worn[there], positions[there]
+        self.handle.visible = bool(len(positions))
+        if len(positions):
+            # Equal arrays are not sent again (viser compares), so what rests costs no bytes.
+            self.handle.batched_positions = np.ascontiguousarray(positions)
+            self.handle.batched_wxyzs = np.ascontiguousarray(worn[:, 3:])
