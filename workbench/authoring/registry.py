@@ -18,19 +18,24 @@ not document; tests/authoring/test_registry.py fails when one of them moves (man
 
 from __future__ import annotations
 
+import functools
+import inspect
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-import mani_skill.agents
-import mani_skill.agents.registration
 import mani_skill.envs  # noqa: F401  (registers the built-in tasks, which a file may replace)
-import mani_skill.utils.registration
 from gymnasium.envs.registration import registry as gymnasium_registry
+from mani_skill import agents
+from mani_skill.agents import registration as agent_registration
 from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.envs.sapien_env import BaseEnv
+
+# Not `import mani_skill.utils.registration`: mani_skill's own `from .envs import *` binds the name
+# `utils` on the package to mani_skill.envs.utils.
+from mani_skill.utils import registration as env_registration
 from mani_skill.utils.assets import DATA_GROUPS
 from mani_skill.utils.registration import REGISTERED_ENVS, EnvSpec
 
@@ -110,9 +115,7 @@ def registering(is_own: Callable[[str], bool]) -> Iterator[Registrations]:
     Leaves the tables as they are afterwards, whether the body raises or not: see `Registrations.undo`.
     """
     registrations = Registrations()
-    registration = mani_skill.utils.registration
-    agents = mani_skill.agents.registration
-    register_env, register_agent = registration.register_env, agents.register_agent
+    register_env, register_agent = env_registration.register_env, agent_registration.register_agent
 
     def noting(name: str, cls: type, override: bool, caller: tuple[str, int], register: Callable[[], Any]) -> Any:
         file, line = caller
@@ -131,29 +134,32 @@ def registering(is_own: Callable[[str], bool]) -> Iterator[Registrations]:
         registrations.placed[name] = _take(name)
         return result
 
+    @functools.wraps(register_env)
     def own_register_env(*args: Any, **kwargs: Any) -> Callable[[type], type]:
         caller = _caller()
         decorator = register_env(*args, **kwargs)
         if not is_own(caller[0]):
             return decorator
-        uid, override = arguments(register_env, args, kwargs)
-        return lambda cls: noting(uid, cls, override, caller, lambda: decorator(cls))
+        given = inspect.signature(register_env).bind(*args, **kwargs).arguments
+        name, override = given["uid"], bool(given.get("override"))
+        return lambda cls: noting(name, cls, override, caller, lambda: decorator(cls))
 
+    @functools.wraps(register_agent)
     def own_register_agent(*args: Any, **kwargs: Any) -> Callable[[type], type]:
         caller = _caller()
         decorator = register_agent(*args, **kwargs)
         if not is_own(caller[0]):
             return decorator
-        override = bool(kwargs.get("override", len(args) > 1 and args[1]))
+        override = bool(inspect.signature(register_agent).bind(*args, **kwargs).arguments.get("override"))
         return lambda cls: noting(cls.uid, cls, override, caller, lambda: decorator(cls))
 
-    registration.register_env = own_register_env
-    agents.register_agent = mani_skill.agents.register_agent = own_register_agent
+    env_registration.register_env = own_register_env
+    agents.register_agent = agent_registration.register_agent = own_register_agent
     try:
         yield registrations
     finally:
-        registration.register_env = register_env
-        agents.register_agent = mani_skill.agents.register_agent = register_agent
+        env_registration.register_env = register_env
+        agents.register_agent = agent_registration.register_agent = register_agent
 
 
 def _caller() -> tuple[str, int]:

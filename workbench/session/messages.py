@@ -208,6 +208,8 @@ class Stepped:
     """Pictures that belong to exactly this step (only while capturing)."""
     seeds: NDArray[np.int64] | None = None
     """(N,) episode seed of each env, where a reset was part of this."""
+    again: bool = False
+    """The state as it stands, sent once more with its pictures because capturing begins."""
 
 
 @dataclass(frozen=True)

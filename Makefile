@@ -1,0 +1,95 @@
+# Two commands are enough: `make open` and `make test`. Each sets up what it needs, once: a virtual
+# environment in .venv, the tested versions from constraints.txt, a Vulkan driver for SAPIEN where there is
+# none, Chromium for the tests. What is there already is left alone, so the second time is quick.
+#
+#   make open TASK=path/to/task.py ARGS="--num-envs 4 --port 8123"
+#   make test ARGS="-k camera"
+
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help open test test-all lint wheel doctor clean set-up set-up-test FORCE
+
+TASK ?= tasks/push_cube.py
+ARGS ?=
+VENV := .venv
+BIN := $(VENV)/bin
+
+# The first Python that runs and that every pinned package has a release for. A pyenv shim can be on PATH and
+# still not run, so each is asked.
+PYTHON ?= $(shell for p in python3 python3.12 python3.11; do \
+	$$p -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))' 2>/dev/null && echo $$p && break; \
+	done)
+
+# A .venv whose interpreter is gone (the system's Python was upgraded) is made anew.
+ifneq ($(wildcard $(VENV)/pyvenv.cfg),)
+BROKEN_VENV := $(shell $(BIN)/python -c '' 2>/dev/null || echo FORCE)
+endif
+
+help:
+	@echo "make open      show tasks/push_cube.py in the browser (TASK=file or env id, ARGS=options of workbench open)"
+	@echo "make test      lint, types and the tests that need no GPU and little time (ARGS=options of pytest)"
+	@echo "make test-all  the slow tests too"
+	@echo "make lint      ruff and pyright"
+	@echo "make wheel     dist/*.whl"
+	@echo "make doctor    what this machine can do, and what to do about the rest"
+	@echo "make clean     remove what building and testing left; .venv stays"
+
+open: set-up
+	@env_lines=$$($(BIN)/python -m workbench.machine.software_vulkan --export); eval "$$env_lines"; \
+	exec $(BIN)/workbench open $(TASK) $(ARGS)
+
+test: lint
+	@env_lines=$$($(BIN)/python -m workbench.machine.software_vulkan --export); eval "$$env_lines"; \
+	$(BIN)/python -m pytest -m "not slow" $(ARGS)
+
+test-all: lint
+	@env_lines=$$($(BIN)/python -m workbench.machine.software_vulkan --export); eval "$$env_lines"; \
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: set-up-test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+wheel: set-up-test
+	$(BIN)/python -m build --wheel
+
+doctor: set-up
+	@$(BIN)/python -m workbench.machine.doctor
+
+clean:
+	rm -rf dist build .pytest_cache .ruff_cache .hypothesis
+	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -print0 | xargs -0 -r rm -rf
+
+set-up: $(VENV)/.installed
+
+set-up-test: $(VENV)/.installed-test
+	@$(BIN)/python -m workbench.machine.chromium
+
+$(VENV)/pyvenv.cfg: $(BROKEN_VENV)
+	@if [ -z "$(PYTHON)" ]; then \
+		echo "Workbench needs Python 3.11 or 3.12 and found neither as python3, python3.12 nor python3.11." >&2; \
+		echo "Install one (Debian 12 and Ubuntu 24.04 have one as python3), or name it: make PYTHON=/path/to/python3.12" >&2; \
+		exit 1; \
+	fi
+	@if ! $(PYTHON) -c 'import ensurepip' 2>/dev/null; then \
+		package=$$($(PYTHON) -c 'import sys; print("python%d.%d-venv" % sys.version_info[:2])'); \
+		if [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then \
+			apt-get update -q && DEBIAN_FRONTEND=noninteractive apt-get install -y -q $$package; \
+		else \
+			echo "$(PYTHON) cannot make virtual environments. Type: sudo apt-get install $$package" >&2; exit 1; \
+		fi; \
+	fi
+	$(PYTHON) -m venv --clear $(VENV)
+
+$(VENV)/.installed: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
+	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e .
+	@touch $@
+
+$(VENV)/.installed-test: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
+	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[test]'
+	@touch $(VENV)/.installed $@
+
+FORCE:

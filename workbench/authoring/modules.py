@@ -1,0 +1,245 @@
+"""The author's modules in Python's own tables: found, executed fresh, and put back.
+
+`importlib.reload` is the wrong tool for a file that is executed on every save: it runs the new text
+in the old namespace, so names that were deleted live on, and it does nothing for the modules
+beside the file. Python's own import is wrong too, in one small way that bites: it believes a
+``.pyc`` whose recorded modification time, in whole seconds, and size match the source, so of two
+saves within a second that change ``0.1`` to ``0.2`` the second is not seen.
+
+So each task has an `AuthorFinder` on ``sys.meta_path``. It finds what lies in the task's folder as
+Python would, but compiles from text alone, remembers every text it executed (that is what the
+watcher follows, what a recording keeps, and what `linecache` must show in tracebacks although the
+file on disk has moved on), and can be given texts to use in place of what is on disk, which is how
+the last good version comes back. `set_aside` takes the author's modules out of ``sys.modules`` so
+that an edited helper is read again, and `put_back` undoes that.
+"""
+
+from __future__ import annotations
+
+import importlib.machinery
+import importlib.util
+import linecache
+import os
+import re
+import sys
+import sysconfig
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from hashlib import sha256
+from importlib.abc import MetaPathFinder
+from pathlib import Path
+from types import CodeType, ModuleType
+
+_MODULE_PREFIX = "workbench_task_"
+_LIBRARY_FOLDERS = {"site-packages", "dist-packages"}
+_LIBRARY_ROOTS = tuple(
+    {
+        os.path.realpath(sysconfig.get_paths()[name]) + os.sep
+        for name in ("stdlib", "platstdlib", "purelib", "platlib")
+    }
+)
+_WORKBENCH = str(Path(__file__).resolve().parents[1]) + os.sep
+
+
+@dataclass(frozen=True)
+class ModuleName:
+    """How a task's file is called in ``sys.modules``, and what must be on ``sys.path`` for it."""
+
+    name: str
+    search_folder: Path
+
+
+def module_name(file: Path) -> ModuleName:
+    """A name that is the same for every load of `file` and that no other module has.
+
+    A file in a package (its folder has an ``__init__.py``) goes by its dotted name, because only
+    then do its relative imports work.
+    """
+    if (file.parent / "__init__.py").is_file():
+        parts, folder = [] if file.stem == "__init__" else [file.stem], file.parent
+        while (folder / "__init__.py").is_file() and folder.name.isidentifier():
+            parts.insert(0, folder.name)
+            folder = folder.parent
+        return ModuleName(".".join(parts), folder)
+    stem = re.sub(r"\W", "_", file.stem)
+    return ModuleName(f"{_MODULE_PREFIX}{stem}_{sha256(str(file).encode()).hexdigest()[:8]}", file.parent)
+
+
+class AuthorFinder(MetaPathFinder):
+    """Finds and executes the modules of one task: its file, and what lies in the folder beside it."""
+
+    def __init__(self, file: Path, given: Mapping[str, str]) -> None:
+        self.file = file
+        self.main, self.search_folder = module_name(file).name, module_name(file).search_folder
+        self.given = given
+        """Path to text that is used in place of what is on disk."""
+        self.texts: dict[str, str] = {}
+        """Path to text of everything read so far, in order; the task's own file first."""
+        self.names: list[str] = []
+        """Names in ``sys.modules`` of what was executed."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        if fullname == self.main:
+            return self._spec(fullname, str(self.file), is_package=self.file.stem == "__init__")
+        last = fullname.rpartition(".")[2]
+        for folder in [str(self.search_folder)] if path is None else list(path):
+            for name, is_package in ((os.path.join(last, "__init__.py"), True), (f"{last}.py", False)):
+                candidate = os.path.join(folder, name)
+                if candidate in self.given:
+                    return self._spec(fullname, candidate, is_package)
+        found = importlib.machinery.PathFinder.find_spec(fullname, path, target)
+        if found is None or found.origin is None or not isinstance(
+            found.loader, importlib.machinery.SourceFileLoader
+        ):
+            return None
+        if not is_own_file(found.origin, self.file.parent):
+            return None
+        return self._spec(fullname, found.origin, found.submodule_search_locations is not None)
+
+    def text(self, path: str) -> str:
+        """What is executed for `path`. Raises OSError, or SyntaxError for what is no text."""
+        if path in self.given:
+            return self.given[path]
+        with open(path, "rb") as file:
+            return decode(path, file.read())
+
+    def remember(self, path: str, text: str) -> None:
+        self.texts[path] = text
+        show_in_tracebacks(path, text)
+
+    def _spec(self, name: str, path: str, is_package: bool) -> importlib.machinery.ModuleSpec | None:
+        return importlib.util.spec_from_file_location(
+            name,
+            path,
+            loader=_AuthorLoader(self, name, path),
+            submodule_search_locations=[os.path.dirname(path)] if is_package else None,
+        )
+
+
+class _AuthorLoader(importlib.machinery.SourceFileLoader):
+    """Executes one text. Has no part in bytecode files: they are neither read nor written."""
+
+    def __init__(self, finder: AuthorFinder, name: str, path: str) -> None:
+        super().__init__(name, path)
+        self.finder = finder
+
+    def get_source(self, fullname: str) -> str:
+        path = self.get_filename(fullname)
+        return self.finder.texts[path] if path in self.finder.texts else self.finder.text(path)
+
+    def get_code(self, fullname: str) -> CodeType:
+        path = self.get_filename(fullname)
+        text = self.finder.text(path)
+        # Before compile(): a SyntaxError's place must be looked up in the text that has it.
+        self.finder.remember(path, text)
+        if "\0" in text:
+            # Python 3.10 raises a ValueError here, which names no file.
+            line = text[: text.index("\0")].count("\n") + 1
+            raise SyntaxError("source code cannot contain null bytes", (path, line, 1, None))
+        return compile(text, path, "exec", dont_inherit=True)
+
+    def exec_module(self, module: ModuleType) -> None:
+        name = module.__name__
+        self.finder.names.append(name)
+        stem = self.finder.file.stem
+        if name == self.finder.main and stem not in sys.modules and stem not in sys.stdlib_module_names:
+            # A helper that imports the task by its file's name must get this module: executed a
+            # second time under another name, it would register its ids twice.
+            sys.modules[stem] = module
+            self.finder.names.append(stem)
+        exec(self.get_code(name), module.__dict__)
+
+
+def decode(path: str, raw: bytes) -> str:
+    """The text of a Python source file: its coding line or UTF-8, line ends as ``\\n``.
+
+    Raises SyntaxError, with `path` and line, where Python's own functions raise a
+    UnicodeDecodeError that names neither.
+    """
+    try:
+        return importlib.util.decode_source(raw)
+    except UnicodeDecodeError as exc:
+        line = raw[: exc.start].count(b"\n") + 1
+        raise SyntaxError(f"{exc}; save the file as UTF-8", (path, line, 1, None)) from None
+    except SyntaxError as exc:  # an unknown encoding in the coding line
+        raise SyntaxError(exc.msg, (path, 1, 1, None)) from None
+
+
+def is_own_file(path: str, folder: Path) -> bool:
+    """True for the author's files in or below `folder`.
+
+    A task in a project's root has everything below it: a virtual environment, and the workbench
+    itself where it is installed from its repository. Those are nobody's helpers.
+    """
+    root = str(folder) + os.sep
+    if not path.startswith(root) or path.startswith((_WORKBENCH, *_LIBRARY_ROOTS)):
+        return False
+    return not any(part in _LIBRARY_FOLDERS or part.startswith(".") for part in path[len(root) :].split(os.sep))
+
+
+@dataclass(frozen=True)
+class SetAside:
+    """The author's modules, and what tracebacks showed of them, while a new version is tried."""
+
+    modules: dict[str, ModuleType]
+    lines: dict[str, object]
+    path: list[str]
+
+
+def set_aside(finder: AuthorFinder, is_other_task: Callable[[str], bool]) -> SetAside:
+    """Take the author's modules out of ``sys.modules``: those in the folder, other tasks' helpers.
+
+    The latter because ``helper`` of another task's folder would be found in ``sys.modules`` before
+    ``helper`` of this one. Main modules of other tasks stay (`is_other_task` of their name): nothing
+    imports them by name, and their classes may be in use.
+    """
+    folder = finder.file.parent
+    aside: dict[str, ModuleType] = {}
+    for name, module in list(sys.modules.items()):
+        if name in ("__main__", "__mp_main__") or is_other_task(name):
+            continue
+        # Not getattr: modules that import lazily would import on being asked.
+        attributes = getattr(module, "__dict__", {})
+        spec, file = attributes.get("__spec__"), attributes.get("__file__")
+        if name == finder.main or isinstance(getattr(spec, "loader", None), _AuthorLoader):
+            aside[name] = module
+        elif isinstance(file, str):
+            if file.endswith(".py") and is_own_file(file, folder):
+                aside[name] = module
+        elif spec is not None and spec.origin is None and spec.submodule_search_locations is not None:
+            # A folder without __init__.py: ``from robots import arm`` takes the attribute ``arm``
+            # of the namespace module, and would get the old one without any import.
+            places = [os.path.join(place, "x.py") for place in spec.submodule_search_locations]
+            if any(is_own_file(place, folder) for place in places):
+                aside[name] = module
+    lines = {path: entry for path, entry in linecache.cache.items() if is_own_file(path, folder)}
+    for name in aside:
+        del sys.modules[name]
+    return SetAside(aside, lines, list(sys.path))
+
+
+def put_back(aside: SetAside, finder: AuthorFinder) -> None:
+    """Undo `set_aside` and all that `finder` executed since."""
+    for name in finder.names:
+        sys.modules.pop(name, None)
+    sys.modules.update(aside.modules)
+    for name, module in aside.modules.items():
+        # ``import package.part`` binds ``part`` on the package, and a failed load has rebound it.
+        parent, _, last = name.rpartition(".")
+        if parent in sys.modules:
+            setattr(sys.modules[parent], last, module)
+    for path in finder.texts:
+        linecache.cache.pop(path, None)
+    linecache.cache.update(aside.lines)  # type: ignore[arg-type]
+    sys.path[:] = aside.path
+
+
+def show_in_tracebacks(path: str, text: str) -> None:
+    """Make `linecache` serve `text` for `path`, whatever becomes of the file.
+
+    An entry without a modification time is one that `linecache.checkcache`, which runs before
+    every traceback, leaves alone.
+    """
+    linecache.cache[path] = (len(text), None, text.splitlines(keepends=True), path)

@@ -1,0 +1,75 @@
+"""Which simulation and which renderer this machine can give.
+
+``auto`` must never surprise: GPU simulation needs CUDA *and* PhysX's GPU library, and SAPIEN fetches
+that library from the network at first use. So it is looked for on disk, never fetched by the way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+import sapien
+import sapien.physx as physx
+import torch
+
+
+class BackendUnavailable(RuntimeError):
+    """The backend that was asked for does not work on this machine."""
+
+
+@dataclass(frozen=True)
+class ChosenBackend:
+    simulation: Literal["cpu", "gpu"]
+    render_backend: str
+    """What ManiSkill takes: ``cpu`` (any Vulkan device), ``gpu`` (CUDA) or ``none``."""
+
+
+def gpu_library_path() -> Path:
+    """Where SAPIEN keeps PhysX's GPU library on Linux (see ``sapien/physx/__init__.py``)."""
+    return Path.home() / ".sapien" / "physx" / physx.version() / "libPhysXGpu_64.so"
+
+
+def why_no_gpu_simulation() -> str | None:
+    """One sentence, or None when GPU simulation can be used."""
+    if not torch.cuda.is_available():
+        return "no CUDA device is visible to torch"
+    if not physx.is_gpu_enabled() and not gpu_library_path().exists():
+        return (
+            "PhysX's GPU library is not installed; with a network, "
+            "python -c 'import sapien.physx as p; p.enable_gpu()' fetches it"
+        )
+    return None
+
+
+@lru_cache(maxsize=1)
+def render_device_name() -> str | None:
+    """Name of the device that SAPIEN renders with, or None when it finds none."""
+    try:
+        sapien.render.RenderSystem(sapien.Device("cpu"))
+    except RuntimeError:
+        return None
+    return _device_summary()
+
+
+def _device_summary() -> str:
+    summary = sapien.render.get_device_summary()
+    names = [line.strip() for line in summary.splitlines() if line.strip()]
+    return names[-1] if names else "unknown device"
+
+
+def choose_backend(wanted: Literal["auto", "cpu", "gpu"], render: bool) -> ChosenBackend:
+    """Settle ``auto``; refuse ``gpu`` where it cannot be.
+
+    Raises:
+        BackendUnavailable: with the reason, and what to use instead.
+    """
+    reason = None if wanted == "cpu" else why_no_gpu_simulation()
+    if wanted == "gpu" and reason is not None:
+        raise BackendUnavailable(f"GPU simulation is not available: {reason}. Use --backend cpu.")
+    simulation: Literal["cpu", "gpu"] = "gpu" if wanted != "cpu" and reason is None else "cpu"
+    if not render or render_device_name() is None:
+        return ChosenBackend(simulation, "none")
+    return ChosenBackend(simulation, "gpu" if simulation == "gpu" else "cpu")

@@ -1,0 +1,210 @@
+"""A running task: N envs behind one small interface that gives plain arrays.
+
+Everything that shows, checks, records or replays a task asks here, and never ManiSkill itself. The
+class underneath is the author's own, made batched on the CPU (`cpu_scene`) or handed to ManiSkill's
+GPU simulation, and the caller need not know which.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from numpy.typing import NDArray
+
+from workbench.core import actions
+from workbench.core.assets import refuse_download_prompts, require_assets
+from workbench.core.backends import choose_backend
+from workbench.core.body_table import BodyTable, build_body_table, read_poses
+from workbench.core.cpu_scene import batched_class
+from workbench.core.render_device import keep_render_device
+from workbench.core.step import StepResult
+
+Backend = Literal["auto", "cpu", "gpu"]
+
+
+@dataclass(frozen=True)
+class EnvOptions:
+    """How a task is made."""
+
+    num_envs: int = 16
+    backend: Backend = "auto"
+    """``cpu``: batched on the CPU. ``gpu``: ManiSkill's GPU simulation. ``auto``: the GPU if it works."""
+    render: bool = True
+    """False makes no render system: no pictures, and nothing asked of a graphics driver."""
+    kwargs: Mapping[str, Any] = field(default_factory=dict)
+    """Further keyword arguments of the task class: ``obs_mode``, ``robot_uids``, ``control_mode`` ..."""
+
+    def __post_init__(self) -> None:
+        if self.num_envs < 1:
+            raise ValueError(f"num_envs must be at least 1, not {self.num_envs}")
+
+
+def make_env(
+    task: type[BaseEnv],
+    options: EnvOptions,
+    *,
+    asset_ids: Sequence[str] = (),
+    default_kwargs: Mapping[str, Any] | None = None,
+) -> BaseEnv:
+    """The task class with N envs, unwrapped, as ``gym.make(...).unwrapped`` would give it.
+
+    Raises:
+        MissingAssets: the task or its robot needs a download; names it and the command.
+        BackendUnavailable: ``backend="gpu"`` on a machine that cannot.
+        Exception: whatever the author's class raises while it builds.
+    """
+    require_assets(task.__name__, asset_ids)
+    backend = choose_backend(options.backend, options.render)
+    kwargs: dict[str, Any] = {**(default_kwargs or {}), "reward_mode": default_reward_mode(task), **options.kwargs}
+    kwargs["render_backend"] = backend.render_backend
+    kwargs["num_envs"] = options.num_envs
+    if backend.render_backend != "none":
+        keep_render_device(backend.render_backend)
+    with refuse_download_prompts():
+        if backend.simulation == "gpu":
+            return task(sim_backend="physx_cuda", **kwargs)
+        return batched_class(task)(**kwargs)
+
+
+def default_reward_mode(task: type[BaseEnv]) -> str:
+    """The richest reward that the class really implements.
+
+    ManiSkill's own default is ``normalized_dense`` whether or not the class has one, and the first
+    step of a task without a dense reward then raises a bare NotImplementedError.
+    """
+    wanted = ("normalized_dense", "dense", "sparse", "none")
+    method = {"normalized_dense": "compute_normalized_dense_reward", "dense": "compute_dense_reward"}
+    for mode in wanted:
+        hook = method.get(mode)
+        implemented = hook is None or getattr(task, hook) is not getattr(BaseEnv, hook)
+        if mode in task.SUPPORTED_REWARD_MODES and implemented:
+            return mode
+    return "none"
+
+
+class TaskEnv:
+    """N envs of one task: reset, step, and what they look like, in plain arrays."""
+
+    def __init__(
+        self,
+        env: BaseEnv,
+        max_episode_steps: int | None = None,
+        check: Callable[[Mapping[str, Any], Any], None] | None = None,
+    ) -> None:
+        """
+        Args:
+            env: an unwrapped ManiSkill env (see `make_env`).
+            max_episode_steps: the time limit that ``gym.make``'s wrapper would apply.
+            check: called with what ``evaluate`` and the reward returned, before either is converted;
+                raises if the task broke its contract.
+        """
+        self.env = env
+        self.max_episode_steps = max_episode_steps
+        self.parts = actions.action_parts(env)
+        self.table: BodyTable = build_body_table(env)
+        self.obs: Any = None
+        """The last observation, as the task's ``obs_mode`` gives it."""
+        self._check = check
+
+    @property
+    def num_envs(self) -> int:
+        return self.env.num_envs
+
+    @property
+    def control_dt(self) -> float:
+        """Simulated seconds in one control step."""
+        return self.env.control_timestep
+
+    def reset(self, seed: int | Sequence[int] | None = None, env_idx: Sequence[int] | None = None) -> StepResult:
+        """Start new episodes in all envs, or in those of `env_idx`.
+
+        Args:
+            seed: one seed for the whole batch (env i gets ``seed + i``), or one for each env that is
+                reset; None goes on with the task's own random numbers.
+        """
+        chosen = list(range(self.num_envs)) if env_idx is None else [int(i) for i in env_idx]
+        if any(not 0 <= i < self.num_envs for i in chosen):
+            raise IndexError(f"env_idx {chosen} is out of range for {self.num_envs} envs")
+        if not chosen:
+            raise ValueError("env_idx is empty: name the envs to reset, or leave it out to reset all")
+        options = {} if env_idx is None else {"env_idx": torch.tensor(chosen, device=self.env.device)}
+        seeds = self._seeds(seed, chosen)
+        self.obs, info = self.env.reset(seed=seeds, options=options)
+        info = {key: value for key, value in info.items() if key != "reconfigure"}
+        # A rebuild (`reconfiguration_freq`) replaces every body.
+        self._refresh_if_rebuilt()
+        if self._check is not None:
+            self._check(info, None)
+        return self._result(info, np.zeros(self.num_envs, np.float32), self._terminated(info), None)
+
+    def step(self, action: NDArray[np.float32] | None) -> StepResult:
+        """One control step of all envs with a flat action (N, A), or None to leave the targets alone."""
+        env_action = None if action is None else actions.to_env_action(self.env, self.parts, action)
+        self.obs, reward, terminated, _, info = self.env.step(env_action)
+        if self._check is not None:
+            self._check(info, reward)
+        return self._result(info, to_numpy(reward).astype(np.float32), to_numpy(terminated), action)
+
+    @property
+    def episode_seeds(self) -> NDArray[np.int64]:
+        """(N,) the seeds that the envs were last reset with."""
+        return np.asarray(self.env._episode_seed, dtype=np.int64)
+
+    def close(self) -> None:
+        self.env.close()
+
+    def _refresh_if_rebuilt(self) -> None:
+        if self.table.scene is not self.env.scene:
+            self.table = build_body_table(self.env)
+            self.parts = actions.action_parts(self.env)
+
+    def _seeds(self, seed: int | Sequence[int] | None, chosen: list[int]) -> list[int] | None:
+        if seed is None:
+            return None
+        given = [seed + i for i in range(len(chosen))] if isinstance(seed, int) else [int(s) for s in seed]
+        if len(given) != len(chosen):
+            raise ValueError(f"{len(given)} seeds for {len(chosen)} envs")
+        # ManiSkill replaces the seeds of all envs by the list that it is given, also in a partial
+        # reset: a list for the subset alone would shorten it and shift the seeds of the others.
+        every = self.env._episode_seed
+        seeds = [0] * self.num_envs if every is None else [int(s) for s in every]
+        for env, value in zip(chosen, given, strict=True):
+            seeds[env] = value
+        return seeds
+
+    def _terminated(self, info: Mapping[str, Any]) -> NDArray[np.bool_]:
+        flags = [to_numpy(info[key]).astype(bool) for key in ("success", "fail") if key in info]
+        return np.logical_or.reduce(flags) if flags else np.zeros(self.num_envs, bool)
+
+    def _result(
+        self,
+        info: Mapping[str, Any],
+        reward: NDArray[np.float32],
+        terminated: NDArray[np.bool_],
+        action: NDArray[np.float32] | None,
+    ) -> StepResult:
+        elapsed = to_numpy(self.env.elapsed_steps).astype(np.int32)
+        limit = self.max_episode_steps
+        truncated = np.zeros(self.num_envs, bool) if limit is None else elapsed >= limit
+        evaluate = {key: to_numpy(value) for key, value in info.items() if key != "elapsed_steps"}
+        return StepResult(
+            elapsed_steps=elapsed,
+            reward=reward,
+            terminated=terminated,
+            truncated=truncated,
+            evaluate=evaluate,
+            poses=read_poses(self.env, self.table),
+            action=None if action is None else np.array(action, dtype=np.float32),
+        )
+
+
+def to_numpy(value: Any) -> NDArray[Any]:
+    """A copy on the host, so that what was returned does not change with the next step."""
+    if isinstance(value, torch.Tensor):
+        return value.detach().cpu().numpy().copy()
+    return np.array(value)

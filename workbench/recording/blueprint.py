@@ -1,0 +1,95 @@
+"""How a recording looks when it is opened: the same arrangement as the workbench's own page.
+
+The scene is large on the left, what the cameras saw is on the right, and the curves lie below, all
+moved by one slider over ``step``. Rerun can also arrange views by itself, but its rules change from
+release to release and put one view on every number, so nothing is left to them.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from workbench.recording.episode import CameraTrack, Episode
+from workbench.recording.layout import CAMERAS, EVENTS, STEP, WORLD, camera_entities, evaluate_entity
+
+MAX_SERIES = 32
+"""An ``evaluate()`` entry with more numbers than this is kept, but not drawn: it hides the others."""
+EYE_DIRECTION = (0.75, 0.85, 0.6)
+"""From where the scene is looked at, seen from its middle: ManiSkill's render cameras do likewise."""
+
+
+def episode_blueprint(episode: Episode) -> rrb.Blueprint:
+    scene = rrb.Spatial3DView(
+        name="Scene",
+        origin=WORLD,
+        # A depth picture in a 3-D view is a cloud of points over the very meshes that it shows.
+        contents=["$origin/**", f"- {CAMERAS}/*/depth", f"- {CAMERAS}/*/segmentation"],
+        eye_controls=_eye(episode),
+        line_grid=False,
+    )
+    top: rrb.ContainerLike = scene
+    if episode.cameras:
+        top = rrb.Horizontal(scene, _cameras(episode), column_shares=[3, 2])
+    return rrb.Blueprint(
+        rrb.Vertical(top, _curves(episode), row_shares=[5, 2]),
+        rrb.TimePanel(
+            state="collapsed",
+            timeline=STEP,
+            fps=1.0 / episode.info.control_dt if episode.info.control_dt > 0 else None,
+            play_state="paused",
+        ),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _cameras(episode: Episode) -> rrb.ContainerLike:
+    rows = [_camera(*pair) for pair in zip(episode.cameras, camera_entities(episode.cameras))]
+    return rows[0] if len(rows) == 1 else rrb.Vertical(*rows) if len(rows) <= 3 else rrb.Tabs(*rows)
+
+
+def _camera(camera: CameraTrack, entity: str) -> rrb.ContainerLike:
+    modalities = [m for m in ("rgb", "depth", "segmentation") if getattr(camera, m) is not None]
+    views = [
+        rrb.Spatial2DView(name=f"{camera.info.name} {m}", origin=entity, contents=[f"$origin/{m}"]) for m in modalities
+    ]
+    return views[0] if len(views) == 1 else rrb.Grid(*views, name=camera.info.name)
+
+
+def _curves(episode: Episode) -> rrb.ContainerLike:
+    drawn = [evaluate_entity(k) for k, v in episode.evaluate.items() if 0 < math.prod(v.shape[1:]) <= MAX_SERIES]
+    views: list[rrb.View] = [rrb.TimeSeriesView(name="Reward", origin="/reward")]
+    if drawn:
+        views.append(rrb.TimeSeriesView(name="Evaluate", origin="/evaluate", contents=drawn))
+    if episode.action_names:
+        views.append(rrb.TimeSeriesView(name="Action", origin="/action"))
+    views.append(rrb.TextLogView(name="Events", origin=EVENTS))
+    return rrb.Horizontal(*views)
+
+
+def _eye(episode: Episode) -> rrb.EyeControls3D:
+    """Look at what can move. By itself rerun frames the whole scene, and a ground plane is 100 m wide."""
+    kinds = np.array(episode.geometry.body_kinds)
+    points = episode.poses[0, np.isin(kinds, ("link", "dynamic")), :3]
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points) == 0:
+        points = np.zeros((1, 3), dtype=np.float32)
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle = (low + high) / 2
+    direction = np.array(EYE_DIRECTION) / np.linalg.norm(EYE_DIRECTION)
+    distance = 1.5 * max(float(np.linalg.norm(high - low)), 0.5)
+    return rrb.EyeControls3D(
+        kind=rrb.Eye3DKind.Orbital,
+        position=middle + distance * direction,
+        look_target=middle,
+        eye_up=(0.0, 0.0, 1.0),
+    )
+
+
+__all__ = ["episode_blueprint"]

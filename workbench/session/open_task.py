@@ -1,0 +1,193 @@
+"""From a file or an env id to a running, tried-out task with everything a page must know of it.
+
+A task that imports and builds can still fail at its first step, in its reward or in a partial reset.
+Whoever opens a task wants to hear that before the version that works is thrown away; so opening
+includes a rehearsal: one reset, one step, one partial reset, each with the returns checked. Only what
+passes is handed over. The page, ``workbench record`` and the benchmarks open tasks through here.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from workbench.authoring.load import LoadedTask, load_task
+from workbench.authoring.problem import TaskError, problem_from_exception
+from workbench.authoring.returns import check_step_returns
+from workbench.core import actions
+from workbench.core.backends import render_device_name
+from workbench.core.pictures import list_cameras, segmentation_names
+from workbench.core.scene_geometry import read_geometry
+from workbench.core.step import StepResult
+from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+from workbench.session.messages import ActionDimension, TaskDescription, TaskOptions
+
+
+@dataclass(frozen=True)
+class OpenedTask:
+    loaded: LoadedTask
+    env: TaskEnv
+    description: TaskDescription
+    first: StepResult
+    """The state after the reset with the seed that was asked for."""
+    milliseconds: dict[str, float]
+    """Wall time of each part: import, build, reset, rehearse, geometry."""
+
+
+def open_task(
+    reference: str,
+    options: TaskOptions,
+    *,
+    source: Mapping[str, str] | None = None,
+    on_activity: Callable[[str], None] = lambda activity: None,
+) -> OpenedTask:
+    """Import, build, rehearse and reset a task.
+
+    Raises:
+        TaskError: with the author's file and line; nothing of the task stays behind.
+    """
+    clock = _Clock()
+    on_activity(f"importing {reference.rsplit('/', 1)[-1]}")
+    loaded = load_task(reference, source=source)
+    clock.lap("import")
+
+    on_activity(f"building {options.num_envs} {'env' if options.num_envs == 1 else 'envs'}")
+    with _blamed("build", loaded):
+        env = make_env(
+            loaded.cls,
+            EnvOptions(num_envs=options.num_envs, backend=options.backend, kwargs=options.env_kwargs),
+            asset_ids=loaded.asset_ids,
+            default_kwargs=loaded.default_kwargs,
+        )
+    clock.lap("build")
+    try:
+        with _blamed("build", loaded):
+            task = TaskEnv(env, loaded.max_episode_steps, check=_returns_check(loaded, options.num_envs))
+        on_activity("trying a reset and a step")
+        rehearse(task, loaded, options.seed)
+        clock.lap("rehearse")
+        with _blamed("reset", loaded):
+            first = task.reset(seed=options.seed)
+        clock.lap("reset")
+        on_activity("reading the shapes")
+        description = describe(loaded, task)
+        clock.lap("geometry")
+    except BaseException:
+        env.close()
+        raise
+    return OpenedTask(loaded, task, description, first, clock.laps)
+
+
+def rehearse(task: TaskEnv, loaded: LoadedTask, seed: int) -> None:
+    """One reset, one step and one partial reset; raises TaskError where the task fails in one."""
+    with _blamed("reset", loaded):
+        task.reset(seed=seed)
+    step_checked(task, loaded, actions.hold_action(task.parts, task.num_envs))
+    if task.num_envs > 1:
+        with _blamed("reset", loaded):
+            task.reset(env_idx=[0])
+
+
+def step_checked(task: TaskEnv, loaded: LoadedTask, action: Any) -> StepResult:
+    """`TaskEnv.step`, with what goes wrong told as the author's own mistake.
+
+    ManiSkill trips over an unbatched ``success`` in its own code; the author's line is then not in the
+    traceback at all, so what ``evaluate`` returns is looked at before the traceback is believed.
+    """
+    try:
+        return task.step(action if task.parts else None)
+    except TaskError:
+        raise
+    except Exception as error:
+        problem = problem_from_exception(error, "step", loaded.source_files)
+        if problem.file is None or "mani_skill" in problem.file:
+            try:
+                returned = task.env.evaluate()
+            except Exception:
+                raise TaskError(problem) from error  # evaluate itself raises: the first error says so
+            blamed = check_step_returns(loaded.cls, task.num_envs, returned, None, loaded.source_files)
+            if blamed is not None:
+                raise TaskError(blamed) from error
+        raise TaskError(problem) from error
+
+
+def describe(loaded: LoadedTask, task: TaskEnv) -> TaskDescription:
+    """What the page must know of the task, as plain data."""
+    env = task.env
+    dimensions = [
+        ActionDimension(name, float(low), float(high))
+        for part in task.parts
+        for name, low, high in zip(part.names, part.low, part.high, strict=True)
+    ]
+    simulation = "gpu" if env.device.type == "cuda" else "cpu (batched)"
+    can_render = bool(env.scene.can_render())
+    renderer = render_device_name() if can_render else None
+    control_mode = None if env.agent is None else str(env.control_mode)
+    return TaskDescription(
+        env_id=loaded.env_id,
+        class_name=loaded.class_name,
+        file=None if loaded.file is None else str(loaded.file),
+        source_files=tuple(str(path) for path in loaded.source_files) if loaded.followed else (),
+        source_hash=loaded.source_hash,
+        source=dict(loaded.source),
+        backend=simulation,
+        device=f"{env.device}" + (f", pictures on {renderer}" if renderer else ", no pictures"),
+        num_envs=task.num_envs,
+        max_episode_steps=loaded.max_episode_steps,
+        obs_mode=env.obs_mode,
+        reward_mode=env.reward_mode,
+        control_mode=control_mode,
+        control_dt=task.control_dt,
+        actions=tuple(dimensions),
+        geometry=read_geometry(env, task.table),
+        cameras=list_cameras(env),
+        segmentation=segmentation_names(env),
+        can_render=can_render,
+    )
+
+
+def _returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, Any], Any], None]:
+    def check(evaluate: Mapping[str, Any], reward: Any) -> None:
+        entries = {key: value for key, value in evaluate.items() if key != "elapsed_steps"}
+        problem = check_step_returns(loaded.cls, num_envs, entries, reward, loaded.source_files)
+        if problem is not None:
+            raise TaskError(problem)
+
+    return check
+
+
+class _blamed:
+    """Turns what the author's code raises into a TaskError that names their line."""
+
+    def __init__(self, stage: str, loaded: LoadedTask) -> None:
+        self._stage, self._loaded = stage, loaded
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        # SystemExit as well: an author's exit() must not take the worker along.
+        if isinstance(error, (Exception, SystemExit)) and not isinstance(error, TaskError):
+            problem = problem_from_exception(error, self._stage, self._loaded.source_files)
+            raise TaskError(problem) from error
+
+
+class _Clock:
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+        self.laps: dict[str, float] = {}
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.laps[name] = self.laps.get(name, 0.0) + 1000 * (now - self._last)
+        self._last = now
+
+
+def zero_action(task: TaskEnv) -> np.ndarray:
+    """(N, A) zeros, within the bounds."""
+    low, high = actions.bounds(task.parts)
+    return np.broadcast_to(np.clip(0.0, low, high), (task.num_envs, len(low))).astype(np.float32)

@@ -1,0 +1,76 @@
+"""When the next control step is due: a budget of simulated time.
+
+The player should run at a chosen multiple of real time, whatever a step costs and however uneven the
+loop is. So wall time earns simulated time (times the speed), a step spends ``control_dt`` of it, and a
+step is due when there is enough. What the machine cannot keep up with is forgotten after a tenth of a
+second, or one slow picture would be followed by a burst. (The idea is that of mjlab's base viewer.)
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+
+_LONGEST_DEBT = 0.1
+"""Wall seconds of simulation that may be caught up with."""
+
+
+@dataclass
+class Pacer:
+    control_dt: float
+    """Simulated seconds of one control step."""
+    speed: float = 1.0
+    """Simulated seconds per wall second; ``inf`` means that a step is always due."""
+    _budget: float = 0.0
+    _last: float | None = None
+
+    def start(self, now: float) -> None:
+        """Begin (again) to earn time; the first step is due at once."""
+        self._last, self._budget = now, self.control_dt
+
+    def due(self, now: float) -> bool:
+        """Whether a step may be taken at wall time `now` (seconds, monotonic)."""
+        if self._last is None:
+            self.start(now)
+        assert self._last is not None
+        if math.isinf(self.speed):
+            return True
+        earned = (now - self._last) * self.speed
+        most = max(self.control_dt, _LONGEST_DEBT * self.speed)
+        self._budget, self._last = min(self._budget + earned, most), now
+        return self._budget >= self.control_dt * (1 - 1e-9)
+
+    def spend(self) -> None:
+        """A control step was taken."""
+        if not math.isinf(self.speed):
+            self._budget -= self.control_dt
+
+    def wait(self) -> float:
+        """Wall seconds until the next step is due, as seen at the last `due`."""
+        if math.isinf(self.speed):
+            return 0.0
+        return max(0.0, (self.control_dt - self._budget) / self.speed)
+
+
+@dataclass
+class Rate:
+    """Events per second over the last second or so."""
+
+    window: float = 1.0
+    _times: deque[float] = field(default_factory=deque)
+
+    def tick(self, now: float) -> None:
+        self._times.append(now)
+        while self._times and now - self._times[0] > self.window:
+            self._times.popleft()
+
+    def per_second(self, now: float) -> float:
+        while self._times and now - self._times[0] > self.window:
+            self._times.popleft()
+        if len(self._times) < 2:
+            return 0.0
+        return (len(self._times) - 1) / max(self._times[-1] - self._times[0], 1e-9)
+
+    def clear(self) -> None:
+        self._times.clear()

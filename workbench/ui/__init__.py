@@ -1,0 +1,1 @@
+"""The page: viser and nothing else talks to the browser."""

@@ -1,0 +1,97 @@
+"""The banner over the top of the view: what is wrong in the author's file, until it is right again.
+
+It floats over the view and never over the controls, because the last good version keeps running
+behind it and stays usable. First the sentence that is needed (what failed, where), then the line of
+code and the message; the whole traceback only on demand.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import viser
+
+from workbench.authoring.problem import Problem
+from workbench.session.view import SessionView
+from workbench.ui.fragments import render
+
+DOING = {
+    "syntax": "cannot be read",
+    "import": "failed to import",
+    "build": "failed to build its scene",
+    "reset": "failed in reset",
+    "step": "failed in step",
+    "evaluate": "failed in evaluate",
+    "reward": "failed in its reward",
+    "observation": "failed in its observation",
+    "returns": "returned something of the wrong shape",
+    "policy": "was stopped by its policy",
+    "worker": "lost its worker process",
+}
+
+
+class Banner:
+    """A floating panel that is there only while a problem stands.
+
+    Args:
+        server: The page.
+        reload: Asks the session to load the file again.
+        restart: Asks the session for a new worker process.
+    """
+
+    def __init__(self, server: viser.ViserServer, reload, restart) -> None:
+        self._panel = server.gui.add_panel(visible=False, order=-10.0)
+        with self._panel.add_tab("Problem", viser.Icon.ALERT_TRIANGLE):
+            self._html = server.gui.add_html("")
+            self._reload = server.gui.add_button("Load the file again", icon=viser.Icon.REFRESH, color="gray")
+            self._restart = server.gui.add_button(
+                "Start a new worker", icon=viser.Icon.POWER, color="gray", visible=False
+            )
+        self._panel.float(x=12, y=12, width=520)
+        self._reload.on_click(lambda _: reload())
+        self._restart.on_click(lambda _: restart())
+        self._serial: int | None = None
+
+    def draw(self, view: SessionView) -> None:
+        problem = view.problem
+        if problem is None:
+            if self._panel.visible:
+                self._panel.visible = False
+            self._serial = None
+            return
+        stopped = view.state == "stopped"
+        if self._restart.visible != stopped:
+            self._restart.visible = stopped
+        # Written once a problem: a new text would close the traceback that someone has open.
+        if view.problem_serial != self._serial:
+            self._serial = view.problem_serial
+            self._html.content = banner_html(problem, view)
+            self._panel.visible = True
+            self._panel.expand()
+
+
+def banner_html(problem: Problem, view: SessionView) -> str:
+    """The banner's content; every value escaped."""
+    task = None if view.task is None else (view.task.class_name or view.task.env_id)
+    where = None
+    if problem.file is not None:
+        where = Path(problem.file).name + (f":{problem.line}" if problem.line is not None else "")
+    if view.state == "stopped":
+        kept = "The worker process is gone, so nothing moves until there is a new one."
+    elif view.task is None:
+        kept = "There is no version to show yet. Mend the file and save it; the page follows."
+    elif view.playing:
+        kept = "The last good version keeps running."
+    else:
+        kept = "The last good version stays on the page."
+    return render(
+        "banner",
+        subject=task or (Path(problem.file).name if problem.file else "The task"),
+        doing=DOING.get(problem.stage, f"failed in {problem.stage}"),
+        where=where,
+        path=problem.file,
+        code=problem.code,
+        message=problem.message,
+        kept=kept,
+        traceback=problem.traceback.rstrip(),
+    )

@@ -1,0 +1,81 @@
+"""The selected env's cameras in the 3-D view, each a frustum with its live picture on it."""
+
+from __future__ import annotations
+
+import numpy as np
+import viser
+import viser.transforms
+from numpy.typing import NDArray
+
+from workbench.core.pictures import CameraInfo, CameraKind, Picture
+
+CAMERA_TO_OPENCV = viser.transforms.SO3.from_matrix(
+    # Columns: OpenCV's right, down and forward in ManiSkill's camera frame (x forward, y left, z up).
+    np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+)
+SIZE = 0.12
+"""Depth of a frustum, metres: a hand's breadth, so that it hides nothing of a table-top scene."""
+COLOURS: dict[CameraKind, tuple[int, int, int]] = {"sensor": (245, 159, 0), "human": (132, 94, 247)}
+
+
+class CameraFrustums:
+    """One frustum for each camera whose picture is at hand; a camera's pose travels with its picture."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._drawn: dict[tuple[CameraKind, str], viser.CameraFrustumHandle] = {}
+
+    def draw(
+        self,
+        cameras: tuple[CameraInfo, ...],
+        pictures: dict[tuple[CameraKind, str], Picture],
+        offset: NDArray[np.float32],
+    ) -> None:
+        """Draw these pictures' cameras and take away all others.
+
+        Args:
+            cameras: The task's cameras.
+            pictures: Those to show; empty shows none.
+            offset: (3,) where the selected env stands in the view.
+        """
+        known = {(camera.kind, camera.name): camera for camera in cameras}
+        for key in [key for key in self._drawn if key not in pictures or key not in known]:
+            self._drawn.pop(key).remove()
+        for key, picture in pictures.items():
+            if key in known:
+                self._draw_one(known[key], picture, offset)
+
+    def clear(self) -> None:
+        self.draw((), {}, np.zeros(3, np.float32))
+
+    def _draw_one(self, camera: CameraInfo, picture: Picture, offset: NDArray[np.float32]) -> None:
+        wxyz, position = frustum_pose(picture, offset)
+        key = (camera.kind, camera.name)
+        handle = self._drawn.get(key)
+        if handle is None:
+            self._drawn[key] = self._server.scene.add_camera_frustum(
+                f"/cameras/{camera.kind} {camera.name}",
+                fov=camera.fovy,
+                aspect=camera.width / camera.height,
+                scale=SIZE,
+                thickness=2.0,
+                thickness_units="screen",
+                color=COLOURS[camera.kind],
+                image=picture.rgb,
+                format="jpeg",
+                jpeg_quality=75,
+                wxyz=wxyz,
+                position=position,
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            return
+        handle.wxyz, handle.position = wxyz, position
+        if picture.rgb is not None:
+            handle.image = picture.rgb
+
+
+def frustum_pose(picture: Picture, offset: NDArray[np.float32]) -> tuple[NDArray, NDArray]:
+    """wxyz and position of the camera in the view, in OpenCV's frame (z forward, y down)."""
+    turned = viser.transforms.SO3(picture.pose[3:].astype(np.float64)) @ CAMERA_TO_OPENCV
+    return turned.wxyz, (picture.pose[:3] + offset).astype(np.float64)

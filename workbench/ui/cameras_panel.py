@@ -1,0 +1,195 @@
+"""The Cameras tab: what the selected env's cameras see, and which of them are asked for.
+
+A picture costs 50 to 100 ms on a machine without a GPU, so only what is shown is rendered. viser does
+not say which tab a person looks at; the check boxes do: a camera without a tick is not asked of the
+session. A picture that is replaced before the browser has loaded it is never seen at all (measured:
+at 1,000 a second the page shows one in five seconds), hence the limit on how often they are sent.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+import numpy as np
+import viser
+
+from workbench.core.pictures import CameraInfo, CameraKind, Picture
+from workbench.session.messages import CameraRequest, TaskDescription
+from workbench.session.session import Session
+from workbench.session.view import SessionView
+from workbench.ui.false_colour import (
+    DepthRange,
+    colour_depth,
+    colour_segmentation,
+    depth_range,
+    segments_seen,
+)
+from workbench.ui.fragments import render
+
+FASTEST = 1 / 15
+"""Seconds between two pictures of one camera."""
+MODALITIES = ("rgb", "depth", "segmentation")
+KIND_NAMES: dict[CameraKind, str] = {"sensor": "sensor", "human": "for people"}
+
+
+@dataclass
+class _Camera:
+    info: CameraInfo
+    ticks: dict[str, viser.GuiCheckboxHandle]
+    captions: dict[str, viser.GuiHtmlHandle]
+    folder: viser.GuiFolderHandle
+    images: dict[str, viser.GuiImageHandle] = field(default_factory=dict)
+    depth_span: DepthRange | None = None
+
+    def wanted(self) -> tuple[str, ...]:
+        return tuple(modality for modality, tick in self.ticks.items() if tick.value is True)
+
+
+class CamerasPanel:
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._server = server
+        self._session = session
+        self._cameras: dict[tuple[CameraKind, str], _Camera] = {}
+        self._remembered: dict[tuple[CameraKind, str, str], bool] = {}
+        self._task_serial = -1
+        self._pictures_serial = -1
+        self._env = -1
+        self._drawn_at = 0.0
+        self._asked: tuple[CameraRequest, ...] | None = None
+        self._note = server.gui.add_html("")
+        self._frustums = server.gui.add_checkbox(
+            "In the view", True, hint="Draw these cameras, with their pictures, in the 3-D view."
+        )
+        self._folder = server.gui.add_folder(None)
+
+    @property
+    def show_frustums(self) -> bool:
+        return self._frustums.value is True
+
+    def draw(self, view: SessionView) -> None:
+        if view.task is not None and view.task_serial != self._task_serial:
+            self._task_serial = view.task_serial
+            self._build(view.task)
+        self._ask()
+        if view.pictures_serial == self._pictures_serial and view.selected_env == self._env:
+            return
+        if time.monotonic() - self._drawn_at < FASTEST:
+            return
+        self._pictures_serial, self._env = view.pictures_serial, view.selected_env
+        self._drawn_at = time.monotonic()
+        for key, camera in self._cameras.items():
+            picture = view.pictures.get(key)
+            if picture is not None and picture.env == view.selected_env and view.task is not None:
+                self._draw_camera(camera, picture, view.task, view.picture_milliseconds)
+
+    def shown_pictures(self, view: SessionView) -> dict[tuple[CameraKind, str], Picture]:
+        """The pictures of cameras with a tick, of the selected env: what the view's frustums wear."""
+        return {
+            key: picture
+            for key, picture in view.pictures.items()
+            if picture.env == view.selected_env and key in self._cameras and self._cameras[key].wanted()
+        }
+
+    def _build(self, task: TaskDescription) -> None:
+        """One folder a camera; ticks that were there under the same name stay as they were."""
+        for key, camera in self._cameras.items():
+            for modality, tick in camera.ticks.items():
+                self._remembered[(*key, modality)] = tick.value is True
+            camera.folder.remove()
+        self._cameras = {}
+        self._asked = None
+        if not task.can_render:
+            note = (
+                "This machine has no render device, so there are no pictures. "
+                "Run workbench doctor to see what is missing."
+            )
+        elif not task.cameras:
+            note = "This task has no camera."
+        else:
+            note = ""
+        self._note.content = render("note", text=note)
+        self._note.visible = bool(note)
+        self._frustums.visible = not note
+        if note:
+            return
+        first_of_kind = {}
+        for camera in task.cameras:
+            first_of_kind.setdefault(camera.kind, camera.name)
+        with self._folder:
+            for info in task.cameras:
+                self._cameras[(info.kind, info.name)] = self._build_camera(
+                    info, first_of_kind[info.kind] == info.name
+                )
+
+    def _build_camera(self, info: CameraInfo, first: bool) -> _Camera:
+        gui = self._server.gui
+        folder = gui.add_folder(f"{info.name} · {KIND_NAMES[info.kind]}")
+        ticks, captions = {}, {}
+        with folder:
+            gui.add_html(
+                render(
+                    "camera_facts",
+                    size=f"{info.width} × {info.height}",
+                    fovy=f"{np.degrees(info.fovy):.0f}°",
+                    mount=info.mount,
+                )
+            )
+            for order, modality in enumerate(m for m in MODALITIES if m in info.modalities):
+                on = self._remembered.get((info.kind, info.name, modality), first and modality == "rgb")
+                ticks[modality] = gui.add_checkbox(modality, on, order=10.0 * order + 10)
+                captions[modality] = gui.add_html("", order=10.0 * order + 12)
+        return _Camera(info, ticks, captions, folder)
+
+    def _ask(self) -> None:
+        """Ask for exactly the pictures that have a tick."""
+        wanted = tuple(
+            CameraRequest(camera.info.name, camera.info.kind, camera.wanted())
+            for camera in self._cameras.values()
+            if camera.wanted()
+        )
+        if wanted != self._asked:
+            self._asked = wanted
+            self._session.watch_cameras(wanted)
+        for camera in self._cameras.values():
+            for modality, tick in camera.ticks.items():
+                shown = tick.value is True
+                camera.captions[modality].visible = shown
+                if modality in camera.images:
+                    camera.images[modality].visible = shown
+
+    def _draw_camera(
+        self, camera: _Camera, picture: Picture, task: TaskDescription, milliseconds: float
+    ) -> None:
+        wanted = camera.wanted()
+        if "rgb" in wanted and picture.rgb is not None:
+            self._draw_image(camera, "rgb", picture.rgb)
+            camera.captions["rgb"].content = render("rgb_caption", milliseconds=f"{milliseconds:.0f}")
+        if "depth" in wanted and picture.depth is not None:
+            span = depth_range(picture.depth)
+            if span is not None:
+                # Only ever widened: a scale that follows each picture would recolour what stands still.
+                camera.depth_span = span if camera.depth_span is None else camera.depth_span.widened(span)
+            shown = camera.depth_span or DepthRange(0.0, 1.0)
+            self._draw_image(camera, "depth", colour_depth(picture.depth, shown))
+            camera.captions["depth"].content = render(
+                "depth_caption", near=f"{shown.near:.2f}", far=f"{shown.far:.2f}"
+            )
+        if "segmentation" in wanted and picture.segmentation is not None:
+            self._draw_image(camera, "segmentation", colour_segmentation(picture.segmentation))
+            legend, more = segments_seen(picture.segmentation, task.segmentation)
+            camera.captions["segmentation"].content = render("segmentation_caption", legend=legend, more=more)
+
+    def _draw_image(self, camera: _Camera, modality: str, pixels: np.ndarray) -> None:
+        handle = camera.images.get(modality)
+        if handle is None:
+            with camera.folder:
+                camera.images[modality] = self._server.gui.add_image(
+                    pixels,
+                    # Flat colours of a segmentation would get halos from JPEG.
+                    format="png" if modality == "segmentation" else "jpeg",
+                    jpeg_quality=75,
+                    order=camera.ticks[modality].order + 1,
+                )
+        else:
+            handle.image = pixels

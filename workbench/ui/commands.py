@@ -1,0 +1,46 @@
+"""Every action that matters, with a key and a name in the command palette (Ctrl+K).
+
+Keys work while no text field has the focus. The list is one table, so that the page, the palette and
+the help that is made from it cannot disagree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import viser
+from viser._messages import HotkeyKey, KeyModifier  # the types of add_command's arguments (viser 1.1.1)
+
+
+@dataclass(frozen=True)
+class Command:
+    label: str
+    run: Callable[[], None]
+    key: HotkeyKey | None = None
+    modifier: KeyModifier | None = None
+    description: str | None = None
+
+    @property
+    def key_name(self) -> str:
+        """For a person: ``Space``, ``Shift R``, ``→``."""
+        if self.key is None:
+            return ""
+        name = {"space": "Space", "arrowleft": "←", "arrowright": "→"}.get(self.key, self.key)
+        return f"{self.modifier.capitalize()} {name}" if self.modifier else name
+
+
+def register(server: viser.ViserServer, commands: list[Command]) -> None:
+    """Put the commands into the palette of every page."""
+    for command in commands:
+        handle = server.gui.add_command(
+            command.label,
+            description=command.description,
+            hotkey=command.key,
+            modifier=command.modifier,
+        )
+        handle.on_trigger(_without_event(command.run))
+
+
+def _without_event(run: Callable[[], None]) -> Callable[[object], None]:
+    return lambda _event: run()

@@ -1,0 +1,92 @@
+"""One input of the page whose truth is in the session.
+
+Three parties may set a value: the person at the input, a key or a second page, and the session
+itself (a value that it refuses). The input only asks, the session decides, and the page shows what
+the session says. Two things go wrong if that is done plainly. A value that comes back while the
+person still drags would pull the slider out of their hand: so an input that was touched a moment
+ago is left alone. And each key stroke in a text field would be applied: so an input may ask to be
+left to settle first.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, Generic, TypeVar
+
+import viser
+
+T = TypeVar("T")
+
+HANDS_OFF = 0.5
+"""Seconds after a person touched an input in which it is not written to."""
+
+
+class Control(Generic[T]):
+    """Ties one viser input to one setting of the session.
+
+    Args:
+        handle: The input.
+        read: The input's value as the session's, checked; raises ValueError with a sentence for the
+            person when it is out of range, since a page may send anything.
+        send: Asks the session for it. Must not block.
+        shown: The session's value as the input's.
+        settle: Seconds without a change before a value is sent.
+    """
+
+    def __init__(
+        self,
+        handle: viser.GuiInputHandle[Any],
+        read: Callable[[Any], T],
+        send: Callable[[T], None],
+        shown: Callable[[T], Any] = lambda value: value,
+        settle: float = 0.0,
+    ) -> None:
+        self.handle = handle
+        self._read = read
+        self._send = send
+        self._shown = shown
+        self._settle = settle
+        self._touched = -1e9
+        self._waiting: viser.ClientHandle | None = None
+        self._lock = threading.Lock()
+        handle.on_update(self._on_update)
+
+    def show(self, value: T) -> None:
+        """Show what the session says, unless someone has their hand on the input; send what settled."""
+        idle = time.monotonic() - self._touched
+        with self._lock:
+            client = self._waiting if idle >= self._settle else None
+            if client is not None:
+                self._waiting = None
+        if client is not None:
+            self._apply(client)
+        elif idle > HANDS_OFF + self._settle:
+            shown = self._shown(value)
+            if self.handle.value != shown:
+                self.handle.value = shown
+
+    def enable(self, enabled: bool) -> None:
+        if self.handle.disabled == enabled:
+            self.handle.disabled = not enabled
+
+    def _on_update(self, event: viser.GuiEvent) -> None:
+        if event.client is None:
+            return  # `show` wrote it; sending it back would make an endless exchange.
+        self._touched = time.monotonic()
+        if self._settle:
+            with self._lock:
+                self._waiting = event.client
+        else:
+            self._apply(event.client)
+
+    def _apply(self, client: viser.ClientHandle) -> None:
+        # Callbacks run in a pool of threads and finish in any order: the handle has the newest.
+        try:
+            value = self._read(self.handle.value)
+        except ValueError as error:
+            self._touched = -1e9
+            client.add_notification("Not possible", str(error), color="orange", auto_close_seconds=6.0)
+            return
+        self._send(value)

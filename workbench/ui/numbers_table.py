@@ -1,0 +1,81 @@
+"""The numbers of the task: one row an entry, the selected env beside the whole batch.
+
+What ``evaluate`` returns decides the rows. A bool is counted over the batch ("3 of 16"), a number is
+averaged, a vector is shortened; an entry that is a surprise (wrong length, NaN, a string array) is
+shown as it is rather than left out, because a surprise is what an author looks for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.core.step import StepResult
+
+LONGEST_VECTOR = 4
+
+
+@dataclass(frozen=True)
+class NumberRow:
+    name: str
+    selected: str
+    batch: str
+    mood: str = ""
+    """``good`` or ``bad`` for success and failure of the selected env, else empty."""
+
+
+def number_rows(step: StepResult, selected_env: int, max_episode_steps: int | None) -> list[NumberRow]:
+    """Elapsed steps, reward, success and fail first, then every other entry by its name."""
+    env = selected_env
+    of = f" / {max_episode_steps}" if max_episode_steps else ""
+    rows = [
+        NumberRow("elapsed steps", f"{_item(step.elapsed_steps, env)}{of}", _batch(step.elapsed_steps)),
+        NumberRow("reward", _item(step.reward, env), _batch(step.reward)),
+    ]
+    first = [key for key in ("success", "fail") if key in step.evaluate]
+    rest = sorted(key for key in step.evaluate if key not in first)
+    for key in first + rest:
+        values = np.asarray(step.evaluate[key])
+        mood = ""
+        if key in first and values.ndim and env < len(values) and bool(np.any(values[env])):
+            mood = "good" if key == "success" else "bad"
+        rows.append(NumberRow(str(key), _item(values, env), _batch(values), mood))
+    return rows
+
+
+def _item(values: NDArray, env: int) -> str:
+    if values.ndim == 0 or env >= len(values):
+        return "—"
+    item = np.asarray(values[env])
+    if item.ndim == 0:
+        return _one(item)
+    flat = item.reshape(-1)
+    shown = ", ".join(_one(value) for value in flat[:LONGEST_VECTOR])
+    more = f", … {len(flat)}" if len(flat) > LONGEST_VECTOR else ""
+    return f"[{shown}{more}]"
+
+
+def _one(value: NDArray) -> str:
+    if value.dtype.kind == "b":
+        return "yes" if value else "no"
+    if value.dtype.kind in "iu":
+        return str(int(value))
+    if value.dtype.kind == "f":
+        number = float(value)
+        if not np.isfinite(number):
+            return str(number)
+        return f"{number:.3f}" if 1e-3 <= abs(number) < 1e4 or number == 0 else f"{number:.2e}"
+    return str(value)
+
+
+def _batch(values: NDArray) -> str:
+    if values.ndim == 0:
+        return _one(values)
+    if values.ndim == 1 and values.dtype.kind == "b":
+        return f"{int(values.sum())} of {len(values)}"
+    if values.ndim == 1 and values.dtype.kind in "iuf" and len(values):
+        mean = np.asarray(values, np.float64).mean()
+        return f"mean {_one(np.asarray(mean))}"
+    return ""

@@ -1,0 +1,211 @@
+"""The page: its parts put together, and the one loop that redraws them.
+
+The session lives by its own clock and the browsers by theirs. Between them is this loop: it waits
+until the session has something new, takes one immutable snapshot and lets every part compare it with
+what it drew last. So a part is a function of the snapshot, nothing is sent twice, and callbacks of the
+page, which run in any thread and any order, only ever ask the session for something.
+
+With no page open nothing is drawn, and the session is told so that it renders nothing either.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import viser
+
+from workbench.session.session import Session
+from workbench.session.view import SessionView
+from workbench.ui.banner import Banner
+from workbench.ui.camera_frustums import CameraFrustums
+from workbench.ui.cameras_panel import CamerasPanel
+from workbench.ui.commands import Command, register
+from workbench.ui.curves_panel import CurvesPanel
+from workbench.ui.env_layout import EnvLayout, env_under_ray, lay_out
+from workbench.ui.fragments import style_sheet
+from workbench.ui.numbers_panel import NumbersPanel
+from workbench.ui.record_panel import RecordPanel
+from workbench.ui.run_panel import RunPanel
+from workbench.ui.scene_view import SceneView
+from workbench.ui.selection_mark import SelectionMark
+from workbench.ui.status_line import StatusLine
+from workbench.ui.view_panel import ViewPanel
+from workbench.ui.viewpoint import FOV, Viewpoint, frame_all, frame_one
+
+FRAME = 1 / 30
+"""Seconds. Faster pushes make a browser slower (measured: 350 a second leave it 13 to 30)."""
+PANEL_WIDTH = 340
+
+
+class Page:
+    """The workbench's page on this server, showing this session.
+
+    Args:
+        server: Of viser, already behind its door.
+        session: What is shown and asked.
+    """
+
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._server = server
+        self._session = session
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._layout: EnvLayout | None = None
+        self._task_serial = -1
+        self._framed: object = None
+        self._num_clients = -1
+
+        server.scene.set_up_direction("+z")
+        server.scene.configure_default_lights(enabled=True, cast_shadow=False)
+        server.initial_camera.fov = FOV
+        server.gui.main_panel.dock_right()
+        server.gui.main_panel.set_width(PANEL_WIDTH)
+        server.gui.set_panel_label("Workbench")
+
+        server.gui.add_html(style_sheet())
+        self._status = StatusLine(server)
+        tabs = server.gui.add_tab_group()
+        with tabs.add_tab("Run", viser.Icon.PLAYER_PLAY):
+            self._run = RunPanel(server, session)
+            self._view_panel = ViewPanel(server)
+        with tabs.add_tab("Cameras", viser.Icon.CAMERA):
+            self._cameras = CamerasPanel(server, session)
+        with tabs.add_tab("Reward", viser.Icon.CHART_LINE):
+            self._numbers = NumbersPanel(server)
+            self._curves = CurvesPanel(server)
+        with tabs.add_tab("Episodes", viser.Icon.MOVIE):
+            self._record = RecordPanel(server, session.start_recording, session.stop_recording)
+        self._banner = Banner(server, session.reload, session.restart_worker)
+
+        self._scene = SceneView(server)
+        self._mark = SelectionMark(server)
+        self._frustums = CameraFrustums(server)
+        register(server, self._commands())
+        server.scene.on_click()(self._on_scene_click)
+
+    # --- life ------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Begin to redraw, in a thread of its own."""
+        if self._thread is not None:
+            raise RuntimeError("The page was started already.")
+        self._thread = threading.Thread(target=self._redraw_for_ever, name="page", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop to redraw; returns when the loop has ended."""
+        self._stopping.set()
+        if self._thread is not None:
+            self._thread.join(timeout=5.0)
+
+    def _redraw_for_ever(self) -> None:
+        seen = -1
+        while not self._stopping.is_set():
+            began = time.monotonic()
+            seen = self._session.wait(seen, timeout=0.1)
+            if self._count_clients():
+                self.redraw()
+            self._stopping.wait(max(0.0, FRAME - (time.monotonic() - began)))
+
+    def redraw(self) -> None:
+        """Draw the session as it is now."""
+        view = self._session.view()
+        with self._server.atomic():
+            self._draw_scene(view)
+        self._server.flush()
+        self._status.draw(view)
+        self._banner.draw(view)
+        self._run.draw(view)
+        self._view_panel.draw(view)
+        self._cameras.draw(view)
+        self._numbers.draw(view)
+        self._curves.draw(view)
+        self._record.draw(view)
+
+    def _count_clients(self) -> int:
+        count = len(self._server.get_clients())
+        if count != self._num_clients:
+            self._num_clients = count
+            self._session.set_clients(count)
+        return count
+
+    # --- the 3-D view ----------------------------------------------------------------------------
+
+    def _draw_scene(self, view: SessionView) -> None:
+        task, step = view.task, view.step
+        if task is None or step is None or step.poses.shape[:2] != (
+            task.num_envs,
+            len(task.geometry.body_names),
+        ):
+            # Between two versions a step of the old one may stand beside the new task.
+            return
+        if view.task_serial != self._task_serial or self._layout is None:
+            self._task_serial = view.task_serial
+            self._layout = lay_out(task.geometry, step.poses)
+            self._scene.build(task.geometry, self._layout, step.poses)
+            self._server.gui.set_panel_label(task.env_id)
+        one = self._view_panel.only_selected and task.num_envs > 1
+        env = min(view.selected_env, task.num_envs - 1)
+        self._scene.move(step.poses, self._layout, env if one else None)
+        self._mark.draw(self._layout, env, shown=task.num_envs > 1 and not one)
+        pictures = self._cameras.shown_pictures(view) if self._cameras.show_frustums else {}
+        offset = np.zeros(3, np.float32) if one else self._layout.offsets[env]
+        self._frustums.draw(task.cameras, pictures, offset)
+        # A scene of another size is framed anew; a reload that keeps the size never moves the view.
+        size = np.round(np.concatenate([self._layout.low, self._layout.high]), 0).tobytes()
+        framing = (task.env_id, task.num_envs, one, size)
+        if framing != self._framed:
+            self._framed = framing
+            self.frame(view)
+
+    def frame(self, view: SessionView) -> None:
+        """Point every open page, and those to come, at what is shown."""
+        initial = self._viewpoint(view, None)
+        if initial is None:
+            return
+        self._server.initial_camera.position = initial.position
+        self._server.initial_camera.look_at = initial.look_at
+        for client in self._server.get_clients().values():
+            viewpoint = self._viewpoint(view, client)
+            if viewpoint is not None:
+                client.camera.position = viewpoint.position
+                client.camera.look_at = viewpoint.look_at
+
+    def _viewpoint(self, view: SessionView, client: viser.ClientHandle | None) -> Viewpoint | None:
+        if self._layout is None or view.task is None:
+            return None
+        aspect = {}
+        if client is not None and client.camera.image_height:
+            aspect = {"aspect": client.camera.image_width / client.camera.image_height}
+        if self._view_panel.only_selected or view.task.num_envs == 1:
+            human = next((p for (kind, _), p in view.pictures.items() if kind == "human"), None)
+            return frame_one(self._layout, human, **aspect)
+        return frame_all(self._layout, **aspect)
+
+    def _on_scene_click(self, event: viser.SceneClickEvent) -> None:
+        layout, view = self._layout, self._session.view()
+        if layout is None or view.task is None or self._view_panel.only_selected:
+            return
+        env = env_under_ray(layout, np.array(event.ray_origin), np.array(event.ray_direction))
+        if env is not None and env < view.task.num_envs:
+            self._session.select_env(env)
+
+    # --- keys ------------------------------------------------------------------------------------
+
+    def _commands(self) -> list[Command]:
+        session, run = self._session, self._run
+        return [
+            Command("Play or pause", run.toggle_play, "space"),
+            Command("Single step", session.step, "S"),
+            Command("Reset all envs", session.reset, "R"),
+            Command("Reset the selected env", run.reset_this, "R", "shift"),
+            Command("Next env", lambda: run.select_neighbour(1), "arrowright"),
+            Command("Previous env", lambda: run.select_neighbour(-1), "arrowleft"),
+            Command("Show all envs or the selected one", self._view_panel.toggle_only_selected, "O"),
+            Command("Frame what is shown", lambda: self.frame(session.view()), "F"),
+            Command("Start or stop recording", self._record.toggle, "C"),
+            Command("Load the file again", session.reload, "L"),
+            Command("Dark or light", self._view_panel.toggle_dark, "D"),
+        ]

@@ -1,0 +1,214 @@
+"""The Run tab: play, step, reset, speed, seed, env, what happens at an episode's end, and actions.
+
+Nothing here touches an env. Every input asks the session and shows what the session says (see
+`controls`), so a key, a second page and this panel cannot disagree.
+"""
+
+from __future__ import annotations
+
+import math
+
+import viser
+
+from workbench.session.messages import ActionSource, EpisodeEnd
+from workbench.session.session import Session
+from workbench.session.view import SessionView
+from workbench.ui.action_sliders import ActionSliders
+from workbench.ui.checked import checked_choice, checked_int, checked_text
+from workbench.ui.controls import Control
+
+SPEEDS: dict[str, float] = {
+    "0.1 ×": 0.1,
+    "0.25 ×": 0.25,
+    "0.5 ×": 0.5,
+    "1 ×": 1.0,
+    "2 ×": 2.0,
+    "4 ×": 4.0,
+    "8 ×": 8.0,
+    "as fast as it can": math.inf,
+}
+EPISODE_ENDS: dict[str, EpisodeEnd] = {
+    "reset that env": "reset",
+    "let it run on": "continue",
+    "pause": "pause",
+}
+SOURCES: dict[str, ActionSource] = {
+    "hold still": "hold",
+    "zero": "zero",
+    "random": "random",
+    "sliders": "sliders",
+    "policy": "policy",
+}
+STEP, RESET_ALL, RESET_THIS = "Step", "Reset all", "Reset this env"
+PREVIOUS, NEXT = "‹ previous", "next ›"
+LARGEST_SEED = 2**31 - 1
+
+
+class RunPanel:
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._session = session
+        self._view: SessionView | None = None
+        self._task_serial = -1
+        gui = server.gui
+
+        self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
+        self._play.on_click(lambda _: self.toggle_play())
+        self._transport = gui.add_button_group("", (STEP, RESET_ALL, RESET_THIS))
+        self._transport.on_click(self._on_transport)
+
+        self._env_folder = gui.add_folder("Environment")
+        with self._env_folder:
+            self._env = Control(
+                gui.add_slider("Selected", min=0, max=1, step=1, initial_value=0),
+                read=lambda value: checked_int(value, 0, self._num_envs() - 1, "env"),
+                send=session.select_env,
+            )
+            self._neighbours = gui.add_button_group("", (PREVIOUS, NEXT))
+            self._neighbours.on_click(
+                lambda event: self.select_neighbour(-1 if event.target.value == PREVIOUS else 1)
+            )
+
+        with gui.add_folder("Episode"):
+            self._speed = Control(
+                gui.add_dropdown("Speed", tuple(SPEEDS), "1 ×", hint="Simulated seconds in one second."),
+                read=lambda value: SPEEDS[checked_choice(value, tuple(SPEEDS), "speed")],
+                send=session.set_speed,
+                shown=self._speed_shown,
+            )
+            self._seed = Control(
+                gui.add_number(
+                    "Seed", 0, min=0, max=LARGEST_SEED, step=1, hint="A new seed resets every env with it."
+                ),
+                read=lambda value: checked_int(value, 0, LARGEST_SEED, "seed"),
+                send=session.set_seed,
+                settle=0.6,
+            )
+            self._end = Control(
+                gui.add_dropdown("At its end", tuple(EPISODE_ENDS), "reset that env"),
+                read=lambda value: EPISODE_ENDS[checked_choice(value, tuple(EPISODE_ENDS), "rule")],
+                send=session.set_episode_end,
+                shown=lambda rule: _name_of(EPISODE_ENDS, rule),
+            )
+
+        with gui.add_folder("Actions"):
+            self._source = Control(
+                gui.add_dropdown("Source", tuple(SOURCES), "hold still"),
+                read=lambda value: SOURCES[checked_choice(value, tuple(SOURCES), "source")],
+                send=self._choose_source,
+                shown=self._source_shown,
+            )
+            self._policy = Control(
+                gui.add_text("Policy", "", hint="module:function or file.py:function, given obs, returns the action."),
+                read=self._read_policy,
+                send=lambda policy: session.set_action_source("policy", policy),
+                settle=0.8,
+            )
+            self._policy_hint = gui.add_html(
+                '<div class="wb-note">Type <code>module:function</code> or <code>file.py:function</code>. '
+                "It is called with the observation and returns the action.</div>"
+            )
+            self._sliders = ActionSliders(server, session)
+        self._choosing_policy = False
+
+    # --- what keys and buttons do ----------------------------------------------------------------
+
+    def toggle_play(self) -> None:
+        if self._session.view().playing:
+            self._session.pause()
+        else:
+            self._session.play()
+
+    def reset_this(self) -> None:
+        self._session.reset((self._session.view().selected_env,))
+
+    def select_neighbour(self, step: int) -> None:
+        """The next (1) or previous (-1) env, round the end."""
+        count = self._num_envs()
+        self._session.select_env((self._session.view().selected_env + step) % count)
+
+    def _on_transport(self, event: viser.GuiEvent) -> None:
+        actions = {
+            STEP: self._session.step,
+            RESET_ALL: self._session.reset,
+            RESET_THIS: self.reset_this,
+        }
+        actions[checked_choice(event.target.value, tuple(actions), "button")]()
+
+    # --- drawing ---------------------------------------------------------------------------------
+
+    def draw(self, view: SessionView) -> None:
+        self._view = view
+        can_act = view.task is not None and view.state != "stopped"
+        if view.task_serial != self._task_serial and view.task is not None:
+            self._task_serial = view.task_serial
+            several = view.task.num_envs > 1
+            self._env_folder.visible = several
+            self._env.handle.max = max(1, view.task.num_envs - 1)
+            self._sliders.build(view.task.actions, view.sliders)
+        self._draw_play(view.playing, can_act)
+        for handle in (self._transport, self._neighbours):
+            if handle.disabled == can_act:
+                handle.disabled = not can_act
+        for control in (self._env, self._speed, self._seed, self._end, self._source, self._policy):
+            control.enable(can_act)
+        self._env.show(view.selected_env)
+        self._speed.show(view.speed)
+        self._seed.show(view.seed)
+        self._end.show(view.episode_end)
+        self._source.show(view.action_source)
+        self._policy.show(view.policy or "")
+        if view.action_source == "policy" or self._source.handle.value != "policy":
+            self._choosing_policy = False
+        policy_wanted = view.action_source == "policy" or self._choosing_policy
+        self._policy.handle.visible = policy_wanted
+        self._policy_hint.visible = policy_wanted and not view.policy
+        self._sliders.draw(view.action_source == "sliders", view.sliders)
+
+    def _draw_play(self, playing: bool, can_act: bool) -> None:
+        label = "Pause" if playing else "Play"
+        if self._play.label != label:
+            self._play.label = label
+            self._play.icon = viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY
+        if self._play.disabled == can_act:
+            self._play.disabled = not can_act
+
+    # --- values ----------------------------------------------------------------------------------
+
+    def _num_envs(self) -> int:
+        task = self._session.view().task
+        return 1 if task is None else task.num_envs
+
+    def _speed_shown(self, speed: float) -> str:
+        name = _name_of(SPEEDS, speed)
+        if name is None:
+            # A speed that came from the command line and is none of ours.
+            name = f"{speed:g} ×"
+            SPEEDS[name] = speed
+        if name not in self._speed.handle.options:
+            self._speed.handle.options = tuple(SPEEDS)
+        return name
+
+    def _source_shown(self, source: ActionSource) -> str | None:
+        return "policy" if self._choosing_policy else _name_of(SOURCES, source)
+
+    def _choose_source(self, source: ActionSource) -> None:
+        if source != "policy":
+            self._choosing_policy = False
+            self._session.set_action_source(source)
+            return
+        policy = self._policy.handle.value
+        if ":" in policy:
+            self._session.set_action_source("policy", policy)
+        else:
+            # Nothing to run yet: the field for its name appears, the actions stay as they are.
+            self._choosing_policy = True
+
+    def _read_policy(self, value: object) -> str:
+        text = checked_text(value, 500, "policy").strip()
+        if ":" not in text:
+            raise ValueError("A policy is written module:function or file.py:function.")
+        return text
+
+
+def _name_of(names, value):
+    return next((name for name, known in names.items() if known == value), None)

@@ -1,0 +1,58 @@
+"""Which env is selected, said in the view: a frame on the floor round it and its number.
+
+On the floor and not round the bodies, so that nothing of the task is covered.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import viser
+
+from workbench.ui.env_layout import MARGIN, EnvLayout
+
+COLOUR = (34, 139, 230)
+
+
+class SelectionMark:
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._frame: viser.LineSegmentsHandle | None = None
+        self._label: viser.LabelHandle | None = None
+        self._drawn: tuple[int, int, bool] | None = None
+
+    def draw(self, layout: EnvLayout, env: int, shown: bool) -> None:
+        """Mark this env; not `shown` when it is alone in the view and needs no mark."""
+        wanted = (id(layout), env, shown)
+        if wanted == self._drawn:
+            return
+        self._drawn = wanted
+        if not shown:
+            self.clear()
+            return
+        offset = layout.offsets[env]
+        corner_low = layout.low[:2] + offset[:2] - MARGIN * 0.4
+        corner_high = layout.high[:2] + offset[:2] + MARGIN * 0.4
+        (x0, y0), (x1, y1) = corner_low, corner_high
+        # A centimetre above the floor, or the two flicker through each other.
+        z = layout.floor_height + 0.01
+        corners = np.array([(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)], np.float32)
+        edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+        label_at = np.array([x1, (y0 + y1) / 2, z])
+        if self._frame is None or self._label is None:
+            self._frame = self._server.scene.add_line_segments(
+                "/selected/frame", edges, COLOUR, thickness=3.0, thickness_units="screen"
+            )
+            self._label = self._server.scene.add_label(
+                "/selected/label", f"env {env}", position=label_at, anchor="top-center"
+            )
+        else:
+            self._frame.points = edges
+            self._label.text = f"env {env}"
+            self._label.position = label_at
+
+    def clear(self) -> None:
+        self._drawn = None if self._frame is not None else self._drawn
+        for handle in (self._frame, self._label):
+            if handle is not None:
+                handle.remove()
+        self._frame = self._label = None

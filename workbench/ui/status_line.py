@@ -1,0 +1,62 @@
+"""The line above the tabs: what runs, on what, how fast, and whether all is well."""
+
+from __future__ import annotations
+
+import time
+
+import viser
+
+from workbench.session.view import SessionView
+from workbench.ui.fragments import render
+
+REDRAW_EVERY = 0.25
+"""Seconds. Rates that change faster cannot be read."""
+
+WORDS = {
+    "starting": "starting",
+    "loading": "loading",
+    "running": "running",
+    "paused": "paused",
+    "error": "error",
+    "stopped": "worker stopped",
+}
+
+
+class StatusLine:
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._handle = server.gui.add_html("")
+        self._drawn_at = 0.0
+        self._state = ""
+
+    def draw(self, view: SessionView) -> None:
+        now = time.monotonic()
+        state = f"{view.state} {view.stale} {view.activity} {view.task_serial}"
+        if state == self._state and now - self._drawn_at < REDRAW_EVERY:
+            return
+        self._drawn_at, self._state = now, state
+        self._handle.content = render("status_line", **status_values(view))
+
+
+def status_values(view: SessionView) -> dict[str, object]:
+    """What the template is given."""
+    task = view.task
+    moving = view.playing and view.state in ("running", "error") and task is not None
+    return {
+        "state": view.state,
+        "word": "running" if view.state == "error" and moving else WORDS[view.state],
+        "problem": view.problem is not None,
+        "stale": view.stale and view.state not in ("starting", "loading"),
+        "activity": view.activity,
+        "task": None if task is None else task.env_id,
+        "backend": "" if task is None else task.backend,
+        "device": "" if task is None else task.device,
+        "envs": "" if task is None else ("1 env" if task.num_envs == 1 else f"{task.num_envs} envs"),
+        "moving": moving,
+        "steps_per_second": f"{view.steps_per_second:.0f}",
+        "env_steps_per_second": ""
+        if task is None
+        else f"{view.steps_per_second * task.num_envs:,.0f}".replace(",", " "),
+        "real_time_factor": f"{view.real_time_factor:.2f}",
+        "behind": moving and view.speed != float("inf") and view.real_time_factor < 0.85 * view.speed,
+        "speed": f"{view.speed:g}",
+    }

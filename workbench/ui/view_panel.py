@@ -1,0 +1,44 @@
+"""How the page shows what it shows: all envs or one, dark or light."""
+
+from __future__ import annotations
+
+import viser
+
+from workbench.session.view import SessionView
+
+ALL, ONE = "all envs", "the selected env"
+DARK, LIGHT = "dark", "light"
+BRAND = (34, 139, 230)
+
+
+class ViewPanel:
+    def __init__(self, server: viser.ViserServer, dark: bool = True) -> None:
+        self._server = server
+        with server.gui.add_folder("View"):
+            self._show = server.gui.add_dropdown("Show", (ALL, ONE), ALL)
+            self._theme = server.gui.add_dropdown("Theme", (DARK, LIGHT), DARK if dark else LIGHT)
+        self._theme.on_update(lambda _: self._apply_theme())
+        self._apply_theme()
+
+    @property
+    def only_selected(self) -> bool:
+        return self._show.value == ONE
+
+    def toggle_only_selected(self) -> None:
+        self._show.value = ALL if self.only_selected else ONE
+
+    def toggle_dark(self) -> None:
+        self._theme.value = LIGHT if self._theme.value == DARK else DARK
+
+    def draw(self, view: SessionView) -> None:
+        several = view.task is not None and view.task.num_envs > 1
+        if self._show.visible != several:
+            self._show.visible = several
+
+    def _apply_theme(self) -> None:
+        self._server.gui.configure_theme(
+            dark_mode=self._theme.value != LIGHT,
+            show_logo=False,
+            show_share_button=False,
+            brand_color=BRAND,
+        )
