@@ -166,9 +166,20 @@ def scene_of(base: Any) -> tuple[SceneGeometry, list[Any]]:
     return geometry, [body for _, _, body in named]
 
 
+def _scale(shape: Any) -> NDArray[np.float32]:
+    """SAPIEN keeps its primitives as unit shapes, all but the capsule."""
+    if isinstance(shape, sapien.render.RenderShapeBox):
+        return np.asarray(shape.half_size, dtype=np.float32)
+    if isinstance(shape, sapien.render.RenderShapeSphere):
+        return np.full(3, shape.radius, dtype=np.float32)
+    if isinstance(shape, sapien.render.RenderShapeCylinder):
+        return np.array([shape.half_length, shape.radius, shape.radius], dtype=np.float32)
+    return np.asarray(getattr(shape, "scale", (1, 1, 1)), dtype=np.float32)
+
+
 def _visual(name: str, shape: Any, part: Any, body: int) -> Visual:
     local = shape.local_pose.to_transformation_matrix()
-    scale = np.asarray(getattr(shape, "scale", (1, 1, 1)), dtype=np.float32)
+    scale = _scale(shape)
     vertices = (part.vertices * scale) @ local[:3, :3].T + local[:3, 3]
     normals = part.get_vertex_normal() @ local[:3, :3].T
     uvs = part.get_vertex_uv()

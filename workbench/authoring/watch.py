@@ -4,14 +4,14 @@ What a person calls one save is many things to the file system: truncate and wri
 temporary file and rename it over; delete and create; and formatters that do it all again 20 ms
 later. Watching the *files* loses them at the first rename, because the watch goes with the inode.
 So the folders are watched, events are gathered until it has been quiet for a moment, and then the
-files are read and compared with what was last known: only new text is a change, so a `touch`, a
-`git checkout` of the same content or a line-end conversion does not rebuild a scene.
+files are read and compared with what was last known: only new text is a change, so a ``touch``, a
+``git checkout`` of the same content or a line-end conversion does not rebuild a scene.
 
 What is known at first can be given: between a load's reading of a file and `follow` an author can
 save, and that save must not be lost. A file that is gone or empty may be half of a save, so this
-is believed only when it lasts. Once a second the files are compared without any event too, for
-file systems that send none (network mounts), for a folder that was deleted and made again, and for
-systems out of inotify watches.
+is believed only when it lasts. Four times a second the files are compared without any event too:
+for file systems that send none (network mounts), for a folder that was deleted and made again, and
+for systems out of inotify watches, where watchfiles polls and sees no second save in one second.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ QUIET_MS = 30
 """A burst is over when nothing has happened for this long."""
 BURST_MS = 200
 """A burst that does not end is looked at after this long."""
-RECHECK_MS = 1000
+RECHECK_MS = 250
 """How often the files are compared without any event."""
 GONE_S = 0.3
 """How long a file must be missing or empty before that counts as its new content."""
@@ -126,7 +126,7 @@ class SourceWatcher:
                     return  # made anew: the watch is on the folder that was deleted
         except (OSError, _rust_notify.WatchfilesRustInternalError) as exc:
             if self._force_polling:
-                logger.warning("Cannot watch %s: %s. Looking once a second.", ", ".join(map(str, folders)), exc)
+                logger.warning("Cannot watch %s: %s. Looking now and then.", ", ".join(map(str, folders)), exc)
                 self._folders_changed.wait(RECHECK_MS / 1000)
             else:
                 logger.warning("No file events to be had (%s): polling the folders instead.", exc)

@@ -166,6 +166,12 @@ def _put_back(table: BodyTable, actor: Any, flat: NDArray[np.float32]) -> None:
 
 def _find_rows(table: BodyTable, bodies: list[_Body]) -> None:
     slots, rows = [], []
+    # Read whole, once a struct: on a GPU every number that is read by itself waits for the device.
+    rows_of = {
+        id(b.struct): scene_seams.data_rows_of(b.struct).tolist()
+        for b in bodies
+        if table.kinds[b.body] != "static"
+    }
     for b in bodies:
         slot = b.env * len(table.names) + b.body
         if table.kinds[b.body] == "static":
@@ -173,7 +179,7 @@ def _find_rows(table: BodyTable, bodies: list[_Body]) -> None:
             table.fixed[b.env, b.body] = [*pose.p, *pose.q]
         else:
             slots.append(slot)
-            rows.append(int(scene_seams.data_rows_of(b.struct)[b.position]))
+            rows.append(rows_of[id(b.struct)][b.position])
     table.slots = np.array(slots, dtype=np.int64)
     table.rows = torch.tensor(rows, dtype=torch.int64, device=table.scene.device)
 

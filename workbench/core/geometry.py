@@ -31,9 +31,11 @@ class Mesh:
     faces: NDArray[np.uint32]
     """(F, 3) indices into `vertices`, counter-clockwise seen from outside."""
     normals: NDArray[np.float32] | None = None
-    """(V, 3), or None where the source gave none."""
+    """(V, 3) unit length, or None where the source gave none."""
     uvs: NDArray[np.float32] | None = None
-    """(V, 2), or None where there is no texture."""
+    """(V, 2), or None where there is no texture. As in glTF and SAPIEN: (0, 0) is the top left corner
+    of the first row, v grows downwards, and values outside 0..1 repeat the texture. trimesh and OBJ
+    count v from the bottom: give those ``1 - v``."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +43,18 @@ class Material:
     """A SAPIEN ``RenderMaterial`` as far as a browser can show it."""
 
     base_color: tuple[float, float, float, float]
-    """RGBA in 0..1."""
+    """RGBA in 0..1, *linear*, as SAPIEN and glTF (``baseColorFactor``) mean it; see `srgb_color`.
+    White where there is a texture, which replaces it."""
     metallic: float = 0.0
     roughness: float = 1.0
     texture: NDArray[np.uint8] | None = None
-    """(H, W, 4) RGBA base colour texture, first row on top."""
+    """(H, W, 4) RGBA base colour texture, sRGB encoded as in an image file, first row on top."""
+
+    @property
+    def srgb_color(self) -> tuple[float, float, float, float]:
+        """`base_color` as a colour picker or CSS would say it: RGB sRGB encoded, alpha unchanged."""
+        r, g, b = (12.92 * c if c <= 0.0031308 else 1.055 * c ** (1 / 2.4) - 0.055 for c in self.base_color[:3])
+        return r, g, b, self.base_color[3]
 
 
 @dataclass(frozen=True)
@@ -60,6 +69,9 @@ class Visual:
     """(K,) env index of each instance."""
     bodies: NDArray[np.int32]
     """(K,) body index of each instance."""
+    ground: bool = False
+    """A flat floor that reaches far beyond its own env. A view that sets envs side by side draws one
+    of them under all: floors of many envs lie in one plane and flicker."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,10 @@ from __future__ import annotations
 from functools import cached_property
 from typing import Any
 
+import numpy as np
 import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from mani_skill.utils.structs.articulation import Articulation
 from mani_skill.utils.structs.articulation_joint import ArticulationJoint
 from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct
@@ -82,3 +85,21 @@ def _replace(owner: type, name: str, value: cached_property) -> None:
     # A cached_property assigned after the class body has no name, and raises when it is first read.
     value.__set_name__(owner, name)
     setattr(owner, name, value)
+
+
+def episode_seeds(env: BaseEnv) -> np.ndarray | None:
+    """(N,) the seeds that the envs were last reset with; None before the first reset."""
+    return env._episode_seed
+
+
+def set_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: list[int]) -> None:
+    """Seed the numpy randomness of some envs, and leave the others' as it is.
+
+    ``BaseEnv.reset(seed=[...], options={"env_idx": ...})`` takes the list for all envs: the seeds of a
+    subset would replace, and shorten, the seeds of the whole batch.
+    """
+    every = np.array(env._episode_seed, dtype=np.int64)
+    every[env_idx] = seeds
+    env._episode_seed = every
+    env._batched_episode_rng[env_idx] = BatchedRNG.from_seeds(seeds, backend=env._batched_rng_backend)
+    env._episode_rng = env._batched_episode_rng[0]

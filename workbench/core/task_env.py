@@ -22,6 +22,7 @@ from workbench.core.backends import choose_backend
 from workbench.core.body_table import BodyTable, build_body_table, read_poses
 from workbench.core.cpu_scene import batched_class
 from workbench.core.render_device import keep_render_device
+from workbench.core.seams import episode_seeds, set_episode_seeds
 from workbench.core.step import StepResult
 
 Backend = Literal["auto", "cpu", "gpu"]
@@ -123,24 +124,40 @@ class TaskEnv:
     def reset(self, seed: int | Sequence[int] | None = None, env_idx: Sequence[int] | None = None) -> StepResult:
         """Start new episodes in all envs, or in those of `env_idx`.
 
+        All at once is ManiSkill's own ``reset(seed=[...])``. For a subset, ManiSkill seeds torch with the
+        seed of env 0, whichever envs are reset, so that a seed given for env 3 means nothing; here a
+        partial reset draws from the first seed given, and ``reset(seed=7, env_idx=[3])`` starts the
+        episode that a single stock env starts with ``reset(seed=7)``.
+
         Args:
-            seed: one seed for the whole batch (env i gets ``seed + i``), or one for each env that is
-                reset; None goes on with the task's own random numbers.
+            seed: one seed for the whole batch (the i-th env that is reset gets ``seed + i``), or one for
+                each env that is reset; None goes on with the task's own random numbers.
         """
         chosen = list(range(self.num_envs)) if env_idx is None else [int(i) for i in env_idx]
-        if any(not 0 <= i < self.num_envs for i in chosen):
-            raise IndexError(f"env_idx {chosen} is out of range for {self.num_envs} envs")
         if not chosen:
             raise ValueError("env_idx is empty: name the envs to reset, or leave it out to reset all")
-        options = {} if env_idx is None else {"env_idx": torch.tensor(chosen, device=self.env.device)}
-        seeds = self._seeds(seed, chosen)
-        self.obs, info = self.env.reset(seed=seeds, options=options)
+        if any(not 0 <= i < self.num_envs for i in chosen):
+            raise IndexError(f"env_idx {chosen} is out of range for {self.num_envs} envs")
+        seeds = _seed_list(seed, len(chosen))
+        if env_idx is None:
+            self.obs, info = self.env.reset(seed=seeds)
+        else:
+            self.obs, info = self._partial_reset(chosen, seeds)
         info = {key: value for key, value in info.items() if key != "reconfigure"}
-        # A rebuild (`reconfiguration_freq`) replaces every body.
         self._refresh_if_rebuilt()
         if self._check is not None:
             self._check(info, None)
         return self._result(info, np.zeros(self.num_envs, np.float32), self._terminated(info), None)
+
+    def _partial_reset(self, chosen: list[int], seeds: list[int] | None) -> tuple[Any, dict[str, Any]]:
+        options = {"env_idx": torch.tensor(chosen, device=self.env.device)}
+        if seeds is None:
+            return self.env.reset(options=options)
+        set_episode_seeds(self.env, chosen, seeds)
+        devices = [self.env.device] if self.env.device.type == "cuda" else []
+        with torch.random.fork_rng(devices=devices):
+            torch.manual_seed(seeds[0])
+            return self.env.reset(options=options)
 
     def step(self, action: NDArray[np.float32] | None) -> StepResult:
         """One control step of all envs with a flat action (N, A), or None to leave the targets alone."""
@@ -153,29 +170,16 @@ class TaskEnv:
     @property
     def episode_seeds(self) -> NDArray[np.int64]:
         """(N,) the seeds that the envs were last reset with."""
-        return np.asarray(self.env._episode_seed, dtype=np.int64)
+        return np.array(episode_seeds(self.env), dtype=np.int64)
 
     def close(self) -> None:
         self.env.close()
 
     def _refresh_if_rebuilt(self) -> None:
+        # With `reconfiguration_freq` a reset may replace the scene, and with it every body.
         if self.table.scene is not self.env.scene:
             self.table = build_body_table(self.env)
             self.parts = actions.action_parts(self.env)
-
-    def _seeds(self, seed: int | Sequence[int] | None, chosen: list[int]) -> list[int] | None:
-        if seed is None:
-            return None
-        given = [seed + i for i in range(len(chosen))] if isinstance(seed, int) else [int(s) for s in seed]
-        if len(given) != len(chosen):
-            raise ValueError(f"{len(given)} seeds for {len(chosen)} envs")
-        # ManiSkill replaces the seeds of all envs by the list that it is given, also in a partial
-        # reset: a list for the subset alone would shorten it and shift the seeds of the others.
-        every = self.env._episode_seed
-        seeds = [0] * self.num_envs if every is None else [int(s) for s in every]
-        for env, value in zip(chosen, given, strict=True):
-            seeds[env] = value
-        return seeds
 
     def _terminated(self, info: Mapping[str, Any]) -> NDArray[np.bool_]:
         flags = [to_numpy(info[key]).astype(bool) for key in ("success", "fail") if key in info]
@@ -201,6 +205,15 @@ class TaskEnv:
             poses=read_poses(self.env, self.table),
             action=None if action is None else np.array(action, dtype=np.float32),
         )
+
+
+def _seed_list(seed: int | Sequence[int] | None, count: int) -> list[int] | None:
+    if seed is None:
+        return None
+    seeds = [seed + i for i in range(count)] if isinstance(seed, int) else [int(s) for s in seed]
+    if len(seeds) != count:
+        raise ValueError(f"{len(seeds)} seeds for {count} envs")
+    return seeds
 
 
 def to_numpy(value: Any) -> NDArray[Any]:

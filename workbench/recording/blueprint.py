@@ -14,7 +14,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from workbench.recording.episode import CameraTrack, Episode
-from workbench.recording.layout import CAMERAS, EVENTS, STEP, WORLD, camera_entities, evaluate_entity
+from workbench.recording.layout import EVENTS, STEP, WORLD, camera_entities, evaluate_entity
 
 MAX_SERIES = 32
 """An ``evaluate()`` entry with more numbers than this is kept, but not drawn: it hides the others."""
@@ -23,11 +23,12 @@ EYE_DIRECTION = (0.75, 0.85, 0.6)
 
 
 def episode_blueprint(episode: Episode) -> rrb.Blueprint:
+    cameras = camera_entities(episode.cameras)
     scene = rrb.Spatial3DView(
         name="Scene",
         origin=WORLD,
         # A depth picture in a 3-D view is a cloud of points over the very meshes that it shows.
-        contents=["$origin/**", f"- {CAMERAS}/*/depth", f"- {CAMERAS}/*/segmentation"],
+        contents=["$origin/**", *(f"- {camera}/{m}" for camera in cameras for m in ("depth", "segmentation"))],
         eye_controls=_eye(episode),
         line_grid=False,
     )
@@ -50,8 +51,10 @@ def episode_blueprint(episode: Episode) -> rrb.Blueprint:
 
 
 def _cameras(episode: Episode) -> rrb.ContainerLike:
-    rows = [_camera(*pair) for pair in zip(episode.cameras, camera_entities(episode.cameras))]
-    return rows[0] if len(rows) == 1 else rrb.Vertical(*rows) if len(rows) <= 3 else rrb.Tabs(*rows)
+    parts = [_camera(*pair) for pair in zip(episode.cameras, camera_entities(episode.cameras))]
+    if len(parts) == 1:
+        return parts[0]
+    return rrb.Vertical(*parts) if all(isinstance(part, rrb.View) for part in parts) else rrb.Tabs(*parts)
 
 
 def _camera(camera: CameraTrack, entity: str) -> rrb.ContainerLike:
@@ -59,17 +62,21 @@ def _camera(camera: CameraTrack, entity: str) -> rrb.ContainerLike:
     views = [
         rrb.Spatial2DView(name=f"{camera.info.name} {m}", origin=entity, contents=[f"$origin/{m}"]) for m in modalities
     ]
-    return views[0] if len(views) == 1 else rrb.Grid(*views, name=camera.info.name)
+    if len(views) == 1:
+        return views[0]
+    return rrb.Vertical(views[0], rrb.Horizontal(*views[1:]), row_shares=[3, 2], name=camera.info.name)
 
 
 def _curves(episode: Episode) -> rrb.ContainerLike:
     drawn = [evaluate_entity(k) for k, v in episode.evaluate.items() if 0 < math.prod(v.shape[1:]) <= MAX_SERIES]
-    views: list[rrb.View] = [rrb.TimeSeriesView(name="Reward", origin="/reward")]
+    legend = rrb.PlotLegend(visible=True)
+    views: list[rrb.View] = [rrb.TimeSeriesView(name="Reward", origin="/reward", plot_legend=legend)]
     if drawn:
-        views.append(rrb.TimeSeriesView(name="Evaluate", origin="/evaluate", contents=drawn))
+        views.append(rrb.TimeSeriesView(name="Evaluate", origin="/evaluate", contents=drawn, plot_legend=legend))
     if episode.action_names:
-        views.append(rrb.TimeSeriesView(name="Action", origin="/action"))
-    views.append(rrb.TextLogView(name="Events", origin=EVENTS))
+        views.append(rrb.TimeSeriesView(name="Action", origin="/action", plot_legend=legend))
+    columns = rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
+    views.append(rrb.TextLogView(name="Events", origin=EVENTS, columns=columns))
     return rrb.Horizontal(*views)
 
 
@@ -91,5 +98,3 @@ def _eye(episode: Episode) -> rrb.EyeControls3D:
         eye_up=(0.0, 0.0, 1.0),
     )
 
-
-__all__ = ["episode_blueprint"]

@@ -41,6 +41,11 @@ JPEG_QUALITY = 85
 FRUSTUM_METRES = 0.12
 """How far in front of a camera its picture is drawn in the 3-D view."""
 MILLIMETRES_PER_METRE = 1000.0
+SERIES_COLORS = (
+    (86, 180, 233), (230, 159, 0), (0, 158, 115), (240, 228, 66), (204, 121, 167), (213, 94, 0), (0, 114, 178),
+    (160, 160, 160),
+)
+"""Okabe and Ito's palette, which the colour-blind can tell apart, with grey for its black."""
 
 _OPTICAL_FROM_CAMERA = (0.5, -0.5, 0.5, -0.5)
 """wxyz of the OpenCV camera axes (x right, y down, z forward) within ManiSkill's (x forward, y left,
@@ -82,7 +87,9 @@ class EpisodeLog:
         flat = np.asarray(values, dtype=np.float64).reshape(len(steps), len(names))
         if flat.shape[1] == 0:
             return
-        self.static(entity, rr.SeriesLines(names=list(names)))
+        # Rerun gives an entity one colour, however many series it holds.
+        colors = [SERIES_COLORS[index % len(SERIES_COLORS)] for index in range(len(names))] if len(names) > 1 else None
+        self.static(entity, rr.SeriesLines(names=list(names), colors=colors))
         columns = rr.Scalars.columns(scalars=flat.reshape(-1))
         self.columns(entity, steps, columns.partition([flat.shape[1]] * len(flat)))
 

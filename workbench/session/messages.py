@@ -153,11 +153,10 @@ class WatchCameras:
 
 @dataclass(frozen=True)
 class SetCapture:
-    """While on, every step comes back whole (poses, and pictures of every camera), to be recorded."""
+    """While on, every step comes back with the pictures of all cameras of these envs, to be recorded."""
 
     env_idx: tuple[int, ...]
     """Empty turns it off."""
-    with_pictures: bool = True
 
 
 @dataclass(frozen=True)
@@ -208,8 +207,6 @@ class Stepped:
     """Pictures that belong to exactly this step (only while capturing)."""
     seeds: NDArray[np.int64] | None = None
     """(N,) episode seed of each env, where a reset was part of this."""
-    again: bool = False
-    """The state as it stands, sent once more with its pictures because capturing begins."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from workbench.authoring.load import LoadedTask, load_task
+from workbench.authoring import registry
+from workbench.authoring.load import LoadedTask, load_task, with_late_imports
 from workbench.authoring.problem import TaskError, problem_from_exception
 from workbench.authoring.returns import check_step_returns
 from workbench.core import actions
@@ -60,7 +61,7 @@ def open_task(
         env = make_env(
             loaded.cls,
             EnvOptions(num_envs=options.num_envs, backend=options.backend, kwargs=options.env_kwargs),
-            asset_ids=loaded.asset_ids,
+            asset_ids=_asset_ids(loaded),
             default_kwargs=loaded.default_kwargs,
         )
     clock.lap("build")
@@ -74,6 +75,7 @@ def open_task(
             first = task.reset(seed=options.seed)
         clock.lap("reset")
         on_activity("reading the shapes")
+        loaded = with_late_imports(loaded)
         description = describe(loaded, task)
         clock.lap("geometry")
     except BaseException:
@@ -158,6 +160,11 @@ def _returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, 
             raise TaskError(problem)
 
     return check
+
+
+def _asset_ids(loaded: LoadedTask) -> list[str]:
+    spec = registry.environment(loaded.env_id)
+    return [] if spec is None else list(spec.asset_download_ids or [])
 
 
 class _blamed:

@@ -49,6 +49,7 @@ from workbench.session.messages import (
 )
 from workbench.session.open_task import OpenedTask, open_task, step_checked, zero_action
 from workbench.session.pacing import Pacer, Rate
+from workbench.session.episodes import recorded_modalities
 from workbench.session.policy import Policy, load_policy
 
 _STATUS_PERIOD = 0.25
@@ -63,7 +64,6 @@ class Worker:
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
         self._opened: OpenedTask | None = None
-        self._step: StepResult | None = None
         self._playing = False
         self._source: ActionSource = "random"
         self._policy: Policy | None = None
@@ -143,7 +143,7 @@ class Worker:
         except TaskError as error:
             self._send(Failed(error.problem, kept=self._opened is not None))
             return
-        before, self._opened, self._step = self._opened, opened, opened.first
+        before, self._opened = self._opened, opened
         self._pacer = Pacer(opened.env.control_dt, self._pacer.speed)
         self._rng = np.random.default_rng(request.options.seed)
         self._rate.clear()
@@ -166,7 +166,9 @@ class Worker:
         # The random actions start again with the seed, or "reset" would not repeat an episode.
         if request.seed is not None:
             self._rng = np.random.default_rng(request.seed)
-        self._guarded(lambda opened: self._reset_envs(opened, request.env_idx, request.seed))
+        count = 0 if request.env_idx is None else len(request.env_idx)
+        seed = self._fresh_seeds(count) if request.seed is None and count else request.seed
+        self._guarded(lambda opened: self._reset_envs(opened, request.env_idx, seed))
 
     def _set_speed(self, request: SetSpeed) -> None:
         self._pacer.speed = request.speed
@@ -193,9 +195,6 @@ class Worker:
 
     def _set_capture(self, request: SetCapture) -> None:
         self._capture = request
-        if request.env_idx and self._opened is not None and self._step is not None:
-            nothing = np.zeros(self._opened.env.num_envs, bool)
-            self._send_step(self._step, nothing, again=True)
 
     def _stop(self, request: Quit) -> None:
         self._quit = True
@@ -229,12 +228,18 @@ class Worker:
         if len(ended) == 0:
             return
         if self._episode_end == "reset":
-            self._reset_envs(opened, tuple(int(i) for i in ended), None)
+            self._reset_envs(opened, tuple(int(i) for i in ended), self._fresh_seeds(len(ended)))
         elif self._episode_end == "pause":
             self._playing = False
             self._send_status(None)
 
-    def _reset_envs(self, opened: OpenedTask, env_idx: tuple[int, ...] | None, seed: int | None) -> None:
+    def _fresh_seeds(self, count: int) -> list[int]:
+        # Each episode has a seed of its own, or a recording of it could not say how to start it again.
+        return [int(seed) for seed in self._rng.integers(2**31, size=count)]
+
+    def _reset_envs(
+        self, opened: OpenedTask, env_idx: tuple[int, ...] | None, seed: int | list[int] | None
+    ) -> None:
         try:
             step = opened.env.reset(seed=seed, env_idx=env_idx)
         except TaskError:
@@ -266,23 +271,18 @@ class Worker:
         return actions.hold_action(env.parts, env.num_envs)
 
     def _send_step(
-        self,
-        step: StepResult,
-        reset_mask: np.ndarray,
-        seeds: np.ndarray | None = None,
-        again: bool = False,
+        self, step: StepResult, reset_mask: np.ndarray, seeds: np.ndarray | None = None
     ) -> None:
-        self._step = step
         self._pictures_stale = True
         captured: tuple[Picture, ...] = ()
-        if self._capture.with_pictures and self._opened is not None:
+        if self._capture.env_idx and self._opened is not None:
             wanted = tuple(
-                (camera.name, camera.kind, _recorded(camera.kind, camera.modalities))
+                (camera.name, camera.kind, recorded_modalities(camera))
                 for camera in self._opened.description.cameras
             )
             for env in self._capture.env_idx:
                 captured += take_pictures(self._opened.env.env, env, wanted)
-        self._send(Stepped(step, reset_mask, captured, seeds, again))
+        self._send(Stepped(step, reset_mask, captured, seeds))
 
     # --- pictures and status -----------------------------------------------------------------------
 
@@ -315,9 +315,9 @@ class Worker:
         self._send(Pictures(pictures, 1000 * self._picture_cost))
 
     def _send_status(self, now: float | None) -> None:
-        """Every quarter of a second, or at once when `now` is None."""
+        """Every quarter of a second while playing, or at once when `now` is None."""
         moment = time.monotonic()
-        if now is not None and now - self._status_sent < _STATUS_PERIOD:
+        if now is not None and (not self._playing or now - self._status_sent < _STATUS_PERIOD):
             return
         self._status_sent = moment
         steps = self._rate.per_second(moment) if self._playing else 0.0
@@ -326,12 +326,6 @@ class Worker:
 
 def _as_tuple(request: CameraRequest) -> tuple[str, Any, tuple[str, ...]]:
     return request.name, request.kind, request.modalities
-
-
-def _recorded(kind: str, modalities: tuple[str, ...]) -> tuple[str, ...]:
-    """What an episode keeps of a camera: of a sensor what a policy may see, of a human camera colour."""
-    wanted = ("rgb", "depth", "segmentation") if kind == "sensor" else ("rgb",)
-    return tuple(m for m in wanted if m in modalities)
 
 
 def main() -> None:

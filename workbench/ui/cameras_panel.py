@@ -133,7 +133,8 @@ class CamerasPanel:
                     size=f"{info.width} × {info.height}",
                     fovy=f"{np.degrees(info.fovy):.0f}°",
                     mount=info.mount,
-                )
+                ),
+                order=1.0,
             )
             for order, modality in enumerate(m for m in MODALITIES if m in info.modalities):
                 on = self._remembered.get((info.kind, info.name, modality), first and modality == "rgb")

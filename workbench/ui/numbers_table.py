@@ -77,5 +77,5 @@ def _batch(values: NDArray) -> str:
         return f"{int(values.sum())} of {len(values)}"
     if values.ndim == 1 and values.dtype.kind in "iuf" and len(values):
         mean = np.asarray(values, np.float64).mean()
-        return f"mean {_one(np.asarray(mean))}"
+        return f"mean {mean:.1f}" if values.dtype.kind in "iu" else f"mean {_one(np.asarray(mean))}"
     return ""

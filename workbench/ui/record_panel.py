@@ -26,7 +26,7 @@ class RecordPanel:
         self._selected_env = 0
         self._active = False
         self._html_drawn = ""
-        self._which = server.gui.add_dropdown("Record", (THIS_ENV, ALL_ENVS), THIS_ENV)
+        self._which = server.gui.add_dropdown("Record", (THIS_ENV, ALL_ENVS), initial_value=THIS_ENV)
         self._button = server.gui.add_button("Record", icon=viser.Icon.PLAYER_RECORD, color="red")
         self._status = server.gui.add_html("")
         self._button.on_click(lambda _: self.toggle())

@@ -70,7 +70,9 @@ class RunPanel:
 
         with gui.add_folder("Episode"):
             self._speed = Control(
-                gui.add_dropdown("Speed", tuple(SPEEDS), "1 ×", hint="Simulated seconds in one second."),
+                gui.add_dropdown(
+                    "Speed", tuple(SPEEDS), initial_value="1 ×", hint="Simulated seconds in one second."
+                ),
                 read=lambda value: SPEEDS[checked_choice(value, tuple(SPEEDS), "speed")],
                 send=session.set_speed,
                 shown=self._speed_shown,
@@ -84,7 +86,7 @@ class RunPanel:
                 settle=0.6,
             )
             self._end = Control(
-                gui.add_dropdown("At its end", tuple(EPISODE_ENDS), "reset that env"),
+                gui.add_dropdown("At its end", tuple(EPISODE_ENDS), initial_value="reset that env"),
                 read=lambda value: EPISODE_ENDS[checked_choice(value, tuple(EPISODE_ENDS), "rule")],
                 send=session.set_episode_end,
                 shown=lambda rule: _name_of(EPISODE_ENDS, rule),
@@ -92,7 +94,7 @@ class RunPanel:
 
         with gui.add_folder("Actions"):
             self._source = Control(
-                gui.add_dropdown("Source", tuple(SOURCES), "hold still"),
+                gui.add_dropdown("Source", tuple(SOURCES), initial_value="hold still"),
                 read=lambda value: SOURCES[checked_choice(value, tuple(SOURCES), "source")],
                 send=self._choose_source,
                 shown=self._source_shown,

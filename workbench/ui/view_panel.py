@@ -15,8 +15,8 @@ class ViewPanel:
     def __init__(self, server: viser.ViserServer, dark: bool = True) -> None:
         self._server = server
         with server.gui.add_folder("View"):
-            self._show = server.gui.add_dropdown("Show", (ALL, ONE), ALL)
-            self._theme = server.gui.add_dropdown("Theme", (DARK, LIGHT), DARK if dark else LIGHT)
+            self._show = server.gui.add_dropdown("Show", (ALL, ONE), initial_value=ALL)
+            self._theme = server.gui.add_dropdown("Theme", (DARK, LIGHT), initial_value=DARK if dark else LIGHT)
         self._theme.on_update(lambda _: self._apply_theme())
         self._apply_theme()
 

@@ -1,0 +1,1 @@
+"""What the machine at hand can do, and bringing what it lacks: render driver, browser, system libraries."""

@@ -1,0 +1,466 @@
+"""The session on the server's side: what the page asks for, and what it sees.
+
+The page's controls call methods here; each only notes the wish and sends a message, so none waits for
+the env. One thread starts the worker, takes its events one by one and turns them into the state from
+which `Session.view` makes a snapshot. When the worker dies, that same thread starts another with the
+last version that ran, and the page never goes away.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from workbench.authoring.problem import Problem
+from workbench.authoring.watch import SourceWatcher
+from workbench.core.pictures import CameraKind, Picture
+from workbench.core.step import StepResult
+from workbench.session.messages import (
+    ActionSource,
+    CameraRequest,
+    EpisodeEnd,
+    Event,
+    Failed,
+    Load,
+    Loaded,
+    Loading,
+    Pictures,
+    Play,
+    Request,
+    Reset,
+    SetActionSource,
+    SetCapture,
+    SetEpisodeEnd,
+    SetSliders,
+    SetSpeed,
+    SingleStep,
+    Status,
+    Stepped,
+    TaskDescription,
+    TaskOptions,
+    WatchCameras,
+)
+from workbench.session.past import Past
+from workbench.session.process import WorkerProcess, describe_exit
+from workbench.session.record_live import LiveRecorder
+from workbench.session.view import Curves, SessionView, State
+
+_PRINTED_LINES = 200
+_MOST_RESTARTS = 3
+"""Workers that may die one after the other without a load in between, before we stop starting them."""
+
+
+@dataclass
+class _State:
+    """What the snapshots are made of; only touched under the session's lock."""
+
+    state: State = "starting"
+    activity: str = "starting the worker"
+    stale: bool = False
+    task: TaskDescription | None = None
+    task_serial: int = 0
+    load_milliseconds: dict[str, float] = field(default_factory=dict)
+    step: StepResult | None = None
+    step_serial: int = 0
+    pictures: dict[tuple[CameraKind, str], Picture] = field(default_factory=dict)
+    pictures_serial: int = 0
+    picture_milliseconds: float = 0.0
+    problem: Problem | None = None
+    problem_serial: int = 0
+    problem_at_run: bool = False
+    past: Past | None = None
+    selected_env: int = 0
+    playing: bool = False
+    wants_play: bool = False
+    speed: float = 1.0
+    episode_end: EpisodeEnd = "reset"
+    action_source: ActionSource = "random"
+    policy: str | None = None
+    sliders: tuple[float, ...] = ()
+    steps_per_second: float = 0.0
+    real_time_factor: float = 0.0
+    cameras: tuple[CameraRequest, ...] = ()
+    clients: int = 0
+    printed: deque[str] = field(default_factory=lambda: deque(maxlen=_PRINTED_LINES))
+    deaths: int = 0
+
+
+class Session:
+    """One task, one worker, any number of pages. All methods are thread-safe and return at once."""
+
+    def __init__(
+        self,
+        task: str,
+        options: TaskOptions,
+        *,
+        recordings: Path,
+        on_event: Callable[[Event], None] = lambda event: None,
+    ) -> None:
+        """
+        Args:
+            task: a file, ``file.py:ClassName``, or a registered env id.
+            recordings: folder that recorded episodes go to; made when the first is written.
+            on_event: called with every event of the worker on the session's thread (the terminal).
+        """
+        self._task = task
+        self._options = options
+        self._seed = options.seed
+        self._on_event = on_event
+        self._lock = threading.Lock()
+        self._changed = threading.Condition(self._lock)
+        self._change = 0
+        self._state = _State()
+        self._curves: Curves | None = None
+        self._closing = False
+        self._restart_asked = False
+        self._worker: WorkerProcess | None = None
+        self._last_good: dict[str, str] | None = None
+        self._recorder = LiveRecorder(recordings, self._note)
+        self._watcher = SourceWatcher(self._on_files_changed)
+        self._thread = threading.Thread(target=self._run, name="session", daemon=True)
+        self._thread.start()
+
+    # --- what the page reads -----------------------------------------------------------------------
+
+    def view(self) -> SessionView:
+        """A snapshot; cheap enough for every frame."""
+        recording = self._recorder.status()
+        with self._lock:
+            s = self._state
+            if s.past is not None and (self._curves is None or self._curves.serial != s.step_serial):
+                self._curves = s.past.curves()
+            return SessionView(
+                state=s.state,
+                activity=s.activity,
+                stale=s.stale,
+                task=s.task,
+                task_serial=s.task_serial,
+                load_milliseconds=s.load_milliseconds,
+                step=s.step,
+                step_serial=s.step_serial,
+                pictures=s.pictures,
+                pictures_serial=s.pictures_serial,
+                picture_milliseconds=s.picture_milliseconds,
+                problem=s.problem,
+                problem_serial=s.problem_serial,
+                curves=self._curves if s.past is not None else None,
+                selected_env=s.selected_env,
+                playing=s.playing,
+                speed=s.speed,
+                seed=self._seed,
+                episode_end=s.episode_end,
+                action_source=s.action_source,
+                policy=s.policy,
+                sliders=s.sliders,
+                steps_per_second=s.steps_per_second,
+                real_time_factor=s.real_time_factor,
+                recording=recording,
+                printed=tuple(s.printed),
+            )
+
+    def wait(self, seen: int, timeout: float) -> int:
+        """Block until something changed since the counter `seen`; returns the counter as it is now."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._change != seen or self._closing, timeout)
+            return self._change
+
+    # --- what the page asks for --------------------------------------------------------------------
+
+    def reload(self) -> None:
+        """Load the file again."""
+        self._send(self._load_request(None))
+
+    def restart_worker(self) -> None:
+        """End the worker, whatever it is doing, and start another with the file as it is now."""
+        with self._lock:
+            self._restart_asked = True
+            self._state.deaths = 0
+            self._last_good = None
+            worker = self._worker
+        if worker is not None:
+            worker.kill()
+
+    def play(self) -> None:
+        self._set(playing=True, wants_play=True)
+        self._send(Play(True))
+
+    def pause(self) -> None:
+        self._set(playing=False, wants_play=False)
+        self._send(Play(False))
+
+    def step(self) -> None:
+        """One control step; pauses first."""
+        self.pause()
+        self._send(SingleStep())
+
+    def reset(self, env_idx: tuple[int, ...] | None = None) -> None:
+        """All envs with the session's seed, or some with fresh seeds."""
+        self._send(Reset(env_idx, self._seed if env_idx is None else None))
+
+    def set_seed(self, seed: int) -> None:
+        """Take another seed and reset all envs with it."""
+        with self._lock:
+            self._seed = int(seed)
+        self.reset()
+
+    def set_speed(self, speed: float) -> None:
+        """Simulated seconds per wall second; ``math.inf`` for as fast as the machine can."""
+        self._set(speed=speed)
+        self._send(SetSpeed(speed))
+
+    def set_episode_end(self, rule: EpisodeEnd) -> None:
+        self._set(episode_end=rule)
+        self._send(SetEpisodeEnd(rule))
+
+    def set_action_source(self, source: ActionSource, policy: str | None = None) -> None:
+        self._set(action_source=source, policy=policy)
+        self._send(SetActionSource(source, policy))
+
+    def set_sliders(self, action: tuple[float, ...]) -> None:
+        """The action (A,) that every env gets while the action source is ``sliders``."""
+        self._set(sliders=action)
+        self._send(SetSliders(action))
+
+    def select_env(self, env: int) -> None:
+        """The env whose pictures and numbers are shown."""
+        with self._lock:
+            last = 0 if self._state.task is None else self._state.task.num_envs - 1
+            chosen = min(max(int(env), 0), last)
+            if chosen == self._state.selected_env:
+                return
+            self._state.selected_env = chosen
+            # The other env's picture must not stand beside this env's numbers until a new one comes.
+            self._state.pictures = {}
+            self._state.pictures_serial += 1
+        self._watch()
+        self._note()
+
+    def watch_cameras(self, cameras: tuple[CameraRequest, ...]) -> None:
+        """Which pictures of the selected env are on screen; no others are rendered."""
+        with self._lock:
+            if cameras == self._state.cameras:
+                return
+            self._state.cameras = cameras
+        self._watch()
+
+    def set_clients(self, count: int) -> None:
+        """How many pages are open; with none, no picture is rendered."""
+        with self._lock:
+            before, self._state.clients = self._state.clients, count
+        if (before == 0) != (count == 0):
+            self._watch()
+
+    def start_recording(self, env_idx: tuple[int, ...] | None = None) -> None:
+        """Record from a fresh episode on: the envs (all if None) are reset, and capturing begins."""
+        with self._lock:
+            task = self._state.task
+        if task is None:
+            return
+        envs = tuple(range(task.num_envs)) if env_idx is None else env_idx
+        self._recorder.start(task, envs)
+        self._send(SetCapture(envs))
+        self.reset(None if env_idx is None else envs)
+        self._note()
+
+    def stop_recording(self) -> None:
+        """Write what was gathered of the episodes under way, and stop."""
+        self._send(SetCapture(()))
+        self._recorder.stop()
+        self._note()
+
+    def close(self) -> None:
+        """End the worker and the watcher, and wait for episodes that are being written."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+            worker = self._worker
+        self._watcher.stop()
+        if worker is not None:
+            worker.stop()
+        self._thread.join()
+        self._recorder.close()
+
+    # --- the session's thread ------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while not self._closing:
+            worker = WorkerProcess(self._on_line)
+            with self._lock:
+                self._worker = worker
+                self._restart_asked = False
+                closing = self._closing
+            if closing:
+                worker.stop()
+                return
+            self._greet(worker)
+            try:
+                while True:
+                    event = worker.receive()
+                    if event is not None:
+                        self._handle(event)
+            except EOFError:
+                self._on_death(worker)
+            if not self._wait_for_restart():
+                return
+
+    def _greet(self, worker: WorkerProcess) -> None:
+        """Tell a new worker everything that the one before it knew."""
+        s = self._state
+        worker.send(SetSpeed(s.speed))
+        worker.send(SetEpisodeEnd(s.episode_end))
+        worker.send(SetActionSource(s.action_source, s.policy))
+        worker.send(self._load_request(self._last_good))
+        if s.wants_play:
+            worker.send(Play(True))
+        worker.send(self._watch_request())
+
+    def _on_death(self, worker: WorkerProcess) -> None:
+        code = worker.exit_code()
+        worker.stop(grace=0.0)
+        self._recorder.stop()
+        with self._lock:
+            self._worker = None
+            if self._closing:
+                return
+            s = self._state
+            s.playing, s.steps_per_second, s.real_time_factor = False, 0.0, 0.0
+            if not self._restart_asked:
+                s.deaths += 1
+                s.wants_play = False
+                tail = "\n".join(list(s.printed)[-20:])
+                self._set_problem(
+                    Problem("worker", f"the worker process {describe_exit(code)}", s.task and s.task.file,
+                            None, None, tail)
+                )
+            s.state, s.activity = "starting", "starting another worker"
+        self._note()
+
+    def _wait_for_restart(self) -> bool:
+        """False when the session ends. After too many deaths in a row, wait to be asked."""
+        with self._changed:
+            if self._state.deaths >= _MOST_RESTARTS:
+                self._state.state = "stopped"
+                self._state.activity = ""
+                self._change += 1
+                self._changed.notify_all()
+                self._changed.wait_for(lambda: self._restart_asked or self._closing)
+            return not self._closing
+
+    def _handle(self, event: Event) -> None:
+        if isinstance(event, Loaded):
+            self._on_loaded(event)
+        elif isinstance(event, Stepped):
+            self._on_stepped(event)
+        else:
+            with self._lock:
+                self._apply(event)
+        self._note()
+        self._on_event(event)
+
+    def _apply(self, event: Event) -> None:
+        s = self._state
+        if isinstance(event, Loading):
+            s.state, s.activity = "loading", event.activity
+        elif isinstance(event, Failed):
+            s.activity = ""
+            self._set_problem(event.problem)
+            s.problem_at_run = s.state != "loading"
+            s.state = "error"
+            s.stale = s.stale or not s.problem_at_run
+        elif isinstance(event, Pictures):
+            if event.pictures and event.pictures[0].env == s.selected_env:
+                s.pictures = {(picture.kind, picture.camera): picture for picture in event.pictures}
+                s.pictures_serial += 1
+                s.picture_milliseconds = event.milliseconds
+        elif isinstance(event, Status):
+            s.playing = event.playing
+            s.steps_per_second, s.real_time_factor = event.steps_per_second, event.real_time_factor
+            if s.state in ("running", "paused"):
+                s.state = "running" if event.playing else "paused"
+
+    def _on_loaded(self, event: Loaded) -> None:
+        # Episodes of the version before end here: their steps and the new ones do not belong together.
+        recording = self._recorder.status()
+        self._recorder.stop()
+        task = event.task
+        with self._lock:
+            s = self._state
+            self._last_good = dict(task.source) or None
+            s.task, s.step, s.load_milliseconds = task, event.first, event.milliseconds
+            s.task_serial += 1
+            s.step_serial += 1
+            s.past, self._curves = Past(task.num_envs), None
+            s.pictures, s.sliders = {}, ()
+            s.pictures_serial += 1
+            s.selected_env = min(s.selected_env, task.num_envs - 1)
+            s.activity, s.stale, s.deaths = "", False, 0
+            if s.problem is not None and s.problem.stage != "worker":
+                self._set_problem(None)
+            s.state = "running" if s.playing else "paused"
+        self._watcher.follow([Path(path) for path in task.source_files], dict(task.source))
+        self._watch()
+        if recording.active:
+            self.start_recording(recording.env_idx)
+
+    def _on_stepped(self, event: Stepped) -> None:
+        with self._lock:
+            s = self._state
+            s.step = event.step
+            s.step_serial += 1
+            if s.past is not None:
+                s.past.add(event)
+            if s.state == "error" and s.problem_at_run:
+                # What failed while running runs again: the task was reset, or the policy changed.
+                self._set_problem(None)
+                s.state = "running" if s.playing else "paused"
+        self._recorder.take(event)
+
+    def _on_files_changed(self, paths: set[Path]) -> None:
+        with self._lock:
+            self._state.stale = True
+        self._note()
+        self.reload()
+
+    def _on_line(self, stream: str, line: str) -> None:
+        with self._lock:
+            self._state.printed.append(line)
+        self._note()
+
+    # --- small things --------------------------------------------------------------------------------
+
+    def _set_problem(self, problem: Problem | None) -> None:
+        self._state.problem = problem
+        self._state.problem_serial += 1
+
+    def _load_request(self, source: dict[str, str] | None) -> Load:
+        options = TaskOptions(self._options.num_envs, self._options.backend, self._seed, self._options.env_kwargs)
+        return Load(self._task, options, source)
+
+    def _watch_request(self) -> WatchCameras:
+        s = self._state
+        return WatchCameras(s.selected_env, s.cameras if s.clients > 0 else ())
+
+    def _watch(self) -> None:
+        with self._lock:
+            request = self._watch_request()
+        self._send(request)
+
+    def _send(self, request: Request) -> None:
+        with self._lock:
+            worker = self._worker
+        if worker is not None:
+            worker.send(request)
+
+    def _set(self, **values: object) -> None:
+        with self._lock:
+            for name, value in values.items():
+                setattr(self._state, name, value)
+        self._note()
+
+    def _note(self) -> None:
+        with self._changed:
+            self._change += 1
+            self._changed.notify_all()
