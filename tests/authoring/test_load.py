@@ -91,7 +91,7 @@ def test_a_registered_id_gives_the_built_in_class_and_its_source() -> None:
         ("push.py:1st", "after the colon"),
         ("bad\0name.py", "not a path"),
         ("~nobody-of-that-name/push.py", "not a path"),
-        ("x" * 5000 + ".py", "cannot be looked at"),
+        ("x" * 5000 + ".py", "cannot look at the file"),
         (os.devnull, "not a .py file"),
     ],
 )
@@ -417,7 +417,7 @@ def test_a_wrong_encoding_is_told_at_its_line(write: Write) -> None:
     path.write_bytes(b"# one\n# W\xfcrfel\n")
     problem = refused(path)
     assert (problem.stage, problem.line) == ("syntax", 2)
-    assert "UTF-8" in problem.message
+    assert "UTF-8" in problem.message and problem.code == "# W\N{REPLACEMENT CHARACTER}rfel"
     path.write_bytes(b"# coding: klingon\n")
     problem = refused(path)
     assert (problem.stage, problem.line) == ("syntax", 1)

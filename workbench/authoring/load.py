@@ -189,7 +189,7 @@ def _check_file(file: Path) -> None:
             # A pipe, say: reading it would wait for ever.
             raise _refused(f"{file} is not an ordinary file")
     except OSError as exc:
-        raise _refused(f"{file} cannot be looked at: {exc.strerror}") from exc
+        raise _refused(f"cannot look at the file ({exc.strerror}): {file}") from exc
 
 
 def _missing(file: Path) -> TaskError:

@@ -103,7 +103,13 @@ class AuthorFinder(MetaPathFinder):
         if path in self.given:
             return self.given[path]
         with open(path, "rb") as file:
-            return decode(path, file.read())
+            raw = file.read()
+        try:
+            return decode(path, raw)
+        except SyntaxError:
+            # The author is to be shown the line, and this is one of their files.
+            self.remember(path, raw.decode(errors="replace"))
+            raise
 
     def remember(self, path: str, text: str) -> None:
         self.texts[path] = text

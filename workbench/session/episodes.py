@@ -43,7 +43,7 @@ class EpisodeGatherer:
         """The next reset or step of the batch."""
         for env in self._builders:
             if stepped.reset_mask[env]:
-                self._end(env)
+                self.end(env)
                 seed = int(stepped.seeds[env]) if stepped.seeds is not None else -1
                 self._begin(env, stepped.step, seed, stepped.captured)
             elif stepped.step.action is not None:
@@ -52,7 +52,13 @@ class EpisodeGatherer:
     def finish(self) -> None:
         """End the episodes under way where they are."""
         for env in self._builders:
-            self._end(env)
+            self.end(env)
+
+    def end(self, env: int) -> None:
+        """End the episode of `env` where it is; it must have a step to be kept."""
+        builder, self._builders[env] = self._builders[env], None
+        if builder is not None and len(builder) > 0:
+            self._on_episode(builder.finish())
 
     def _begin(self, env: int, step: StepResult, seed: int, pictures: Iterable[Picture]) -> None:
         task = self._task
@@ -79,12 +85,7 @@ class EpisodeGatherer:
             return
         builder.append(step, env, pictures)
         if step.terminated[env] or step.truncated[env]:
-            self._end(env)
-
-    def _end(self, env: int) -> None:
-        builder, self._builders[env] = self._builders[env], None
-        if builder is not None and len(builder) > 0:
-            self._on_episode(builder.finish())
+            self.end(env)
 
 
 def package_versions() -> dict[str, str]:

@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from workbench.authoring.problem import Problem
+from workbench.authoring.reference import named_file
 from workbench.authoring.watch import SourceWatcher
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.step import StepResult
@@ -118,8 +119,11 @@ class Session:
         self._restart_asked = False
         self._worker: WorkerProcess | None = None
         self._last_good: dict[str, str] | None = None
+        self._restoring = False
         self._recorder = LiveRecorder(recordings, self._note)
         self._watcher = SourceWatcher(self._on_files_changed)
+        self._own_file = named_file(task)
+        self._follow((), {})
         self._thread = threading.Thread(target=self._run, name="session", daemon=True)
         self._thread.start()
 
@@ -312,6 +316,7 @@ class Session:
         worker.send(SetSpeed(s.speed))
         worker.send(SetEpisodeEnd(s.episode_end))
         worker.send(SetActionSource(s.action_source, s.policy))
+        self._restoring = self._last_good is not None
         worker.send(self._load_request(self._last_good))
         if s.wants_play:
             worker.send(Play(True))
@@ -357,6 +362,10 @@ class Session:
         else:
             with self._lock:
                 self._apply(event)
+            if isinstance(event, Failed) and event.problem.file is not None:
+                # A module beside the task that broke before the task had ever imported it whole.
+                known = self._state.task.source_files if self._state.task is not None else ()
+                self._follow((*known, event.problem.file), {})
         self._note()
         self._on_event(event)
 
@@ -396,11 +405,14 @@ class Session:
             s.pictures, s.sliders = {}, ()
             s.pictures_serial += 1
             s.selected_env = min(s.selected_env, task.num_envs - 1)
-            s.activity, s.stale, s.deaths = "", False, 0
-            if s.problem is not None and s.problem.stage != "worker":
+            s.activity, s.deaths = "", 0
+            # The last good version came back after a worker's death: what killed it still stands.
+            s.stale = self._restoring
+            if not self._restoring:
                 self._set_problem(None)
+            self._restoring = False
             s.state = "running" if s.playing else "paused"
-        self._watcher.follow([Path(path) for path in task.source_files], dict(task.source))
+        self._follow(task.source_files, {} if s.stale else task.source)
         self._watch()
         if recording.active:
             self.start_recording(recording.env_idx)
@@ -428,6 +440,13 @@ class Session:
         with self._lock:
             self._state.printed.append(line)
         self._note()
+
+    def _follow(self, paths: Iterable[str], texts: Mapping[str, str]) -> None:
+        """Watch the task's own file, whether or not it ever loaded, and `paths` beside it."""
+        if self._own_file is None:
+            return
+        beside = [Path(p) for p in paths if Path(p).is_relative_to(self._own_file.parent)]
+        self._watcher.follow({self._own_file, *beside}, texts)
 
     # --- small things --------------------------------------------------------------------------------
 

@@ -77,7 +77,9 @@ class DoorOptions:
         if not self.host:
             raise ValueError("The host to listen on is empty; give an address such as 127.0.0.1.")
         if not 0 <= self.port <= 65535:
-            raise ValueError(f"Port {self.port} does not exist; give one from 1 to 65535, or 0 for any free one.")
+            raise ValueError(
+                f"Port {self.port} does not exist; give one from 1 to 65535, or 0 for any free one."
+            )
         if not self.token and not gate.is_loopback(self.host.lower()):
             raise ValueError(
                 f"Without a token everyone who can reach {self.host} could run code on this machine through the "
@@ -119,7 +121,9 @@ class Door:
                 other needs brings its own Content-Security-Policy).
         """
         if len(prefix) < 3 or not prefix.startswith("/") or not prefix.endswith("/"):
-            raise ValueError(f"A route's prefix begins and ends with a slash, as in /recordings/; got {prefix!r}.")
+            raise ValueError(
+                f"A route's prefix begins and ends with a slash, as in /recordings/; got {prefix!r}."
+            )
         if prefix in self._routes:
             raise ValueError(f"There is a route for {prefix} already.")
         self._routes[prefix] = (handler, dict(headers or {}))
@@ -161,11 +165,15 @@ def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) ->
                 if asked.websocket:
                     response = viser_hook(connection, request)
                 else:
-                    response = await _admitted_reply(routes, viser_hook, connection, request, verdict.authority)
+                    response = await _admitted_reply(
+                        routes, viser_hook, connection, request, verdict.authority
+                    )
             elif isinstance(verdict, gate.Entered):
                 response = _entered_reply(verdict)
             else:
-                response = _reply(403, "text/html; charset=utf-8", refusal_page(verdict.reason), _PAGE_OF_OURS)
+                response = _reply(
+                    403, "text/html; charset=utf-8", refusal_page(verdict.reason), _PAGE_OF_OURS
+                )
             if response is not None:
                 # websockets gives up 10 s after the last byte was handed to the kernel; on a slow line
                 # megabytes are still on their way then.
@@ -243,7 +251,9 @@ def _listen(options: DoorOptions) -> socket.socket:
             host, options.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )[0]
     except (OSError, UnicodeError) as error:
-        raise DoorError(f"Cannot listen on {options.host}: {error}. Give an address of this machine.") from None
+        raise DoorError(
+            f"Cannot listen on {options.host}: {error}. Give an address of this machine."
+        ) from None
     last = min(options.port + PORTS_TO_TRY, 65536) if options.port == DEFAULT_PORT else options.port + 1
     for port in range(options.port, last):
         try:
@@ -257,7 +267,9 @@ def _listen(options: DoorOptions) -> socket.socket:
                 ) from None
     if options.port == DEFAULT_PORT:
         raise DoorError(f"Ports {options.port} to {last - 1} are all taken; --port 0 takes any free one.")
-    raise DoorError(f"Port {options.port} is taken by another program; give another with --port, or 0 for any.")
+    raise DoorError(
+        f"Port {options.port} is taken by another program; give another with --port, or 0 for any."
+    )
 
 
 def _our_names(options: DoorOptions) -> frozenset[str]:
@@ -372,7 +384,9 @@ def _refusal_page(example: str) -> Callable[[str], bytes]:
     return lambda reason: page.replace("{{reason}}", html.escape(reason)).encode()
 
 
-def _reply(status: int, kind: str, body: bytes, headers: Mapping[str, str], gzipped: bool = False) -> Response:
+def _reply(
+    status: int, kind: str, body: bytes, headers: Mapping[str, str], gzipped: bool = False
+) -> Response:
     extra = {"Content-Encoding": "gzip", "Vary": "Accept-Encoding"} if gzipped else {}
     fields = {"Content-Type": kind, "Content-Length": str(len(body)), **_EVERY_REPLY, **extra, **headers}
     return Response(status, HTTPStatus(status).phrase, Headers(fields), body)

@@ -25,7 +25,6 @@ import ipaddress
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Union
 from urllib.parse import parse_qsl, quote, unquote, urlencode
 
 _AUTHORITY = re.compile(r"(\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9_](?:[A-Za-z0-9._-]{0,252}))(?::([0-9]{1,5}))?")
@@ -83,7 +82,7 @@ class Refused:
     """One sentence for the person who reads the 403 page. Holds no text from the request."""
 
 
-Verdict = Union[Admitted, Entered, Refused]
+Verdict = Admitted | Entered | Refused
 
 
 def split_authority(text: str) -> tuple[str, int | None] | None:

@@ -24,22 +24,22 @@ import threading
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import Any, Union
+from typing import Any
 
 import msgspec
 import rich
 import viser
 import viser._messages
 import viser.infra
-import viser.infra._infra as infra
+import viser.infra._infra
 import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 WRITTEN_FOR = "1.1.1"
 
-Hook = Callable[[ServerConnection, Request], Union[Response, None]]
-AsyncHook = Callable[[ServerConnection, Request], Awaitable[Union[Response, None]]]
+Hook = Callable[[ServerConnection, Request], Response | None]
+AsyncHook = Callable[[ServerConnection, Request], Awaitable[Response | None]]
 
 MESSAGES_FROM_CLIENTS = frozenset(
     {
@@ -81,11 +81,21 @@ PRIVATE_NAMES = (
 )
 """Names that this module relies on; ``infra`` is ``viser.infra._infra``, ``messages`` ``viser._messages``."""
 
-PRIVATE_ATTRIBUTES = ("_websock_server", "_websock_server._incoming_handlers", "_websock_server._server_thread")
+PRIVATE_ATTRIBUTES = (
+    "_websock_server",
+    "_websock_server._incoming_handlers",
+    "_websock_server._server_thread",
+)
 """Attributes of a `viser.ViserServer` that this module relies on."""
+
+STOP_SECONDS = 1.0
+"""How long a page gets to answer the closing handshake."""
 
 _log = logging.getLogger("workbench.door")
 _making = threading.Lock()
+
+# Any: the checker rightly says that viser does not export these names.
+infra: Any = viser.infra._infra
 
 
 class SeamError(RuntimeError):
@@ -220,19 +230,26 @@ class GatedViser:
     _serving: websockets.asyncio.server.serve
 
     def stop(self) -> None:
-        """Stop viser and close every connection. Quick also when a browser holds sockets open on which
-        it has not asked anything yet (Chromium does): `websockets` would wait for each of those."""
+        """Stop viser and close every connection, within about a second.
+
+        `websockets` would wait for each socket on which a browser has not asked anything yet (Chromium
+        holds such sockets open), and ten seconds for a page that does not answer the closing handshake.
+        """
         listening = self._serving.server
-
-        def drop_unfinished() -> None:
-            for connection in list(listening.handlers):
-                if connection not in listening.connections:
-                    connection.transport.abort()
-
         loop = listening.get_loop()
+        started = loop.time()
+
+        def drop() -> None:
+            patient = loop.time() - started < STOP_SECONDS
+            for connection in list(listening.handlers):
+                if not (patient and connection in listening.connections):
+                    connection.transport.abort()
+            # Again: a socket that was just accepted is not among the handlers yet.
+            loop.call_later(0.02, drop)
+
         if not loop.is_closed():
             with contextlib.suppress(RuntimeError):  # closed since: then nothing is left to drop
-                loop.call_soon_threadsafe(drop_unfinished)
+                loop.call_soon_threadsafe(drop)
         with _making, _quiet_viser():
             self.server.stop()
 
@@ -298,7 +315,9 @@ def make_viser(
         with _quiet_viser():
             server.stop()
         listening.close()
-        raise _moved("viser did not start its server the known way" if not missing else f"viser has no {missing}")
+        raise _moved(
+            "viser did not start its server the known way" if not missing else f"viser has no {missing}"
+        )
     for name in REFUSED_FROM_CLIENTS:
         server._websock_server.unregister_handler(getattr(viser._messages, name))
     return GatedViser(server, serving[0])

@@ -1,0 +1,187 @@
+"""An exception becomes the author's line, hook and words."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from workbench.authoring.load import LoadedTask, load_task
+from workbench.authoring.problem import Problem, TaskError, problem_from_exception, shorten
+
+Write = Callable[..., Path]
+
+
+def caught(call: Callable[[], object], files: tuple[Path, ...], stage: str = "step", cls: type | None = None) -> Problem:
+    try:
+        call()
+    except BaseException as exc:
+        return problem_from_exception(exc, stage, files, cls)
+    raise AssertionError("nothing was raised")
+
+
+@pytest.fixture
+def task(write: Write) -> LoadedTask:
+    return load_task(str(write("push.py", TASK, task=True)))
+
+
+TASK = """
+import torch
+
+def ping(n):
+    return pong(n)
+
+def pong(n):
+    return ping(n)
+
+class PushEnv(BaseEnv):
+    def __init__(self):
+        pass
+
+    def evaluate(self):
+        raise KeyError("cube")
+
+    def compute_dense_reward(self, obs, action, info):
+        return torch.zeros(2) + torch.zeros(3)
+
+    def compute_normalized_dense_reward(self, obs, action, info):
+        return self.compute_dense_reward(obs, action, info) / 2
+
+    def _get_obs_extra(self, info):
+        return self.evaluate()
+
+    def _load_scene(self, options):
+        try:
+            self.evaluate()
+        except KeyError as exc:
+            raise RuntimeError("no scene") from exc
+
+    def _initialize_episode(self, env_idx, options):
+        try:
+            {}["a"]
+        except KeyError:
+            {}["b"]
+
+    @property
+    def _default_sensor_configs(self):
+        return unknown_name
+
+    def helper(self):
+        assert self.evaluate is None
+
+    def swallowed(self):
+        try:
+            1 / 0
+        except ZeroDivisionError as exc:
+            import json
+            json.loads("{")
+
+    def deep(self):
+        ping(0)
+
+    def long(self):
+        raise ValueError("x" * 100_000 + "\\nsecond")
+
+    def unprintable(self):
+        class Odd(Exception):
+            def __str__(self):
+                raise RuntimeError
+        raise Odd
+"""
+
+
+@pytest.mark.parametrize(
+    ("method", "args", "stage", "message", "code"),
+    [
+        ("evaluate", 0, "evaluate", "KeyError: 'cube'", 'raise KeyError("cube")'),
+        ("compute_normalized_dense_reward", 3, "reward", "RuntimeError: The size of tensor", "return torch.zeros(2) + torch.zeros(3)"),
+        ("_get_obs_extra", 1, "evaluate", "KeyError: 'cube'", 'raise KeyError("cube")'),
+        ("_load_scene", 1, "build", "RuntimeError: no scene", 'raise RuntimeError("no scene") from exc'),
+        ("_initialize_episode", 2, "reset", "KeyError: 'b'", '{}["b"]'),
+        ("helper", 0, "step", "AssertionError: assert self.evaluate is None", "assert self.evaluate is None"),
+        ("swallowed", 0, "step", "JSONDecodeError", 'json.loads("{")'),
+        ("unprintable", 0, "step", "its __str__ raised RuntimeError", "raise Odd"),
+    ],
+)  # fmt: skip
+def test_the_place_is_the_innermost_line_of_the_authors_and_the_stage_is_the_hooks(
+    method: str, args: int, stage: str, message: str, code: str, task: LoadedTask
+) -> None:
+    env = task.cls()
+    problem = caught(lambda: getattr(env, method)(*[None] * args), task.source_files)
+    assert (problem.stage, problem.code) == (stage, code)
+    assert message in problem.message
+    assert problem.file == str(task.file)
+    text = task.source[str(task.file)].splitlines()
+    assert problem.line is not None and text[problem.line - 1].strip() == code
+    assert problem.message.partition(":")[0].split(" ")[0] in problem.traceback or method == "unprintable"
+
+
+def test_a_property_that_says_what_cameras_there_are_belongs_to_the_build(task: LoadedTask) -> None:
+    env = task.cls()
+    problem = caught(lambda: env._default_sensor_configs, task.source_files, "step")
+    assert (problem.stage, problem.code) == ("build", "return unknown_name")
+
+
+def test_an_error_of_a_librarys_that_comes_from_the_authors_has_the_authors_line(task: LoadedTask) -> None:
+    env = task.cls()
+
+    def library() -> None:
+        try:
+            env.evaluate()
+        except KeyError as exc:
+            error = exc
+        raise OSError("could not go on") from error
+
+    problem = caught(library, task.source_files)
+    assert problem.code == 'raise KeyError("cube")'
+    assert problem.message == "OSError: could not go on (from KeyError: 'cube')"
+
+
+def test_where_no_line_of_the_authors_ran_it_is_the_hook_that_gave_the_wrong_thing(task: LoadedTask) -> None:
+    env = task.cls()
+
+    def get_info() -> dict:
+        return dict(**None)  # type: ignore[arg-type]  # what ManiSkill does with evaluate() -> None
+
+    problem = caught(get_info, task.source_files, "step", type(env))
+    assert (problem.stage, problem.code) == ("evaluate", "def evaluate(self):")
+    nobody = caught(get_info, (), "step", type(env))
+    assert (nobody.stage, nobody.file, nobody.line, nobody.code) == ("evaluate", None, None, None)
+
+
+def test_endless_recursion_and_endless_messages_are_bounded(task: LoadedTask) -> None:
+    env = task.cls()
+    deep = caught(env.deep, task.source_files)  # type: ignore[attr-defined]
+    assert deep.code in ("return pong(n)", "return ping(n)")
+    assert "lines left out" in deep.traceback and len(deep.traceback.splitlines()) < 250
+    long = caught(env.long, task.source_files)  # type: ignore[attr-defined]
+    assert len(long.message) <= 500 and "\n" not in long.message
+    assert len(long.traceback) < 20_000
+    # The end of a traceback is what is read first.
+    assert deep.traceback.splitlines()[-1].startswith("RecursionError")
+
+
+def test_chains_that_bite_their_tail_end() -> None:
+    one, two = ValueError("one"), ValueError("two")
+    one.__context__, two.__context__ = two, one
+    assert problem_from_exception(one, "step", ()).message == "ValueError: one"
+
+
+def test_problems_and_their_errors_cross_a_pipe() -> None:
+    problem = Problem("import", "m", "f.py", 3, "x", "t")
+    error = pickle.loads(pickle.dumps(TaskError(problem)))
+    assert error.problem == problem
+    assert str(error) == "f.py:3: m"
+
+
+@given(st.text(), st.integers(min_value=1, max_value=80))
+def test_a_shortened_text_is_one_line_of_bounded_length(text: str, limit: int) -> None:
+    short = shorten(text, limit)
+    assert len(short) <= limit
+    assert len(short.splitlines()) <= 1
+    if len(text) <= limit and text == " ".join(text.split()):
+        assert short == text

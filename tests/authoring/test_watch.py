@@ -1,0 +1,218 @@
+"""Saves, as editors make them, become one call each with the last content on disk."""
+
+from __future__ import annotations
+
+import os
+import queue
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from workbench.authoring.watch import SourceWatcher
+
+PATIENCE = 20.0
+"""Seconds to wait for what must come. Nothing is asserted of how soon it does."""
+SILENCE = 0.8
+"""Seconds to wait for what must not come."""
+
+
+class Calls:
+    """What a watcher said, with the content of the files at that moment."""
+
+    def __init__(self) -> None:
+        self.queue: queue.Queue[dict[str, str | None]] = queue.Queue()
+
+    def __call__(self, paths: set[Path]) -> None:
+        self.queue.put({path.name: path.read_text() if path.exists() else None for path in paths})
+
+    def next(self) -> dict[str, str | None]:
+        return self.queue.get(timeout=PATIENCE)
+
+    def until(self, expected: dict[str, str | None]) -> int:
+        """Take calls until one is `expected`; how many it took."""
+        for number in range(1, 100):
+            if self.next() == expected:
+                return number
+        raise AssertionError("too many calls")
+
+    def none(self) -> bool:
+        try:
+            self.queue.get(timeout=SILENCE)
+        except queue.Empty:
+            return True
+        return False
+
+
+@pytest.fixture
+def calls() -> Calls:
+    return Calls()
+
+
+@pytest.fixture(params=["events", "polling"])
+def watcher(request: pytest.FixtureRequest, calls: Calls) -> Iterator[SourceWatcher]:
+    started = SourceWatcher(calls, force_polling=True if request.param == "polling" else None)
+    yield started
+    started.stop()
+
+
+@pytest.fixture
+def file(watcher: SourceWatcher, tmp_path: Path) -> Path:
+    path = tmp_path / "task.py"
+    path.write_text("a = 0\n")
+    watcher.follow([path])
+    return path
+
+
+def write(path: Path, text: str) -> None:
+    path.write_text(text)
+
+
+def rename_over(path: Path, text: str) -> None:
+    path.with_suffix(".tmp").write_text(text)
+    os.replace(path.with_suffix(".tmp"), path)
+
+
+def backup_and_create(path: Path, text: str) -> None:
+    path.rename(path.with_suffix(".py~"))
+    path.write_text(text)
+
+
+def delete_and_create(path: Path, text: str) -> None:
+    path.unlink()
+    time.sleep(0.05)
+    path.write_text(text)
+
+
+@pytest.mark.parametrize("save", [write, rename_over, backup_and_create, delete_and_create])
+def test_every_way_of_saving_is_seen_again_and_again(
+    save: Callable[[Path, str], None], file: Path, calls: Calls
+) -> None:
+    for number in (1, 2, 3):
+        save(file, f"a = {number}\n")
+        assert calls.next() == {"task.py": f"a = {number}\n"}
+    assert calls.none()
+
+
+def test_a_burst_of_saves_is_few_calls_and_the_last_content_wins(file: Path, calls: Calls) -> None:
+    for number in range(1, 11):
+        file.write_text(f"a = {number}\n")
+        time.sleep(0.005)
+    assert calls.until({"task.py": "a = 10\n"}) <= 3
+    assert calls.none()
+
+
+def test_only_new_content_of_followed_files_counts(file: Path, calls: Calls) -> None:
+    os.utime(file)
+    file.with_name("other.py").write_text("b = 1\n")
+    file.write_text(file.read_text())
+    assert calls.none()
+
+
+def test_line_ends_alone_are_no_change_and_a_crlf_file_is_followed(file: Path, calls: Calls) -> None:
+    file.write_bytes(b"a = 0\r\n")
+    assert calls.none()
+    file.write_bytes(b"a = 1\r\n")
+    assert calls.next() == {"task.py": "a = 1\n"}
+
+
+def test_a_file_that_stays_away_is_told_once_and_so_is_its_return(file: Path, calls: Calls) -> None:
+    file.unlink()
+    assert calls.next() == {"task.py": None}
+    assert calls.none()
+    file.write_text("a = 0\n")
+    assert calls.next() == {"task.py": "a = 0\n"}
+
+
+def test_a_save_that_truncates_first_is_not_seen_empty(file: Path, calls: Calls) -> None:
+    with open(file, "w") as opened:
+        opened.flush()
+        time.sleep(0.12)
+        opened.write("a = 1\n")
+    assert calls.next() == {"task.py": "a = 1\n"}
+    assert calls.none()
+
+
+def test_a_file_emptied_for_good_is_told(file: Path, calls: Calls) -> None:
+    file.write_text("")
+    assert calls.next() == {"task.py": ""}
+
+
+def test_a_folder_deleted_and_made_again_is_watched_again(
+    watcher: SourceWatcher, calls: Calls, tmp_path: Path
+) -> None:
+    path = tmp_path / "project" / "task.py"
+    for number in (1, 2):
+        path.parent.mkdir()
+        path.write_text(f"a = {number}\n")
+        watcher.follow([path], {str(path): "a = 0\n"})
+        calls.until({"task.py": f"a = {number}\n"})
+        path.write_text(f"a = {number}{number}\n")
+        calls.until({"task.py": f"a = {number}{number}\n"})
+        shutil.rmtree(path.parent)
+        calls.until({"task.py": None})
+
+
+def test_what_was_saved_between_the_reading_and_the_following_is_not_lost(
+    watcher: SourceWatcher, calls: Calls, tmp_path: Path
+) -> None:
+    path = tmp_path / "task.py"
+    path.write_text("a = 1\n")
+    watcher.follow([path], {str(path): "a = 0\n"})
+    assert calls.next() == {"task.py": "a = 1\n"}
+    watcher.follow([path], {str(path): "a = 1\n"})
+    assert calls.none()
+
+
+def test_files_in_several_folders_are_followed_and_left(watcher: SourceWatcher, calls: Calls, tmp_path: Path) -> None:
+    one, two = tmp_path / "one.py", tmp_path / "below" / "two.py"
+    two.parent.mkdir()
+    for path in (one, two):
+        path.write_text("a = 0\n")
+    watcher.follow([one])
+    watcher.follow([one, two])
+    two.write_text("a = 1\n")
+    assert calls.next() == {"two.py": "a = 1\n"}
+    watcher.follow([one])
+    two.write_text("a = 2\n")
+    one.write_text("a = 2\n")
+    assert calls.next() == {"one.py": "a = 2\n"}
+    assert calls.none()
+
+
+def test_a_call_that_raises_is_logged_and_the_next_save_is_seen(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "task.py"
+    path.write_text("a = 0\n")
+    calls = Calls()
+
+    def on_change(paths: set[Path]) -> None:
+        calls(paths)
+        raise ValueError("of the listener's")
+
+    watcher = SourceWatcher(on_change)
+    watcher.follow([path])
+    for number in (1, 2):
+        path.write_text(f"a = {number}\n")
+        assert calls.next() == {"task.py": f"a = {number}\n"}
+    watcher.stop()
+    assert "of the listener's" in caplog.text
+
+
+def test_it_stops_from_outside_and_from_its_own_call(tmp_path: Path) -> None:
+    path = tmp_path / "task.py"
+    path.write_text("a = 0\n")
+    calls = Calls()
+    watcher = SourceWatcher(lambda paths: (watcher.stop(), calls(paths))[1])
+    watcher.follow([path])
+    path.write_text("a = 1\n")
+    assert calls.next() == {"task.py": "a = 1\n"}
+    watcher.stop()
+    path.write_text("a = 2\n")
+    assert calls.none()
+    idle = SourceWatcher(calls)
+    idle.stop()
+    idle.stop()

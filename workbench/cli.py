@@ -1,0 +1,235 @@
+"""The commands: ``workbench open``, ``workbench record``, ``workbench doctor``.
+
+Only what a terminal needs lives here: arguments in, lines out, exit codes. Heavy imports wait until a
+command is chosen, so that ``--help`` and a mistyped option answer at once.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+import workbench
+
+if TYPE_CHECKING:
+    from workbench.authoring.problem import Problem
+    from workbench.session.messages import Event, TaskOptions
+
+Task = Annotated[str, tyro.conf.Positional]
+"""A task file, ``file.py:ClassName``, or a registered env id such as ``PickCube-v1``."""
+Backend = Literal["auto", "cpu", "gpu"]
+
+app = tyro.extras.SubcommandApp()
+out = Console(highlight=False)
+err = Console(stderr=True, highlight=False)
+
+
+@app.command(name="open")
+def open_page(
+    task: Task,
+    /,
+    num_envs: int = 16,
+    backend: Backend = "auto",
+    seed: int = 0,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    token: bool = True,
+    recordings: Path = Path("recordings"),
+    env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+) -> int:
+    """Open a task in a browser page that follows its file.
+
+    Args:
+        task: a task file, file.py:ClassName, or a registered env id such as PickCube-v1.
+        num_envs: environments to run at once.
+        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (gpu if it works).
+        seed: seed of the first reset; env i gets seed + i.
+        host: address to listen on; anything but this machine's own needs the token.
+        port: port of the page; 0 takes any free one.
+        token: ask for the token of the printed address (--no-token: this machine only).
+        recordings: folder for recorded episodes.
+        env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
+    """
+    from workbench.ui.door import DoorError, DoorOptions, open_door
+
+    try:
+        options = _task_options(num_envs, backend, seed, env)
+        door = open_door(DoorOptions(host=host, port=port, token=token), label="Workbench")
+    except (ValueError, DoorError) as error:
+        return _refuse(str(error))
+    from workbench.session.session import Session
+    from workbench.ui.page import Page
+
+    for line in (door.warning, door.notice):
+        if line:
+            err.print(f"[yellow]{escape(line)}[/]")
+    session = Session(task, options, recordings=recordings, on_event=_say)
+    page = Page(door.server, session)
+    stop = threading.Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        stop.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, on_signal)
+    try:
+        page.start()
+        out.print(f"[bold]Workbench[/] {workbench.__version__}: {escape(task)}, {num_envs} envs")
+        # Not through rich, which would break the address in a narrow terminal.
+        print(f"  page    {door.url}", flush=True)
+        print(f"  remote  {door.ssh_hint}", flush=True)
+        print("  Ctrl-C ends it.", flush=True)
+        stop.wait()
+    finally:
+        out.print("closing")
+        page.stop()
+        session.close()
+        door.close()
+    return 0
+
+
+@app.command
+def record(
+    task: Task,
+    /,
+    episodes: int = 4,
+    num_envs: int = 4,
+    seed: int = 0,
+    actions: str = "random",
+    out: Path = Path("recordings"),
+    pictures: bool = True,
+    max_steps: int | None = None,
+    backend: Backend = "auto",
+    env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+) -> int:
+    """Record episodes of a task, one .rrd file each, without a page.
+
+    Args:
+        task: a task file, file.py:ClassName, or a registered env id such as PickCube-v1.
+        episodes: how many, over all envs.
+        num_envs: environments to run at once.
+        seed: seed of the first episode; each further one counts up.
+        actions: random, zero, hold, or a policy as module:function or file.py:function.
+        out: folder for the files.
+        pictures: record what every camera sees (--no-pictures is much faster).
+        max_steps: longest episode; else the task's own limit.
+        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (gpu if it works).
+        env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
+    """
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from workbench.authoring.problem import TaskError
+    from workbench.session.record import RecordOptions
+    from workbench.session.record import record as record_episodes
+
+    try:
+        options = _task_options(num_envs, backend, seed, env)
+    except ValueError as error:
+        return _refuse(str(error))
+    what = RecordOptions(task, out, episodes, actions, pictures, max_steps, options)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    try:
+        with Progress(*columns, console=err) as bar:
+            row = bar.add_task("opening", total=episodes)
+            written = record_episodes(
+                what,
+                on_activity=lambda activity: bar.update(row, description=activity),
+                on_progress=lambda now: bar.update(
+                    row, completed=now.episodes, description=f"recording, step {now.steps}"
+                ),
+            )
+            bar.update(row, completed=len(written), description="recorded")
+    except TaskError as error:
+        _print_problem(error.problem)
+        return 1
+    except (OSError, ValueError) as error:
+        return _refuse(str(error))
+    except KeyboardInterrupt:
+        return _refuse("interrupted; episodes that had ended are kept")
+    for episode in written:
+        ended = {None: "", True: "success", False: "no success"}[episode.success]
+        print(f"{episode.path}  {episode.steps} steps  return {episode.total_reward:.3f}  {ended}".rstrip())
+    print(f"Open one with: rerun {written[0].path}")
+    return 0
+
+
+@app.command
+def doctor() -> int:
+    """Say what this machine can do, and for each lack what to do about it."""
+    from workbench.machine.doctor import diagnose, exit_code, print_report
+
+    findings = diagnose()
+    print_report(findings)
+    return exit_code(findings)
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Entry of the ``workbench`` command."""
+    code: Any = app.cli(
+        prog="workbench",
+        description="Workbench: write ManiSkill tasks in front of a live, batched view of them.",
+        args=args,
+    )
+    sys.exit(code)
+
+
+def _task_options(num_envs: int, backend: Backend, seed: int, env: Sequence[str]) -> TaskOptions:
+    from workbench.session.messages import TaskOptions
+
+    if not 1 <= num_envs <= 4096:
+        raise ValueError(f"--num-envs must be from 1 to 4096, not {num_envs}")
+    if not 0 <= seed < 2**31:
+        raise ValueError(f"--seed must be from 0 to {2**31 - 1}, not {seed}")
+    return TaskOptions(num_envs, backend, seed, dict(_env_argument(pair) for pair in env))
+
+
+def _env_argument(pair: str) -> tuple[str, Any]:
+    name, equals, value = pair.partition("=")
+    if not equals or not name.isidentifier():
+        raise ValueError(f"--env takes name=value, as in --env robot_uids=fetch; got {pair!r}")
+    try:
+        return name, json.loads(value)
+    except json.JSONDecodeError:
+        return name, value
+
+
+def _say(event: Event) -> None:
+    """What the page shows of loads and failures, in the terminal as well."""
+    from workbench.session.messages import Failed, Loaded
+
+    if isinstance(event, Loaded):
+        parts = ", ".join(f"{name} {ms:.0f}" for name, ms in event.milliseconds.items())
+        total = sum(event.milliseconds.values())
+        out.print(f"[green]loaded[/] {escape(event.task.env_id)} in {total:.0f} ms [dim]({parts})[/]")
+    elif isinstance(event, Failed):
+        _print_problem(event.problem)
+        if event.kept:
+            err.print("[dim]the last good version keeps running[/]")
+
+
+def _print_problem(problem: Problem) -> None:
+    place = "" if problem.file is None else f"{problem.file}:{problem.line or 1}: "
+    err.print(f"[red]{escape(problem.stage)} failed[/] {escape(place)}{escape(problem.message)}", soft_wrap=True)
+    if problem.code:
+        err.print(f"    {escape(problem.code)}", soft_wrap=True)
+    if problem.traceback:
+        err.print(f"[dim]{escape(problem.traceback.rstrip())}[/]", soft_wrap=True)
+
+
+def _refuse(message: str) -> int:
+    err.print(f"[red]{escape(message)}[/]", soft_wrap=True)
+    return 2
+
+
+if __name__ == "__main__":
+    main()

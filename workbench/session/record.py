@@ -1,0 +1,167 @@
+"""Record episodes from the command line, without a page: as many envs at once as asked for.
+
+Each episode is started by a reset of its env alone with a seed of its own (the first seed, counting
+up), so that episode k of a recording is the one that ``gym.make(...).reset(seed=seed + k)`` starts,
+whatever the number of envs. Envs whose episode ends take the next; when all are begun, those that are
+done wait for the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from workbench.authoring.problem import TaskError, problem_from_exception
+from workbench.core import actions
+from workbench.core.pictures import Picture
+from workbench.core.step import StepResult
+from workbench.core.take_pictures import take_pictures
+from workbench.recording.episode import Episode
+from workbench.recording.rrd import episode_filename, write_rrd
+from workbench.session.episodes import EpisodeGatherer, recorded_modalities
+from workbench.session.messages import Stepped, TaskOptions
+from workbench.session.open_task import OpenedTask, open_task, step_checked, zero_action
+from workbench.session.policy import load_policy
+
+_STEPS_WITHOUT_LIMIT = 200
+
+
+@dataclass(frozen=True)
+class RecordOptions:
+    task: str
+    out: Path
+    episodes: int = 4
+    actions: str = "random"
+    """``random``, ``zero``, ``hold``, or a policy ``module:function`` or ``file.py:function``."""
+    pictures: bool = True
+    max_steps: int | None = None
+    """Longest episode; None takes the task's own limit, or 200 steps where it has none."""
+    options: TaskOptions = field(default_factory=lambda: TaskOptions(num_envs=4))
+
+
+@dataclass(frozen=True)
+class Written:
+    path: Path
+    steps: int
+    total_reward: float
+    success: bool | None
+
+
+@dataclass(frozen=True)
+class Progress:
+    episodes: int
+    """Episodes written so far."""
+    steps: int
+    """Control steps of the batch so far."""
+
+
+def record(
+    what: RecordOptions,
+    on_activity: Callable[[str], None] = lambda activity: None,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+) -> list[Written]:
+    """Record `what.episodes` episodes into `what.out`, one file each.
+
+    Raises:
+        TaskError: the task cannot be opened, or fails while it runs.
+        RecordingError: a file cannot be written.
+    """
+    if what.episodes < 1:
+        raise ValueError(f"episodes must be at least 1, not {what.episodes}")
+    torch.set_num_threads(1)  # see workbench.session.worker.main
+    opened = open_task(what.task, what.options, on_activity=on_activity)
+    written: list[Written] = []
+
+    def keep(episode: Episode) -> None:
+        success = episode.evaluate.get("success")
+        path = write_rrd(episode, what.out / episode_filename(episode.info))
+        ended_well = None if success is None else bool(np.any(success[-1]))
+        written.append(Written(path, len(episode.reward), float(episode.reward.sum()), ended_well))
+
+    try:
+        _run(opened, what, keep, lambda steps: on_progress(Progress(len(written), steps)))
+    finally:
+        opened.env.close()
+    return written
+
+
+def _run(
+    opened: OpenedTask,
+    what: RecordOptions,
+    keep: Callable[[Episode], None],
+    on_steps: Callable[[int], None],
+) -> None:
+    env, seed = opened.env, what.options.seed
+    envs = list(range(min(what.episodes, env.num_envs)))
+    gatherer = EpisodeGatherer(opened.description, envs, keep)
+    limit = what.max_steps or opened.description.max_episode_steps or _STEPS_WITHOUT_LIMIT
+    act = _action_source(opened, what)
+    begun = steps = 0
+    running: set[int] = set()
+    while True:
+        for index in envs:
+            if index not in running and begun < what.episodes:
+                _begin(opened, gatherer, index, seed + begun, what.pictures)
+                running.add(index)
+                begun += 1
+        if not running:
+            return
+        step = step_checked(env, opened.loaded, act())
+        gatherer.take(_stepped(opened, step, None, sorted(running) if what.pictures else [], None))
+        for index in sorted(running):
+            over = bool(step.terminated[index] or step.truncated[index])
+            if over or step.elapsed_steps[index] >= limit:
+                gatherer.end(index)
+                running.discard(index)
+        steps += 1
+        on_steps(steps)
+
+
+def _begin(opened: OpenedTask, gatherer: EpisodeGatherer, index: int, seed: int, pictures: bool) -> None:
+    try:
+        step = opened.env.reset(seed=seed, env_idx=[index])
+    except TaskError:
+        raise
+    except Exception as error:
+        raise TaskError(problem_from_exception(error, "reset", opened.loaded.source_files)) from error
+    gatherer.take(_stepped(opened, step, index, [index] if pictures else [], opened.env.episode_seeds))
+
+
+def _stepped(
+    opened: OpenedTask, step: StepResult, reset: int | None, pictured: list[int], seeds: np.ndarray | None
+) -> Stepped:
+    mask = np.zeros(opened.env.num_envs, bool)
+    if reset is not None:
+        mask[reset] = True
+    wanted = tuple((c.name, c.kind, recorded_modalities(c)) for c in opened.description.cameras)
+    captured: tuple[Picture, ...] = ()
+    for index in pictured:
+        captured += take_pictures(opened.env.env, index, wanted)
+    return Stepped(step, mask, captured, seeds)
+
+
+def _action_source(opened: OpenedTask, what: RecordOptions) -> Callable[[], np.ndarray]:
+    env = opened.env
+    if what.actions == "random":
+        rng = np.random.default_rng(what.options.seed)
+        return lambda: actions.random_action(env.parts, env.num_envs, rng)
+    if what.actions == "zero":
+        return lambda: zero_action(env)
+    if what.actions == "hold":
+        return lambda: actions.hold_action(env.parts, env.num_envs)
+    try:
+        policy = load_policy(what.actions)
+    except (Exception, SystemExit) as error:
+        raise TaskError(problem_from_exception(error, "policy", ())) from error
+
+    def act() -> np.ndarray:
+        try:
+            return actions.to_flat_action(env.env, env.parts, policy(env.obs))
+        except Exception as error:
+            raise TaskError(problem_from_exception(error, "policy", ())) from error
+
+    return act
