@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import gc
 import importlib
 import inspect
 import os
 import sys
 import traceback
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +18,7 @@ from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 from workbench.authoring import registry
-from workbench.authoring.load import LoadedTask, load_task, with_late_imports
+from workbench.authoring.load import LoadedTask, load_task, take_back, with_late_imports
 from workbench.authoring.problem import Problem, TaskError
 
 Write = Callable[..., Path]
@@ -483,6 +485,38 @@ def test_after_a_failed_load_all_is_as_it_was(write: Write) -> None:
     shown = traceback.format_exception(caught.value)[-2]
     assert "return helper.SIZE, lazy.SIZE, self.fail" in shown
     assert inspect.getsource(good.cls).startswith('@register_env("AuthorPush-v1"')
+
+
+def test_a_load_whose_class_cannot_be_built_is_taken_back(write: Write) -> None:
+    helper = write("helper.py", "SIZE = 1\n")
+    path = write("push.py", "import helper\n" + PUSH, task=True)
+    good = load_task(str(path))
+    before, modules = tables(), dict(sys.modules)
+    for number in range(3):
+        helper.write_text("SIZE = 2\n")
+        path.write_text(path.read_text() + f"\nNUMBER = {number}\n")
+        bad = load_task(str(path))
+        assert sys.modules["helper"].SIZE == 2
+        assert take_back(bad) and not take_back(bad)
+        assert tables() == before
+        assert {name: sys.modules.get(name) for name in modules} == modules
+        assert "NUMBER" not in inspect.getsource(sys.modules[good.cls.__module__])
+    assert with_late_imports(good).source_hash == good.source_hash
+    again = load_task(str(path))
+    assert not take_back(good)
+    load_task(str(write("other.py", PUSH.replace("AuthorPush", "AuthorOther"), task=True)))
+    assert not take_back(again)
+    assert not take_back(load_task("PickCube-v1"))
+
+
+def test_old_versions_are_let_go(write: Write) -> None:
+    path = write("push.py", PUSH, task=True)
+    versions = []
+    for _ in range(5):
+        versions.append(weakref.ref(load_task(str(path)).cls))
+    gc.collect()
+    # The newest runs, and the one before it would come back if the newest were taken back.
+    assert [version() is None for version in versions] == [True, True, True, False, False]
 
 
 def test_a_library_that_a_failed_load_imported_stays_registered(write: Write, folder: Path) -> None:

@@ -133,8 +133,7 @@ def test_an_error_of_a_librarys_that_comes_from_the_authors_has_the_authors_line
         try:
             env.evaluate()
         except KeyError as exc:
-            error = exc
-        raise OSError("could not go on") from error
+            raise OSError("could not go on") from exc
 
     problem = caught(library, task.source_files)
     assert problem.code == 'raise KeyError("cube")'

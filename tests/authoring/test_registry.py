@@ -42,7 +42,8 @@ def test_an_entry_has_what_a_load_reads() -> None:
 
 def test_registering_writes_only_the_tables_that_are_kept() -> None:
     before = [dict(table) for table in registry._TABLES]
-    with registry.registering(lambda file: file == THIS_FILE) as registrations:
+    registrations = registry.Registrations()
+    with registry.registering(lambda file: file == THIS_FILE, registrations):
 
         @env_registration.register_env("AuthorRegistry-v1", max_episode_steps=3)
         class Task(BaseEnv):
@@ -69,7 +70,8 @@ def test_registering_writes_only_the_tables_that_are_kept() -> None:
 
 def test_other_files_register_as_they_always_do() -> None:
     built_in = env_registration.REGISTERED_ENVS["PickCube-v1"].cls
-    with registry.registering(lambda file: False) as registrations:
+    registrations = registry.Registrations()
+    with registry.registering(lambda file: False, registrations):
 
         @env_registration.register_env("PickCube-v1")
         class Task(BaseEnv):
@@ -81,7 +83,8 @@ def test_other_files_register_as_they_always_do() -> None:
 
 def test_upstreams_own_refusals_still_refuse() -> None:
     before = [dict(table) for table in registry._TABLES]
-    with registry.registering(lambda file: file == THIS_FILE) as registrations:
+    registrations = registry.Registrations()
+    with registry.registering(lambda file: file == THIS_FILE, registrations):
         with pytest.raises(TypeError, match="BaseEnv"):
             env_registration.register_env("AuthorRegistry-v1")(dict)
         with pytest.raises(RuntimeError, match="json"):

@@ -1,50 +1,105 @@
-"""A short, real episode: stock ManiSkill, real physics and pictures of a real camera."""
+"""A short, real episode: stock ManiSkill, real physics, pictures of a fixed and of a mounted camera."""
 
 from __future__ import annotations
 
-import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
 
-# Before rerun is imported anywhere: without it rerun turns what it refuses into warnings.
-os.environ["RERUN_STRICT"] = "1"
+import gymnasium as gym
+import mani_skill.envs  # noqa: F401  (registers the tasks)
+import numpy as np
+import pytest
+import rerun as rr
+from numpy.typing import NDArray
 
-from dataclasses import dataclass  # noqa: E402
-from typing import Any  # noqa: E402
-
-import gymnasium as gym  # noqa: E402
-import mani_skill.envs  # noqa: E402, F401  (registers the tasks)
-import numpy as np  # noqa: E402
-import pytest  # noqa: E402
-import sapien.render  # noqa: E402
-import torch  # noqa: E402
-from numpy.typing import NDArray  # noqa: E402
-
-from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual  # noqa: E402
-from workbench.core.pictures import CameraInfo, Picture  # noqa: E402
-from workbench.core.step import StepResult  # noqa: E402
-from workbench.recording.columns import EpisodeBuilder  # noqa: E402
-from workbench.recording.episode import Episode, EpisodeInfo  # noqa: E402
+from workbench.core.body_table import BodyTable, build_body_table, read_poses
+from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
+from workbench.core.pictures import CameraInfo, Picture
+from workbench.core.scene_geometry import read_geometry
+from workbench.core.step import StepResult
+from workbench.recording.columns import EpisodeBuilder
+from workbench.recording.episode import Episode, EpisodeInfo
 
 STEPS = 8
 SEED = 3
+SIZE = 96
 
 
 @dataclass(frozen=True)
 class Recorded:
+    """An episode, and what ManiSkill itself said of its cameras at each of the T + 1 states."""
+
     episode: Episode
-    extrinsic_cv: NDArray[np.float32]
-    """(T + 1, 3, 4) of ``base_camera``, by ManiSkill itself."""
-    intrinsic_cv: NDArray[np.float32]
-    """(T + 1, 3, 3)"""
-    depth_mm: NDArray[np.int16]
-    """(T + 1, H, W) as ManiSkill gave it."""
+    extrinsic_cv: dict[str, NDArray[np.float32]]
+    """Camera name to (T + 1, 3, 4)."""
+    intrinsic_cv: dict[str, NDArray[np.float32]]
+    """Camera name to (T + 1, 3, 3)."""
+    depth_mm: dict[str, NDArray[np.int16]]
+    """Camera name to (T + 1, H, W)."""
+
+
+@pytest.fixture(autouse=True)
+def strict_rerun() -> Iterator[None]:
+    """Without it rerun turns what it refuses into warnings."""
+    before = rr.strict_mode()
+    rr.set_strict_mode(True)
+    yield
+    rr.set_strict_mode(before)
 
 
 @pytest.fixture(scope="session")
 def recorded() -> Recorded:
-    return record_stock("PickCube-v1")
+    return record_stock("PickCube-v1", robot_uids="panda_wristcam")
 
 
-def record_stock(task: str, size: int = 96, steps: int = STEPS, **kwargs: Any) -> Recorded:
+@pytest.fixture(scope="session")
+def make_episode() -> Callable[..., Episode]:
+    """A small episode made by hand, for the cases that no simulation gives; fields can be replaced."""
+    return _make_episode
+
+
+def _make_episode(steps: int = 3, **fields: Any) -> Episode:
+    poses = np.zeros((steps + 1, 2, 7), dtype=np.float32)
+    poses[..., 3] = 1
+    poses[:, 1, 0] = np.arange(steps + 1)
+    box = Mesh(
+        np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=np.float32), np.array([[0, 1, 2]], dtype=np.uint32)
+    )
+    both = np.array([0, 1], dtype=np.int32)
+    values: dict[str, Any] = {
+        "info": EpisodeInfo(
+            task="Made-v1",
+            env_index=0,
+            seed=7,
+            source_file=None,
+            source_hash="",
+            source={},
+            control_dt=0.05,
+            control_mode=None,
+            backend="cpu",
+        ),
+        "geometry": SceneGeometry(
+            num_envs=1,
+            body_names=("floor", "robot/hand"),
+            body_kinds=("static", "link"),
+            body_hidden=(False, False),
+            visuals=(Visual("box", box, Material((1.0, 0.5, 0.0, 1.0)), np.zeros(2, dtype=np.int32), both),),
+        ),
+        "segmentation": {},
+        "poses": poses,
+        "action": np.zeros((steps, 1), dtype=np.float32),
+        "action_names": ("grip",),
+        "reward": np.zeros(steps, dtype=np.float32),
+        "terminated": np.zeros(steps, dtype=np.bool_),
+        "truncated": np.zeros(steps, dtype=np.bool_),
+        "evaluate": {},
+        "cameras": [],
+    }
+    return Episode(**{**values, **fields})
+
+
+def record_stock(task: str, size: int = SIZE, steps: int = STEPS, **kwargs: Any) -> Recorded:
     """`steps` random steps of a stock single env, through `EpisodeBuilder`."""
     env = gym.make(
         task,
@@ -55,62 +110,17 @@ def record_stock(task: str, size: int = 96, steps: int = STEPS, **kwargs: Any) -
         **kwargs,
     )
     try:
-        return _play(env, task, size, steps)
+        return _play(env, task, steps)
     finally:
         env.close()
 
 
-def _play(env: gym.Env, task: str, size: int, steps: int) -> Recorded:
+def _play(env: gym.Env, task: str, steps: int) -> Recorded:
     base: Any = env.unwrapped
     obs, _ = env.reset(seed=SEED)
     env.action_space.seed(SEED)
-    geometry, bodies = scene_of(base)
-    params, depths = [], []
-
-    def pictures() -> list[Picture]:
-        found = []
-        for name, images in obs["sensor_data"].items():
-            depth = images["depth"][0, ..., 0].numpy()
-            depths.append(depth)
-            params.append({key: value[0].numpy().copy() for key, value in obs["sensor_param"][name].items()})
-            found.append(
-                Picture(
-                    camera=name,
-                    kind="sensor",
-                    env=0,
-                    pose=base._sensors[name].camera.get_global_pose().raw_pose[0].numpy().copy(),
-                    rgb=images["rgb"][0].numpy(),
-                    depth=depth.astype(np.float32) / 1000,
-                    segmentation=images["segmentation"][0, ..., 0].numpy().astype(np.int32),
-                )
-            )
-        return found
-
-    def state(action: NDArray | None, reward: float = 0.0, ended: bool = False, cut: bool = False) -> StepResult:
-        return StepResult(
-            elapsed_steps=base.elapsed_steps.numpy().astype(np.int32).reshape(1),
-            reward=np.array([reward], dtype=np.float32),
-            terminated=np.array([ended]),
-            truncated=np.array([cut]),
-            evaluate={key: value.numpy().copy() for key, value in base.evaluate().items()},
-            poses=np.stack([[body.pose.raw_pose[0].numpy() for body in bodies]]).astype(np.float32),
-            action=None if action is None else action.astype(np.float32)[None],
-        )
-
-    camera = base._sensors["base_camera"]
-    first = pictures()
-    info = CameraInfo(
-        name="base_camera",
-        kind="sensor",
-        width=size,
-        height=size,
-        fovy=float(camera.config.fov),
-        near=camera.config.near,
-        far=camera.config.far,
-        intrinsic=params[0]["intrinsic_cv"],
-        mount=None,
-        modalities=("rgb", "depth", "segmentation"),
-    )
+    table = build_body_table(base)
+    seen = [obs]
     builder = EpisodeBuilder(
         EpisodeInfo(
             task=task,
@@ -124,83 +134,74 @@ def _play(env: gym.Env, task: str, size: int, steps: int) -> Recorded:
             backend="cpu",
             versions={"mani_skill": "3.0.1", "rerun-sdk": "0.41.0"},
         ),
-        geometry,
+        read_geometry(base, table),
         {int(key): body.name for key, body in base.segmentation_id_map.items()},
         [f"action{index}" for index in range(env.action_space.shape[-1])],
-        [info],
+        [_camera_info(name, sensor, obs) for name, sensor in base._sensors.items()],
     )
-    builder.start(state(None), 0, first)
+    builder.start(_state(base, table), 0, _pictures(base, obs))
     for _ in range(steps):
         action = env.action_space.sample()
         obs, reward, ended, cut, _ = env.step(action)
-        builder.append(state(action, float(reward), bool(ended), bool(cut)), 0, pictures())
+        seen.append(obs)
+        builder.append(_state(base, table, action, float(reward), bool(ended), bool(cut)), 0, _pictures(base, obs))
+
+    def of_cameras(group: str, key: str) -> dict[str, NDArray]:
+        return {name: np.stack([o[group][name][key][0].numpy() for o in seen]) for name in base._sensors}
+
     return Recorded(
         episode=builder.finish(),
-        extrinsic_cv=np.stack([param["extrinsic_cv"] for param in params]),
-        intrinsic_cv=np.stack([param["intrinsic_cv"] for param in params]),
-        depth_mm=np.stack(depths),
+        extrinsic_cv=of_cameras("sensor_param", "extrinsic_cv"),
+        intrinsic_cv=of_cameras("sensor_param", "intrinsic_cv"),
+        depth_mm={name: depth[..., 0] for name, depth in of_cameras("sensor_data", "depth").items()},
     )
 
 
-def scene_of(base: Any) -> tuple[SceneGeometry, list[Any]]:
-    """What the bodies of a stock single env look like, and the bodies."""
-    named = [(actor.name, actor.px_body_type, actor)
-             for actor in base.scene.actors.values()]
-    for articulation in base.scene.articulations.values():
-        named += [(f"{articulation.name}/{link.name}", "link", link) for link in articulation.links]
-    visuals = []
-    for index, (name, _, body) in enumerate(named):
-        entity = body._objs[0] if hasattr(body._objs[0], "find_component_by_type") else body._objs[0].entity
-        rendered = entity.find_component_by_type(sapien.render.RenderBodyComponent)
-        for shape in rendered.render_shapes if rendered is not None else []:
-            parts = shape.parts if isinstance(shape, sapien.render.RenderShapeTriangleMesh) else [shape]
-            for part in parts:
-                visuals.append(_visual(f"{name}/{len(visuals)}", shape, part, index))
-    geometry = SceneGeometry(
-        num_envs=1,
-        body_names=tuple(name for name, _, _ in named),
-        body_kinds=tuple(kind for _, kind, _ in named),  # type: ignore[misc]
-        body_hidden=tuple(body in base._hidden_objects for _, _, body in named),
-        visuals=tuple(visuals),
+def _state(
+    base: Any,
+    table: BodyTable,
+    action: NDArray | None = None,
+    reward: float = 0.0,
+    ended: bool = False,
+    cut: bool = False,
+) -> StepResult:
+    return StepResult(
+        elapsed_steps=base.elapsed_steps.numpy().astype(np.int32).reshape(1),
+        reward=np.array([reward], dtype=np.float32),
+        terminated=np.array([ended]),
+        truncated=np.array([cut]),
+        evaluate={key: value.numpy().copy() for key, value in base.evaluate().items()},
+        poses=read_poses(base, table),
+        action=None if action is None else action.astype(np.float32)[None],
     )
-    return geometry, [body for _, _, body in named]
 
 
-def _scale(shape: Any) -> NDArray[np.float32]:
-    """SAPIEN keeps its primitives as unit shapes, all but the capsule."""
-    if isinstance(shape, sapien.render.RenderShapeBox):
-        return np.asarray(shape.half_size, dtype=np.float32)
-    if isinstance(shape, sapien.render.RenderShapeSphere):
-        return np.full(3, shape.radius, dtype=np.float32)
-    if isinstance(shape, sapien.render.RenderShapeCylinder):
-        return np.array([shape.half_length, shape.radius, shape.radius], dtype=np.float32)
-    return np.asarray(getattr(shape, "scale", (1, 1, 1)), dtype=np.float32)
+def _pictures(base: Any, obs: dict[str, Any]) -> list[Picture]:
+    return [
+        Picture(
+            camera=name,
+            kind="sensor",
+            env=0,
+            pose=base._sensors[name].camera.get_global_pose().raw_pose[0].numpy().copy(),
+            rgb=images["rgb"][0].numpy(),
+            depth=images["depth"][0, ..., 0].numpy().astype(np.float32) / 1000,
+            segmentation=images["segmentation"][0, ..., 0].numpy().astype(np.int32),
+        )
+        for name, images in obs["sensor_data"].items()
+    ]
 
 
-def _visual(name: str, shape: Any, part: Any, body: int) -> Visual:
-    local = shape.local_pose.to_transformation_matrix()
-    scale = _scale(shape)
-    vertices = (part.vertices * scale) @ local[:3, :3].T + local[:3, 3]
-    normals = part.get_vertex_normal() @ local[:3, :3].T
-    uvs = part.get_vertex_uv()
-    color = part.material.base_color_texture
-    texture = None
-    if color is not None and len(uvs) == len(vertices):
-        texture = color.download()
-        if texture.dtype != np.uint8:
-            texture = (np.clip(texture, 0, 1) * 255).astype(np.uint8)
-    return Visual(
+def _camera_info(name: str, sensor: Any, obs: dict[str, Any]) -> CameraInfo:
+    config = sensor.config
+    return CameraInfo(
         name=name,
-        mesh=Mesh(
-            vertices=vertices.astype(np.float32),
-            faces=part.triangles.astype(np.uint32),
-            normals=normals.astype(np.float32) if len(normals) == len(vertices) else None,
-            uvs=uvs.astype(np.float32) if texture is not None else None,
-        ),
-        material=Material(base_color=tuple(part.material.base_color), texture=texture),
-        envs=np.zeros(1, dtype=np.int32),
-        bodies=np.array([body], dtype=np.int32),
+        kind="sensor",
+        width=config.width,
+        height=config.height,
+        fovy=float(config.fov),
+        near=config.near,
+        far=config.far,
+        intrinsic=obs["sensor_param"][name]["intrinsic_cv"][0].numpy(),
+        mount=config.mount.name if config.mount is not None else config.entity_uid,
+        modalities=("rgb", "depth", "segmentation"),
     )
-
-
-torch.set_num_threads(1)

@@ -23,7 +23,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from workbench.authoring import registry
-from workbench.authoring.modules import AuthorFinder, decode, put_back, set_aside
+from workbench.authoring.modules import AuthorFinder, SetAside, decode, put_back, set_aside
 from workbench.authoring.problem import Problem, TaskError, problem_from_exception, shorten
 
 if TYPE_CHECKING:
@@ -58,10 +58,14 @@ class LoadedTask:
     file's class under them."""
 
 
-@dataclass(frozen=True)
+@dataclass
 class _Load:
     finder: AuthorFinder
     registrations: registry.Registrations
+    before: _Load | None
+    """The load of the same file that this one replaced."""
+    aside: SetAside | None
+    """What stood in ``sys.modules`` before it; None once another load has built on this one."""
 
 
 _loads: dict[Path, _Load] = {}
@@ -90,6 +94,20 @@ def with_late_imports(task: LoadedTask) -> LoadedTask:
     return task if load is None else dataclasses.replace(task, **_source_fields(load.finder))
 
 
+def take_back(task: LoadedTask) -> bool:
+    """Undo the load that gave `task`, as if it had failed: for a class that imports but cannot be built.
+
+    Only the newest load can be taken back; False for any other, and for a task that is not followed.
+    """
+    load = None if task.file is None or not task.followed else _loads.get(task.file)
+    if load is None or load.aside is None or sys.modules.get(load.finder.main) is None:
+        return False
+    if vars(sys.modules[load.finder.main]).get(task.class_name) is not task.cls:
+        return False
+    _revert(load)
+    return True
+
+
 def source_hash(source: Mapping[str, str], folder: Path) -> str:
     """sha256 over names relative to `folder` and texts, 12 hex digits."""
     digest = sha256()
@@ -101,10 +119,31 @@ def source_hash(source: Mapping[str, str], folder: Path) -> str:
 
 
 def _load_file(file: Path, class_name: str | None, given: dict[str, str]) -> LoadedTask:
-    before = _loads.get(file)
     finder = AuthorFinder(file, given)
     others = {load.finder.main for path, load in _loads.items() if path != file}
-    aside = set_aside(finder, others.__contains__)
+    load = _begin(finder, set_aside(finder, others.__contains__))
+    with registry.registering(finder.texts.__contains__, load.registrations):
+        try:
+            module = importlib.import_module(finder.main)
+            task = _choose(module, class_name, finder, load.registrations)
+        except BaseException as exc:
+            # Before anything is put back: the problem's lines are those of the text that failed.
+            problem = None if isinstance(exc, KeyboardInterrupt) else _import_problem(exc, finder)
+            _revert(load)
+            if problem is None:
+                raise
+            raise TaskError(problem) from exc
+    for earlier in _loads.values():
+        if earlier is not load:
+            earlier.aside = None
+    # With them would live every version there ever was.
+    if load.before is not None:
+        load.before.aside = load.before.before = None
+    return task
+
+
+def _begin(finder: AuthorFinder, aside: SetAside) -> _Load:
+    before = _loads.get(finder.file)
     if before is not None:
         before.registrations.undo()
         sys.meta_path.remove(before.finder)
@@ -113,25 +152,21 @@ def _load_file(file: Path, class_name: str | None, given: dict[str, str]) -> Loa
     sys.path[:] = [folder, *(entry for entry in sys.path if entry != folder)]
     # A helper that was created a moment ago is not in the listing of its folder that Python keeps.
     importlib.invalidate_caches()
+    _loads[finder.file] = load = _Load(finder, registry.Registrations(), before, aside)
+    return load
 
-    with registry.registering(finder.texts.__contains__) as registrations:
-        try:
-            module = importlib.import_module(finder.main)
-            task = _choose(module, class_name, finder, registrations)
-        except BaseException as exc:
-            # Before anything is put back: the problem's lines are those of the text that failed.
-            problem = None if isinstance(exc, KeyboardInterrupt) else _import_problem(exc, finder)
-            registrations.undo()
-            sys.meta_path.remove(finder)
-            put_back(aside, finder)
-            if before is not None:
-                before.registrations.redo()
-                sys.meta_path.insert(0, before.finder)
-            if problem is None:
-                raise
-            raise TaskError(problem) from exc
-    _loads[file] = _Load(finder, registrations)
-    return task
+
+def _revert(load: _Load) -> None:
+    assert load.aside is not None
+    load.registrations.undo()
+    sys.meta_path.remove(load.finder)
+    put_back(load.aside, load.finder)
+    if load.before is None:
+        del _loads[load.finder.file]
+    else:
+        load.before.registrations.redo()
+        sys.meta_path.insert(0, load.before.finder)
+        _loads[load.finder.file] = load.before
 
 
 # --- the reference -------------------------------------------------------------------------------

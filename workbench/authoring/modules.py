@@ -29,6 +29,7 @@ from hashlib import sha256
 from importlib.abc import MetaPathFinder
 from pathlib import Path
 from types import CodeType, ModuleType
+from typing import Any
 
 _MODULE_PREFIX = "workbench_task_"
 _LIBRARY_FOLDERS = {"site-packages", "dist-packages"}
@@ -166,11 +167,14 @@ def decode(path: str, raw: bytes) -> str:
     """
     try:
         return importlib.util.decode_source(raw)
-    except UnicodeDecodeError as exc:
-        line = raw[: exc.start].count(b"\n") + 1
-        raise SyntaxError(f"{exc}; save the file as UTF-8", (path, line, 1, None)) from None
-    except SyntaxError as exc:  # an unknown encoding in the coding line
-        raise SyntaxError(exc.msg, (path, 1, 1, None)) from None
+    except (UnicodeDecodeError, SyntaxError) as exc:
+        message, line = str(exc), 1
+        try:
+            raw.decode()
+        except UnicodeDecodeError as wrong:
+            message = f"{wrong}; save the file as UTF-8"
+            line = raw[: wrong.start].count(b"\n") + 1
+        raise SyntaxError(message, (path, line, 1, None)) from None
 
 
 def is_own_file(path: str, folder: Path) -> bool:
@@ -190,7 +194,7 @@ class SetAside:
     """The author's modules, and what tracebacks showed of them, while a new version is tried."""
 
     modules: dict[str, ModuleType]
-    lines: dict[str, object]
+    lines: dict[str, Any]
     path: list[str]
 
 
@@ -220,7 +224,7 @@ def set_aside(finder: AuthorFinder, is_other_task: Callable[[str], bool]) -> Set
             places = [os.path.join(place, "x.py") for place in spec.submodule_search_locations]
             if any(is_own_file(place, folder) for place in places):
                 aside[name] = module
-    lines = {path: entry for path, entry in linecache.cache.items() if is_own_file(path, folder)}
+    lines: dict[str, Any] = {path: entry for path, entry in linecache.cache.items() if is_own_file(path, folder)}
     for name in aside:
         del sys.modules[name]
     return SetAside(aside, lines, list(sys.path))
@@ -238,7 +242,7 @@ def put_back(aside: SetAside, finder: AuthorFinder) -> None:
             setattr(sys.modules[parent], last, module)
     for path in finder.texts:
         linecache.cache.pop(path, None)
-    linecache.cache.update(aside.lines)  # type: ignore[arg-type]
+    linecache.cache.update(aside.lines)
     sys.path[:] = aside.path
 
 

@@ -10,6 +10,7 @@ bounded, because a `RecursionError` or an exception that prints a tensor can be 
 
 from __future__ import annotations
 
+import inspect
 import linecache
 import re
 import traceback as tracebacks
@@ -159,8 +160,7 @@ def definition_line(function: object) -> tuple[str, int] | None:
     if isinstance(function, property):
         function = function.fget
     function = getattr(function, "__func__", function)
-    while hasattr(function, "__wrapped__"):
-        function = getattr(function, "__wrapped__")
+    function = inspect.unwrap(function) if callable(function) else function
     code = getattr(function, "__code__", None)
     if code is None:
         return None

@@ -109,12 +109,11 @@ def is_task(value: object) -> bool:
 
 
 @contextmanager
-def registering(is_own: Callable[[str], bool]) -> Iterator[Registrations]:
-    """Note and let through what files for which `is_own` holds register meanwhile.
+def registering(is_own: Callable[[str], bool], registrations: Registrations) -> Iterator[None]:
+    """Note in `registrations`, and let through, what files for which `is_own` holds register meanwhile.
 
     Leaves the tables as they are afterwards, whether the body raises or not: see `Registrations.undo`.
     """
-    registrations = Registrations()
     register_env, register_agent = env_registration.register_env, agent_registration.register_agent
 
     def noting(name: str, cls: type, override: bool, caller: tuple[str, int], register: Callable[[], Any]) -> Any:
@@ -156,7 +155,7 @@ def registering(is_own: Callable[[str], bool]) -> Iterator[Registrations]:
     env_registration.register_env = own_register_env
     agents.register_agent = agent_registration.register_agent = own_register_agent
     try:
-        yield registrations
+        yield
     finally:
         env_registration.register_env = register_env
         agents.register_agent = agent_registration.register_agent = register_agent

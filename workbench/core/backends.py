@@ -55,9 +55,15 @@ def render_device_name() -> str | None:
 
 
 def _device_summary() -> str:
-    summary = sapien.render.get_device_summary()
-    names = [line.strip() for line in summary.splitlines() if line.strip()]
-    return names[-1] if names else "unknown device"
+    """The first supported device of a report of blocks ``GPU: name``, ``Supported: 1`` ..."""
+    name = "unknown device"
+    for line in sapien.render.get_device_summary().splitlines():
+        key, _, value = line.strip().partition(":")
+        if key == "GPU":
+            name = value.strip()
+        elif key == "Supported" and value.strip() == "1":
+            return name
+    return name
 
 
 def choose_backend(wanted: Literal["auto", "cpu", "gpu"], render: bool) -> ChosenBackend:

@@ -20,7 +20,6 @@ What makes it quick:
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -30,109 +29,12 @@ import torch
 from numpy.typing import NDArray
 
 from workbench.core.contacts import BodyImpulseQuery, ContactReader, CpuArray, PairImpulseQuery
+from workbench.core.cpu_layout import BODY, Layout, lay_out
 
-_BODY = 13
-"""Floats of a body in ``pack()``: quaternion wxyz, position, linear and angular velocity."""
-_FROM_PACKED_BODY = np.array([4, 5, 6, 0, 1, 2, 3, 7, 8, 9, 10, 11, 12])
-"""Where ManiSkill's row [p, q, v, w] finds its columns in a packed body [q, p, v, w]."""
-_FROM_PACKED_POSE = np.array([4, 5, 6, 0, 1, 2, 3])
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """Where everything lies: rows of the tensors, and positions in the concatenated packs."""
-
-    bodies: list[physx.PhysxRigidDynamicComponent]
-    body_rows: NDArray[np.int64]
-    links: list[physx.PhysxArticulationLinkComponent]
-    link_rows: NDArray[np.int64]
-    articulations: list[physx.PhysxArticulation]
-    root_rows: NDArray[np.int64]
-    dofs: NDArray[np.int64]
-    body_at: NDArray[np.int64]
-    root_at: NDArray[np.int64]
-    qpos_at: NDArray[np.int64]
-    qvel_at: NDArray[np.int64]
-    target_qpos_at: NDArray[np.int64]
-    target_qvel_at: NDArray[np.int64]
-    link_pose_at: NDArray[np.int64]
-    """Within the poses of the link's own env; see `_pack_poses`."""
-    link_env: NDArray[np.int64]
-    row_of: dict[int, int]
-    index_of: dict[int, int]
-    row_count: int
-
-
-def _lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Scene]) -> _Layout:
-    bodies: list[Any] = []
-    links: list[Any] = []
-    articulations: list[Any] = []
-    body_rows, link_rows, root_rows, dofs = [], [], [], []
-    body_at, root_at, link_pose_at = [], [], []
-    link_env: list[int] = []
-    joint_at: list[tuple[int, int]] = []
-    row = packed = 0
-    for env, (system, scene) in enumerate(zip(systems, scenes, strict=True)):
-        entities = scene.entities  # held, because an id is unique only among objects that are alive
-        entity_at = {id(entity): 7 * i for i, entity in enumerate(entities)}
-        for body in system.rigid_dynamic_components:
-            bodies.append(body)
-            body_rows.append(row)
-            body_at.append(packed + _FROM_PACKED_BODY)
-            row, packed = row + 1, packed + _BODY
-        seen: set[int] = set()
-        env_articulations = []
-        for link in system.articulation_link_components:
-            links.append(link)
-            link_rows.append(row)
-            link_pose_at.append(entity_at[id(link.entity)] + _FROM_PACKED_POSE)
-            link_env.append(env)
-            articulation = link.articulation
-            if id(articulation) not in seen:
-                seen.add(id(articulation))
-                env_articulations.append(articulation)
-                articulations.append(articulation)
-                root_rows.append(row)
-                dofs.append(articulation.dof)
-            row += 1
-        for articulation in env_articulations:
-            root_at.append(packed + _FROM_PACKED_BODY)
-            packed += _BODY
-            joint_at.append((packed, articulation.dof))
-            packed += 4 * articulation.dof
-    width = max(dofs, default=0)
-    nothing = packed  # one zero behind all packs: what the padding of shorter articulations reads
-
-    def joint_columns(offset: Callable[[int, int], NDArray[np.int64]]) -> NDArray[np.int64]:
-        columns = np.full((len(joint_at), width), nothing, dtype=np.int64)
-        for i, (start, dof) in enumerate(joint_at):
-            columns[i, :dof] = offset(start, dof)
-        return columns
-
-    def stacked(rows: list[NDArray[np.int64]], columns: int) -> NDArray[np.int64]:
-        return np.stack(rows) if rows else np.zeros((0, columns), dtype=np.int64)
-
-    every_body = bodies + links
-    return _Layout(
-        bodies=bodies,
-        body_rows=np.array(body_rows, dtype=np.int64),
-        links=links,
-        link_rows=np.array(link_rows, dtype=np.int64),
-        articulations=articulations,
-        root_rows=np.array(root_rows, dtype=np.int64),
-        dofs=np.array(dofs, dtype=np.int64),
-        body_at=stacked(body_at, _BODY),
-        root_at=stacked(root_at, _BODY),
-        qpos_at=joint_columns(lambda start, dof: start + np.arange(dof)),
-        qvel_at=joint_columns(lambda start, dof: start + dof + np.arange(dof)),
-        target_qpos_at=joint_columns(lambda start, dof: start + 2 * dof + 2 * np.arange(dof)),
-        target_qvel_at=joint_columns(lambda start, dof: start + 2 * dof + 2 * np.arange(dof) + 1),
-        link_pose_at=stacked(link_pose_at, 7),
-        link_env=np.array(link_env, dtype=np.int64),
-        row_of={id(b): r for b, r in zip(every_body, [*body_rows, *link_rows], strict=True)},
-        index_of={id(a): i for i, a in enumerate(articulations)},
-        row_count=row,
-    )
+_TOO_EARLY = (
+    "The simulation is not initialised yet: in _load_agent and _load_scene only initial poses "
+    "may be set. Read and write state (poses, qpos, velocities) in _initialize_episode."
+)
 
 
 class BatchedCpuSystem:
@@ -146,7 +48,7 @@ class BatchedCpuSystem:
         self.scenes = list(scenes)
         self.systems: list[physx.PhysxCpuSystem] = [scene.physx_system for scene in scenes]  # pyright: ignore
         self.contacts = ContactReader(self.systems)
-        self._layout: _Layout | None = None
+        self._layout: Layout | None = None
         self._packed: NDArray[np.float32] | None = None
         self._posed: NDArray[np.float32] | None = None
         self._pose_lengths: list[int] = []
@@ -196,7 +98,7 @@ class BatchedCpuSystem:
         """One substep of every env."""
         for system in self.systems:
             system.step()
-        self._forget()
+        self.note_change()
 
     def sync_poses_gpu_to_cpu(self) -> None:
         """Nothing to do: SAPIEN's entities are the simulation here."""
@@ -205,9 +107,9 @@ class BatchedCpuSystem:
 
     def gpu_init(self) -> None:
         """Lay out the tensors over the bodies that were built; called once a scene is complete."""
-        layout = self._layout = _lay_out(self.systems, self.scenes)
+        layout = self._layout = lay_out(self.systems, self.scenes)
         width = layout.qpos_at.shape[1]
-        self._data, self._data_seen = _twin((layout.row_count, _BODY))
+        self._data, self._data_seen = _twin((layout.row_count, BODY))
         self._qpos, self._qpos_seen = _twin(layout.qpos_at.shape)
         self._qvel, self._qvel_seen = _twin(layout.qpos_at.shape)
         self._qf, self._qf_seen = _twin(layout.qpos_at.shape)
@@ -248,18 +150,21 @@ class BatchedCpuSystem:
         return self._laid_out.index_of[id(articulation)]
 
     @property
-    def _laid_out(self) -> _Layout:
+    def _laid_out(self) -> Layout:
         if self._layout is None:
-            raise RuntimeError(
-                "The simulation is not initialised yet: in _load_agent and _load_scene only initial poses "
-                "may be set. Read and write state (poses, qpos, velocities) in _initialize_episode."
-            )
+            raise RuntimeError(_TOO_EARLY)
         return self._layout
+
+    def __getattr__(self, name: str) -> Any:
+        # The tensors exist from `gpu_init` on: a task that asks earlier is told what it did wrong.
+        if name.startswith("cuda_") and self.__dict__.get("_layout") is None:
+            raise RuntimeError(_TOO_EARLY)
+        raise AttributeError(f"the batched CPU system has no '{name}'")
 
     def _check_layout(self) -> None:
         """Compare the packs with the getters, since SAPIEN documents neither their order nor their size."""
         layout, packed = self._laid_out, self._pack()
-        expected = _BODY * (len(layout.bodies) + len(layout.articulations)) + 4 * int(layout.dofs.sum())
+        expected = BODY * (len(layout.bodies) + len(layout.articulations)) + 4 * int(layout.dofs.sum())
         agrees = len(packed) == expected + 1
         if agrees:
             for body, at in zip(layout.bodies, layout.body_at, strict=True):
@@ -359,7 +264,8 @@ class BatchedCpuSystem:
             self._posed = np.frombuffer(b"".join(packs), dtype=np.float32)
         return self._posed[self._link_pose_at]
 
-    def _forget(self) -> None:
+    def note_change(self) -> None:
+        """The simulation moved on, here or by a call on one of `systems`: what was packed is old."""
         self._packed = self._posed = None
         self._version += 1
         self.contacts.invalidate()
@@ -416,7 +322,7 @@ class BatchedCpuSystem:
             if differs[i, 7:].any() and not body.kinematic:
                 body.linear_velocity = row[7:10]
                 body.angular_velocity = row[10:13]
-            self._forget()
+            self.note_change()
         self._data_seen[layout.body_rows] = now
 
     def gpu_apply_articulation_root_pose(self) -> None:
@@ -425,7 +331,7 @@ class BatchedCpuSystem:
         for i in np.flatnonzero((now != seen).any(axis=1)):
             _refuse_nan(now[i], layout.articulations[i].name)
             layout.articulations[i].links[0].pose = sapien.Pose(now[i, :3], now[i, 3:7])
-            self._forget()
+            self.note_change()
         self._data_seen[layout.root_rows, :7] = now
 
     def gpu_apply_articulation_root_velocity(self) -> None:
@@ -435,7 +341,7 @@ class BatchedCpuSystem:
             _refuse_nan(now[i], layout.articulations[i].name)
             layout.articulations[i].set_root_linear_velocity(now[i, :3])
             layout.articulations[i].set_root_angular_velocity(now[i, 3:])
-            self._forget()
+            self.note_change()
         self._data_seen[layout.root_rows, 7:] = now
 
     def gpu_apply_articulation_qpos(self) -> None:
@@ -466,7 +372,7 @@ class BatchedCpuSystem:
             articulation = self._laid_out.articulations[i]
             _refuse_nan(now[i], articulation.name)
             getattr(articulation, setter)(now[i, : articulation.dof])
-            self._forget()
+            self.note_change()
         seen[:] = now
 
     def _apply_targets(
@@ -490,7 +396,7 @@ class BatchedCpuSystem:
             for set_target, value in zip(setters[i], now[i].tolist(), strict=False):
                 set_target(value)
         if changed.any():
-            self._forget()
+            self.note_change()
         seen[:] = now
 
     def _apply_forces(self, values: NDArray[np.float32], kind: str) -> None:

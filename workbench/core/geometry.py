@@ -69,9 +69,6 @@ class Visual:
     """(K,) env index of each instance."""
     bodies: NDArray[np.int32]
     """(K,) body index of each instance."""
-    ground: bool = False
-    """A flat floor that reaches far beyond its own env. A view that sets envs side by side draws one
-    of them under all: floors of many envs lie in one plane and flicker."""
 
 
 @dataclass(frozen=True)

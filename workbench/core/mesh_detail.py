@@ -19,39 +19,42 @@ from dataclasses import replace
 import fast_simplification
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from workbench.core.geometry import Mesh
 
 _CREASE_COSINE = float(np.cos(np.deg2rad(40.0)))
 """Neighbouring faces that bend less than this are shaded as one smooth surface."""
-_CLUSTER_ABOVE = 60_000
-"""Faces above which vertices are first snapped to a grid; quadric collapse alone would take seconds."""
+_DENSE = 60_000
+"""Above so many faces a mesh is a whole CAD assembly: what is inside is left out, and vertices are
+snapped to a grid first, where quadric collapse alone would take seconds."""
 _CLUSTER_CELLS = 400
 _WELD_CELLS = 1_000_000
+_COARSEST_CELLS = 25
 
 
 def reduce_mesh(mesh: Mesh, max_faces: int) -> Mesh:
     """`mesh` with about `max_faces` triangles at most; as it is when it has no more than that.
 
-    A mesh of many loose pieces may stay somewhat above, because a piece cannot become less than a few
-    triangles.
+    A textured mesh may stay above: the edges of its pieces of texture are kept as they are.
     """
     if len(mesh.faces) <= max_faces:
         return mesh
-    cells = _WELD_CELLS
-    if len(mesh.faces) > _CLUSTER_ABOVE and mesh.uvs is None:
-        cells = _CLUSTER_CELLS
-    first, faces = _weld(mesh, cells)
-    vertices = mesh.vertices[first]
-    uvs = None if mesh.uvs is None else mesh.uvs[first]
-    # One pass gives up after a number of rounds: a mesh of many small pieces wants more than one.
-    for _ in range(3):
-        if len(faces) <= max_faces:
-            break
+    cells, source = _WELD_CELLS, mesh.faces
+    if len(mesh.faces) > _DENSE and mesh.uvs is None:
+        cells, source = _CLUSTER_CELLS, mesh.faces[_seen_from_outside(mesh)]
+    vertices, faces, uvs = _weld(mesh.vertices, source, mesh.uvs, cells)
+    while len(faces) > max_faces:
         count = len(faces)
         vertices, faces, uvs = _collapse(vertices, faces, uvs, max_faces)
-        if len(faces) > 0.95 * count:
+        if len(faces) <= max_faces * 1.1 or mesh.uvs is not None:
             break
+        if len(faces) > 0.7 * count:
+            # Hundreds of loose pieces (screws, vents) that cannot shrink: only a coarser grid joins them.
+            cells = min(cells, _CLUSTER_CELLS) // 2
+            if cells < _COARSEST_CELLS:
+                break
+            vertices, faces, uvs = _weld(vertices, faces, uvs, cells)
     if len(faces) == 0:
         return mesh
     return with_normals(Mesh(vertices.astype(np.float32), faces.astype(np.uint32), uvs=uvs))
@@ -139,18 +142,43 @@ def drop_uvs(mesh: Mesh) -> Mesh:
     return mesh if mesh.uvs is None else replace(mesh, uvs=None)
 
 
-def _weld(mesh: Mesh, cells: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Index of the first of each group of vertices at one place (and uv), and faces over the groups."""
-    extent = float(np.ptp(mesh.vertices, axis=0).max()) or 1.0
-    grid = np.round((mesh.vertices - mesh.vertices.min(axis=0)) / extent * cells).astype(np.int64)
+def _weld(
+    vertices: NDArray[np.float32], faces: NDArray, uvs: NDArray[np.float32] | None, cells: int
+) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32] | None]:
+    """One vertex for all that lie in one cell of a grid (and have one uv); faces that vanish are dropped."""
+    extent = float(np.ptp(vertices, axis=0).max()) or 1.0
+    grid = np.round((vertices - vertices.min(axis=0)) / extent * cells).astype(np.int64)
     key = (grid[:, 0] << 42) | (grid[:, 1] << 21) | grid[:, 2]
-    if mesh.uvs is not None:
-        texel = np.round(mesh.uvs.astype(np.float64) * 8192).astype(np.int64)
+    if uvs is not None:
+        texel = np.round(uvs.astype(np.float64) * 8192).astype(np.int64)
         key = np.unique(np.column_stack([key, texel]), axis=0, return_inverse=True)[1].reshape(-1)
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
-    faces = inverse.reshape(-1)[mesh.faces]
-    whole = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    return first, faces[whole]
+    welded = inverse.reshape(-1)[faces]
+    whole = (welded[:, 0] != welded[:, 1]) & (welded[:, 1] != welded[:, 2]) & (welded[:, 2] != welded[:, 0])
+    return vertices[first], welded[whole], None if uvs is None else uvs[first]
+
+
+def _seen_from_outside(mesh: Mesh) -> NDArray[np.bool_]:
+    """(F,) False for faces that others hide from 26 directions: screws and boards in a camera's housing.
+
+    A depth image of the faces' centres, of 256 cells a side, for each direction.
+    """
+    centres = mesh.vertices[mesh.faces].mean(axis=1)
+    cell = float(np.ptp(centres, axis=0).max()) / 256
+    seen = np.zeros(len(centres), dtype=bool)
+    for direction in np.stack(np.meshgrid(*3 * [[-1.0, 0.0, 1.0]]), axis=-1).reshape(-1, 3):
+        if not direction.any():
+            continue
+        forward = direction / np.linalg.norm(direction)
+        right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
+        right /= np.linalg.norm(right)
+        at = centres @ np.stack([right, np.cross(forward, right), forward], axis=1)
+        pixel = np.round((at[:, :2] - at[:, :2].min(axis=0)) / cell).astype(np.int64)
+        number = pixel[:, 0] * (pixel[:, 1].max() + 1) + pixel[:, 1]
+        nearest = np.full(number.max() + 1, np.inf)
+        np.minimum.at(nearest, number, at[:, 2])
+        seen |= at[:, 2] <= nearest[number] + 2 * cell
+    return seen
 
 
 def _collapse(
@@ -162,8 +190,12 @@ def _collapse(
     points = vertices.astype(np.float64)
     triangles = np.ascontiguousarray(faces, dtype=np.int32)
     if uvs is None:
-        points, triangles = fast_simplification.simplify(points, triangles, target_count=max_faces)
-        return points.astype(np.float32), triangles.astype(np.int64), None
+        new_points, new_faces = fast_simplification.simplify(points, triangles, target_count=max_faces)
+        # Where a quadric is nearly singular its optimum can lie anywhere: a spike out of the surface.
+        distance, nearest = cKDTree(points).query(new_points)
+        spike = distance > 0.04 * np.ptp(points, axis=0).max()
+        new_points[spike] = points[nearest[spike]]
+        return new_points.astype(np.float32), new_faces.astype(np.int64), None
     # The edge of a piece of texture is a border of the welded mesh; moved, it would open a gap.
     _, _, collapses = fast_simplification.simplify(
         points, triangles, target_count=max_faces, return_collapses=True, preserve_border=True

@@ -1,4 +1,8 @@
-"""Pictures of chosen cameras of chosen envs."""
+"""What cameras there are, and what one of them saw: plain data that crosses the pipe.
+
+The functions that ask SAPIEN are in `take_pictures`, so that whoever only shows pictures need not
+import a simulator.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +35,8 @@ class CameraInfo:
     mount: str | None
     """Body name that the camera rides on, or None when it stands still."""
     modalities: tuple[str, ...]
-    """What its shader gives, of ``rgb depth segmentation position normal albedo``."""
+    """What its shader gives, of ``rgb depth segmentation position normal albedo``. Only the first three
+    can be asked for as a `Picture`."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,7 @@ class Picture:
     rgb: NDArray[np.uint8] | None = None
     """(H, W, 3)"""
     depth: NDArray[np.float32] | None = None
-    """(H, W) metres along the optical axis; 0 where the ray met nothing."""
+    """(H, W) metres along the optical axis; 0 where the ray met nothing. ManiSkill's own observation is
+    this in whole millimetres as int16, which ends at 32.767 m; here there is no such end."""
     segmentation: NDArray[np.int32] | None = None
     """(H, W) ids of actors and links; 0 is background. Names in `TaskDescription.segmentation`."""

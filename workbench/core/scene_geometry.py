@@ -29,8 +29,6 @@ from workbench.core.collision_geometry import collision_parts
 from workbench.core.geometry import BodyKind, Material, Mesh, SceneGeometry, Visual
 from workbench.core.mesh_detail import drop_uvs, flat_rectangle, reduce_mesh, with_normals
 
-_GROUND_WIDTH = 20.0
-"""A flat horizontal rectangle of more metres than this, in both directions, is ground."""
 _FLAT_FACES = 100
 """Meshes of more faces than this are tried as a flat rectangle."""
 _KEPT_MESHES = 1000
@@ -94,7 +92,6 @@ def read_geometry(env: Any, table: BodyTable, detail: Detail | None = None) -> S
                 material=material,
                 envs=where[:, 0].copy(),
                 bodies=where[:, 1].copy(),
-                ground=table.kinds[body] in ("static", "kinematic") and _is_ground(mesh),
             )
         )
     return SceneGeometry(
@@ -104,11 +101,6 @@ def read_geometry(env: Any, table: BodyTable, detail: Detail | None = None) -> S
         body_hidden=table.hidden,
         visuals=tuple(visuals),
     )
-
-
-def _is_ground(mesh: Mesh) -> bool:
-    extent = np.ptp(mesh.vertices, axis=0)
-    return bool(extent[2] < 1e-3 and extent[0] > _GROUND_WIDTH and extent[1] > _GROUND_WIDTH)
 
 
 def _collision_parts(entity: Any, kind: BodyKind) -> Iterator[Part]:

@@ -28,9 +28,14 @@ class PackageVersion:
     """As apt names it in ``-t``: ``bookworm-backports``."""
 
 
+def has_apt() -> bool:
+    """True on Debian, Ubuntu and what descends from them."""
+    return shutil.which("apt-get") is not None
+
+
 def can_install_packages() -> bool:
     """True for root on a machine with apt."""
-    return os.geteuid() == 0 and shutil.which("apt-get") is not None
+    return has_apt() and os.geteuid() == 0
 
 
 def os_release(path: Path = Path("/etc/os-release")) -> dict[str, str]:
@@ -52,7 +57,12 @@ def apt_get(arguments: Sequence[str], options: Sequence[str] = (), timeout_s: fl
     print("+ " + " ".join(["apt-get", *arguments]), file=sys.stderr, flush=True)
     try:
         done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, capture_output=True, text=True, env=environment, timeout=timeout_s
+            command,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            env=environment,
+            timeout=timeout_s,
         )
     except (OSError, subprocess.TimeoutExpired) as problem:
         raise AptFailed(f"{' '.join(command)}: {problem}") from problem
@@ -65,7 +75,9 @@ def available_versions(package: str, options: Sequence[str] = ()) -> list[Packag
     """What apt could install, newest first; empty without apt or before the first ``apt-get update``."""
     if shutil.which("apt-cache") is None:
         return []
-    done = subprocess.run(["apt-cache", *options, "madison", package], capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        ["apt-cache", *options, "madison", package], capture_output=True, text=True, timeout=60
+    )
     return parse_madison(done.stdout)
 
 

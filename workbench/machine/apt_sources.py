@@ -32,7 +32,9 @@ class AptSource:
 
 def parse_one_line_format(text: str) -> list[AptSource]:
     """The sources of a ``*.list`` file. Lines that are not a ``deb`` source are passed over."""
-    return [source for line in text.splitlines() if (source := _parse_line(line.split("#", 1)[0])) is not None]
+    return [
+        source for line in text.splitlines() if (source := _parse_line(line.split("#", 1)[0])) is not None
+    ]
 
 
 def _parse_line(line: str) -> AptSource | None:
@@ -51,10 +53,15 @@ def parse_deb822_format(text: str) -> list[AptSource]:
     """The enabled ``deb`` sources of a ``*.sources`` file."""
     sources: list[AptSource] = []
     for fields in _paragraphs(text):
-        if "deb" not in fields.get("types", "").split() or fields.get("enabled", "yes").strip().lower() == "no":
+        if (
+            "deb" not in fields.get("types", "").split()
+            or fields.get("enabled", "yes").strip().lower() == "no"
+        ):
             continue
         options = {name: fields[name.lower()] for name in CARRIED_OPTIONS if name.lower() in fields}
-        uris, suites, components = (tuple(fields.get(key, "").split()) for key in ("uris", "suites", "components"))
+        uris, suites, components = (
+            tuple(fields.get(key, "").split()) for key in ("uris", "suites", "components")
+        )
         if uris and suites:
             sources.append(AptSource(uris, suites, components, options))
     return sources

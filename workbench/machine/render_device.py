@@ -104,7 +104,10 @@ def driver_files() -> list[Path]:
         *(Path(part) for part in (os.environ.get("XDG_CONFIG_DIRS") or "/etc/xdg").split(os.pathsep)),
         Path("/etc"),
         Path(os.environ.get("XDG_DATA_HOME") or home / ".local/share"),
-        *(Path(p) for p in (os.environ.get("XDG_DATA_DIRS") or "/usr/local/share:/usr/share").split(os.pathsep)),
+        *(
+            Path(p)
+            for p in (os.environ.get("XDG_DATA_DIRS") or "/usr/local/share:/usr/share").split(os.pathsep)
+        ),
     ]
     return sorted({file for root in roots for file in (root / "vulkan" / "icd.d").glob("*.json")})
 
@@ -181,7 +184,9 @@ def _vulkan_drivers() -> dict[str, str]:
         struct.pack_into("=I", properties, 0, 1000059001)
         struct.pack_into("=Q", properties, 8, ctypes.addressof(driver))
         vulkan.vkGetPhysicalDeviceProperties2(ctypes.c_void_p(device), properties)
-        drivers[_text(properties, 16 + 20)] = ", ".join(filter(None, (_text(driver, 16 + 4), _text(driver, 276))))
+        drivers[_text(properties, 16 + 20)] = ", ".join(
+            filter(None, (_text(driver, 16 + 4), _text(driver, 276)))
+        )
     return drivers
 
 

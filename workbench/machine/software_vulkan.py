@@ -17,7 +17,6 @@ from __future__ import annotations
 import os
 import re
 import shlex
-import subprocess
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -104,7 +103,13 @@ def ensure_render_device(install: bool) -> RenderProbe:
 def _install_libraries(probe: RenderProbe) -> RenderProbe:
     try:
         apt_get(["update"])
-        apt_get(["install", "--no-install-recommends", *(SYSTEM_LIBRARIES[name] for name in probe.missing_libraries)])
+        apt_get(
+            [
+                "install",
+                "--no-install-recommends",
+                *(SYSTEM_LIBRARIES[name] for name in probe.missing_libraries),
+            ]
+        )
     except AptFailed as failure:
         return replace(probe, error=f"{probe.error}; {failure}")
     return probe_render_device()
@@ -115,7 +120,7 @@ def _bring_mesa(probe: RenderProbe, install: bool) -> RenderProbe:
     if private is not None and (probe_with := probe_render_device(private)).ok:
         return probe_with
     if not install:
-        return _with_advice(probe, "Type `workbench doctor --install`, or in a clone `make open`.")
+        return _with_advice(probe, "Type: python -m workbench.machine.software_vulkan")
     if not has_apt():
         return _with_advice(
             probe, "Install Mesa 24.3 or newer with its Vulkan drivers (lavapipe) from your distribution."
@@ -143,7 +148,11 @@ def _install_mesa(probe: RenderProbe) -> RenderProbe:
         return _with_advice(probe, f"the mirror's backports suite has no {MESA} that is new enough")
     apt_get(["install", "--no-install-recommends", "-t", package.suite, f"{MESA}={package.version}"])
     after = probe_render_device()
-    return after if after.ok else _with_advice(after, f"{MESA} {package.version} is installed and does not help.")
+    return (
+        after
+        if after.ok
+        else _with_advice(after, f"{MESA} {package.version} is installed and does not help.")
+    )
 
 
 def backports_of_this_machine() -> str | None:
@@ -173,5 +182,22 @@ def _command_to_type() -> str:
     )
 
 
+def main() -> None:
+    """Bring a render device if there is none; ``--export`` prints shell lines for the variables it needs."""
+    probe = ensure_render_device(install=True)
+    if probe.ok:
+        if "--export" not in sys.argv[1:]:
+            print(f"SAPIEN renders on {probe.name} ({probe.driver or 'driver unknown'})")
+        for name, value in probe.env.items():
+            print(f"export {name}={shlex.quote(value)}")
+    else:
+        # Not an error for the shell: without a renderer everything but the camera pictures still works.
+        print(f"SAPIEN cannot render here, so there are no camera pictures: {probe.error}", file=sys.stderr)
+
+
 def _with_advice(probe: RenderProbe, advice: str) -> RenderProbe:
     return replace(probe, error=f"{probe.error}. {advice}")
+
+
+if __name__ == "__main__":
+    main()

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import rerun as rr
 import rerun.blueprint as rrb
 
 from workbench.recording.episode import CameraTrack, Episode
@@ -18,6 +17,8 @@ from workbench.recording.layout import EVENTS, STEP, WORLD, camera_entities, eva
 
 MAX_SERIES = 32
 """An ``evaluate()`` entry with more numbers than this is kept, but not drawn: it hides the others."""
+MAX_STACKED = 3
+"""More cameras than this lie behind tabs: one above the other each would be a strip."""
 EYE_DIRECTION = (0.75, 0.85, 0.6)
 """From where the scene is looked at, seen from its middle: ManiSkill's render cameras do likewise."""
 
@@ -51,20 +52,25 @@ def episode_blueprint(episode: Episode) -> rrb.Blueprint:
 
 
 def _cameras(episode: Episode) -> rrb.ContainerLike:
-    parts = [_camera(*pair) for pair in zip(episode.cameras, camera_entities(episode.cameras))]
-    if len(parts) == 1:
+    alone = len(episode.cameras) == 1
+    parts = [_camera(*pair, alone) for pair in zip(episode.cameras, camera_entities(episode.cameras))]
+    if alone:
         return parts[0]
-    return rrb.Vertical(*parts) if all(isinstance(part, rrb.View) for part in parts) else rrb.Tabs(*parts)
+    return rrb.Vertical(*parts) if len(parts) <= MAX_STACKED else rrb.Tabs(*parts)
 
 
-def _camera(camera: CameraTrack, entity: str) -> rrb.ContainerLike:
-    modalities = [m for m in ("rgb", "depth", "segmentation") if getattr(camera, m) is not None]
+def _camera(camera: CameraTrack, entity: str, alone: bool) -> rrb.ContainerLike:
     views = [
-        rrb.Spatial2DView(name=f"{camera.info.name} {m}", origin=entity, contents=[f"$origin/{m}"]) for m in modalities
+        rrb.Spatial2DView(name=f"{camera.info.name} {m}", origin=entity, contents=[f"$origin/{m}"])
+        for m in ("rgb", "depth", "segmentation")
+        if getattr(camera, m) is not None
     ]
+    name = camera.info.name
     if len(views) == 1:
         return views[0]
-    return rrb.Vertical(views[0], rrb.Horizontal(*views[1:]), row_shares=[3, 2], name=camera.info.name)
+    if alone:
+        return rrb.Vertical(views[0], rrb.Horizontal(*views[1:]), row_shares=[3, 2], name=name)
+    return rrb.Horizontal(views[0], rrb.Vertical(*views[1:]), column_shares=[2, 1], name=name)
 
 
 def _curves(episode: Episode) -> rrb.ContainerLike:

@@ -30,9 +30,8 @@ MODALITIES = ("rgb", "depth", "segmentation")
 class EpisodeBuilder:
     """The episode of one env while it happens: `start`, then `append` a step, then `finish`.
 
-    `len()` is the number of control steps so far. After `finish` it can be started again, with the
-    same description, for the env's next episode only if `info` still holds; normally one makes a
-    new builder an episode, because the seed differs.
+    `len()` is the number of control steps so far. One builder is for one episode, since `info` holds
+    its seed.
     """
 
     def __init__(

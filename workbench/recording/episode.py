@@ -22,6 +22,7 @@ class EpisodeInfo:
     task: str
     env_index: int
     seed: int
+    """Episode seed; below 0 where it is not known."""
     source_file: str | None
     source_hash: str
     source: dict[str, str]

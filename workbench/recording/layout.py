@@ -21,6 +21,7 @@ from __future__ import annotations
 import io
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -28,7 +29,7 @@ import rerun as rr
 from numpy.typing import NDArray
 from PIL import Image
 
-from workbench.core.geometry import SceneGeometry
+from workbench.core.geometry import Material, Mesh, SceneGeometry
 from workbench.recording.episode import CameraTrack, Episode
 
 STEP = "step"
@@ -52,24 +53,30 @@ _OPTICAL_FROM_CAMERA = (0.5, -0.5, 0.5, -0.5)
 z up): the rotation matrix [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]."""
 
 
-class EpisodeLog:
-    """Rerun's two ways in, with an account of what went in.
+@dataclass(frozen=True)
+class Account:
+    """What was handed to rerun, for the finished file to be held against.
 
-    Rerun writes on threads of its own, and what those threads fail to write is at best a line on
-    stderr. The account is what the finished file is held against.
+    Rerun writes on threads of its own, and what those fail to write is at best a line on stderr.
     """
+
+    rows: Counter[str] = field(default_factory=Counter)
+    """Entity to number of rows in time."""
+    statics: set[str] = field(default_factory=set)
+    """Entities that hold something static."""
+
+
+class _Log:
+    """Rerun's two ways in, with an account of what went in."""
 
     def __init__(self, recording: rr.RecordingStream, control_dt: float) -> None:
         self._recording = recording
         self._control_dt = control_dt
-        self.rows: Counter[str] = Counter()
-        """Entity to number of rows in time."""
-        self.statics: set[str] = set()
-        """Entities that hold something static."""
+        self.account = Account()
 
     def static(self, entity: str, values: Any) -> None:
         self._recording.log(entity, values, static=True)
-        self.statics.add(entity)
+        self.account.statics.add(entity)
 
     def columns(self, entity: str, steps: NDArray[np.int64], columns: Iterable[Any]) -> None:
         if len(steps) == 0:
@@ -80,28 +87,30 @@ class EpisodeLog:
             rr.TimeColumn(SIM_TIME, duration=np.rint(steps * self._control_dt * 1e9).astype("timedelta64[ns]")),
         ]
         self._recording.send_columns(entity, times, columns)
-        self.rows[entity] += len(steps)
+        self.account.rows[entity] += len(steps)
 
-    def scalars(self, entity: str, steps: NDArray[np.int64], values: NDArray, names: Sequence[str]) -> None:
-        """`values` (len(steps), ...) as one batched entity with a name a series."""
+    def scalars(
+        self, entity: str, steps: NDArray[np.int64], values: NDArray, names: Sequence[str], first_color: int = 0
+    ) -> None:
+        """`values` (len(steps), ...) as one batched entity with a name and a colour a series."""
         flat = np.asarray(values, dtype=np.float64).reshape(len(steps), len(names))
         if flat.shape[1] == 0:
             return
-        # Rerun gives an entity one colour, however many series it holds.
-        colors = [SERIES_COLORS[index % len(SERIES_COLORS)] for index in range(len(names))] if len(names) > 1 else None
+        # Left to itself rerun gives all series of an entity one colour, and entities of one folder much the same.
+        colors = [SERIES_COLORS[(first_color + index) % len(SERIES_COLORS)] for index in range(len(names))]
         self.static(entity, rr.SeriesLines(names=list(names), colors=colors))
         columns = rr.Scalars.columns(scalars=flat.reshape(-1))
         self.columns(entity, steps, columns.partition([flat.shape[1]] * len(flat)))
 
 
-def log_episode(recording: rr.RecordingStream, episode: Episode) -> EpisodeLog:
+def log_episode(recording: rr.RecordingStream, episode: Episode) -> Account:
     """Hand the whole of `episode` to `recording`; returns the account of it."""
-    log = EpisodeLog(recording, episode.info.control_dt)
+    log = _Log(recording, episode.info.control_dt)
     _log_bodies(log, episode)
     _log_cameras(log, episode)
     _log_numbers(log, episode)
     _log_events(log, episode)
-    return log
+    return log.account
 
 
 # --- names ----------------------------------------------------------------------------------------
@@ -146,7 +155,7 @@ def evaluate_entity(name: str) -> str:
 # --- bodies ---------------------------------------------------------------------------------------
 
 
-def _log_bodies(log: EpisodeLog, episode: Episode) -> None:
+def _log_bodies(log: _Log, episode: Episode) -> None:
     log.static(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     steps = np.arange(len(episode.poses), dtype=np.int64)
     entities = body_entities(episode.geometry)
@@ -171,16 +180,18 @@ def _log_bodies(log: EpisodeLog, episode: Episode) -> None:
                 worn[int(body)] += 1
 
 
-def _mesh(mesh: Any, material: Any) -> rr.Mesh3D | None:
+def _mesh(mesh: Mesh, material: Material) -> rr.Mesh3D | None:
     if len(mesh.faces) == 0:
         return None
-    textured = material.texture is not None and mesh.uvs is not None
+    # SAPIEN and rerun agree on uv: v = 0 is the first row of the texture, and beyond 0..1 it repeats.
+    texture = material.texture
+    textured = texture is not None and mesh.uvs is not None
     return rr.Mesh3D(
         vertex_positions=mesh.vertices,
         triangle_indices=mesh.faces,
         vertex_normals=mesh.normals,
         vertex_texcoords=mesh.uvs if textured else None,
-        albedo_texture=np.ascontiguousarray(material.texture[..., :3]) if textured else None,
+        albedo_texture=np.ascontiguousarray(texture[..., :3]) if textured else None,
         albedo_factor=np.rint(np.clip(material.base_color, 0.0, 1.0) * 255).astype(np.uint8),
     )
 
@@ -188,7 +199,7 @@ def _mesh(mesh: Any, material: Any) -> rr.Mesh3D | None:
 # --- cameras --------------------------------------------------------------------------------------
 
 
-def _log_cameras(log: EpisodeLog, episode: Episode) -> None:
+def _log_cameras(log: _Log, episode: Episode) -> None:
     if not episode.cameras:
         return
     names = {0: "background", **episode.segmentation}
@@ -212,7 +223,7 @@ def _log_cameras(log: EpisodeLog, episode: Episode) -> None:
         _log_pictures(log, entity, camera)
 
 
-def _log_pictures(log: EpisodeLog, entity: str, camera: CameraTrack) -> None:
+def _log_pictures(log: _Log, entity: str, camera: CameraTrack) -> None:
     if camera.rgb is not None:
         rgb = f"{entity}/rgb"
         log.static(rgb, rr.EncodedImage.from_fields(media_type="image/jpeg"))
@@ -262,16 +273,18 @@ def encode_depth_png(depth: NDArray[np.float32]) -> bytes:
 # --- numbers and words ----------------------------------------------------------------------------
 
 
-def _log_numbers(log: EpisodeLog, episode: Episode) -> None:
+def _log_numbers(log: _Log, episode: Episode) -> None:
     states = np.arange(len(episode.poses), dtype=np.int64)
     transitions = states[1:]
     log.scalars("/action", transitions, episode.action, episode.action_names)
     log.scalars("/reward", transitions, episode.reward, ["reward"])
+    drawn = 0
     for name, values in episode.evaluate.items():
         series = [name]
         if values.ndim > 1:
             series = [f"{name}[{', '.join(map(str, index))}]" for index in np.ndindex(values.shape[1:])]
-        log.scalars(evaluate_entity(name), states, values, series)
+        log.scalars(evaluate_entity(name), states, values, series, first_color=drawn)
+        drawn += len(series)
     for name in ("success", "fail"):
         if is_flag(episode, name):
             log.scalars(f"/episode/{name}", states, episode.evaluate[name], [name])
@@ -293,7 +306,7 @@ def flag(episode: Episode, name: str) -> NDArray[np.bool_]:
 
 def events(episode: Episode) -> list[tuple[int, str, str]]:
     """(step, level, text) of every moment at which something began, in order of time."""
-    found = [(0, "INFO", f"reset with seed {episode.info.seed}")]
+    found = [(0, "INFO", f"reset with seed {episode.info.seed}" if episode.info.seed >= 0 else "reset")]
     for name, level in (("success", "INFO"), ("fail", "WARN")):
         found += [(step, level, name) for step in _onsets(flag(episode, name))]
     for name, values in (("terminated", episode.terminated), ("truncated", episode.truncated)):
@@ -306,7 +319,7 @@ def _onsets(values: NDArray[np.bool_]) -> list[int]:
     return np.flatnonzero(values & ~before).tolist()
 
 
-def _log_events(log: EpisodeLog, episode: Episode) -> None:
+def _log_events(log: _Log, episode: Episode) -> None:
     steps, levels, texts = zip(*events(episode))
     columns = rr.TextLog.columns(text=list(texts), level=list(levels))
     log.columns(EVENTS, np.array(steps, dtype=np.int64), columns)

@@ -4,7 +4,7 @@ A recording is the one thing that outlives a session, so the file must not lie: 
 after a full disk, not silently short of a camera, not written over yesterday's. Rerun writes on
 threads of its own and turns most errors into warnings. So the file is written under a temporary name
 in the same folder with rerun's strict mode on, read back and held against the account of what was
-handed over (`layout.EpisodeLog`), flushed to the disk, and only then given its name, in one step
+handed over (`layout.Account`), flushed to the disk, and only then given its name, in one step
 that fails where the name exists.
 """
 
@@ -29,7 +29,7 @@ from rerun.error_utils import catch_and_log_exceptions
 
 from workbench.recording.blueprint import episode_blueprint
 from workbench.recording.episode import Episode, EpisodeInfo
-from workbench.recording.layout import EpisodeLog, flag, log_episode
+from workbench.recording.layout import Account, flag, log_episode
 
 _NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EACCES}
 
@@ -51,47 +51,54 @@ def write_rrd(episode: Episode, path: Path) -> Path:
     """
     path = Path(path)
     _check_lengths(episode)
-    temporary = path.parent / f".{uuid.uuid4().hex}.rrd.part"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        # Rerun opens the file too, but reports what fails by a bare RuntimeError.
+        temporary = path.parent / f".{uuid.uuid4().hex}.rrd.part"
+        # Rerun makes the file too, but says what went wrong in a bare RuntimeError.
         temporary.touch(exist_ok=False)
-        account = _write(episode, temporary)
-        _check_written(temporary, account)
-        _sync(temporary)
-        final = _publish(temporary, path)
+        try:
+            account = _write(episode, temporary)
+            _check_written(temporary, account)
+            _sync(temporary)
+            final = _publish(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+            # Every RecordingStream leaves two threads behind once it is let go of (measured, rerun 0.41).
+            rerun_bindings.flush_and_cleanup_orphaned_recordings()
         _sync(path.parent)
         return final
     except OSError as error:
         raise RecordingError(f"Cannot write {path}: {_reason(error, path)}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-        # Every RecordingStream leaves two threads behind once it is let go of (measured, rerun 0.41).
-        rerun_bindings.flush_and_cleanup_orphaned_recordings()
 
 
 def episode_filename(info: EpisodeInfo, when: datetime.datetime | None = None) -> str:
     """``PushCube-v1_seed0003_env03_2026-11-21T08-15-30.rrd``: task, seed, env, local time of writing.
 
-    Only letters, digits and ``. _ -``; sorts by task, then seed, then env, then time. Two episodes of
+    A seed below 0 says that it is not known, and the name then says ``noseed``. Only letters, digits and ``. _ -``; sorts by task, then seed, then env, then time. Two episodes of
     one second get the same name, which `write_rrd` keeps apart.
     """
     when = when or datetime.datetime.now()
     task = re.sub(r"[^A-Za-z0-9._-]+", "-", info.task).strip("-._")[:80] or "task"
-    return f"{task}_seed{info.seed:04d}_env{info.env_index:02d}_{when:%Y-%m-%dT%H-%M-%S}.rrd"
+    seed = f"seed{info.seed:04d}" if info.seed >= 0 else "noseed"
+    return f"{task}_{seed}_env{info.env_index:02d}_{when:%Y-%m-%dT%H-%M-%S}.rrd"
 
 
-def _write(episode: Episode, path: Path) -> EpisodeLog:
+def _write(episode: Episode, path: Path) -> Account:
+    blueprint = episode_blueprint(episode)
     # Without strict mode a mesh that rerun refuses is a warning, and the file lacks it.
     with catch_and_log_exceptions(strict=True):
         # Rerun derives a default id from the process, so two episodes of one process would be taken for one.
         recording = rr.RecordingStream(_application_id(episode.info), recording_id=uuid.uuid4().hex)
-        recording.save(path, default_blueprint=episode_blueprint(episode))
         try:
+            recording.save(path, default_blueprint=blueprint)
             account = log_episode(recording, episode)
             for name, values in properties(episode).items():
-                recording.send_property(name, rr.AnyValues(drop_untyped_nones=True, **values))
+                recording.send_property(name, rr.AnyValues(**values))
             recording.send_recording_name(_title(episode))
+        except RuntimeError as error:
+            # How rerun's native half reports a file that it cannot write: "... (os error 28)".
+            number = re.search(r"os error (\d+)", str(error))
+            raise OSError(int(number[1]) if number else errno.EIO, str(error)) from error
         finally:
             recording.disconnect()
     return account
@@ -105,7 +112,8 @@ def _application_id(info: EpisodeInfo) -> str:
 def _title(episode: Episode) -> str:
     outcome = "success" if flag(episode, "success")[-1] else "fail" if flag(episode, "fail")[-1] else "no success"
     info = episode.info
-    return f"{info.task} seed {info.seed} env {info.env_index}: {outcome}, {len(episode.action)} steps"
+    seed = f"seed {info.seed}" if info.seed >= 0 else "no seed"
+    return f"{info.task} {seed} env {info.env_index}: {outcome}, {len(episode.action)} steps"
 
 
 def properties(episode: Episode) -> dict[str, dict[str, Any]]:
@@ -120,7 +128,7 @@ def properties(episode: Episode) -> dict[str, dict[str, Any]]:
     values: dict[str, dict[str, Any]] = {
         "episode": {
             "task": info.task,
-            "seed": info.seed,
+            "seed": info.seed if info.seed >= 0 else None,
             "env_index": info.env_index,
             "length": len(episode.action),
             "return": float(np.sum(episode.reward, dtype=np.float64)),
@@ -175,7 +183,7 @@ def _check_lengths(episode: Episode) -> None:
             raise ValueError(f"Episode of {steps} steps and {bodies} bodies: {name} is {shape}, not {expected}.")
 
 
-def _check_written(path: Path, account: EpisodeLog) -> None:
+def _check_written(path: Path, account: Account) -> None:
     """Raise OSError unless every row and every static entity of `account` can be read from `path`."""
     rows: Counter[str] = Counter()
     statics: set[str] = set()

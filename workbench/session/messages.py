@@ -224,6 +224,8 @@ class Status:
     """Control steps of the whole batch per second of wall time."""
     real_time_factor: float
     """Simulated seconds per wall second; below the asked speed the machine is the limit."""
+    activity: str = ""
+    """What keeps the worker from its requests for a while, if anything does."""
 
 
 @dataclass(frozen=True)

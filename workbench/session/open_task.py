@@ -21,7 +21,7 @@ from workbench.authoring.problem import TaskError, problem_from_exception
 from workbench.authoring.returns import check_step_returns
 from workbench.core import actions
 from workbench.core.backends import render_device_name
-from workbench.core.pictures import list_cameras, segmentation_names
+from workbench.core.take_pictures import list_cameras, segmentation_names
 from workbench.core.scene_geometry import read_geometry
 from workbench.core.step import StepResult
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env

@@ -387,8 +387,10 @@ class Session:
         elif isinstance(event, Status):
             s.playing = event.playing
             s.steps_per_second, s.real_time_factor = event.steps_per_second, event.real_time_factor
-            if s.state in ("running", "paused"):
-                s.state = "running" if event.playing else "paused"
+            if event.activity:
+                s.state, s.activity = "loading", event.activity
+            elif s.state in ("running", "paused", "loading"):
+                s.state, s.activity = "running" if event.playing else "paused", ""
 
     def _on_loaded(self, event: Loaded) -> None:
         # Episodes of the version before end here: their steps and the new ones do not belong together.

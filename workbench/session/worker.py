@@ -21,7 +21,8 @@ import torch
 
 from workbench.authoring.problem import Problem, TaskError, problem_from_exception
 from workbench.core import actions
-from workbench.core.pictures import Picture, take_pictures
+from workbench.core.pictures import Picture
+from workbench.core.take_pictures import take_pictures
 from workbench.core.step import StepResult
 from workbench.session.messages import (
     ActionSource,
@@ -76,6 +77,7 @@ class Worker:
         self._pictures_stale = False
         self._pictures_done = 0.0
         self._picture_cost = 0.0
+        self._renderer_ready = False
         self._capture = SetCapture(())
         self._status_sent = 0.0
         self._quit = False
@@ -302,6 +304,9 @@ class Worker:
         env = min(self._watch.env, opened.env.num_envs - 1)
         known = {(camera.name, camera.kind) for camera in opened.description.cameras}
         wanted = [c for c in self._watch.cameras if (c.name, c.kind) in known]
+        if not self._renderer_ready:
+            # The first picture of a process compiles the shaders: 5 to 19 s on a software renderer.
+            self._send_status(None, "compiling the renderer's shaders, once")
         started = time.monotonic()
         try:
             pictures = take_pictures(opened.env.env, env, [_as_tuple(c) for c in wanted])
@@ -313,15 +318,20 @@ class Worker:
         self._picture_cost = self._pictures_done - started
         self._pictures_stale = False
         self._send(Pictures(pictures, 1000 * self._picture_cost))
+        if not self._renderer_ready:
+            self._renderer_ready = True
+            self._picture_cost = 0.0
+            self._pacer.start(time.monotonic())
+            self._send_status(None)
 
-    def _send_status(self, now: float | None) -> None:
+    def _send_status(self, now: float | None, activity: str = "") -> None:
         """Every quarter of a second while playing, or at once when `now` is None."""
         moment = time.monotonic()
         if now is not None and (not self._playing or now - self._status_sent < _STATUS_PERIOD):
             return
         self._status_sent = moment
         steps = self._rate.per_second(moment) if self._playing else 0.0
-        self._send(Status(self._playing, steps, steps * self._pacer.control_dt))
+        self._send(Status(self._playing, steps, steps * self._pacer.control_dt, activity))
 
 
 def _as_tuple(request: CameraRequest) -> tuple[str, Any, tuple[str, ...]]:

@@ -23,7 +23,7 @@ class ActionSliders:
         self._session = session
         self._dimensions: tuple[ActionDimension, ...] = ()
         self._controls: list[Control[float]] = []
-        self._folder = server.gui.add_folder("Action of every env", visible=False)
+        self._folder = server.gui.add_folder(None, visible=False)
         with self._folder:
             self._centre = server.gui.add_button("Centre all", color="gray")
         self._centre.on_click(lambda _: self._send_centre())
@@ -48,8 +48,8 @@ class ActionSliders:
                             step=(high - low) / 200,
                             initial_value=min(max(start, low), high),
                         ),
-                        read=lambda value, low=low, high=high, name=dimension.name: checked_number(
-                            value, low, high, name
+                        read=lambda value, low=low, high=high: checked_number(
+                            value, low, high, (low + high) / 2
                         ),
                         send=lambda _: self._send(),
                     )
@@ -59,16 +59,16 @@ class ActionSliders:
         if self._folder.visible != shown:
             self._folder.visible = shown
         if shown and len(values) == len(self._controls):
-            for control, value in zip(self._controls, values):
-                low, high = slider_bounds(self._dimensions[self._controls.index(control)])
+            for dimension, control, value in zip(self._dimensions, self._controls, values, strict=True):
+                low, high = slider_bounds(dimension)
                 control.show(min(max(value, low), high))
 
     def _send(self) -> None:
         # All of them at their newest: two sliders moved at once arrive in any order.
         values = []
-        for dimension, control in zip(self._dimensions, self._controls):
+        for dimension, control in zip(self._dimensions, self._controls, strict=True):
             low, high = slider_bounds(dimension)
-            values.append(checked_number(control.handle.value, low, high, dimension.name))
+            values.append(checked_number(control.handle.value, low, high, (low + high) / 2))
         self._session.set_sliders(tuple(values))
 
     def _send_centre(self) -> None:

@@ -15,6 +15,9 @@ from workbench.authoring.problem import Problem
 from workbench.session.view import SessionView
 from workbench.ui.fragments import render
 
+WIDTH = 520
+"""Pixels; a view that is narrower makes it narrower."""
+
 DOING = {
     "syntax": "cannot be read",
     "import": "failed to import",
@@ -47,7 +50,8 @@ class Banner:
             self._restart = server.gui.add_button(
                 "Start a new worker", icon=viser.Icon.POWER, color="gray", visible=False
             )
-        self._panel.float(x=12, y=12, width=520)
+        # From the right edge of the view: on the left are viser's own notices.
+        self._panel.float(x=-12, y=12, width=WIDTH)
         self._reload.on_click(lambda _: reload())
         self._restart.on_click(lambda _: restart())
         self._serial: int | None = None

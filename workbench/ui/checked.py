@@ -1,16 +1,19 @@
-"""What a control claims, made into what the control can say.
+"""What a control claims, checked against what the control can say.
 
 viser takes a control's value from the browser as it comes: a slider from 0 to 10 holds 99999 if a
 client says so, a dropdown holds a text that is not among its options, and only the Python type is
 forced. The page itself never sends such values, but the page is not the only thing that can speak the
-protocol, and an option list may have changed between the click and its arrival. An env index of 99999
-must not reach the worker. So a panel passes every ``handle.value`` through one of these before it uses
-it. They are pure and never raise on a value; what cannot be made sense of becomes the fallback.
+protocol, and a list of options may have changed between the click and its arrival. An env index of
+99999 must not reach the worker.
+
+So a panel passes every ``handle.value`` through one of these before it uses it. A value that the
+control cannot have is refused with a sentence for the person, not quietly bent into another one: the
+session keeps what it had, and the control goes back to showing that. Only the rounding of a browser's
+arithmetic at the ends of a slider is set right in silence.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from typing import TypeVar
 
@@ -18,61 +21,72 @@ import numpy as np
 
 Choice = TypeVar("Choice")
 
-
-def checked_number(value: object, low: float, high: float, fallback: float) -> float:
-    """``value`` held between ``low`` and ``high`` (infinities too: they are beyond a bound); ``fallback``,
-    held in the same way, for NaN and for what is not a real number. A bool is not a number here.
-
-    Raises:
-        ValueError: ``low`` is greater than ``high``, or one of the three numbers of the control is NaN.
-    """
-    if not low <= high or math.isnan(fallback):
-        raise ValueError(f"A control from {low} to {high} that falls back to {fallback} does not exist.")
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
-        value = fallback
-    # Compared before it is converted: float() raises on an int of more than 308 digits.
-    if value > high:
-        return float(high)
-    if value < low:
-        return float(low)
-    return checked_number(fallback, low, high, low) if value != value else float(value)
+ROUNDING = 1e-6
+"""Part of a slider's range by which its value may lie beyond the ends: ``low + n * step``, added up in a
+browser, passes ``high`` by a few units in the last place."""
 
 
-def checked_int(value: object, low: int, high: int, fallback: int) -> int:
-    """`checked_number` for whole numbers; a fraction goes to the nearest one (halves to the even one).
+def checked_number(value: object, low: float, high: float, name: str) -> float:
+    """``value`` as a float in ``[low, high]``.
+
+    Args:
+        value: What the control holds: of any type, of any size.
+        low: Least value.
+        high: Greatest value.
+        name: What the sentence calls the value.
 
     Raises:
-        ValueError: ``low`` is greater than ``high``.
+        ValueError: It is not a real number (a bool is none here), is NaN, or lies outside.
     """
-    if low > high:
-        raise ValueError(f"A control from {low} to {high} does not exist.")
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
-        value = fallback
-    if value > high:
-        return high
-    if value < low:
-        return low
-    return (
-        checked_int(fallback, low, high, low)
-        if value != value
-        else round(float(value) if isinstance(value, np.floating) else value)
-    )
+        raise ValueError(f"The {name} is not a number.")
+    if value != value:
+        raise ValueError(f"The {name} is not a number.")
+    slack = (high - low) * ROUNDING
+    # Compared before it is converted: float() fails on an int of more than 308 digits.
+    if not low - slack <= value <= high + slack:
+        raise ValueError(f"The {name} goes from {low:g} to {high:g}.")
+    return min(max(float(value), float(low)), float(high))
 
 
-def checked_choice(value: object, options: Iterable[Choice], fallback: Choice) -> Choice:
-    """The one of ``options`` that equals ``value`` and is of its type (True is not 1); else ``fallback``,
-    which need not be one of them (a dropdown without options has to say something)."""
+def checked_int(value: object, low: int, high: int, name: str) -> int:
+    """``value`` as a whole number in ``[low, high]``; 3.0 is 3, as browsers have only one kind of number.
+
+    Raises:
+        ValueError: It is not a whole number, or lies outside.
+    """
+    if isinstance(value, (float, np.floating)) and float(value).is_integer():
+        value = int(value)
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
+        raise ValueError(f"The {name} is not a whole number.")
+    if not low <= value <= high:
+        raise ValueError(f"The {name} goes from {low} to {high}." if low <= high else f"There is no {name}.")
+    return int(value)
+
+
+def checked_choice(value: object, options: Iterable[Choice], name: str) -> Choice:
+    """The one of ``options`` that equals ``value`` and is of its type (True is not 1).
+
+    Raises:
+        ValueError: There is none.
+    """
     for option in options:
         if type(option) is type(value) and option == value:
             return option
-    return fallback
+    raise ValueError(f"That {name} is not one of those on offer.")
 
 
-def checked_text(value: object, longest: int, fallback: str) -> str:
-    """``value`` as one line of at most ``longest`` printable characters, without blanks around it;
-    ``fallback`` if it is not a text or nothing is left. Not escaped: what goes into HTML or markdown is
-    escaped where it goes in."""
+def checked_text(value: object, longest: int, name: str) -> str:
+    """``value`` as one line of at most ``longest`` characters, all of them printable. Not escaped: text is
+    escaped where it goes into HTML or markdown.
+
+    Raises:
+        ValueError: It is not a text, is longer, or has line breaks, control or direction characters.
+    """
     if not isinstance(value, str):
-        return fallback
-    line = "".join(character for character in value if character.isprintable()).strip()[:longest].strip()
-    return line or fallback
+        raise ValueError(f"The {name} is not a text.")
+    if len(value) > longest:
+        raise ValueError(f"The {name} is longer than {longest} characters.")
+    if not value.isprintable():
+        raise ValueError(f"The {name} has characters that cannot be shown, such as a line break.")
+    return value

@@ -145,8 +145,7 @@ def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) ->
         label: shown at the top of viser's panel.
 
     Raises:
-        DoorError: the host or port cannot be bound.
-        viser_seam.SeamError: the installed viser is not one that can be gated.
+        DoorError: the host or port cannot be bound, or the installed viser is not one that can be gated.
     """
     listening = _listen(options)
     host, port = listening.getsockname()[:2]
@@ -182,7 +181,10 @@ def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) ->
 
         return answer
 
-    gated = viser_seam.make_viser(listening, wrap, label, MAX_MESSAGE_BYTES, RESPONSE_SECONDS)
+    try:
+        gated = viser_seam.make_viser(listening, wrap, label, MAX_MESSAGE_BYTES, RESPONSE_SECONDS)
+    except viser_seam.SeamError as error:
+        raise DoorError(str(error)) from error
     door = Door(
         options=options,
         server=gated.server,
@@ -312,9 +314,10 @@ def _try_own_door(host: str, port: int) -> None:
     finally:
         knock.close()
     if status != 403:
-        raise viser_seam.SeamError(
+        raise DoorError(
             f"The page's door does not hold: a request that must be refused got {status}. "
-            f"It is written for viser {viser_seam.WRITTEN_FOR}; {viser.__version__} is installed."
+            f"It is written for viser {viser_seam.WRITTEN_FOR} and {viser.__version__} is installed; install "
+            f"viser=={viser_seam.WRITTEN_FOR}."
         )
 
 

@@ -22,6 +22,8 @@ FLOOR_WIDTH = 8.0
 """Metres. A flat static thing wider than this in both directions is a floor: ManiSkill's ground is
 40 to 100 m wide, the largest table 2.4 m."""
 FLOOR_THICKNESS = 0.05
+WIDER = 1.4
+"""A view is wider than it is tall, and depth is foreshortened in it."""
 MARGIN = 0.35
 """Metres between two envs at rest; a robot that reaches out uses some of it."""
 
@@ -99,10 +101,10 @@ def grid_offsets(num_envs: int, spacing: NDArray) -> NDArray[np.float32]:
     """(N, 3) offsets of a grid about the origin, env 0 in front on the left as seen from +x.
 
     Rows run along y and are filled from +x (nearest to where the camera starts) backwards. Their
-    number is chosen so that the whole takes up a square as nearly as whole rows allow.
+    number is chosen so that the whole is `WIDER` times as wide as deep, as nearly as whole rows allow.
     """
     width, depth = float(spacing[1]), float(spacing[0])
-    columns = max(1, min(num_envs, round((num_envs * depth / width) ** 0.5)))
+    columns = max(1, min(num_envs, round((num_envs * WIDER * depth / width) ** 0.5)))
     rows = -(-num_envs // columns)
     row, column = np.divmod(np.arange(num_envs), columns)
     x = ((rows - 1) / 2 - row) * depth
@@ -128,46 +130,6 @@ def env_under_ray(layout: EnvLayout, origin: NDArray, direction: NDArray) -> int
     if not hit.any():
         return None
     return int(np.where(hit, enters, np.inf).argmin())
-
-
-def flat_as_quad(mesh: Mesh) -> Mesh:
-    """A level rectangle cut into many triangles, as two; anything else comes back as it is.
-
-    ManiSkill's ground is 20,000 triangles of one plane, more than all the robots of a batch that
-    was simplified for the browser. Two are enough where height is constant, the outline is the
-    bounding rectangle and texture coordinates are linear in x and y.
-    """
-    points = mesh.vertices
-    if len(mesh.faces) <= 2 or not len(points) or np.ptp(points[:, 2]) > 1e-6:
-        return mesh
-    low, high = points.min(axis=0), points.max(axis=0)
-    a, b, c = (points[mesh.faces[:, i], :2].astype(np.float64) for i in range(3))
-    ab, ac = b - a, c - a
-    signed = 0.5 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
-    rectangle = float(np.prod((high - low)[:2].astype(np.float64)))
-    if abs(abs(signed.sum()) - rectangle) > 1e-3 * rectangle:
-        return mesh
-    corners = np.array(
-        [[x, y, low[2]] for x, y in ((low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1]))],
-        np.float32,
-    )
-    uvs = None
-    if mesh.uvs is not None:
-        design = np.column_stack([points[:, :2], np.ones(len(points))])
-        linear, *_ = np.linalg.lstsq(design, mesh.uvs, rcond=None)
-        if np.abs(design @ linear - mesh.uvs).max() > 1e-3:
-            return mesh
-        uvs = np.column_stack([corners[:, :2], np.ones(4)]) @ linear
-    faces = np.array([[0, 1, 2], [0, 2, 3]], np.uint32)
-    up = 1.0
-    if signed.sum() < 0:
-        faces, up = faces[:, ::-1].copy(), -1.0
-    return Mesh(
-        vertices=corners,
-        faces=faces,
-        normals=np.tile(np.array([0, 0, up], np.float32), (4, 1)),
-        uvs=None if uvs is None else uvs.astype(np.float32),
-    )
 
 
 def _extent(mesh: Mesh) -> NDArray:

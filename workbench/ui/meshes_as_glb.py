@@ -9,7 +9,7 @@ that needs more than 128.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
@@ -22,6 +22,10 @@ from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 
 LARGEST_TEXTURE = 1024
 """Pixels. A page is sent every texture before it shows anything; 4k scans are megabytes each."""
+
+
+LAYER = 4e-4
+"""Metres between painted layers; two steps of a 24 bit depth buffer at ten metres."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,23 @@ def group_by_wearers(geometry: SceneGeometry) -> tuple[WornTogether, ...]:
     )
 
 
+def face_limit(visuals: tuple[Visual, ...], shown_envs: int, num_envs: int, budget: int) -> int:
+    """The most triangles a visual may have so that all instances together stay within the budget.
+
+    Simple shapes keep all of theirs; only the rich ones give way, down to a few hundred.
+    """
+    faces = np.array([len(visual.mesh.faces) for visual in visuals], np.int64)
+    shown = np.array([len(visual.envs) for visual in visuals], np.int64) * shown_envs / num_envs
+    fewest, most = 200, int(max(faces.max(initial=0), 200))
+    while fewest < most:
+        limit = (fewest + most + 1) // 2
+        if (np.minimum(faces, limit) * shown).sum() <= budget:
+            fewest = limit
+        else:
+            most = limit - 1
+    return fewest
+
+
 def as_glb(parts: list[tuple[Mesh, Material]]) -> bytes:
     """One GLB of these parts, all in the frame of the body that wears them.
 
@@ -56,6 +77,7 @@ def as_glb(parts: list[tuple[Mesh, Material]]) -> bytes:
     they have, so normals are always written, and texture coordinates as soon as one part has some.
     """
     textured = any(mesh.uvs is not None for mesh, _ in parts)
+    parts = list(zip(lift_painted_layers([mesh for mesh, _ in parts]), [m for _, m in parts], strict=True))
     scene = trimesh.Scene()
     for number, (mesh, material) in enumerate(parts):
         solid = trimesh.Trimesh(
@@ -70,6 +92,33 @@ def as_glb(parts: list[tuple[Mesh, Material]]) -> bytes:
     return bytes(scene.export(file_type="glb", include_normals=True))
 
 
+def lift_painted_layers(meshes: list[Mesh]) -> list[Mesh]:
+    """Thin layers of one body that lie on each other, pulled apart as far as a browser can tell.
+
+    ManiSkill paints its targets as discs that rise by a hundredth of a millimetre each. SAPIEN's float
+    depth keeps them apart; a browser's 24 bits do not, and the rings turn into noise. Layers (thinner
+    than a millimetre, crossing each other's outline) are scaled along their thin axis so that each is
+    `LAYER` beyond the one before; what has any thickness stays as it is.
+    """
+    layers: dict[int, list[int]] = {}
+    for number, mesh in enumerate(meshes):
+        if len(mesh.vertices):
+            extent = np.ptp(mesh.vertices, axis=0)
+            if extent.min() < 1e-3 and extent.max() > 20 * extent.min():
+                layers.setdefault(int(extent.argmin()), []).append(number)
+    lifted = list(meshes)
+    for axis, numbers in layers.items():
+        if len(numbers) < 2:
+            continue
+        numbers = sorted(numbers, key=lambda n: np.abs(meshes[n].vertices[:, axis]).max())
+        for rank, number in enumerate(numbers):
+            mesh = meshes[number]
+            vertices = mesh.vertices.copy()
+            vertices[:, axis] += np.sign(vertices[:, axis]) * rank * LAYER
+            lifted[number] = replace(mesh, vertices=vertices)
+    return lifted
+
+
 def _pbr(material: Material, number: int) -> PBRMaterial:
     red, green, blue, alpha = (float(np.clip(c, 0.0, 1.0)) for c in material.base_color)
     texture = None if material.texture is None else _texture(material.texture)
@@ -78,7 +127,8 @@ def _pbr(material: Material, number: int) -> PBRMaterial:
         name=f"part {number}",
         baseColorFactor=[red, green, blue, alpha],
         baseColorTexture=texture,
-        metallicFactor=float(np.clip(material.metallic, 0.0, 1.0)),
+        # Bare metal shows nothing but what it reflects, and there are no surroundings to reflect.
+        metallicFactor=float(np.clip(material.metallic, 0.0, 0.4)),
         roughnessFactor=float(np.clip(material.roughness, 0.0, 1.0)),
         alphaMode="BLEND" if see_through else "OPAQUE",
         # Meshes of robots are often open shells with mixed winding; seen from behind they would

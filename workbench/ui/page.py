@@ -10,6 +10,7 @@ With no page open nothing is drawn, and the session is told so that it renders n
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 
@@ -25,6 +26,7 @@ from workbench.ui.commands import Command, register
 from workbench.ui.curves_panel import CurvesPanel
 from workbench.ui.env_layout import EnvLayout, env_under_ray, lay_out
 from workbench.ui.fragments import style_sheet
+from workbench.ui.lights import light
 from workbench.ui.numbers_panel import NumbersPanel
 from workbench.ui.record_panel import RecordPanel
 from workbench.ui.run_panel import RunPanel
@@ -33,6 +35,8 @@ from workbench.ui.selection_mark import SelectionMark
 from workbench.ui.status_line import StatusLine
 from workbench.ui.view_panel import ViewPanel
 from workbench.ui.viewpoint import FOV, Viewpoint, frame_all, frame_one
+
+log = logging.getLogger(__name__)
 
 FRAME = 1 / 30
 """Seconds. Faster pushes make a browser slower (measured: 350 a second leave it 13 to 30)."""
@@ -54,12 +58,17 @@ class Page:
         self._thread: threading.Thread | None = None
         self._layout: EnvLayout | None = None
         self._task_serial = -1
+        self._built: tuple[bool, int] | None = None
         self._framed: object = None
         self._num_clients = -1
 
         server.scene.set_up_direction("+z")
-        server.scene.configure_default_lights(enabled=True, cast_shadow=False)
+        light(server)
         server.initial_camera.fov = FOV
+        # Depth is 24 bit: with viser's near plane of a centimetre a goal that is painted a millimetre
+        # above a table flickers from a few metres on.
+        server.initial_camera.near = 0.05
+        server.initial_camera.far = 300.0
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(PANEL_WIDTH)
         server.gui.set_panel_label("Workbench")
@@ -106,8 +115,23 @@ class Page:
             began = time.monotonic()
             seen = self._session.wait(seen, timeout=0.1)
             if self._count_clients():
-                self.redraw()
+                try:
+                    self.redraw()
+                except Exception:
+                    # A page that stands still and looks alive is worse than one that says so.
+                    log.exception("The page could not be drawn; trying again.")
+                    self._say_broken()
+                    self._stopping.wait(1.0)
             self._stopping.wait(max(0.0, FRAME - (time.monotonic() - began)))
+
+    def _say_broken(self) -> None:
+        for client in self._server.get_clients().values():
+            client.add_notification(
+                "This page could not be drawn",
+                "The reason is in the terminal of the workbench. It is tried again.",
+                color="red",
+                auto_close_seconds=5.0,
+            )
 
     def redraw(self) -> None:
         """Draw the session as it is now."""
@@ -141,16 +165,25 @@ class Page:
         ):
             # Between two versions a step of the old one may stand beside the new task.
             return
+        one = self._view_panel.only_selected and task.num_envs > 1
+        env = min(view.selected_env, task.num_envs - 1)
         if view.task_serial != self._task_serial or self._layout is None:
             self._task_serial = view.task_serial
             self._layout = lay_out(task.geometry, step.poses)
-            self._scene.build(task.geometry, self._layout, step.poses)
             self._server.gui.set_panel_label(task.env_id)
-        one = self._view_panel.only_selected and task.num_envs > 1
-        env = min(view.selected_env, task.num_envs - 1)
+            self._built = None
+        built = (one, self._view_panel.triangles)
+        if built != self._built:
+            self._built = built
+            self._scene.build(
+                task.geometry, self._layout, step.poses, env if one else None, self._view_panel.triangles
+            )
         self._scene.move(step.poses, self._layout, env if one else None)
         self._mark.draw(self._layout, env, shown=task.num_envs > 1 and not one)
         pictures = self._cameras.shown_pictures(view) if self._cameras.show_frustums else {}
+        if one or task.num_envs == 1:
+            # The view of one env starts at its human camera, whose picture would then fill it.
+            pictures = {key: picture for key, picture in pictures.items() if key[0] != "human"}
         offset = np.zeros(3, np.float32) if one else self._layout.offsets[env]
         self._frustums.draw(task.cameras, pictures, offset)
         # A scene of another size is framed anew; a reload that keeps the size never moves the view.

@@ -47,7 +47,6 @@ LARGEST_SEED = 2**31 - 1
 class RunPanel:
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
-        self._view: SessionView | None = None
         self._task_serial = -1
         gui = server.gui
 
@@ -56,11 +55,11 @@ class RunPanel:
         self._transport = gui.add_button_group("", (STEP, RESET_ALL, RESET_THIS))
         self._transport.on_click(self._on_transport)
 
-        self._env_folder = gui.add_folder("Environment")
+        self._env_folder = gui.add_folder("Environment", visible=False)
         with self._env_folder:
             self._env = Control(
                 gui.add_slider("Selected", min=0, max=1, step=1, initial_value=0),
-                read=lambda value: checked_int(value, 0, self._num_envs() - 1, "env"),
+                read=lambda value: checked_int(value, 0, self._num_envs() - 1, self._session.view().selected_env),
                 send=session.select_env,
             )
             self._neighbours = gui.add_button_group("", (PREVIOUS, NEXT))
@@ -73,7 +72,7 @@ class RunPanel:
                 gui.add_dropdown(
                     "Speed", tuple(SPEEDS), initial_value="1 ×", hint="Simulated seconds in one second."
                 ),
-                read=lambda value: SPEEDS[checked_choice(value, tuple(SPEEDS), "speed")],
+                read=lambda value: SPEEDS[checked_choice(value, SPEEDS, "1 ×")],
                 send=session.set_speed,
                 shown=self._speed_shown,
             )
@@ -81,13 +80,13 @@ class RunPanel:
                 gui.add_number(
                     "Seed", 0, min=0, max=LARGEST_SEED, step=1, hint="A new seed resets every env with it."
                 ),
-                read=lambda value: checked_int(value, 0, LARGEST_SEED, "seed"),
+                read=lambda value: checked_int(value, 0, LARGEST_SEED, self._session.view().seed),
                 send=session.set_seed,
                 settle=0.6,
             )
             self._end = Control(
                 gui.add_dropdown("At its end", tuple(EPISODE_ENDS), initial_value="reset that env"),
-                read=lambda value: EPISODE_ENDS[checked_choice(value, tuple(EPISODE_ENDS), "rule")],
+                read=lambda value: EPISODE_ENDS[checked_choice(value, EPISODE_ENDS, "reset that env")],
                 send=session.set_episode_end,
                 shown=lambda rule: _name_of(EPISODE_ENDS, rule),
             )
@@ -95,7 +94,7 @@ class RunPanel:
         with gui.add_folder("Actions"):
             self._source = Control(
                 gui.add_dropdown("Source", tuple(SOURCES), initial_value="hold still"),
-                read=lambda value: SOURCES[checked_choice(value, tuple(SOURCES), "source")],
+                read=lambda value: SOURCES[checked_choice(value, SOURCES, "hold still")],
                 send=self._choose_source,
                 shown=self._source_shown,
             )
@@ -134,12 +133,13 @@ class RunPanel:
             RESET_ALL: self._session.reset,
             RESET_THIS: self.reset_this,
         }
-        actions[checked_choice(event.target.value, tuple(actions), "button")]()
+        action = actions.get(event.target.value)
+        if action is not None:
+            action()
 
     # --- drawing ---------------------------------------------------------------------------------
 
     def draw(self, view: SessionView) -> None:
-        self._view = view
         can_act = view.task is not None and view.state != "stopped"
         if view.task_serial != self._task_serial and view.task is not None:
             self._task_serial = view.task_serial
@@ -148,9 +148,9 @@ class RunPanel:
             self._env.handle.max = max(1, view.task.num_envs - 1)
             self._sliders.build(view.task.actions, view.sliders)
         self._draw_play(view.playing, can_act)
-        for handle in (self._transport, self._neighbours):
-            if handle.disabled == can_act:
-                handle.disabled = not can_act
+        # viser cannot grey out a group of buttons; one that does nothing must not be there.
+        if self._transport.visible != can_act:
+            self._transport.visible = can_act
         for control in (self._env, self._speed, self._seed, self._end, self._source, self._policy):
             control.enable(can_act)
         self._env.show(view.selected_env)
@@ -206,7 +206,7 @@ class RunPanel:
             self._choosing_policy = True
 
     def _read_policy(self, value: object) -> str:
-        text = checked_text(value, 500, "policy").strip()
+        text = checked_text(value, 500, "")
         if ":" not in text:
             raise ValueError("A policy is written module:function or file.py:function.")
         return text

@@ -8,17 +8,21 @@ parent that moves in the same frame makes them shake.
 
 Showing one env alone really sends one env: the arrays of a batch may change their length, the
 browser then keeps that many instances. Bodies that an env lacks (NaN) are left out the same way.
+What a browser can draw is limited by triangles, so the fewer envs are shown the finer they are.
 """
 
 from __future__ import annotations
+
+from functools import lru_cache
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.core.geometry import SceneGeometry
-from workbench.ui.env_layout import EnvLayout, flat_as_quad, is_floor
-from workbench.ui.meshes_as_glb import WornTogether, as_glb, group_by_wearers
+from workbench.core.geometry import SceneGeometry, Visual
+from workbench.core.mesh_detail import reduce_mesh
+from workbench.ui.env_layout import EnvLayout, is_floor
+from workbench.ui.meshes_as_glb import WornTogether, as_glb, face_limit, group_by_wearers
 
 
 class SceneView:
@@ -28,13 +32,32 @@ class SceneView:
         self._server = server
         self._drawn: list[_DrawnGroup] = []
         self._floor_grid: viser.GridHandle | None = None
+        self._glb = lru_cache(maxsize=128)(_glb_of)
 
-    def build(self, geometry: SceneGeometry, layout: EnvLayout, poses: NDArray[np.float32]) -> None:
-        """Replace whatever was shown by this scene, at these poses ((N, B, 7), env frames)."""
+    def build(
+        self,
+        geometry: SceneGeometry,
+        layout: EnvLayout,
+        poses: NDArray[np.float32],
+        only_env: int | None = None,
+        triangles: int = 200_000,
+    ) -> None:
+        """Replace whatever was shown by this scene.
+
+        Args:
+            geometry: What it looks like.
+            layout: Where each env stands.
+            poses: (N, B, 7) in env frames.
+            only_env: Show this env alone; None shows all.
+            triangles: About how many may be drawn; richer shapes are simplified to fit.
+        """
         self.clear()
+        shown_envs = geometry.num_envs if only_env is None else 1
+        limit = face_limit(geometry.visuals, shown_envs, geometry.num_envs, triangles)
         for number, group in enumerate(group_by_wearers(geometry)):
             floor = all(is_floor(visual, geometry) for visual in group.visuals)
-            self._drawn.append(_DrawnGroup(self._server, number, group, floor))
+            glb = self._glb(_Same(group.visuals), limit)
+            self._drawn.append(_DrawnGroup(self._server, number, group, glb, floor))
         if not layout.has_floor:
             low, high = layout.box_of_all()
             self._floor_grid = self._server.scene.add_grid(
@@ -47,7 +70,7 @@ class SceneView:
                 cell_color=(150, 150, 150),
                 section_color=(120, 120, 120),
             )
-        self.move(poses, layout, only_env=None)
+        self.move(poses, layout, only_env)
 
     def move(self, poses: NDArray[np.float32], layout: EnvLayout, only_env: int | None) -> None:
         """Put every body where it is now.
@@ -73,19 +96,35 @@ class SceneView:
         return tuple(group.handle for group in self._drawn)
 
 
+class _Same:
+    """Visuals as a key of the cache: the same objects, since arrays cannot be hashed."""
+
+    def __init__(self, visuals: tuple[Visual, ...]) -> None:
+        self.visuals = visuals
+
+    def __hash__(self) -> int:
+        return hash(tuple(id(visual) for visual in self.visuals))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and all(
+            mine is theirs for mine, theirs in zip(self.visuals, other.visuals, strict=False)
+        )
+
+
+def _glb_of(same: _Same, limit: int) -> bytes:
+    return as_glb([(reduce_mesh(visual.mesh, limit), visual.material) for visual in same.visuals])
+
+
 class _DrawnGroup:
     def __init__(
-        self, server: viser.ViserServer, number: int, group: WornTogether, floor: bool
+        self, server: viser.ViserServer, number: int, group: WornTogether, glb: bytes, floor: bool
     ) -> None:
         self._group = group
         self._floor = floor
-        parts = [
-            (flat_as_quad(visual.mesh) if floor else visual.mesh, visual.material) for visual in group.visuals
-        ]
-        # Instance 0 starts far below the ground: the first move follows in the same batch.
+        # One instance far below the ground; the first move follows in the same batch.
         self.handle = server.scene.add_batched_glb(
             f"/envs/{number:03d} {group.name.replace('/', ' ')}",
-            as_glb(parts),
+            glb,
             batched_wxyzs=np.array([[1, 0, 0, 0]], np.float32),
             batched_positions=np.array([[0, 0, -1000]], np.float32),
             # viser's levels of detail leave holes in open meshes and pop while one looks.

@@ -1,6 +1,6 @@
-"""Which env is selected, said in the view: a frame on the floor round it and its number.
+"""Which env is selected, said in the view: a frame round it and its number.
 
-On the floor and not round the bodies, so that nothing of the task is covered.
+Level and round the bodies, never over them, so that nothing of the task is covered.
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ class SelectionMark:
         corner_low = layout.low[:2] + offset[:2] - MARGIN * 0.4
         corner_high = layout.high[:2] + offset[:2] + MARGIN * 0.4
         (x0, y0), (x1, y1) = corner_low, corner_high
-        # A centimetre above the floor, or the two flicker through each other.
-        z = layout.floor_height + 0.01
+        # A frame on the floor under a table is hidden by the tables in front, so it goes where things
+        # happen: ManiSkill puts table tops at z = 0. A centimetre above, or the two flicker.
+        z = max(layout.floor_height, min(0.0, float(layout.high[2]))) + 0.01
         corners = np.array([(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)], np.float32)
         edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
         label_at = np.array([x1, (y0 + y1) / 2, z])

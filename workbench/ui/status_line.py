@@ -43,7 +43,7 @@ def status_values(view: SessionView) -> dict[str, object]:
     moving = view.playing and view.state in ("running", "error") and task is not None
     return {
         "state": view.state,
-        "word": "running" if view.state == "error" and moving else WORDS[view.state],
+        "word": WORDS[view.state],
         "problem": view.problem is not None,
         "stale": view.stale and view.state not in ("starting", "loading"),
         "activity": view.activity,

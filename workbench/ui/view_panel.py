@@ -5,10 +5,13 @@ from __future__ import annotations
 import viser
 
 from workbench.session.view import SessionView
+from workbench.ui.checked import checked_choice
 
+DETAILS = {"fine": 1_000_000, "normal": 200_000, "coarse": 50_000}
+"""Triangles in the view. A browser without a graphics card wants the fewest."""
 ALL, ONE = "all envs", "the selected env"
 DARK, LIGHT = "dark", "light"
-BRAND = (34, 139, 230)
+BRAND = (25, 100, 170)
 
 
 class ViewPanel:
@@ -16,6 +19,12 @@ class ViewPanel:
         self._server = server
         with server.gui.add_folder("View"):
             self._show = server.gui.add_dropdown("Show", (ALL, ONE), initial_value=ALL)
+            self._detail = server.gui.add_dropdown(
+                "Detail",
+                tuple(DETAILS),
+                initial_value="normal",
+                hint="How finely shapes are drawn. Choose coarse if the view is slow.",
+            )
             self._theme = server.gui.add_dropdown("Theme", (DARK, LIGHT), initial_value=DARK if dark else LIGHT)
         self._theme.on_update(lambda _: self._apply_theme())
         self._apply_theme()
@@ -23,6 +32,10 @@ class ViewPanel:
     @property
     def only_selected(self) -> bool:
         return self._show.value == ONE
+
+    @property
+    def triangles(self) -> int:
+        return DETAILS[checked_choice(self._detail.value, DETAILS, "normal")]
 
     def toggle_only_selected(self) -> None:
         self._show.value = ALL if self.only_selected else ONE

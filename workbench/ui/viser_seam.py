@@ -74,9 +74,8 @@ PRIVATE_NAMES = (
     "infra.websockets.exceptions.ConnectionClosedOK",
     "infra.websockets.exceptions.ConnectionClosedError",
     "infra.WebsockServer._background_worker",
-    "infra.WebsockServer._handle_incoming_message",
-    "infra.WebsockServer.unregister_handler",
-    "messages.Message.deserialize",
+    "infra.WebsockMessageHandler.unregister_handler",
+    "infra.Message.deserialize",
     *(f"messages.{name}" for name in (*sorted(MESSAGES_FROM_CLIENTS), *REFUSED_FROM_CLIENTS)),
 )
 """Names that this module relies on; ``infra`` is ``viser.infra._infra``, ``messages`` ``viser._messages``."""

@@ -1,0 +1,58 @@
+"""What every test relies on: rerun strict, a real Chromium by name, no processes left behind."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+
+# Before anything imports rerun, which reads it once: a wrong argument raises instead of printing a warning.
+os.environ["RERUN_STRICT"] = "1"
+
+import psutil
+import pytest
+
+from workbench.machine.chromium import find_chromium, how_to_get_chromium
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    gpu_items = [item for item in items if item.get_closest_marker("gpu")]
+    if not gpu_items:
+        return
+    import torch
+
+    if not torch.cuda.is_available():
+        for item in gpu_items:
+            item.add_marker(pytest.mark.skip(reason="torch sees no CUDA device"))
+
+
+@pytest.fixture(scope="session")
+def chromium_path() -> str:
+    """Path of the Chromium to give to Playwright as ``executable_path``. Without one the test fails."""
+    path = find_chromium()
+    if path is None:
+        pytest.fail(how_to_get_chromium())
+    return path
+
+
+@pytest.fixture(scope="session", autouse=True)
+def no_process_left_behind() -> Iterator[None]:
+    """Workers and browsers that tests started must be gone when the tests are."""
+    yield
+    deadline = time.monotonic() + 10
+    while (left := _children()) and time.monotonic() < deadline:
+        time.sleep(0.2)
+    assert not left, f"tests left processes behind: {left}"
+
+
+def _children() -> list[str]:
+    left: list[str] = []
+    for child in psutil.Process().children(recursive=True):
+        try:
+            command = " ".join(child.cmdline())
+            # multiprocessing keeps this one for the life of the interpreter that spawned a process.
+            if child.status() != psutil.STATUS_ZOMBIE and "multiprocessing.resource_tracker" not in command:
+                left.append(f"{child.pid} {command[:200]}")
+        except psutil.NoSuchProcess:
+            continue
+    return left

@@ -1,0 +1,174 @@
+"""Poses of all bodies as one array, against what ManiSkill's own structs say."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import mani_skill.envs  # noqa: F401 (registers the tasks)
+import numpy as np
+import pytest
+import sapien
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
+from mani_skill.utils.registration import REGISTERED_ENVS
+from mani_skill.utils.structs import Actor
+
+from workbench.core.body_table import BodyTable, build_body_table, read_poses
+from workbench.core.task_env import EnvOptions, make_env
+
+TASKS = ["PickCube-v1", "PushCube-v1", "PegInsertionSide-v1", "MS-CartpoleBalance-v1"]
+
+
+def batched(task: str | type[BaseEnv], num_envs: int = 4) -> BaseEnv:
+    cls = REGISTERED_ENVS[task].cls if isinstance(task, str) else task
+    env = make_env(cls, EnvOptions(num_envs=num_envs, backend="cpu", render=False))
+    env.reset(seed=1)
+    return env
+
+
+def stock(task: str) -> Any:
+    env: Any = gym.make(task, render_backend="none").unwrapped
+    env.reset(seed=1)
+    return env
+
+
+def assert_poses_are_those_of_the_structs(env: Any, table: BodyTable) -> None:
+    poses = read_poses(env, table)
+    assert poses.shape == (env.num_envs, len(table.names), 7) and poses.dtype == np.float32
+    checked = np.zeros(poses.shape[:2], bool)
+    named = {**env.scene.actors, **env.scene.actor_views}
+    for name, articulation in env.scene.articulations.items():
+        named.update({f"{name}/{link.name}": link for link in articulation.links})
+    for body, name in enumerate(table.names):
+        struct = named[name]
+        envs = struct._scene_idxs.numpy()
+        np.testing.assert_array_equal(poses[envs, body], struct.pose.raw_pose.numpy(), err_msg=name)
+        checked[envs, body] = True
+    np.testing.assert_array_equal(checked, ~np.isnan(poses).any(axis=-1))
+
+
+@pytest.mark.parametrize("make", [stock, batched])
+@pytest.mark.parametrize("task", TASKS)
+def test_poses_are_those_of_maniskill(task: str, make: Any) -> None:
+    env = make(task)
+    table = build_body_table(env)
+    assert len(set(table.names)) == len(table.names)
+    for _ in range(3):
+        env.step(torch.from_numpy(np.atleast_2d(env.action_space.sample())))
+        assert_poses_are_those_of_the_structs(env, table)
+    env.reset(seed=2)
+    # PegInsertionSide makes new pegs for every episode of a single env.
+    table = table if table.scene is env.scene else build_body_table(env)
+    assert_poses_are_those_of_the_structs(env, table)
+    env.close()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_poses_are_those_of_the_physics(task: str) -> None:
+    """Against the entities themselves, which know nothing of ManiSkill's tensors."""
+    env = batched(task)
+    table = build_body_table(env)
+    env.step(torch.from_numpy(env.action_space.sample()))
+    env.reset(options=dict(env_idx=torch.tensor([1, 3])))
+    poses = read_poses(env, table)
+    for e in range(env.num_envs):
+        for b in range(len(table.names)):
+            pose = table.entities[e, b].pose
+            np.testing.assert_allclose(poses[e, b], [*pose.p, *pose.q], atol=1e-6, err_msg=table.names[b])
+    env.close()
+
+
+def test_names_are_readable_and_kinds_are_right() -> None:
+    env = stock("PickCube-v1")
+    table = build_body_table(env)
+    kind = dict(zip(table.names, table.kinds, strict=True))
+    assert kind["cube"] == "dynamic" and kind["ground"] == "static" and kind["goal_site"] == "kinematic"
+    assert kind["panda/panda_hand"] == "link"
+    assert [n for n, h in zip(table.names, table.hidden, strict=True) if h] == ["goal_site"]
+    env.close()
+
+
+def test_objects_that_differ_between_envs_are_one_body() -> None:
+    env = batched("PegInsertionSide-v1")
+    table = build_body_table(env)
+    assert "peg" in table.names and "box_with_hole" in table.names
+    assert not [name for name in table.names if name.startswith("peg_")]
+    assert not np.isnan(read_poses(env, table)).any()
+    env.close()
+
+
+def test_a_hidden_body_is_where_it_would_be_seen() -> None:
+    env: Any = batched("PickCube-v1")
+    table = build_body_table(env)
+    goal = table.names.index("goal_site")
+    shown = read_poses(env, table)
+    env.goal_site.hide_visual()
+    np.testing.assert_array_equal(read_poses(env, table), shown)
+    env.reset(seed=5)
+    moved = read_poses(env, table)
+    assert np.abs(moved[:, goal, :3]).max() < 2.0
+    assert (moved[:, goal, :3] != shown[:, goal, :3]).any()
+    env.goal_site.show_visual()
+    np.testing.assert_array_equal(read_poses(env, table), moved)
+    env.close()
+
+
+class SparseBodiesEnv(PushCubeEnv):
+    """A body that only envs 0 and 2 have, and a view over two bodies of the same env."""
+
+    def _load_scene(self, options: dict) -> None:
+        super()._load_scene(options)
+
+        def ball(name: str, scene_idxs: list[int] | None = None) -> Actor:
+            builder = self.scene.create_actor_builder()
+            builder.add_sphere_collision(radius=0.02)
+            builder.initial_pose = sapien.Pose([0.3, 0.3, 1.0 + 0.1 * len(name)])
+            builder.set_scene_idxs(scene_idxs)
+            return builder.build_dynamic(name=name)
+
+        self.rare = ball("rare", list(range(0, self.num_envs, 2)))
+        self.pair = Actor.merge([ball("left"), ball("right")], name="pair")
+
+
+def test_a_body_that_an_env_lacks_is_nan_there_only() -> None:
+    env = batched(SparseBodiesEnv)
+    table = build_body_table(env)
+    missing = np.isnan(read_poses(env, table)).all(axis=-1)
+    assert np.argwhere(missing).tolist() == [[1, table.names.index("rare")], [3, table.names.index("rare")]]
+    assert_poses_are_those_of_the_structs(env, table)
+    env.close()
+
+
+def test_a_view_over_two_bodies_of_one_env_leaves_them_their_names() -> None:
+    env = batched(SparseBodiesEnv, num_envs=2)
+    table = build_body_table(env)
+    assert {"left", "right"} < set(table.names) and "pair" not in table.names
+    env.close()
+
+
+def test_a_stock_env_may_gain_an_entity() -> None:
+    env = stock("PushCube-v1")
+    table = build_body_table(env)
+    before = read_poses(env, table)
+    env.scene.sub_scenes[0].add_entity(sapien.Entity())
+    np.testing.assert_array_equal(read_poses(env, table), before)
+    env.close()
+
+
+def test_a_table_of_an_old_scene_is_refused() -> None:
+    env = stock("PushCube-v1")
+    table = build_body_table(env)
+    env.reset(seed=0, options=dict(reconfigure=True))
+    with pytest.raises(ValueError, match="build_body_table"):
+        read_poses(env, table)
+    env.close()
+
+
+def test_all_envs_in_one_sub_scene_are_refused() -> None:
+    env = stock("PushCube-v1")
+    env.scene.parallel_in_single_scene = True  # ManiSkill itself allows it only with a GPU
+    with pytest.raises(NotImplementedError, match="parallel_in_single_scene"):
+        build_body_table(env)
+    env.close()

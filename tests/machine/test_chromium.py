@@ -1,0 +1,32 @@
+from __future__ import annotations
+
+import stat
+from pathlib import Path
+
+import pytest
+
+from workbench.machine.chromium import chromium_version, find_chromium, how_to_get_chromium
+
+
+def test_the_chromium_of_this_machine_tells_its_version(chromium_path: str) -> None:
+    version = chromium_version(chromium_path)
+    assert version and any(character.isdigit() for character in version)
+
+
+def test_ubuntus_stub_for_the_snap_is_not_taken_for_a_browser(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stub = tmp_path / "chromium-browser"
+    stub.write_text("#!/bin/sh\necho 'requires the chromium snap to be installed.' >&2\nexit 10\n")
+    stub.chmod(stub.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.delenv("PLAYWRIGHT_CHROMIUM", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert find_chromium() is None
+
+
+def test_a_browser_that_was_named_and_does_not_run_is_not_replaced_by_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("PLAYWRIGHT_CHROMIUM", "/nonexistent/chromium")
+    assert find_chromium() is None
+    assert "/nonexistent/chromium" in how_to_get_chromium()

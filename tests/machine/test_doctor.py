@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+import io
+import socket
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from workbench.machine import doctor
+from workbench.machine.doctor import Finding, diagnose, exit_code, print_report
+
+
+@pytest.fixture(scope="module")
+def findings() -> dict[str, Finding]:
+    return {finding.topic: finding for finding in diagnose()}
+
+
+def test_every_topic_is_answered_and_this_machine_runs_the_workbench(findings: dict[str, Finding]) -> None:
+    topics = {
+        "Python",
+        "packages",
+        "render device",
+        "CUDA",
+        "GPU physics",
+        "cores, memory",
+        "page",
+        "browser (tests)",
+    }
+    assert set(findings) == topics
+    assert exit_code(list(findings.values())) == 0, findings
+    assert all(finding.advice for finding in findings.values() if finding.ok is not True)
+
+
+def test_versions_that_must_match_are_shown(findings: dict[str, Finding]) -> None:
+    for pinned in ("mani-skill 3.0.1", "sapien 3.0.3", "viser 1.1.1", "rerun-sdk 0.41.0", "torch 2."):
+        assert pinned in findings["packages"].what
+
+
+def test_gpu_physics_is_looked_for_without_fetching_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert doctor._gpu()
+    assert not list(tmp_path.rglob("*PhysX*"))
+
+
+def test_a_taken_port_is_said_with_the_option_to_change_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        monkeypatch.setattr(doctor, "DEFAULT_PORT", taken.getsockname()[1])
+        (finding,) = doctor._page_address()
+    assert finding.ok is None
+    assert finding.advice and "--port" in finding.advice
+
+
+def test_a_question_that_fails_is_told_and_the_others_are_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail() -> list[Finding]:
+        raise OSError("no such thing")
+
+    monkeypatch.setattr(doctor, "_cores_and_memory", fail)
+    by_topic = {finding.topic: finding for finding in diagnose()}
+    assert by_topic["cores, memory"].what == "not known: OSError: no such thing"
+    assert by_topic["Python"].ok
+
+
+def test_the_report_shows_what_to_do_and_reads_brackets_as_text() -> None:
+    said = io.StringIO()
+    lack = Finding("render device", False, "found [none]", "Type: apt install [this]")
+    print_report([Finding("Python", True, "3.11"), lack], Console(file=said, width=60))
+    assert "found [none]" in said.getvalue()
+    assert "Type: apt install [this]" in said.getvalue()
+    assert exit_code([lack]) == 1

@@ -1,0 +1,65 @@
+"""The example tasks, imported as anybody would, and made with stock ManiSkill."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import pytest
+import sapien
+
+FOLDER = Path(__file__).parents[2] / "tasks"
+IDS = {"push_cube": "WorkbenchPushCube-v1", "minimal": "WorkbenchMinimal-v1"}
+
+
+def import_file(name: str) -> None:
+    spec = importlib.util.spec_from_file_location(f"example_{name}", FOLDER / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    spec.loader.exec_module(importlib.util.module_from_spec(spec))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def example_tasks() -> None:
+    for name in IDS:
+        if IDS[name] not in gym.registry:
+            import_file(name)
+
+
+@pytest.fixture(scope="session")
+def render_system(example_tasks: None) -> object:
+    """Kept alive, because with the last one go the shaders: 5 s for each env instead of 0.2 s."""
+    try:
+        return sapien.render.RenderSystem(sapien.Device("cpu"))
+    except RuntimeError as exc:
+        pytest.skip(f"this machine has no render device: {exc}")
+
+
+@pytest.fixture
+def make(example_tasks: None) -> Iterator[Callable[..., gym.Env]]:
+    """Plain ``gym.make`` on ManiSkill's own single CPU env."""
+    envs: list[gym.Env] = []
+
+    def make_env(name: str, render_backend: str = "none", **kwargs: Any) -> gym.Env:
+        env = gym.make(IDS[name], num_envs=1, sim_backend="cpu", render_backend=render_backend, **kwargs)
+        envs.append(env)
+        return env
+
+    yield make_env
+    for env in envs:
+        env.close()
+
+
+@pytest.fixture
+def mani_skill_log() -> Iterator[list[str]]:
+    """Lines that ManiSkill logs; its logger (whose name ends in a space) does not propagate."""
+    lines: list[str] = []
+    handler = logging.Handler()
+    handler.emit = lambda record: lines.append(record.getMessage())  # type: ignore[method-assign]
+    logger = logging.getLogger("mani_skill ")
+    logger.addHandler(handler)
+    yield lines
+    logger.removeHandler(handler)

@@ -1,0 +1,137 @@
+"""The tutorial's task: solvable, honest about what it tells a policy, and to be seen in pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+
+Make = Callable[..., Any]
+
+
+def scripted_push(env: Any, seed: int) -> tuple[dict, list[float]]:
+    """Go behind the cube, down, and forward, with ``pd_ee_delta_pos``; the last info, and all rewards.
+
+    One unit of an action is 0.1 m.
+    """
+    base = env.unwrapped
+    _, info = env.reset(seed=seed)
+    rewards: list[float] = []
+    leg = 0
+    for _ in range(50):
+        tcp, cube, goal = base.agent.tcp.pose.p, base.cube.pose.p, base.goal.pose.p
+        behind = cube + torch.tensor([-0.09, 0, 0])
+        waypoints = [
+            torch.cat([behind[:, :2], torch.full((1, 1), 0.15)], dim=1),
+            torch.cat([behind[:, :2], torch.full((1, 1), 0.02)], dim=1),
+            torch.cat([goal[:, :2], torch.full((1, 1), 0.02)], dim=1),
+        ]
+        if leg < 2 and torch.linalg.norm(waypoints[leg] - tcp) < 0.03:
+            leg += 1
+        move = ((waypoints[leg] - tcp) / 0.1).clamp(-1, 1)
+        if leg == 2:
+            move = move.clamp(-0.3, 0.3)
+        closed = torch.full((1, 1), -1.0)
+        _, reward, terminated, _, info = env.step(torch.cat([move, closed], dim=1))
+        rewards.append(float(reward))
+        if terminated.any():
+            break
+    return info, rewards
+
+
+def test_a_scripted_push_succeeds_on_every_seed(make: Make) -> None:
+    env = make("push_cube", control_mode="pd_ee_delta_pos")
+    for seed in range(8):
+        info, rewards = scripted_push(env, seed)
+        assert info["success"].all() and info["cube_to_goal"] < 0.1
+        assert rewards[-1] == 1.0
+        assert max(rewards[:-1]) < 0.9 and min(rewards) >= 0
+        # Dense: most of the way each step is worth more than the one before.
+        better = [later > earlier for earlier, later in zip(rewards, rewards[1:], strict=False)]
+        assert sum(better) > 0.8 * len(better)
+
+
+def test_the_normalized_reward_is_the_dense_one_over_its_most(make: Make) -> None:
+    env = make("push_cube", control_mode="pd_ee_delta_pos")
+    normalized = scripted_push(env, 0)[1]
+    dense = scripted_push(make("push_cube", control_mode="pd_ee_delta_pos", reward_mode="dense"), 0)[1]
+    assert len(dense) == len(normalized)
+    torch.testing.assert_close(torch.tensor(dense) / 3, torch.tensor(normalized))
+    assert max(dense) == 3
+
+
+def test_a_cube_beside_the_table_has_failed_and_earns_nothing(make: Make) -> None:
+    env = make("push_cube", control_mode="pd_joint_delta_pos")
+    base = env.unwrapped
+    env.reset(seed=0)
+    pose = base.cube.pose.raw_pose.clone()
+    pose[:, :3] = torch.tensor([0.8, 0, 0.02])
+    base.cube.set_pose(type(base.cube.pose).create(pose))
+    for _ in range(30):
+        _, reward, terminated, _, info = env.step(torch.zeros(env.action_space.shape))
+    assert info["fail"].all() and not info["success"].any()
+    assert terminated.all() and reward == 0
+    assert info["cube_height"] < -0.1
+
+
+def test_what_evaluate_says_is_what_the_poses_say(make: Make) -> None:
+    env = make("push_cube")
+    _, info = env.reset(seed=5)
+    cube, goal = env.unwrapped.cube.pose.p, env.unwrapped.goal.pose.p
+    torch.testing.assert_close(goal[:, :2] - cube[:, :2], torch.tensor([[0.2, 0.0]]))
+    torch.testing.assert_close(info["cube_to_goal"], torch.tensor([0.2]))
+    assert (cube[:, :2].abs() <= 0.1).all()
+    torch.testing.assert_close(info["cube_height"], torch.zeros(1), atol=1e-4, rtol=0)
+
+
+def test_state_is_flat_or_by_name(make: Make) -> None:
+    flat, _ = make("push_cube", obs_mode="state").reset(seed=0)
+    named, _ = make("push_cube", obs_mode="state_dict").reset(seed=0)
+    shapes = {key: tuple(value.shape) for key, value in named["extra"].items()}
+    assert shapes == {"tcp_pose": (1, 7), "goal_pos": (1, 3), "cube_pose": (1, 7), "tcp_to_cube": (1, 3)}
+    assert flat.shape == (1, 9 + 9 + 7 + 3 + 7 + 3)
+
+
+def test_the_fetch_robot_can_do_it_too(make: Make, mani_skill_log: list[str]) -> None:
+    env = make("push_cube", robot_uids="fetch")
+    env.reset(seed=0)
+    for _ in range(3):
+        _, reward, _, _, info = env.step(env.action_space.sample())
+    assert reward.shape == (1,) and not info["fail"].any()
+    assert not [line for line in mani_skill_log if "pose" in line or "supported" in line]
+
+
+def test_pictures_tell_where_to_push_and_not_where_the_cube_is(make: Make, render_system: object) -> None:
+    obs, _ = make("push_cube", render_backend="cpu", obs_mode="rgb").reset(seed=0)
+    assert set(obs["extra"]) == {"tcp_pose", "goal_pos"}
+    assert obs["sensor_data"]["base_camera"]["rgb"].shape == (1, 128, 128, 3)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_sensor_camera_sees_cube_and_target_and_nothing_far_away(
+    seed: int, make: Make, render_system: object
+) -> None:
+    env = make("push_cube", render_backend="cpu", obs_mode="rgb+depth+segmentation")
+    obs, _ = env.reset(seed=seed)
+    data = obs["sensor_data"]["base_camera"]
+    base = env.unwrapped
+    for actor, pixels in ((base.cube, 20), (base.goal, 300)):
+        seen = data["segmentation"] == actor.per_scene_id.reshape(-1, 1, 1, 1)
+        assert seen.sum() > pixels
+    depth = data["depth"]
+    assert 0 < depth.min() and depth.max() < 1500, "millimetres; 0 is nothing"
+    blue = data["rgb"][(data["segmentation"] == base.cube.per_scene_id.reshape(-1, 1, 1, 1))[..., 0]].float()
+    assert (blue[:, 2] > blue[:, 0] + 40).all()
+
+
+def test_the_camera_for_people_shows_robot_cube_and_target(make: Make, render_system: object) -> None:
+    env = make("push_cube", render_backend="cpu", render_mode="rgb_array")
+    env.reset(seed=0)
+    picture = env.render()
+    assert picture.shape == (1, 512, 512, 3) and picture.dtype == torch.uint8
+    red, green, blue = picture[0].int().unbind(-1)
+    assert ((blue > red + 60) & (blue > green + 40)).sum() > 200, "the cube is blue"
+    assert ((red > green + 80) & (red > blue + 60) & (abs(green - blue) < 40)).sum() > 500, "the target is red"
+    assert picture.float().std() > 30

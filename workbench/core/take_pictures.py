@@ -1,0 +1,237 @@
+"""Pictures of chosen cameras of one chosen env, and of nothing else.
+
+ManiSkill renders all cameras of all envs or none, and on a software driver a picture costs 50 ms. A
+page shows a few cameras of one env, so here only those are rendered, from that env's own sub-scene.
+
+What a camera must not see is the delicate part. ManiSkill hides a task's ``_hidden_objects`` from
+sensors and shows them to human cameras, on a stock CPU env by the visibility of the drawn body, in
+batched simulation by moving the object 99999 m away. Here visibility is used always, and an object
+that ManiSkill has moved away is put back while human cameras look; both are undone before returning,
+so a picture leaves no trace in the simulation. The pictures are those that ManiSkill itself would
+give for the state: its own shaders and texture transforms make them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import sapien
+import sapien.render
+import torch
+from numpy.typing import NDArray
+
+from workbench.core import scene_seams
+from workbench.core.body_table import BodyTable, build_body_table
+from workbench.core.pictures import CameraInfo, CameraKind, Picture
+
+_MODALITIES = ("rgb", "depth", "segmentation", "position", "normal", "albedo")
+_TAKEN = ("rgb", "depth", "segmentation")
+_INT16_END = 32.767
+"""Metres. The minimal shader writes positions as int16 millimetres."""
+
+Request = tuple[str, CameraKind, Sequence[str]]
+"""Name, kind and modalities of a camera whose picture is wanted."""
+
+
+def list_cameras(env: Any, table: BodyTable | None = None) -> tuple[CameraInfo, ...]:
+    """All cameras of a ManiSkill env: its sensors (the robot's too), then its human render cameras.
+
+    Empty where nothing can be rendered. Sensors that are no plain cameras are left out.
+
+    Args:
+        table: the env's bodies, to name what a camera is mounted on; made anew if left out.
+    """
+    cameras = _cameras(env)
+    table = table or (build_body_table(env) if cameras else None)
+    infos = []
+    for (kind, name), camera in cameras.items():
+        component = _components(camera)[0]
+        gives = {m for modalities in camera.config.shader_config.texture_names.values() for m in modalities}
+        mount = camera.camera.mount
+        infos.append(
+            CameraInfo(
+                name=name,
+                kind=kind,
+                width=component.width,
+                height=component.height,
+                fovy=float(component.fovy),
+                near=float(component.near),
+                far=float(component.far),
+                intrinsic=np.array(component.get_intrinsic_matrix(), dtype=np.float32),
+                mount=None if mount is None or table is None else _body_name(mount, table),
+                modalities=tuple(m for m in _MODALITIES if m in gives),
+            )
+        )
+    return tuple(infos)
+
+
+def segmentation_names(
+    env: Any, table: BodyTable | None = None, env_index: int | None = None
+) -> dict[int, str]:
+    """Body name of every id in a segmentation picture; 0, the background, is not among them.
+
+    Ids count the entities of a sub-scene, so they are the same in all envs that are built alike.
+    Where envs differ, give `env_index`; without it an id that means two things is called ``a | b``.
+    """
+    table = table or build_body_table(env)
+    names: dict[int, list[str]] = {}
+    for row in table.entities if env_index is None else table.entities[[env_index]]:
+        for entity, name in zip(row, table.names, strict=True):
+            if entity is not None:
+                known = names.setdefault(int(entity.per_scene_id), [])
+                if name not in known:
+                    known.append(name)
+    return {number: " | ".join(known) for number, known in names.items()}
+
+
+def take_pictures(env: Any, env_index: int, requests: Sequence[Request]) -> tuple[Picture, ...]:
+    """Render the cameras that are asked for, in env `env_index`, as it is now; in the order asked.
+
+    Raises:
+        IndexError: there is no such env.
+        ValueError: there is no such camera, or it cannot give what is asked of it.
+        RuntimeError: the renderer failed.
+    """
+    if not 0 <= env_index < env.num_envs:
+        raise IndexError(f"env {env_index} is out of range for {env.num_envs} envs")
+    if not requests:
+        return ()
+    cameras = _cameras(env)
+    for name, kind, modalities in requests:
+        _check(name, kind, modalities, cameras)
+    scene = env.scene
+    if scene.gpu_sim_enabled:
+        scene.px.sync_poses_gpu_to_cpu()
+    sub_scene = scene.sub_scenes[env_index]
+    pictures: dict[int, Picture] = {}
+    for kind in ("sensor", "human"):
+        chosen = [i for i, request in enumerate(requests) if request[1] == kind]
+        if not chosen:
+            continue
+        with _hidden_objects(env, env_index, shown=kind == "human"):
+            sub_scene.update_render()
+            for i in chosen:
+                name, _, modalities = requests[i]
+                pictures[i] = _take(cameras[kind, name], name, kind, env_index, modalities)
+    return tuple(pictures[i] for i in range(len(requests)))
+
+
+def _cameras(env: Any) -> dict[tuple[CameraKind, str], Any]:
+    found: dict[tuple[CameraKind, str], Any] = {}
+    for name, sensor in scene_seams.sensors(env).items():
+        if scene_seams.camera_components(sensor) is not None:
+            found["sensor", name] = sensor
+    for name, camera in scene_seams.human_render_cameras(env).items():
+        if scene_seams.camera_components(camera) is not None:
+            found["human", name] = camera
+    return found
+
+
+def _components(camera: Any) -> list[Any]:
+    components = scene_seams.camera_components(camera)
+    assert components is not None, "only cameras that `_cameras` found come here"
+    return components
+
+
+def _body_name(mount: Any, table: BodyTable) -> str | None:
+    thing = scene_seams.objects_of(mount)[0]
+    entity = thing if isinstance(thing, sapien.Entity) else thing.entity
+    slot = table.slot_of.get(id(entity))
+    return None if slot is None else table.names[slot % len(table.names)]
+
+
+def _check(name: str, kind: str, modalities: Sequence[str], cameras: dict[tuple[CameraKind, str], Any]) -> None:
+    camera = cameras.get((kind, name))  # type: ignore[call-overload]
+    if camera is None:
+        there = ", ".join(f"{n} ({k})" for k, n in cameras) or "none"
+        raise ValueError(f"there is no {kind} camera {name!r} to take a picture with; there are: {there}")
+    gives = {m for ms in camera.config.shader_config.texture_names.values() for m in ms}
+    for modality in modalities:
+        if modality not in _TAKEN:
+            raise ValueError(f"{modality!r} cannot be shown; ask for some of {', '.join(_TAKEN)}")
+        if modality not in gives:
+            pack = camera.config.shader_config.shader_pack
+            raise ValueError(f"camera {name!r} gives no {modality} with the shader pack {pack!r}")
+
+
+@contextmanager
+def _hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]:
+    """Draw the task's hidden objects in this env, or do not, and put everything back afterwards."""
+    was_visible: list[tuple[Any, float]] = []
+    was_at: list[tuple[Any, sapien.Pose]] = []
+    try:
+        for actor in scene_seams.hidden_objects(env):
+            kept = scene_seams.pose_before_hiding(actor)
+            here = zip(scene_seams.objects_of(actor), scene_seams.envs_of(actor), strict=True)
+            for row, (entity, env_of) in enumerate(here):
+                body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
+                if env_of != env_index or body is None:
+                    continue
+                was_visible.append((body, body.visibility))
+                # A ghost of visibility 0.3 stays one; only what is switched off is switched on.
+                body.visibility = (body.visibility or 1.0) if shown else 0.0
+                if shown and kept is not None:
+                    true = np.atleast_2d(kept.cpu().numpy())
+                    true = true[row if len(true) > 1 else 0]
+                    was_at.append((entity, entity.pose))
+                    entity.pose = sapien.Pose(true[:3], true[3:])
+        yield
+    finally:
+        for body, visibility in reversed(was_visible):
+            body.visibility = visibility
+        for entity, pose in reversed(was_at):
+            entity.pose = pose
+
+
+def _take(camera: Any, name: str, kind: CameraKind, env_index: int, modalities: Sequence[str]) -> Picture:
+    component = _components(camera)[env_index]
+    config = camera.config.shader_config
+    component.take_picture()
+    made: dict[str, torch.Tensor] = {}
+    depth = None
+    for texture, gives in config.texture_names.items():
+        if not set(gives) & set(modalities):
+            continue
+        data = component.get_picture(texture)
+        transformed = config.texture_transforms[texture](torch.from_numpy(data)[None])
+        made.update({m: image[0] for m, image in transformed.items() if m in modalities})
+        if "depth" in gives and "depth" in modalities:
+            depth = _depth(texture, data, made["depth"].numpy()[..., 0], component)
+    pose = component.get_global_pose()
+    segmentation = made.get("segmentation")
+    return Picture(
+        camera=name,
+        kind=kind,
+        env=env_index,
+        pose=np.array([*pose.p, *pose.q], dtype=np.float32),
+        rgb=np.ascontiguousarray(made["rgb"].numpy()) if "rgb" in made else None,
+        depth=depth,
+        segmentation=None if segmentation is None else segmentation.numpy()[..., 0].astype(np.int32),
+    )
+
+
+def _depth(texture: str, data: NDArray, transformed: NDArray, component: Any) -> NDArray[np.float32]:
+    """(H, W) metres, 0 for background, from the texture `data` and ManiSkill's own reading of it.
+
+    ManiSkill's standard is int16 millimetres. Where the texture holds float positions in metres, as
+    in the default and ray tracing shaders, they are used as they are. The minimal shader's texture is
+    int16 itself: what lies beyond 32.767 m is clamped to -32768 (measured on lavapipe; a driver may
+    also wrap around) and read from the depth buffer instead.
+    """
+    if texture == "Position" and np.issubdtype(data.dtype, np.floating):
+        # A background of -0.0 would be printed as "-0.0 m".
+        return -data[..., 2] + np.float32(0.0)
+    if np.issubdtype(transformed.dtype, np.floating):
+        return transformed.astype(np.float32)
+    depth = transformed.astype(np.float32) / np.float32(1000.0)
+    beyond = (depth < 0.0) | (depth >= _INT16_END)
+    if beyond.any():
+        # Vulkan's depth in 0..1 of a perspective camera: z = f (1 - n / d) / (f - n).
+        buffer = component.get_picture("GbufferDepth")
+        z = buffer.reshape(*depth.shape, -1)[..., 0][beyond].astype(np.float64)
+        near, far = float(component.near), float(component.far)
+        depth[beyond] = near / np.maximum(1.0 - z * (far - near) / far, near / far)
+    return depth

@@ -1,0 +1,254 @@
+"""What this machine can do for the workbench, and what to do about each lack.
+
+Every question is asked where its answer cannot hurt: SAPIEN's renderer and torch's CUDA in child
+processes with a time limit, because a broken driver crashes or hangs whoever loads it; PhysX's GPU
+library by looking on disk, because SAPIEN fetches it from the network when asked to enable it. So
+the report always comes, within seconds, on the machine where nothing else works.
+"""
+
+from __future__ import annotations
+
+import getpass
+import importlib.metadata
+import json
+import os
+import platform
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+from packaging.requirements import Requirement
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from workbench.machine.chromium import chromium_version, find_chromium, how_to_get_chromium
+from workbench.machine.render_device import driver_files
+from workbench.machine.software_vulkan import ensure_render_device
+
+DISTRIBUTION = "maniskill-workbench"
+DEFAULT_PORT = 8080
+LEAST_MEMORY_GIB = 6.0
+"""One worker with 16 envs and cameras on a software driver, its warm spare, the server and a browser."""
+CHILD_TIMEOUT_S = 60
+
+GPU_QUESTIONS = """
+import json, torch
+from workbench.core.backends import gpu_library_path, why_no_gpu_simulation
+cuda = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())] if torch.cuda.is_available() else []
+print(json.dumps({"built": torch.version.cuda, "cuda": cuda,
+                  "why_not": why_no_gpu_simulation(), "library": str(gpu_library_path())}))
+"""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report."""
+
+    topic: str
+    ok: bool | None
+    """True: works. None: the workbench runs without it, with less. False: it cannot run."""
+    what: str
+    advice: str | None = None
+    """What to do; None where nothing is amiss."""
+
+
+def diagnose() -> list[Finding]:
+    """Look at everything. Never raises: a question that fails is a finding with the failure in it."""
+    questions: list[tuple[str, Callable[[], list[Finding]]]] = [
+        ("Python", _python),
+        ("packages", _packages),
+        ("render device", _render_device),
+        ("CUDA", _gpu),
+        ("cores, memory", _cores_and_memory),
+        ("page", _page_address),
+        ("browser (tests)", _chromium),
+    ]
+    with ThreadPoolExecutor(len(questions)) as pool:
+        answers = [(topic, pool.submit(question)) for topic, question in questions]
+    findings: list[Finding] = []
+    for topic, answer in answers:
+        failure = answer.exception()
+        if failure is None:
+            findings += answer.result()
+        else:
+            advice = "This question should not fail: please report it."
+            findings.append(Finding(topic, None, f"not known: {type(failure).__name__}: {failure}", advice))
+    return findings
+
+
+def exit_code(findings: Sequence[Finding]) -> int:
+    """0 if the workbench can run here, with less perhaps; 1 if not."""
+    return int(any(finding.ok is False for finding in findings))
+
+
+def print_report(findings: Sequence[Finding], console: Console | None = None) -> None:
+    """The findings as a table, each lack followed by what to do."""
+    console = console or Console(highlight=False)
+    marks = {True: "[green]ok[/]", None: "[yellow]less[/]", False: "[red]no[/]"}
+    table = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
+    table.add_column(no_wrap=True)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
+    for finding in findings:
+        text = escape(finding.what) + (f"\n[bold]{escape(finding.advice)}[/]" if finding.advice else "")
+        table.add_row(marks[finding.ok], finding.topic, text)
+    console.print(table)
+    if exit_code(findings):
+        console.print("The workbench cannot run here yet.", style="red")
+    elif any(finding.ok is None for finding in findings):
+        console.print("The workbench runs here, with less where it says so.")
+    else:
+        console.print("The workbench runs here.", style="green")
+
+
+def _python() -> list[Finding]:
+    what = f"{platform.python_version()} on {platform.system()} {platform.machine()}, {sys.executable}"
+    if not (3, 11) <= sys.version_info[:2] <= (3, 12):
+        return [
+            Finding("Python", False, what, "Use Python 3.11 or 3.12: make PYTHON=/path/to/python3.12 open")
+        ]
+    if platform.system() != "Linux":
+        return [Finding("Python", None, what, "Only Linux is tested.")]
+    return [Finding("Python", True, what)]
+
+
+def _packages() -> list[Finding]:
+    """Installed versions against those that the distribution asks for."""
+    try:
+        requirements = [Requirement(line) for line in importlib.metadata.requires(DISTRIBUTION) or []]
+    except importlib.metadata.PackageNotFoundError:
+        return [Finding("packages", False, f"{DISTRIBUTION} is not installed", "Type: make open")]
+    shown: list[str] = []
+    wrong: list[str] = []
+    for requirement in requirements:
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
+            continue
+        try:
+            version = importlib.metadata.version(requirement.name)
+        except importlib.metadata.PackageNotFoundError:
+            wrong.append(f"{requirement} is missing")
+            continue
+        if not requirement.specifier.contains(version, prereleases=True):
+            wrong.append(f"{requirement} is wanted, {version} is installed")
+        if any(part.operator == "==" for part in requirement.specifier) or requirement.name == "torch":
+            shown.append(f"{requirement.name} {version}")
+    what = ", ".join([f"workbench {importlib.metadata.version(DISTRIBUTION)}", *shown])
+    if wrong:
+        advice = "Type: pip install -c constraints.txt -e .  (in a clone: make open)"
+        return [Finding("packages", False, f"{what}. {'; '.join(wrong)}", advice)]
+    return [Finding("packages", True, what)]
+
+
+def _render_device() -> list[Finding]:
+    probe = ensure_render_device(install=False)
+    topic = "render device"
+    if not probe.ok:
+        files = ", ".join(path.name for path in driver_files()) or "none"
+        what = f"SAPIEN cannot render (Vulkan drivers on this machine: {files})"
+        return [Finding(topic, False if probe.missing_libraries else None, what, probe.error)]
+    what = f"{probe.name}, driver {probe.driver or 'unknown'}"
+    if probe.env:
+        what += f", from {probe.env.get('VK_DRIVER_FILES')}"
+    if "llvmpipe" in (probe.name or ""):
+        what += (
+            "; in software: a camera picture of 128 x 128 takes some 50 ms, the first of a process 5 to 19 s"
+        )
+    return [Finding(topic, True, what)]
+
+
+def _gpu() -> list[Finding]:
+    """CUDA through torch, then PhysX on it, without causing SAPIEN to fetch anything."""
+    child = subprocess.run(
+        [sys.executable, "-c", GPU_QUESTIONS],
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=CHILD_TIMEOUT_S,
+    )
+    if child.returncode != 0:
+        last = (child.stderr.strip().splitlines() or [f"ended with {child.returncode}"])[-1]
+        return [Finding("CUDA", False, f"torch or SAPIEN does not load: {last}", "See the lines above.")]
+    answer = json.loads(child.stdout.strip().splitlines()[-1])
+    cuda: list[str] = answer["cuda"]
+    if cuda:
+        physics_advice = (
+            None if answer["why_not"] is None else f"Until then: --backend cpu. {answer['why_not']}"
+        )
+        what = "batched on the GPU" if answer["why_not"] is None else "on the CPU core"
+        found = f"{', '.join(cuda)} (torch for CUDA {answer['built']})"
+        library = f", PhysX GPU library {answer['library']}" if answer["why_not"] is None else ""
+        physics = Finding("GPU physics", answer["why_not"] is None or None, what + library, physics_advice)
+        return [Finding("CUDA", True, found), physics]
+    nvidia = Path("/proc/driver/nvidia/version").is_file()
+    if nvidia and answer["built"] is None:
+        advice = "There is an NVIDIA driver: install torch's CUDA build of the same version to use it."
+    elif nvidia:
+        advice = (
+            f"torch (for CUDA {answer['built']}) sees no device: look at nvidia-smi and CUDA_VISIBLE_DEVICES."
+        )
+    else:
+        advice = None
+    found = (
+        f"no device (torch {'without CUDA' if answer['built'] is None else 'for CUDA ' + answer['built']})"
+    )
+    return [
+        Finding("CUDA", None if advice else True, found, advice),
+        Finding(
+            "GPU physics", True, f"not on this machine, since {answer['why_not']}: the CPU core runs the envs"
+        ),
+    ]
+
+
+def _cores_and_memory() -> list[Finding]:
+    cores = len(os.sched_getaffinity(0))
+    memory = psutil.virtual_memory()
+    total, free = memory.total / 2**30, memory.available / 2**30
+    what = f"{cores} cores, {total:.1f} GiB of memory, {free:.1f} GiB of it available"
+    if free < LEAST_MEMORY_GIB:
+        advice = (
+            f"Less than {LEAST_MEMORY_GIB:.0f} GiB available: close something, or use a smaller --num-envs."
+        )
+        return [Finding("cores, memory", None, what, advice)]
+    return [Finding("cores, memory", True, what)]
+
+
+def _page_address() -> list[Finding]:
+    tunnel = f"ssh -L {DEFAULT_PORT}:127.0.0.1:{DEFAULT_PORT} {getpass.getuser()}@{socket.gethostname()}"
+    what = (
+        f"http://127.0.0.1:{DEFAULT_PORT}/ and a token that `workbench open` prints; from elsewhere: {tunnel}"
+    )
+    with socket.socket() as trial:
+        # As a server does it: a port whose last connections still linger counts as free.
+        trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            trial.bind(("127.0.0.1", DEFAULT_PORT))
+        except OSError as refusal:
+            advice = (
+                f"Port {DEFAULT_PORT} is taken ({refusal.strerror}): use --port, with 0 for any free one."
+            )
+            return [Finding("page", None, what, advice)]
+    return [Finding("page", True, what)]
+
+
+def _chromium() -> list[Finding]:
+    path = find_chromium()
+    if path is None:
+        advice = f"Only `make test` needs it. {how_to_get_chromium()}"
+        return [Finding("browser (tests)", None, "no Chromium", advice)]
+    return [Finding("browser (tests)", True, f"{path}: {chromium_version(path)}")]
+
+
+def main() -> int:
+    findings = diagnose()
+    print_report(findings)
+    return exit_code(findings)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
