@@ -52,7 +52,9 @@ class PushCubeEnv(BaseEnv):
     SUPPORTED_REWARD_MODES = ("normalized_dense", "dense", "sparse", "none")
     agent: Panda | Fetch
 
-    def __init__(self, *args: Any, robot_uids: str = "panda", robot_init_qpos_noise: float = 0.02, **kwargs: Any):
+    def __init__(
+        self, *args: Any, robot_uids: str = "panda", robot_init_qpos_noise: float = 0.02, **kwargs: Any
+    ):
         """Take the task's own options and hand the rest on.
 
         `BaseEnv.__init__` builds the scene and resets it, so whatever the hooks need must be set
@@ -99,7 +101,9 @@ class PushCubeEnv(BaseEnv):
                 pose=sapien.Pose(q=euler2quat(0, np.pi / 2, 0)),
                 radius=GOAL_RADIUS * (5 - ring) / 5,
                 half_length=0.0005 + 0.0002 * ring,
-                material=sapien.render.RenderMaterial(base_color=[0.75, 0.1, 0.1, 1] if ring % 2 == 0 else [1, 1, 1, 1]),
+                material=sapien.render.RenderMaterial(
+                    base_color=[0.75, 0.1, 0.1, 1] if ring % 2 == 0 else [1, 1, 1, 1]
+                ),
             )
         builder.initial_pose = sapien.Pose(p=[0.2, 0, GOAL_HEIGHT])
         self.goal = builder.build_kinematic(name="goal")

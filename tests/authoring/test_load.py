@@ -179,7 +179,9 @@ def test_two_saves_of_the_same_size_within_a_second_are_two_versions(write: Writ
     stamp = path.stat()
     for number in range(5):
         helper.write_text(f"WIDTH = {number}\n")
-        path.write_text(path.read_text().replace("0.1", f"0.{number}").replace(f"0.{number - 1}", f"0.{number}"))
+        path.write_text(
+            path.read_text().replace("0.1", f"0.{number}").replace(f"0.{number - 1}", f"0.{number}")
+        )
         for file in (path, helper):
             os.utime(file, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
         task = load_task(str(path))
@@ -200,7 +202,9 @@ def test_a_new_version_is_what_the_tables_have_and_a_dropped_id_is_gone(write: W
         path.write_text(path.read_text().replace("AuthorPush-v1", env_id).replace("AuthorPush-v2", env_id))
         path.write_text(path.read_text().replace('"AuthorPush"', f'"{env_id}"'))
         task = load_task(str(path))
-        assert [name for name in REGISTERED_ENVS if name.startswith("AuthorPush")] == [task.env_id] == [env_id]
+        assert (
+            [name for name in REGISTERED_ENVS if name.startswith("AuthorPush")] == [task.env_id] == [env_id]
+        )
 
 
 def test_a_built_in_id_is_taken_over_and_given_back(write: Write) -> None:
@@ -290,7 +294,11 @@ def test_a_file_in_a_package_may_import_relatively(write: Write) -> None:
     write("project/common.py", "SIZE = 1\n")
     write("project/tasks/__init__.py", "from .push import PushEnv\n")
     helper = write("project/tasks/helper.py", "SIZE = 1\n")
-    path = write("project/tasks/push.py", "from ..common import SIZE\nfrom .helper import SIZE as OWN\n" + PUSH, task=True)
+    path = write(
+        "project/tasks/push.py",
+        "from ..common import SIZE\nfrom .helper import SIZE as OWN\n" + PUSH,
+        task=True,
+    )
     task = load_task(str(path))
     assert task.cls.__module__ == "project.tasks.push"
     helper.write_text("SIZE = 2\n")
@@ -362,7 +370,9 @@ def test_the_hash_is_of_the_content_and_not_of_the_place(write: Write) -> None:
     assert len(hashes) == 1
 
 
-def test_files_with_crlf_a_byte_order_mark_or_a_coding_line_are_read_as_python_reads_them(write: Write) -> None:
+def test_files_with_crlf_a_byte_order_mark_or_a_coding_line_are_read_as_python_reads_them(
+    write: Write,
+) -> None:
     path = write("push.py", PUSH + '    name = "Würfel"\n', task=True)
     text = path.read_text()
     for raw in (
@@ -392,9 +402,19 @@ def test_files_with_crlf_a_byte_order_mark_or_a_coding_line_are_read_as_python_r
         ("import healper\n", "import", "there is helper.py beside", "import healper"),
         ("from helper import NOTHING\n", "import", "ImportError", "from helper import NOTHING"),
         ("exit()\n", "import", "__main__", "exit()"),
-        ("import sys; sys.exit('no display')\n", "import", "no display", "import sys; sys.exit('no display')"),
+        (
+            "import sys; sys.exit('no display')\n",
+            "import",
+            "no display",
+            "import sys; sys.exit('no display')",
+        ),
         ("def f(): f()\nf()\n", "import", "RecursionError", "def f(): f()"),
-        ("import torch\ntorch.zeros(2) @ torch.zeros(3)\n", "import", "RuntimeError", "torch.zeros(2) @ torch.zeros(3)"),
+        (
+            "import torch\ntorch.zeros(2) @ torch.zeros(3)\n",
+            "import",
+            "RuntimeError",
+            "torch.zeros(2) @ torch.zeros(3)",
+        ),
         ("import ast\nast.parse('1 +')\n", "import", "SyntaxError", "ast.parse('1 +')"),
         ("x = '\0'\n", "syntax", "null byte", None),
     ],
@@ -410,7 +430,9 @@ def test_what_is_wrong_in_the_file_is_told_at_its_line(
     assert code is None or problem.code == code
     assert problem.line is not None
     assert "\n" not in problem.message
-    assert "importlib" not in problem.traceback and "workbench" not in problem.traceback.replace("workbench_task", "")
+    assert "importlib" not in problem.traceback and "workbench" not in problem.traceback.replace(
+        "workbench_task", ""
+    )
     assert len(problem.traceback.splitlines()) < 250
 
 
@@ -430,10 +452,20 @@ def test_what_is_wrong_in_a_helper_is_told_at_the_helpers_line(write: Write) -> 
     helper = write("helper.py", "SIZE = 1\nSIZE = = 2\n")
     path = write("push.py", "import helper\n" + PUSH, task=True)
     problem = refused(path)
-    assert (problem.stage, problem.file, problem.line, problem.code) == ("syntax", str(helper), 2, "SIZE = = 2")
+    assert (problem.stage, problem.file, problem.line, problem.code) == (
+        "syntax",
+        str(helper),
+        2,
+        "SIZE = = 2",
+    )
     helper.write_text("def grow():\n    return [][1]\n\ngrow()\n")
     problem = refused(path)
-    assert (problem.stage, problem.file, problem.line, problem.code) == ("import", str(helper), 2, "return [][1]")
+    assert (problem.stage, problem.file, problem.line, problem.code) == (
+        "import",
+        str(helper),
+        2,
+        "return [][1]",
+    )
 
 
 def test_the_same_id_twice_is_an_error_that_names_both_lines(write: Write) -> None:
@@ -533,4 +565,7 @@ def test_a_file_of_mani_skills_own_can_be_opened_by_its_path() -> None:
     path = inspect.getsourcefile(built_in)
     task: LoadedTask = load_task(str(path))
     assert task.class_name == "PushCubeEnv" and task.cls is not built_in
-    assert sys.modules["mani_skill.envs.tasks.tabletop.pick_cube"].PickCubeEnv is REGISTERED_ENVS["PickCube-v1"].cls
+    assert (
+        sys.modules["mani_skill.envs.tasks.tabletop.pick_cube"].PickCubeEnv
+        is REGISTERED_ENVS["PickCube-v1"].cls
+    )

@@ -16,7 +16,9 @@ from workbench.authoring.problem import Problem, TaskError, problem_from_excepti
 Write = Callable[..., Path]
 
 
-def caught(call: Callable[[], object], files: tuple[Path, ...], stage: str = "step", cls: type | None = None) -> Problem:
+def caught(
+    call: Callable[[], object], files: tuple[Path, ...], stage: str = "step", cls: type | None = None
+) -> Problem:
     try:
         call()
     except BaseException as exc:
@@ -98,7 +100,13 @@ class PushEnv(BaseEnv):
     ("method", "args", "stage", "message", "code"),
     [
         ("evaluate", 0, "evaluate", "KeyError: 'cube'", 'raise KeyError("cube")'),
-        ("compute_normalized_dense_reward", 3, "reward", "RuntimeError: The size of tensor", "return torch.zeros(2) + torch.zeros(3)"),
+        (
+            "compute_normalized_dense_reward",
+            3,
+            "reward",
+            "RuntimeError: The size of tensor",
+            "return torch.zeros(2) + torch.zeros(3)",
+        ),
         ("_get_obs_extra", 1, "evaluate", "KeyError: 'cube'", 'raise KeyError("cube")'),
         ("_load_scene", 1, "build", "RuntimeError: no scene", 'raise RuntimeError("no scene") from exc'),
         ("_initialize_episode", 2, "reset", "KeyError: 'b'", '{}["b"]'),
@@ -106,7 +114,7 @@ class PushEnv(BaseEnv):
         ("swallowed", 0, "step", "JSONDecodeError", 'json.loads("{")'),
         ("unprintable", 0, "step", "its __str__ raised RuntimeError", "raise Odd"),
     ],
-)  # fmt: skip
+)
 def test_the_place_is_the_innermost_line_of_the_authors_and_the_stage_is_the_hooks(
     method: str, args: int, stage: str, message: str, code: str, task: LoadedTask
 ) -> None:

@@ -135,7 +135,8 @@ dtypes = st.sampled_from([torch.bool, torch.int32, torch.float32, torch.float64]
 def test_exactly_the_batched_shapes_pass(shape: tuple[int, ...], dtype: torch.dtype, num_envs: int) -> None:
     value = torch.zeros(shape, dtype=dtype)
     passes = {
-        key: check_step_returns(object, num_envs, {key: value}, None, ()) is None for key in ("success", "other")
+        key: check_step_returns(object, num_envs, {key: value}, None, ()) is None
+        for key in ("success", "other")
     }
     assert passes["success"] == (shape == (num_envs,) and dtype == torch.bool)
     assert passes["other"] == (len(shape) > 0 and shape[0] == num_envs)

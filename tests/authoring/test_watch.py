@@ -166,7 +166,9 @@ def test_what_was_saved_between_the_reading_and_the_following_is_not_lost(
     assert calls.none()
 
 
-def test_files_in_several_folders_are_followed_and_left(watcher: SourceWatcher, calls: Calls, tmp_path: Path) -> None:
+def test_files_in_several_folders_are_followed_and_left(
+    watcher: SourceWatcher, calls: Calls, tmp_path: Path
+) -> None:
     one, two = tmp_path / "one.py", tmp_path / "below" / "two.py"
     two.parent.mkdir()
     for path in (one, two):

@@ -35,7 +35,9 @@ def test_the_same_seed_gives_the_same_episode_whatever_was_before(name: str, mak
 
 
 @pytest.mark.parametrize(("name", "mode"), WITH_REWARD)
-def test_random_steps_give_batched_finite_numbers_in_every_reward_mode(name: str, mode: str, make: Make) -> None:
+def test_random_steps_give_batched_finite_numbers_in_every_reward_mode(
+    name: str, mode: str, make: Make
+) -> None:
     env = make(name, reward_mode=mode, obs_mode="state")
     env.action_space.seed(0)
     obs, _ = env.reset(seed=0)

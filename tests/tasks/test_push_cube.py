@@ -133,5 +133,7 @@ def test_the_camera_for_people_shows_robot_cube_and_target(make: Make, render_sy
     assert picture.shape == (1, 512, 512, 3) and picture.dtype == torch.uint8
     red, green, blue = picture[0].int().unbind(-1)
     assert ((blue > red + 60) & (blue > green + 40)).sum() > 200, "the cube is blue"
-    assert ((red > green + 80) & (red > blue + 60) & (abs(green - blue) < 40)).sum() > 500, "the target is red"
+    assert ((red > green + 80) & (red > blue + 60) & (abs(green - blue) < 40)).sum() > 500, (
+        "the target is red"
+    )
     assert picture.float().std() > 30

@@ -19,8 +19,9 @@ from playwright.sync_api import sync_playwright
 
 from workbench.ui import door as door_module
 from workbench.ui import viser_seam
-from workbench.ui.door import DEFAULT_PORT, Door, DoorError, DoorOptions, folder_handler, open_door
+from workbench.ui.door import DEFAULT_PORT, Door, DoorError, DoorOptions, open_door
 from workbench.ui.gate import cookie_name
+from workbench.ui.replies import folder_handler
 from workbench.web_assets import web_assets_folder
 
 

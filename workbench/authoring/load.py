@@ -175,7 +175,9 @@ def _revert(load: _Load) -> None:
 def _parse(reference: str) -> tuple[Path | None, str | None]:
     """File and class of `reference`; (None, None) for a registered id."""
     if not reference.strip():
-        raise _refused("no task named; give a .py file, file.py:ClassName, or a registered id like PickCube-v1")
+        raise _refused(
+            "no task named; give a .py file, file.py:ClassName, or a registered id like PickCube-v1"
+        )
     if registry.environment(reference) is not None:
         return None, None
     match = _FILE_AND_CLASS.fullmatch(reference)
@@ -191,9 +193,12 @@ def _parse(reference: str) -> tuple[Path | None, str | None]:
 
 def _looks_like_path(reference: str) -> bool:
     return (
-        "/" in reference or "\\" in reference or reference.startswith(("~", "."))
-        or "." in reference or _exists(reference)
-    )  # fmt: skip
+        "/" in reference
+        or "\\" in reference
+        or reference.startswith(("~", "."))
+        or "." in reference
+        or _exists(reference)
+    )
 
 
 def _exists(reference: str) -> bool:
@@ -219,7 +224,9 @@ def _check_file(file: Path) -> None:
         if not file.exists():
             raise _missing(file)
         if file.suffix != ".py":
-            raise _refused(f"{file} is not a .py file; a task is one Python file with a class that inherits BaseEnv")
+            raise _refused(
+                f"{file} is not a .py file; a task is one Python file with a class that inherits BaseEnv"
+            )
         if not file.is_file():
             # A pipe, say: reading it would wait for ever.
             raise _refused(f"{file} is not an ordinary file")
@@ -286,7 +293,9 @@ def _choose(
     """The wanted class, or the one defined last, registered classes before others."""
     file = str(finder.file)
     defined = [
-        value for value in vars(module).values() if registry.is_task(value) and value.__module__ == module.__name__
+        value
+        for value in vars(module).values()
+        if registry.is_task(value) and value.__module__ == module.__name__
     ]
     registered = {
         made.cls: made.name for made in registrations.made if made.file == file and registry.is_task(made.cls)
@@ -294,7 +303,9 @@ def _choose(
     # Registered ones last, in the order of their registration: the last of all is the default.
     candidates = [cls for cls in dict.fromkeys(defined) if cls not in registered] + list(registered)
     if wanted is not None:
-        cls = next((cls for cls in reversed(candidates) if cls.__name__ == wanted), getattr(module, wanted, None))
+        cls = next(
+            (cls for cls in reversed(candidates) if cls.__name__ == wanted), getattr(module, wanted, None)
+        )
         if not registry.is_task(cls):
             raise _no_such_class(wanted, cls, finder, [cls.__name__ for cls in candidates])
     elif candidates:
@@ -347,7 +358,10 @@ def _no_class(module: ModuleType, finder: AuthorFinder) -> TaskError:
         cls = imported[-1]
         hint = f"{cls.__name__} is imported from {cls.__module__}: name that file, or inherit from it here"
     else:
-        hint = "write `class MyTask(BaseEnv):` with BaseEnv from mani_skill.envs.sapien_env, or begin from tasks/minimal.py"
+        hint = (
+            "write `class MyTask(BaseEnv):` with BaseEnv from mani_skill.envs.sapien_env, or begin from "
+            "tasks/minimal.py"
+        )
     return _refused(f"no class in {name} inherits BaseEnv; {hint}", finder.file)
 
 

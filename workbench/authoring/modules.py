@@ -91,8 +91,10 @@ class AuthorFinder(MetaPathFinder):
                 if candidate in self.given:
                     return self._spec(fullname, candidate, is_package)
         found = importlib.machinery.PathFinder.find_spec(fullname, path, target)
-        if found is None or found.origin is None or not isinstance(
-            found.loader, importlib.machinery.SourceFileLoader
+        if (
+            found is None
+            or found.origin is None
+            or not isinstance(found.loader, importlib.machinery.SourceFileLoader)
         ):
             return None
         if not is_own_file(found.origin, self.file.parent):
@@ -186,7 +188,9 @@ def is_own_file(path: str, folder: Path) -> bool:
     root = str(folder) + os.sep
     if not path.startswith(root) or path.startswith((_WORKBENCH, *_LIBRARY_ROOTS)):
         return False
-    return not any(part in _LIBRARY_FOLDERS or part.startswith(".") for part in path[len(root) :].split(os.sep))
+    return not any(
+        part in _LIBRARY_FOLDERS or part.startswith(".") for part in path[len(root) :].split(os.sep)
+    )
 
 
 @dataclass(frozen=True)
@@ -224,7 +228,9 @@ def set_aside(finder: AuthorFinder, is_other_task: Callable[[str], bool]) -> Set
             places = [os.path.join(place, "x.py") for place in spec.submodule_search_locations]
             if any(is_own_file(place, folder) for place in places):
                 aside[name] = module
-    lines: dict[str, Any] = {path: entry for path, entry in linecache.cache.items() if is_own_file(path, folder)}
+    lines: dict[str, Any] = {
+        path: entry for path, entry in linecache.cache.items() if is_own_file(path, folder)
+    }
     for name in aside:
         del sys.modules[name]
     return SetAside(aside, lines, list(sys.path))

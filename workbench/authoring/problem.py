@@ -148,7 +148,8 @@ def format_traceback(exc: BaseException) -> str:
         left_out = len(lines) - TRACEBACK_HEAD_LINES - TRACEBACK_TAIL_LINES
         lines[TRACEBACK_HEAD_LINES:-TRACEBACK_TAIL_LINES] = [f"  ... {left_out} lines left out ..."]
     return "\n".join(
-        line if len(line) <= TRACEBACK_LINE_LIMIT else line[: TRACEBACK_LINE_LIMIT - 1] + "…" for line in lines
+        line if len(line) <= TRACEBACK_LINE_LIMIT else line[: TRACEBACK_LINE_LIMIT - 1] + "…"
+        for line in lines
     )
 
 

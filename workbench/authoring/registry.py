@@ -84,9 +84,7 @@ class Registrations:
     def replaced_names(self) -> tuple[str, ...]:
         """Names that belonged to somebody else: built-in tasks, say."""
         return tuple(
-            name
-            for name, slot in self.displaced.items()
-            if any(value is not _NOTHING for value in slot[:3])
+            name for name, slot in self.displaced.items() if any(value is not _NOTHING for value in slot[:3])
         )
 
 
@@ -116,7 +114,9 @@ def registering(is_own: Callable[[str], bool], registrations: Registrations) -> 
     """
     register_env, register_agent = env_registration.register_env, agent_registration.register_agent
 
-    def noting(name: str, cls: type, override: bool, caller: tuple[str, int], register: Callable[[], Any]) -> Any:
+    def noting(
+        name: str, cls: type, override: bool, caller: tuple[str, int], register: Callable[[], Any]
+    ) -> Any:
         file, line = caller
         earlier = next((made for made in registrations.made if made.name == name), None)
         if earlier is not None and not override:

@@ -46,7 +46,9 @@ def check_step_returns(
     assert isinstance(evaluate, Mapping)
     message = None if reward is None else _wrong_reward(reward, num_envs, evaluate)
     if message is not None:
-        hooks = tuple(name for name in _REWARD_HOOKS if hook_definition(cls, name, source_files)) or _REWARD_HOOKS
+        hooks = (
+            tuple(name for name in _REWARD_HOOKS if hook_definition(cls, name, source_files)) or _REWARD_HOOKS
+        )
         return _problem(cls, hooks, message, source_files)
     return None
 
@@ -59,7 +61,9 @@ def _wrong_evaluate(evaluate: object, num_envs: int) -> str | None:
             return f"returned the key {name!r}; names of entries must be strings"
         if name in ("success", "fail"):
             if not isinstance(value, torch.Tensor) or value.dtype != torch.bool or value.shape != (num_envs,):
-                return f"returned {name!r} as {_describe(value)}; expected a bool tensor of shape ({num_envs},)"
+                return (
+                    f"returned {name!r} as {_describe(value)}; expected a bool tensor of shape ({num_envs},)"
+                )
         elif isinstance(value, str):
             continue
         elif not isinstance(value, torch.Tensor):
@@ -68,7 +72,10 @@ def _wrong_evaluate(evaluate: object, num_envs: int) -> str | None:
                 f"of shape ({num_envs}, ...)"
             )
         elif value.ndim == 0 or value.shape[0] != num_envs:
-            return f"returned {name!r} as {_describe(value)}; expected shape ({num_envs}, ...), a row for each env"
+            return (
+                f"returned {name!r} as {_describe(value)}; "
+                f"expected shape ({num_envs}, ...), a row for each env"
+            )
     return None
 
 
@@ -85,7 +92,9 @@ def _wrong_reward(reward: object, num_envs: int, evaluate: Mapping[str, object])
     wrong = ~torch.isfinite(reward)
     if bool(wrong.any()):
         envs = wrong.nonzero().flatten().tolist()
-        named = ", ".join(str(env) for env in envs[:_ENVS_NAMED]) + (" ..." if len(envs) > _ENVS_NAMED else "")
+        named = ", ".join(str(env) for env in envs[:_ENVS_NAMED]) + (
+            " ..." if len(envs) > _ENVS_NAMED else ""
+        )
         kind = "NaN" if bool(torch.isnan(reward).any()) else "infinity"
         return f"returned {kind} in {len(envs)} of {num_envs} envs ({named}); a reward must be finite"
     return None

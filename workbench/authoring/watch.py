@@ -126,7 +126,9 @@ class SourceWatcher:
                     return  # made anew: the watch is on the folder that was deleted
         except (OSError, _rust_notify.WatchfilesRustInternalError) as exc:
             if self._force_polling:
-                logger.warning("Cannot watch %s: %s. Looking now and then.", ", ".join(map(str, folders)), exc)
+                logger.warning(
+                    "Cannot watch %s: %s. Looking now and then.", ", ".join(map(str, folders)), exc
+                )
                 self._folders_changed.wait(RECHECK_MS / 1000)
             else:
                 logger.warning("No file events to be had (%s): polling the folders instead.", exc)

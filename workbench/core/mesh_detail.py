@@ -26,38 +26,38 @@ from workbench.core.geometry import Mesh
 _CREASE_COSINE = float(np.cos(np.deg2rad(40.0)))
 """Neighbouring faces that bend less than this are shaded as one smooth surface."""
 _DENSE = 60_000
-"""Above so many faces a mesh is a whole CAD assembly: what is inside is left out, and vertices are
-snapped to a grid first, where quadric collapse alone would take seconds."""
-_CLUSTER_CELLS = 400
+"""Above so many faces a mesh is a whole CAD assembly, whose vertices are snapped to a grid at once:
+quadric collapse alone would take seconds and get stuck."""
+_CLUSTER_CELLS = 64
+_COARSEST_CELLS = 16
 _WELD_CELLS = 1_000_000
-_COARSEST_CELLS = 25
 
 
 def reduce_mesh(mesh: Mesh, max_faces: int) -> Mesh:
-    """`mesh` with about `max_faces` triangles at most; as it is when it has no more than that.
+    """`mesh` with about `max_faces` triangles; as it is when it has no more than that.
 
-    A textured mesh may stay above: the edges of its pieces of texture are kept as they are.
+    One of many loose pieces may keep up to twice as many, and a textured one more, because the edges of
+    its pieces of texture are kept as they are.
     """
     if len(mesh.faces) <= max_faces:
         return mesh
-    cells, source = _WELD_CELLS, mesh.faces
-    if len(mesh.faces) > _DENSE and mesh.uvs is None:
-        cells, source = _CLUSTER_CELLS, mesh.faces[_seen_from_outside(mesh)]
-    vertices, faces, uvs = _weld(mesh.vertices, source, mesh.uvs, cells)
-    while len(faces) > max_faces:
-        count = len(faces)
-        vertices, faces, uvs = _collapse(vertices, faces, uvs, max_faces)
-        if len(faces) <= max_faces * 1.1 or mesh.uvs is not None:
+    cells = _WELD_CELLS if mesh.uvs is not None or len(mesh.faces) <= _DENSE else _CLUSTER_CELLS
+    welded = _weld(mesh.vertices, mesh.faces, mesh.uvs, cells)
+    while True:
+        vertices, faces, uvs = welded
+        if len(faces) > max_faces:
+            vertices, faces, uvs = _collapse(vertices, faces, uvs, max_faces)
+        # Hundreds of loose pieces (screws, vents) cannot shrink; only a coarser grid joins them.
+        if len(faces) <= 2 * max_faces or mesh.uvs is not None or cells <= _COARSEST_CELLS:
             break
-        if len(faces) > 0.7 * count:
-            # Hundreds of loose pieces (screws, vents) that cannot shrink: only a coarser grid joins them.
-            cells = min(cells, _CLUSTER_CELLS) // 2
-            if cells < _COARSEST_CELLS:
-                break
-            vertices, faces, uvs = _weld(vertices, faces, uvs, cells)
+        cells = min(int(0.7 * cells), _CLUSTER_CELLS)
+        welded = _weld(*welded, cells)
     if len(faces) == 0:
         return mesh
-    return with_normals(Mesh(vertices.astype(np.float32), faces.astype(np.uint32), uvs=uvs))
+    reduced = with_normals(Mesh(vertices.astype(np.float32), faces.astype(np.uint32), uvs=uvs))
+    if mesh.normals is None or len(mesh.faces) > _DENSE:
+        return reduced
+    return replace(reduced, normals=_normals_of_source(reduced, mesh))
 
 
 def with_normals(mesh: Mesh) -> Mesh:
@@ -142,6 +142,20 @@ def drop_uvs(mesh: Mesh) -> Mesh:
     return mesh if mesh.uvs is None else replace(mesh, uvs=None)
 
 
+def _normals_of_source(reduced: Mesh, source: Mesh) -> NDArray[np.float32]:
+    """(V, 3) normals of the nearest vertices of `source` that face the same way.
+
+    A few large faces make a round surface look dented when their own normals shade it.
+    """
+    assert reduced.normals is not None and source.normals is not None
+    count = min(8, len(source.vertices))
+    _, near = cKDTree(source.vertices).query(reduced.vertices, k=count)
+    candidates = source.normals[near.reshape(-1, count)]
+    agree = np.einsum("vkj,vj->vk", candidates, reduced.normals) > _CREASE_COSINE
+    chosen = candidates[np.arange(len(near)), agree.argmax(axis=1)]
+    return np.where(agree.any(axis=1)[:, None], chosen, reduced.normals).astype(np.float32)
+
+
 def _weld(
     vertices: NDArray[np.float32], faces: NDArray, uvs: NDArray[np.float32] | None, cells: int
 ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32] | None]:
@@ -154,31 +168,11 @@ def _weld(
         key = np.unique(np.column_stack([key, texel]), axis=0, return_inverse=True)[1].reshape(-1)
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
     welded = inverse.reshape(-1)[faces]
+    if cells < _WELD_CELLS:
+        # Surfaces that a coarse grid lays upon each other would be drawn twice, and flicker.
+        welded = welded[np.sort(np.unique(np.sort(welded, axis=1), axis=0, return_index=True)[1])]
     whole = (welded[:, 0] != welded[:, 1]) & (welded[:, 1] != welded[:, 2]) & (welded[:, 2] != welded[:, 0])
     return vertices[first], welded[whole], None if uvs is None else uvs[first]
-
-
-def _seen_from_outside(mesh: Mesh) -> NDArray[np.bool_]:
-    """(F,) False for faces that others hide from 26 directions: screws and boards in a camera's housing.
-
-    A depth image of the faces' centres, of 256 cells a side, for each direction.
-    """
-    centres = mesh.vertices[mesh.faces].mean(axis=1)
-    cell = float(np.ptp(centres, axis=0).max()) / 256
-    seen = np.zeros(len(centres), dtype=bool)
-    for direction in np.stack(np.meshgrid(*3 * [[-1.0, 0.0, 1.0]]), axis=-1).reshape(-1, 3):
-        if not direction.any():
-            continue
-        forward = direction / np.linalg.norm(direction)
-        right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
-        right /= np.linalg.norm(right)
-        at = centres @ np.stack([right, np.cross(forward, right), forward], axis=1)
-        pixel = np.round((at[:, :2] - at[:, :2].min(axis=0)) / cell).astype(np.int64)
-        number = pixel[:, 0] * (pixel[:, 1].max() + 1) + pixel[:, 1]
-        nearest = np.full(number.max() + 1, np.inf)
-        np.minimum.at(nearest, number, at[:, 2])
-        seen |= at[:, 2] <= nearest[number] + 2 * cell
-    return seen
 
 
 def _collapse(
@@ -187,15 +181,17 @@ def _collapse(
     uvs: NDArray[np.float32] | None,
     max_faces: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32] | None]:
-    points = vertices.astype(np.float64)
+    # The method's thresholds are absolute: a mesh of a few centimetres would be collapsed in any order.
+    extent = float(np.ptp(vertices, axis=0).max())
+    points = vertices.astype(np.float64) / extent
     triangles = np.ascontiguousarray(faces, dtype=np.int32)
     if uvs is None:
         new_points, new_faces = fast_simplification.simplify(points, triangles, target_count=max_faces)
         # Where a quadric is nearly singular its optimum can lie anywhere: a spike out of the surface.
         distance, nearest = cKDTree(points).query(new_points)
-        spike = distance > 0.04 * np.ptp(points, axis=0).max()
+        spike = distance > 0.04
         new_points[spike] = points[nearest[spike]]
-        return new_points.astype(np.float32), new_faces.astype(np.int64), None
+        return (new_points * extent).astype(np.float32), new_faces.astype(np.int64), None
     # The edge of a piece of texture is a border of the welded mesh; moved, it would open a gap.
     _, _, collapses = fast_simplification.simplify(
         points, triangles, target_count=max_faces, return_collapses=True, preserve_border=True
@@ -205,4 +201,4 @@ def _collapse(
     order = np.argsort(-np.linalg.norm(points - new_points[new_index], axis=1), kind="stable")
     new_uvs = np.zeros((len(new_points), 2), dtype=np.float32)
     new_uvs[new_index[order]] = uvs[order]
-    return new_points.astype(np.float32), new_faces.astype(np.int64), new_uvs
+    return (new_points * extent).astype(np.float32), new_faces.astype(np.int64), new_uvs

@@ -23,13 +23,13 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
-import rerun_bindings
 from rerun.chunk import RrdReader
 from rerun.error_utils import catch_and_log_exceptions
 
 from workbench.recording.blueprint import episode_blueprint
 from workbench.recording.episode import Episode, EpisodeInfo
 from workbench.recording.layout import Account, flag, log_episode
+from workbench.recording.rerun_seam import release_streams, save_to
 
 _NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EACCES}
 
@@ -63,8 +63,7 @@ def write_rrd(episode: Episode, path: Path) -> Path:
             final = _publish(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)
-            # Every RecordingStream leaves two threads behind once it is let go of (measured, rerun 0.41).
-            rerun_bindings.flush_and_cleanup_orphaned_recordings()
+            release_streams()
         _sync(path.parent)
         return final
     except OSError as error:
@@ -90,7 +89,7 @@ def _write(episode: Episode, path: Path) -> Account:
         # Rerun derives a default id from the process, so two episodes of one process would be taken for one.
         recording = rr.RecordingStream(_application_id(episode.info), recording_id=uuid.uuid4().hex)
         try:
-            recording.save(path, default_blueprint=blueprint)
+            save_to(recording, path, blueprint)
             account = log_episode(recording, episode)
             for name, values in properties(episode).items():
                 recording.send_property(name, rr.AnyValues(**values))

@@ -50,9 +50,14 @@ class Viewer:
     _server: ThreadingHTTPServer | None = None
 
     def wait(self) -> None:
-        """Return when the native viewer's window is closed; a page is served until `close`."""
+        """Return when the native viewer's window is closed; a page is served until `close`.
+
+        Raises:
+            RuntimeError: the viewer ended by itself with an error.
+        """
         if self._process is not None:
-            self._process.wait()
+            if status := self._process.wait():
+                raise RuntimeError(f"rerun's viewer ended with {status}; what it said is above.")
         else:
             threading.Event().wait()
 
@@ -74,7 +79,7 @@ def open_in_rerun(paths: Sequence[Path], *, web: bool | None = None) -> Viewer:
     Raises:
         ValueError: `paths` is empty.
         FileNotFoundError: one of them is no file.
-        RuntimeError: rerun did not start; the message holds what it said.
+        RuntimeError: rerun did not start, or a window was asked for where there is no screen.
     """
     files = [Path(path).resolve() for path in paths]
     if not files:
@@ -84,6 +89,9 @@ def open_in_rerun(paths: Sequence[Path], *, web: bool | None = None) -> Viewer:
             raise FileNotFoundError(f"{file} is not a file: give the path of an .rrd file.")
     if web is None:
         web = not has_screen(os.environ)
+    elif not web and not has_screen(os.environ):
+        # Rerun would listen, load and only then find out.
+        raise RuntimeError("There is no screen here (DISPLAY and WAYLAND_DISPLAY are empty); open the page instead.")
     return serve_web_viewer(files) if web else _open_window(files)
 
 

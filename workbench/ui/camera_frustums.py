@@ -13,8 +13,8 @@ CAMERA_TO_OPENCV = viser.transforms.SO3.from_matrix(
     # Columns: OpenCV's right, down and forward in ManiSkill's camera frame (x forward, y left, z up).
     np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 )
-SIZE = 0.12
-"""Depth of a frustum, metres: a hand's breadth, so that it hides nothing of a table-top scene."""
+SMALL, LARGE = 0.07, 0.14
+"""Depth of a frustum, metres: small beside one env, larger where the whole grid is looked at."""
 COLOURS: dict[CameraKind, tuple[int, int, int]] = {"sensor": (245, 159, 0), "human": (132, 94, 247)}
 
 
@@ -30,6 +30,7 @@ class CameraFrustums:
         cameras: tuple[CameraInfo, ...],
         pictures: dict[tuple[CameraKind, str], Picture],
         offset: NDArray[np.float32],
+        size: float = LARGE,
     ) -> None:
         """Draw these pictures' cameras and take away all others.
 
@@ -37,18 +38,21 @@ class CameraFrustums:
             cameras: The task's cameras.
             pictures: Those to show; empty shows none.
             offset: (3,) where the selected env stands in the view.
+            size: Depth of a frustum in metres.
         """
         known = {(camera.kind, camera.name): camera for camera in cameras}
         for key in [key for key in self._drawn if key not in pictures or key not in known]:
             self._drawn.pop(key).remove()
         for key, picture in pictures.items():
             if key in known:
-                self._draw_one(known[key], picture, offset)
+                self._draw_one(known[key], picture, offset, size)
 
     def clear(self) -> None:
         self.draw((), {}, np.zeros(3, np.float32))
 
-    def _draw_one(self, camera: CameraInfo, picture: Picture, offset: NDArray[np.float32]) -> None:
+    def _draw_one(
+        self, camera: CameraInfo, picture: Picture, offset: NDArray[np.float32], size: float
+    ) -> None:
         wxyz, position = frustum_pose(picture, offset)
         key = (camera.kind, camera.name)
         handle = self._drawn.get(key)
@@ -57,7 +61,7 @@ class CameraFrustums:
                 f"/cameras/{camera.kind} {camera.name}",
                 fov=camera.fovy,
                 aspect=camera.width / camera.height,
-                scale=SIZE,
+                scale=size,
                 thickness=2.0,
                 thickness_units="screen",
                 color=COLOURS[camera.kind],
@@ -70,7 +74,7 @@ class CameraFrustums:
                 receive_shadow=False,
             )
             return
-        handle.wxyz, handle.position = wxyz, position
+        handle.wxyz, handle.position, handle.scale = wxyz, position, size
         if picture.rgb is not None:
             handle.image = picture.rgb
 

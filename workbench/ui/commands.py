@@ -1,6 +1,7 @@
 """Every action that matters, with a key and a name in the command palette (Ctrl+K).
 
-Keys work while no text field has the focus. The list is one table, so that the page, the palette and
+Keys work while no text field has the focus. Arrows are left alone: a slider that has the focus takes them too,
+and one press would count twice. The list is one table, so that the page, the palette and
 the help that is made from it cannot disagree.
 """
 
@@ -23,10 +24,10 @@ class Command:
 
     @property
     def key_name(self) -> str:
-        """For a person: ``Space``, ``Shift R``, ``→``."""
+        """For a person: ``Space``, ``Shift R``."""
         if self.key is None:
             return ""
-        name = {"space": "Space", "arrowleft": "←", "arrowright": "→"}.get(self.key, self.key)
+        name = "Space" if self.key == "space" else self.key
         return f"{self.modifier.capitalize()} {name}" if self.modifier else name
 
 

@@ -13,30 +13,29 @@ Before the address is given to anyone the door tries itself with a request that 
 
 from __future__ import annotations
 
-import asyncio
 import atexit
 import errno
 import getpass
-import gzip
-import html
 import http.client
 import ipaddress
-import logging
-import mimetypes
 import secrets
 import socket
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from http import HTTPStatus
-from pathlib import Path
-from urllib.parse import unquote
 
 import viser
 from websockets.asyncio.server import ServerConnection
-from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from workbench.ui import gate, viser_seam
+from workbench.ui.replies import (
+    Handler,
+    admitted_reply,
+    asked_of,
+    entered_reply,
+    folder_handler,
+    refusals,
+)
 from workbench.web_assets import web_assets_folder
 
 DEFAULT_PORT = 8080
@@ -46,12 +45,6 @@ MAX_MESSAGE_BYTES = 8 * 1024 * 1024
 RESPONSE_SECONDS = 300.0
 """`websockets` gives 10 s for a request and its whole answer: too little for viser's page over a slow
 line, and far too little for a recording."""
-
-Handler = Callable[[str], tuple[int, str, bytes]]
-"""Gets the path behind its prefix (decoded, no query, no ``..``, no backslash, no NUL); returns the
-status, the content type and the body. Runs in a thread of its own, so it may read files."""
-
-_log = logging.getLogger("workbench.door")
 
 
 class DoorError(RuntimeError):
@@ -116,7 +109,7 @@ class Door:
 
         Args:
             prefix: begins and ends with a slash.
-            handler: see `Handler`. If it raises, the browser gets a 500 and the log the traceback.
+            handler: see `workbench.ui.replies.Handler`. If it raises, the browser gets a 500 and the log the traceback.
             headers: added to every reply, in place of the door's own of the same name (a page with
                 other needs brings its own Content-Security-Policy).
         """
@@ -154,25 +147,23 @@ def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) ->
     the_gate = gate.Gate(token=token, names=_our_names(options), any_address=not loopback)
     example = f"http://{_reach(host)}:{port}/" + ("?token=…" if token else "")
     routes: dict[str, tuple[Handler, Mapping[str, str]]] = {}
-    refusal_page = _refusal_page(example)
+    refuse = refusals(example)
 
     def wrap(viser_hook: viser_seam.Hook) -> viser_seam.AsyncHook:
         async def answer(connection: ServerConnection, request: Request) -> Response | None:
-            asked = _asked(request)
+            asked = asked_of(request)
             verdict = gate.judge(the_gate, asked)
             if isinstance(verdict, gate.Admitted):
                 if asked.websocket:
                     response = viser_hook(connection, request)
                 else:
-                    response = await _admitted_reply(
+                    response = await admitted_reply(
                         routes, viser_hook, connection, request, verdict.authority
                     )
             elif isinstance(verdict, gate.Entered):
-                response = _entered_reply(verdict)
+                response = entered_reply(verdict)
             else:
-                response = _reply(
-                    403, "text/html; charset=utf-8", refusal_page(verdict.reason), _PAGE_OF_OURS
-                )
+                response = refuse(verdict.reason)
             if response is not None:
                 # websockets gives up 10 s after the last byte was handed to the kernel; on a slow line
                 # megabytes are still on their way then.
@@ -213,33 +204,6 @@ def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) ->
         raise
     door.add_route("/workbench/", folder_handler(web_assets_folder()))
     return door
-
-
-def folder_handler(folder: Path) -> Handler:
-    """A handler that serves the files below ``folder``, and nothing that a link there points out to."""
-    root = folder.resolve()
-
-    def handle(path: str) -> tuple[int, str, bytes]:
-        file = (root / path.lstrip("/")).resolve()
-        if not file.is_relative_to(root) or not file.is_file():
-            return 404, "text/plain; charset=utf-8", b"There is no such file."
-        return 200, content_type(file.name), file.read_bytes()
-
-    return handle
-
-
-def content_type(name: str) -> str:
-    """Content type by the end of a file's name. Not left to the system's table alone, which may call
-    JavaScript plain text, and browsers then refuse to run it."""
-    known = {
-        ".css": "text/css; charset=utf-8",
-        ".html": "text/html; charset=utf-8",
-        ".js": "text/javascript; charset=utf-8",
-        ".json": "application/json",
-        ".svg": "image/svg+xml",
-        ".wasm": "application/wasm",
-    }
-    return known.get(Path(name).suffix.lower()) or mimetypes.guess_type(name)[0] or "application/octet-stream"
 
 
 # Listening ---------------------------------------------------------------------------------------
@@ -319,131 +283,3 @@ def _try_own_door(host: str, port: int) -> None:
             f"It is written for viser {viser_seam.WRITTEN_FOR} and {viser.__version__} is installed; install "
             f"viser=={viser_seam.WRITTEN_FOR}."
         )
-
-
-# Replies -----------------------------------------------------------------------------------------
-
-_EVERY_REPLY = {
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "X-Frame-Options": "SAMEORIGIN",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Cross-Origin-Opener-Policy": "same-origin",
-    "Connection": "close",
-}
-_PAGE_OF_OURS = {
-    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'self'",
-    "Cache-Control": "no-store",
-}
-
-
-def page_policy(authority: str) -> str:
-    """Content-Security-Policy for viser's page as seen on ``authority`` (``host:port``).
-
-    viser's page is one file of inline scripts that unpack themselves into blobs, workers and wasm, so
-    scripts have to be allowed from those. What the policy is for is ``connect-src``: viser's page takes
-    the address of another server from its own address (``?websocket=``, ``?playbackPath=``), and what
-    that server sends runs as our page. It also keeps pictures in markdown from calling home.
-    """
-    return "; ".join(
-        (
-            "default-src 'self'",
-            "script-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob:",
-            "worker-src 'self' blob:",
-            "style-src 'self' 'unsafe-inline'",
-            "img-src 'self' data: blob:",
-            "media-src 'self' data: blob:",
-            "font-src 'self' data:",
-            f"connect-src 'self' data: blob: ws://{authority} wss://{authority}",
-            "frame-src 'self' blob: data:",
-            "object-src 'none'",
-            "base-uri 'none'",
-            "form-action 'self'",
-            "frame-ancestors 'self'",
-        )
-    )
-
-
-def _asked(request: Request) -> gate.Asked:
-    get = request.headers.get_all
-    return gate.Asked(
-        path=request.path,
-        host=get("Host"),
-        origin=get("Origin"),
-        cookie=get("Cookie"),
-        fetch_site=get("Sec-Fetch-Site"),
-        fetch_mode=get("Sec-Fetch-Mode"),
-        fetch_dest=get("Sec-Fetch-Dest"),
-        # Exactly viser's own question, so that what it takes for a handshake is what was judged as one.
-        websocket=get("Upgrade") == ["websocket"],
-    )
-
-
-def _refusal_page(example: str) -> Callable[[str], bytes]:
-    folder = web_assets_folder()
-    page = (folder / "refused.html").read_text(encoding="utf-8")
-    page = page.replace("{{logo}}", (folder / "logo.svg").read_text(encoding="utf-8"))
-    page = page.replace("{{example}}", html.escape(example))
-    return lambda reason: page.replace("{{reason}}", html.escape(reason)).encode()
-
-
-def _reply(
-    status: int, kind: str, body: bytes, headers: Mapping[str, str], gzipped: bool = False
-) -> Response:
-    extra = {"Content-Encoding": "gzip", "Vary": "Accept-Encoding"} if gzipped else {}
-    fields = {"Content-Type": kind, "Content-Length": str(len(body)), **_EVERY_REPLY, **extra, **headers}
-    return Response(status, HTTPStatus(status).phrase, Headers(fields), body)
-
-
-def _entered_reply(entered: gate.Entered) -> Response:
-    cookie = {"Set-Cookie": entered.set_cookie, **_PAGE_OF_OURS}
-    if not entered.by_page:
-        return _reply(303, "text/plain; charset=utf-8", b"", {"Location": entered.location, **cookie})
-    onward = f'<!doctype html><title>Workbench</title><meta http-equiv="refresh" content="0;url={html.escape(entered.location)}">'
-    return _reply(200, "text/html; charset=utf-8", onward.encode(), cookie)
-
-
-async def _admitted_reply(
-    routes: Mapping[str, tuple[Handler, Mapping[str, str]]],
-    viser_hook: viser_seam.Hook,
-    connection: ServerConnection,
-    request: Request,
-    authority: str,
-) -> Response:
-    page = {"Content-Security-Policy": page_policy(authority), "Cache-Control": "no-cache"}
-    # Decoded once, as viser does; what is still encoded after that is part of a file's name.
-    path = unquote(request.path.partition("?")[0]).replace("\\", "/")
-    prefix = max((prefix for prefix in routes if path.startswith(prefix)), key=len, default=None)
-    if prefix is None:
-        response = viser_hook(connection, request)
-        if response is None:  # viser took for a handshake what was not judged as one
-            return _reply(400, "text/plain; charset=utf-8", b"Bad request.", page)
-        for name, value in {**_EVERY_REPLY, **page}.items():
-            response.headers[name] = value
-        return response
-    if ".." in path.split("/") or "\0" in path:
-        return _reply(404, "text/plain; charset=utf-8", b"There is no such file.", page)
-    handler, headers = routes[prefix]
-    accepts_gzip = any("gzip" in value for value in request.headers.get_all("Accept-Encoding"))
-
-    def work() -> Response:
-        try:
-            status, kind, body = handler(path[len(prefix) :])
-        except Exception:
-            _log.exception("The route %s failed on %s.", prefix, path)
-            status, kind, body = 500, "text/plain; charset=utf-8", b"This went wrong; the terminal says how."
-        zip_it = accepts_gzip and len(body) > 1024 and _compresses(kind)
-        return _reply(status, kind, gzip.compress(body, 6) if zip_it else body, {**page, **headers}, zip_it)
-
-    # In a thread: reading and compressing a recording would hold up every page's websocket.
-    return await asyncio.to_thread(work)
-
-
-def _compresses(kind: str) -> bool:
-    plain = kind.partition(";")[0]
-    return plain.startswith("text/") or plain in (
-        "application/json",
-        "application/javascript",
-        "application/wasm",
-        "image/svg+xml",
-    )

@@ -31,16 +31,16 @@ class DepthRange:
 
 
 def depth_range(depth: NDArray[np.float32]) -> DepthRange | None:
-    """From the 1st to the 98th percentile of what was met, or None where nothing was.
+    """Where most of what was met lies, or None where nothing was met.
 
-    Percentiles and not the extremes, since one pixel of a floor's horizon (hundreds of metres) would
-    leave the whole scene one colour.
+    From the 1st to the 98th percentile and no further than three times the median: a floor that runs
+    to the horizon behind a table would otherwise leave the whole table one colour.
     """
     met = depth[np.isfinite(depth) & (depth > 0)]
     if not met.size:
         return None
-    near, far = np.percentile(met, (1, 98))
-    return DepthRange(float(near), float(max(far, near + 1e-3)))
+    near, median, far = np.percentile(met, (1, 50, 98))
+    return DepthRange(float(near), float(max(min(far, 3 * median), near + 1e-3)))
 
 
 def colour_depth(depth: NDArray[np.float32], span: DepthRange) -> NDArray[np.uint8]:

@@ -169,8 +169,8 @@ def judge(gate: Gate, asked: Asked) -> Verdict:
     host = split_authority(asked.host[0]) if len(asked.host) == 1 else None
     if host is None or not host_is_ours(gate, host[0]):
         return Refused(
-            "It asked for this page under a name that is not this workbench's. "
-            "If the name is truly this machine's, start the workbench with that name allowed."
+            "It asked for this page under a name that the workbench does not know as its own. "
+            "Use the machine's address or host name instead."
         )
 
     if len(asked.origin) > 1 or (asked.origin and not _same_origin(asked.origin[0], host)):

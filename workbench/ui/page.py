@@ -20,7 +20,7 @@ import viser
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.banner import Banner
-from workbench.ui.camera_frustums import CameraFrustums
+from workbench.ui.camera_frustums import LARGE, SMALL, CameraFrustums
 from workbench.ui.cameras_panel import CamerasPanel
 from workbench.ui.commands import Command, register
 from workbench.ui.curves_panel import CurvesPanel
@@ -181,11 +181,12 @@ class Page:
         self._scene.move(step.poses, self._layout, env if one else None)
         self._mark.draw(self._layout, env, shown=task.num_envs > 1 and not one)
         pictures = self._cameras.shown_pictures(view) if self._cameras.show_frustums else {}
-        if one or task.num_envs == 1:
+        alone = one or task.num_envs == 1
+        if alone:
             # The view of one env starts at its human camera, whose picture would then fill it.
             pictures = {key: picture for key, picture in pictures.items() if key[0] != "human"}
         offset = np.zeros(3, np.float32) if one else self._layout.offsets[env]
-        self._frustums.draw(task.cameras, pictures, offset)
+        self._frustums.draw(task.cameras, pictures, offset, SMALL if alone else LARGE)
         # A scene of another size is framed anew; a reload that keeps the size never moves the view.
         size = np.round(np.concatenate([self._layout.low, self._layout.high]), 0).tobytes()
         framing = (task.env_id, task.num_envs, one, size)
@@ -234,8 +235,8 @@ class Page:
             Command("Single step", session.step, "S"),
             Command("Reset all envs", session.reset, "R"),
             Command("Reset the selected env", run.reset_this, "R", "shift"),
-            Command("Next env", lambda: run.select_neighbour(1), "arrowright"),
-            Command("Previous env", lambda: run.select_neighbour(-1), "arrowleft"),
+            Command("Next env", lambda: run.select_neighbour(1), "N"),
+            Command("Previous env", lambda: run.select_neighbour(-1), "P"),
             Command("Show all envs or the selected one", self._view_panel.toggle_only_selected, "O"),
             Command("Frame what is shown", lambda: self.frame(session.view()), "F"),
             Command("Start or stop recording", self._record.toggle, "C"),

@@ -13,16 +13,14 @@ What a browser can draw is limited by triangles, so the fewer envs are shown the
 
 from __future__ import annotations
 
-from functools import lru_cache
-
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.core.geometry import SceneGeometry, Visual
+from workbench.core.geometry import SceneGeometry
 from workbench.core.mesh_detail import reduce_mesh
 from workbench.ui.env_layout import EnvLayout, is_floor
-from workbench.ui.meshes_as_glb import WornTogether, as_glb, face_limit, group_by_wearers
+from workbench.ui.meshes_as_glb import WornTogether, as_glb, face_limit, fingerprint, group_by_wearers
 
 
 class SceneView:
@@ -30,9 +28,9 @@ class SceneView:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
-        self._drawn: list[_DrawnGroup] = []
+        self._drawn: dict[tuple[str, int, int], _DrawnGroup] = {}
+        self._number = 0
         self._floor_grid: viser.GridHandle | None = None
-        self._glb = lru_cache(maxsize=128)(_glb_of)
 
     def build(
         self,
@@ -42,7 +40,7 @@ class SceneView:
         only_env: int | None = None,
         triangles: int = 200_000,
     ) -> None:
-        """Replace whatever was shown by this scene.
+        """Replace whatever was shown by this scene; what looks as before stays and is not sent again.
 
         Args:
             geometry: What it looks like.
@@ -51,13 +49,24 @@ class SceneView:
             only_env: Show this env alone; None shows all.
             triangles: About how many may be drawn; richer shapes are simplified to fit.
         """
-        self.clear()
         shown_envs = geometry.num_envs if only_env is None else 1
         limit = face_limit(geometry.visuals, shown_envs, geometry.num_envs, triangles)
-        for number, group in enumerate(group_by_wearers(geometry)):
+        before, self._drawn = self._drawn, {}
+        for group in group_by_wearers(geometry):
+            looks = fingerprint(group.visuals)
+            key = (looks, limit, sum(looks == known for known, _, _ in self._drawn))
             floor = all(is_floor(visual, geometry) for visual in group.visuals)
-            glb = self._glb(_Same(group.visuals), limit)
-            self._drawn.append(_DrawnGroup(self._server, number, group, glb, floor))
+            drawn = before.pop(key, None)
+            if drawn is None:
+                self._number += 1
+                drawn = _DrawnGroup(self._server, self._number, group, limit)
+            drawn.wear(group, floor)
+            self._drawn[key] = drawn
+        for drawn in before.values():
+            drawn.handle.remove()
+        if self._floor_grid is not None:
+            self._floor_grid.remove()
+            self._floor_grid = None
         if not layout.has_floor:
             low, high = layout.box_of_all()
             self._floor_grid = self._server.scene.add_grid(
@@ -80,11 +89,11 @@ class SceneView:
             layout: Where each env stands.
             only_env: Show this env alone, at the origin; None shows all, on the grid.
         """
-        for group in self._drawn:
+        for group in self._drawn.values():
             group.move(poses, layout, only_env)
 
     def clear(self) -> None:
-        for group in self._drawn:
+        for group in self._drawn.values():
             group.handle.remove()
         self._drawn.clear()
         if self._floor_grid is not None:
@@ -93,34 +102,12 @@ class SceneView:
 
     @property
     def handles(self) -> tuple[viser.BatchedGlbHandle, ...]:
-        return tuple(group.handle for group in self._drawn)
-
-
-class _Same:
-    """Visuals as a key of the cache: the same objects, since arrays cannot be hashed."""
-
-    def __init__(self, visuals: tuple[Visual, ...]) -> None:
-        self.visuals = visuals
-
-    def __hash__(self) -> int:
-        return hash(tuple(id(visual) for visual in self.visuals))
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and all(
-            mine is theirs for mine, theirs in zip(self.visuals, other.visuals, strict=False)
-        )
-
-
-def _glb_of(same: _Same, limit: int) -> bytes:
-    return as_glb([(reduce_mesh(visual.mesh, limit), visual.material) for visual in same.visuals])
+        return tuple(group.handle for group in self._drawn.values())
 
 
 class _DrawnGroup:
-    def __init__(
-        self, server: viser.ViserServer, number: int, group: WornTogether, glb: bytes, floor: bool
-    ) -> None:
-        self._group = group
-        self._floor = floor
+    def __init__(self, server: viser.ViserServer, number: int, group: WornTogether, limit: int) -> None:
+        glb = as_glb([(reduce_mesh(visual.mesh, limit), visual.material) for visual in group.visuals])
         # One instance far below the ground; the first move follows in the same batch.
         self.handle = server.scene.add_batched_glb(
             f"/envs/{number:03d} {group.name.replace('/', ' ')}",
@@ -132,6 +119,11 @@ class _DrawnGroup:
             cast_shadow=False,
             receive_shadow=False,
         )
+        self.wear(group, floor=False)
+
+    def wear(self, group: WornTogether, floor: bool) -> None:
+        """From now on these (env, body) pairs wear it."""
+        self._group, self._floor = group, floor
 
     def move(self, poses: NDArray[np.float32], layout: EnvLayout, only_env: int | None) -> None:
         envs, bodies = self._group.envs, self._group.bodies

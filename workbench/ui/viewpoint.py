@@ -19,7 +19,7 @@ FOV = 0.75
 """Vertical, radians. viser's own 75 degrees bends what stands at the edge of a grid."""
 USUAL_ASPECT = 1.25
 """Of the view beside the panel in a 1280 x 720 window, before a page has said its own."""
-FROM_THE_FRONT = np.array([1.0, 0.12, 0.85])
+FROM_THE_FRONT = np.array([1.0, 0.12, 1.1])
 """ManiSkill's robots look along +x, so their front is seen from there; a little from the side."""
 
 

@@ -1,0 +1,189 @@
+"""What the door answers: the headers of every reply, and the files and routes that are not viser's.
+
+Each reply, a refusal too, tells the browser not to guess types, not to pass the address on, and not to
+show the page inside another site's. viser's page gets a Content-Security-Policy on top (`page_policy`),
+because that page obeys any server that it is pointed at. `workbench.ui.door` decides who gets which
+reply; here is how each is made.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gzip
+import html
+import logging
+import mimetypes
+from collections.abc import Callable, Mapping
+from http import HTTPStatus
+from pathlib import Path
+from urllib.parse import unquote
+
+from websockets.asyncio.server import ServerConnection
+from websockets.datastructures import Headers
+from websockets.http11 import Request, Response
+
+from workbench.ui import gate, viser_seam
+from workbench.web_assets import web_assets_folder
+
+Handler = Callable[[str], tuple[int, str, bytes]]
+"""Gets the path behind its prefix (decoded, no query, no ``..``, no backslash, no NUL); returns the
+status, the content type and the body. Runs in a thread of its own, so it may read files."""
+
+_log = logging.getLogger("workbench.door")
+
+_EVERY_REPLY = {
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "X-Frame-Options": "SAMEORIGIN",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Connection": "close",
+}
+_PAGE_OF_OURS = {
+    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'self'",
+    "Cache-Control": "no-store",
+}
+
+
+def page_policy(authority: str) -> str:
+    """Content-Security-Policy for viser's page as seen on ``authority`` (``host:port``).
+
+    viser's page is one file of inline scripts that unpack themselves into blobs, workers and wasm, so
+    scripts have to be allowed from those. What the policy is for is ``connect-src``: viser's page takes
+    the address of another server from its own address (``?websocket=``, ``?playbackPath=``), and what
+    that server sends runs as our page. It also keeps pictures in markdown from calling home.
+    """
+    return "; ".join(
+        (
+            "default-src 'self'",
+            "script-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob:",
+            "worker-src 'self' blob:",
+            "style-src 'self' 'unsafe-inline'",
+            "img-src 'self' data: blob:",
+            "media-src 'self' data: blob:",
+            "font-src 'self' data:",
+            f"connect-src 'self' data: blob: ws://{authority} wss://{authority}",
+            "frame-src 'self' blob: data:",
+            "object-src 'none'",
+            "base-uri 'none'",
+            "form-action 'self'",
+            "frame-ancestors 'self'",
+        )
+    )
+
+
+def asked_of(request: Request) -> gate.Asked:
+    """What the gate wants to know of a request."""
+    get = request.headers.get_all
+    return gate.Asked(
+        path=request.path,
+        host=get("Host"),
+        origin=get("Origin"),
+        cookie=get("Cookie"),
+        fetch_site=get("Sec-Fetch-Site"),
+        fetch_mode=get("Sec-Fetch-Mode"),
+        fetch_dest=get("Sec-Fetch-Dest"),
+        # Exactly viser's own question, so that what it takes for a handshake is what was judged as one.
+        websocket=get("Upgrade") == ["websocket"],
+    )
+
+
+def refusals(example: str) -> Callable[[str], Response]:
+    """Makes 403 replies that say why, and what to do: open an address like ``example``."""
+    folder = web_assets_folder()
+    page = (folder / "refused.html").read_text(encoding="utf-8")
+    page = page.replace("{{logo}}", (folder / "logo.svg").read_text(encoding="utf-8"))
+    page = page.replace("{{example}}", html.escape(example))
+
+    def refuse(reason: str) -> Response:
+        body = page.replace("{{reason}}", html.escape(reason)).encode()
+        return reply(403, "text/html; charset=utf-8", body, _PAGE_OF_OURS)
+
+    return refuse
+
+
+def reply(status: int, kind: str, body: bytes, headers: Mapping[str, str], gzipped: bool = False) -> Response:
+    extra = {"Content-Encoding": "gzip", "Vary": "Accept-Encoding"} if gzipped else {}
+    fields = {"Content-Type": kind, "Content-Length": str(len(body)), **_EVERY_REPLY, **extra, **headers}
+    return Response(status, HTTPStatus(status).phrase, Headers(fields), body)
+
+
+def entered_reply(entered: gate.Entered) -> Response:
+    cookie = {"Set-Cookie": entered.set_cookie, **_PAGE_OF_OURS}
+    if not entered.by_page:
+        return reply(303, "text/plain; charset=utf-8", b"", {"Location": entered.location, **cookie})
+    onward = f'<!doctype html><title>Workbench</title><meta http-equiv="refresh" content="0;url={html.escape(entered.location)}">'
+    return reply(200, "text/html; charset=utf-8", onward.encode(), cookie)
+
+
+async def admitted_reply(
+    routes: Mapping[str, tuple[Handler, Mapping[str, str]]],
+    viser_hook: viser_seam.Hook,
+    connection: ServerConnection,
+    request: Request,
+    authority: str,
+) -> Response:
+    page = {"Content-Security-Policy": page_policy(authority), "Cache-Control": "no-cache"}
+    # Decoded once, as viser does; what is still encoded after that is part of a file's name.
+    path = unquote(request.path.partition("?")[0]).replace("\\", "/")
+    prefix = max((prefix for prefix in routes if path.startswith(prefix)), key=len, default=None)
+    if prefix is None:
+        response = viser_hook(connection, request)
+        if response is None:  # viser took for a handshake what was not judged as one
+            return reply(400, "text/plain; charset=utf-8", b"Bad request.", page)
+        for name, value in {**_EVERY_REPLY, **page}.items():
+            response.headers[name] = value
+        return response
+    if ".." in path.split("/") or "\0" in path:
+        return reply(404, "text/plain; charset=utf-8", b"There is no such file.", page)
+    handler, headers = routes[prefix]
+    accepts_gzip = any("gzip" in value for value in request.headers.get_all("Accept-Encoding"))
+
+    def work() -> Response:
+        try:
+            status, kind, body = handler(path[len(prefix) :])
+        except Exception:
+            _log.exception("The route %s failed on %s.", prefix, path)
+            status, kind, body = 500, "text/plain; charset=utf-8", b"This went wrong; the terminal says how."
+        zip_it = accepts_gzip and len(body) > 1024 and _compresses(kind)
+        return reply(status, kind, gzip.compress(body, 6) if zip_it else body, {**page, **headers}, zip_it)
+
+    # In a thread: reading and compressing a recording would hold up every page's websocket.
+    return await asyncio.to_thread(work)
+
+
+def _compresses(kind: str) -> bool:
+    plain = kind.partition(";")[0]
+    return plain.startswith("text/") or plain in (
+        "application/json",
+        "application/javascript",
+        "application/wasm",
+        "image/svg+xml",
+    )
+
+
+def folder_handler(folder: Path) -> Handler:
+    """A handler that serves the files below ``folder``, and nothing that a link there points out to."""
+    root = folder.resolve()
+
+    def handle(path: str) -> tuple[int, str, bytes]:
+        file = (root / path.lstrip("/")).resolve()
+        if not file.is_relative_to(root) or not file.is_file():
+            return 404, "text/plain; charset=utf-8", b"There is no such file."
+        return 200, content_type(file.name), file.read_bytes()
+
+    return handle
+
+
+def content_type(name: str) -> str:
+    """Content type by the end of a file's name. Not left to the system's table alone, which may call
+    JavaScript plain text, and browsers then refuse to run it."""
+    known = {
+        ".css": "text/css; charset=utf-8",
+        ".html": "text/html; charset=utf-8",
+        ".js": "text/javascript; charset=utf-8",
+        ".json": "application/json",
+        ".svg": "image/svg+xml",
+        ".wasm": "application/wasm",
+    }
+    return known.get(Path(name).suffix.lower()) or mimetypes.guess_type(name)[0] or "application/octet-stream"
