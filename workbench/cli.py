@@ -7,6 +7,7 @@ command is chosen, so that ``--help`` and a mistyped option answer at once.
 from __future__ import annotations
 
 import json
+import os
 import signal
 import sys
 import threading
@@ -70,6 +71,7 @@ def open_page(
     from workbench.session.session import Session
     from workbench.ui.page import Page
 
+    _use_private_driver()
     for line in (door.warning, door.notice):
         if line:
             err.print(f"[yellow]{escape(line)}[/]")
@@ -128,6 +130,7 @@ def record(
     """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+    _use_private_driver()
     from workbench.authoring.problem import TaskError
     from workbench.session.record import RecordOptions
     from workbench.session.record import record as record_episodes
@@ -181,6 +184,13 @@ def main(args: Sequence[str] | None = None) -> None:
         args=args,
     )
     sys.exit(code)
+
+
+def _use_private_driver() -> None:
+    """Let SAPIEN find the software driver that was unpacked for a user who may not install one."""
+    from workbench.machine.software_vulkan import ensure_render_device
+
+    os.environ.update(ensure_render_device(install=False).env)
 
 
 def _task_options(num_envs: int, backend: Backend, seed: int, env: Sequence[str]) -> TaskOptions:

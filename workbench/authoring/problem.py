@@ -65,7 +65,7 @@ _MACHINERY = ("workbench", "importlib", "_frozen_importlib", "_frozen_importlib_
 class Problem:
     stage: str
     """What was being done: ``syntax import build reset step evaluate reward observation returns
-    policy worker``."""
+    policy pictures worker``."""
     message: str
     """One line: exception type and text."""
     file: str | None

@@ -24,7 +24,14 @@ class BackendUnavailable(RuntimeError):
 class ChosenBackend:
     simulation: Literal["cpu", "gpu"]
     render_backend: str
-    """What ManiSkill takes: ``cpu`` (any Vulkan device), ``gpu`` (CUDA) or ``none``."""
+    """What ManiSkill takes: ``gpu`` (SAPIEN's ``cuda`` device), ``cpu`` (any other) or ``none``."""
+
+
+@dataclass(frozen=True)
+class Renderer:
+    render_backend: str
+    name: str
+    """For people, for example ``llvmpipe (LLVM 15.0.6, 256 bits)``."""
 
 
 def gpu_library_path() -> Path:
@@ -45,13 +52,18 @@ def why_no_gpu_simulation() -> str | None:
 
 
 @lru_cache(maxsize=1)
-def render_device_name() -> str | None:
-    """Name of the device that SAPIEN renders with, or None when it finds none."""
-    try:
-        sapien.render.RenderSystem(sapien.Device("cpu"))
-    except RuntimeError:
-        return None
-    return _device_summary()
+def find_renderer() -> Renderer | None:
+    """What SAPIEN renders with, or None when it finds no device.
+
+    Asked once: a process can have one render device only, and a second one under another name raises.
+    """
+    for device in ("cuda", "cpu") if torch.cuda.is_available() else ("cpu",):
+        try:
+            sapien.render.RenderSystem(sapien.Device(device))
+        except RuntimeError:
+            continue
+        return Renderer("gpu" if device == "cuda" else "cpu", _device_summary())
+    return None
 
 
 def _device_summary() -> str:
@@ -76,6 +88,5 @@ def choose_backend(wanted: Literal["auto", "cpu", "gpu"], render: bool) -> Chose
     if wanted == "gpu" and reason is not None:
         raise BackendUnavailable(f"GPU simulation is not available: {reason}. Use --backend cpu.")
     simulation: Literal["cpu", "gpu"] = "gpu" if wanted != "cpu" and reason is None else "cpu"
-    if not render or render_device_name() is None:
-        return ChosenBackend(simulation, "none")
-    return ChosenBackend(simulation, "gpu" if simulation == "gpu" else "cpu")
+    renderer = find_renderer() if render else None
+    return ChosenBackend(simulation, "none" if renderer is None else renderer.render_backend)

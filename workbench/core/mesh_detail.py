@@ -19,6 +19,8 @@ from dataclasses import replace
 import fast_simplification
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from workbench.core.geometry import Mesh
@@ -31,6 +33,8 @@ quadric collapse alone would take seconds and get stuck."""
 _CLUSTER_CELLS = 64
 _COARSEST_CELLS = 16
 _WELD_CELLS = 1_000_000
+_MOST_PIECES = 200
+_LEAST_FACES = 24
 
 
 def reduce_mesh(mesh: Mesh, max_faces: int) -> Mesh:
@@ -186,12 +190,12 @@ def _collapse(
     points = vertices.astype(np.float64) / extent
     triangles = np.ascontiguousarray(faces, dtype=np.int32)
     if uvs is None:
-        new_points, new_faces = fast_simplification.simplify(points, triangles, target_count=max_faces)
+        new_points, new_faces = _collapse_pieces(points, triangles, max_faces)
         # Where a quadric is nearly singular its optimum can lie anywhere: a spike out of the surface.
         distance, nearest = cKDTree(points).query(new_points)
         spike = distance > 0.04
         new_points[spike] = points[nearest[spike]]
-        return (new_points * extent).astype(np.float32), new_faces.astype(np.int64), None
+        return (new_points * extent).astype(np.float32), new_faces, None
     # The edge of a piece of texture is a border of the welded mesh; moved, it would open a gap.
     _, _, collapses = fast_simplification.simplify(
         points, triangles, target_count=max_faces, return_collapses=True, preserve_border=True
@@ -202,3 +206,31 @@ def _collapse(
     new_uvs = np.zeros((len(new_points), 2), dtype=np.float32)
     new_uvs[new_index[order]] = uvs[order]
     return (new_points * extent).astype(np.float32), new_faces.astype(np.int64), new_uvs
+
+
+def _collapse_pieces(
+    points: NDArray[np.float64], faces: NDArray[np.int32], max_faces: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Collapse each connected piece by itself, with a share of the triangles after its area.
+
+    To a quadric a flat disc costs nothing to lose; taken together with a round housing, the lid goes first.
+    """
+    count = len(points)
+    edges = coo_matrix((np.ones(2 * len(faces)), (faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())), (count, count))
+    pieces, label = connected_components(edges, directed=False)
+    label = label[faces[:, 0]]
+    corner = points[faces]
+    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+    share = np.bincount(label, area, minlength=pieces) / max(area.sum(), 1e-20)
+    new_points, new_faces, used = [], [], 0
+    for piece in np.unique(label) if pieces <= _MOST_PIECES else [None]:
+        own = faces if piece is None else faces[label == piece]
+        target = max_faces if piece is None else max(_LEAST_FACES, int(share[piece] * max_faces))
+        index, flat = np.unique(own, return_inverse=True)
+        vertices, triangles = points[index], flat.reshape(-1, 3).astype(np.int32)
+        if len(triangles) > target:
+            vertices, triangles = fast_simplification.simplify(vertices, triangles, target_count=target)
+        new_points.append(vertices)
+        new_faces.append(triangles.astype(np.int64) + used)
+        used += len(vertices)
+    return np.concatenate(new_points), np.concatenate(new_faces)

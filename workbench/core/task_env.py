@@ -7,7 +7,7 @@ GPU simulation, and the caller need not know which.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -195,7 +195,7 @@ class TaskEnv:
         elapsed = to_numpy(self.env.elapsed_steps).astype(np.int32)
         limit = self.max_episode_steps
         truncated = np.zeros(self.num_envs, bool) if limit is None else elapsed >= limit
-        evaluate = {key: to_numpy(value) for key, value in info.items() if key != "elapsed_steps"}
+        evaluate = {k: _batch(to_numpy(v), self.num_envs) for k, v in _flat(info) if k != "elapsed_steps"}
         return StepResult(
             elapsed_steps=elapsed,
             reward=reward,
@@ -214,6 +214,20 @@ def _seed_list(seed: int | Sequence[int] | None, count: int) -> list[int] | None
     if len(seeds) != count:
         raise ValueError(f"{len(seeds)} seeds for {count} envs")
     return seeds
+
+
+def _flat(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in info.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}/")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _batch(value: NDArray[Any], num_envs: int) -> NDArray[Any]:
+    """(N, ...): one value for all envs (some installed tasks give one) is repeated for each."""
+    batched = value.ndim > 0 and value.shape[0] == num_envs
+    return value if batched else np.broadcast_to(value, (num_envs, *value.shape)).copy()
 
 
 def to_numpy(value: Any) -> NDArray[Any]:

@@ -43,10 +43,10 @@ FRUSTUM_METRES = 0.12
 """How far in front of a camera its picture is drawn in the 3-D view."""
 MILLIMETRES_PER_METRE = 1000.0
 SERIES_COLORS = (
-    (86, 180, 233), (230, 159, 0), (0, 158, 115), (240, 228, 66), (204, 121, 167), (213, 94, 0), (0, 114, 178),
-    (160, 160, 160),
+    (86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167), (213, 94, 0), (0, 114, 178), (150, 150, 150),
 )
-"""Okabe and Ito's palette, which the colour-blind can tell apart, with grey for its black."""
+"""Okabe and Ito's palette, which the colour-blind can tell apart, but for its black and yellow: the
+viewer comes dark and light, and each would vanish on one of the two."""
 
 _OPTICAL_FROM_CAMERA = (0.5, -0.5, 0.5, -0.5)
 """wxyz of the OpenCV camera axes (x right, y down, z forward) within ManiSkill's (x forward, y left,

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from workbench.authoring import registry
-from workbench.authoring.load import LoadedTask, load_task, with_late_imports
-from workbench.authoring.problem import TaskError, problem_from_exception
+from workbench.authoring.load import LoadedTask, load_task, take_back, with_late_imports
+from workbench.authoring.problem import Problem, TaskError, problem_from_exception
 from workbench.authoring.returns import check_step_returns
 from workbench.core import actions
-from workbench.core.backends import render_device_name
+from workbench.core.backends import find_renderer
 from workbench.core.take_pictures import list_cameras, segmentation_names
 from workbench.core.scene_geometry import read_geometry
 from workbench.core.step import StepResult
@@ -56,6 +56,18 @@ def open_task(
     loaded = load_task(reference, source=source)
     clock.lap("import")
 
+    try:
+        return _build(loaded, options, clock, on_activity)
+    except BaseException:
+        # The class imported and cannot be used: without this the last good version would go on with
+        # the new version's helper modules and registrations behind its back.
+        take_back(loaded)
+        raise
+
+
+def _build(
+    loaded: LoadedTask, options: TaskOptions, clock: _Clock, on_activity: Callable[[str], None]
+) -> OpenedTask:
     on_activity(f"building {options.num_envs} {'env' if options.num_envs == 1 else 'envs'}")
     with _blamed("build", loaded):
         env = make_env(
@@ -105,16 +117,20 @@ def step_checked(task: TaskEnv, loaded: LoadedTask, action: Any) -> StepResult:
     except TaskError:
         raise
     except Exception as error:
-        problem = problem_from_exception(error, "step", loaded.source_files)
-        if problem.file is None or "mani_skill" in problem.file:
-            try:
-                returned = task.env.evaluate()
-            except Exception:
-                raise TaskError(problem) from error  # evaluate itself raises: the first error says so
-            blamed = check_step_returns(loaded.cls, task.num_envs, returned, None, loaded.source_files)
+        problem = problem_from_exception(error, "step", loaded.source_files, loaded.cls)
+        if problem.line is None or problem.stage == "step":
+            blamed = _unbatched(task, loaded)
             if blamed is not None:
                 raise TaskError(blamed) from error
         raise TaskError(problem) from error
+
+
+def _unbatched(task: TaskEnv, loaded: LoadedTask) -> Problem | None:
+    try:
+        returned = task.env.evaluate()
+    except Exception as error:
+        return problem_from_exception(error, "evaluate", loaded.source_files, loaded.cls)
+    return check_step_returns(loaded.cls, task.num_envs, returned, None, loaded.source_files)
 
 
 def describe(loaded: LoadedTask, task: TaskEnv) -> TaskDescription:
@@ -127,7 +143,7 @@ def describe(loaded: LoadedTask, task: TaskEnv) -> TaskDescription:
     ]
     simulation = "gpu" if env.device.type == "cuda" else "cpu (batched)"
     can_render = bool(env.scene.can_render())
-    renderer = render_device_name() if can_render else None
+    renderer = find_renderer() if can_render else None
     control_mode = None if env.agent is None else str(env.control_mode)
     return TaskDescription(
         env_id=loaded.env_id,
@@ -137,7 +153,7 @@ def describe(loaded: LoadedTask, task: TaskEnv) -> TaskDescription:
         source_hash=loaded.source_hash,
         source=dict(loaded.source),
         backend=simulation,
-        device=f"{env.device}" + (f", pictures on {renderer}" if renderer else ", no pictures"),
+        device=f"{env.device}" + (f", pictures on {renderer.name}" if renderer else ", no pictures"),
         num_envs=task.num_envs,
         max_episode_steps=loaded.max_episode_steps,
         obs_mode=env.obs_mode,
@@ -154,7 +170,10 @@ def describe(loaded: LoadedTask, task: TaskEnv) -> TaskDescription:
 
 def _returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, Any], Any], None]:
     def check(evaluate: Mapping[str, Any], reward: Any) -> None:
-        entries = {key: value for key, value in evaluate.items() if key != "elapsed_steps"}
+        # An installed task is not its reader's to mend: only what the page cannot do without is asked of
+        # it (PullCubeTool-v1 reports its `cube_progress` unbatched).
+        needed = {"success", "fail"} if not loaded.followed else evaluate.keys() - {"elapsed_steps"}
+        entries = {key: value for key, value in evaluate.items() if key in needed}
         problem = check_step_returns(loaded.cls, num_envs, entries, reward, loaded.source_files)
         if problem is not None:
             raise TaskError(problem)
@@ -179,7 +198,9 @@ class _blamed:
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         # SystemExit as well: an author's exit() must not take the worker along.
         if isinstance(error, (Exception, SystemExit)) and not isinstance(error, TaskError):
-            problem = problem_from_exception(error, self._stage, self._loaded.source_files)
+            problem = problem_from_exception(
+                error, self._stage, self._loaded.source_files, self._loaded.cls
+            )
             raise TaskError(problem) from error
 
 

@@ -171,6 +171,12 @@ class Session:
             self._changed.wait_for(lambda: self._change != seen or self._closing, timeout)
             return self._change
 
+    @property
+    def worker_pid(self) -> int | None:
+        """Process id of the worker; None while there is none."""
+        with self._lock:
+            return None if self._worker is None else self._worker.pid
+
     # --- what the page asks for --------------------------------------------------------------------
 
     def reload(self) -> None:

@@ -15,8 +15,10 @@ from workbench.authoring.problem import Problem
 from workbench.session.view import SessionView
 from workbench.ui.fragments import render
 
-WIDTH = 520
-"""Pixels; a view that is narrower makes it narrower."""
+WIDEST, NARROWEST = 520, 240
+"""Pixels. Between them it is as wide as the narrowest open view leaves room for: over the controls it
+would hide the very buttons that the last good version is still used with."""
+GAP = 12
 
 DOING = {
     "syntax": "cannot be read",
@@ -51,7 +53,9 @@ class Banner:
                 "Start a new worker", icon=viser.Icon.POWER, color="gray", visible=False
             )
         # From the right edge of the view: on the left are viser's own notices.
-        self._panel.float(x=-12, y=12, width=WIDTH)
+        self._panel.float(x=-GAP, y=GAP, width=WIDEST)
+        self._server = server
+        self._width = WIDEST
         self._reload.on_click(lambda _: reload())
         self._restart.on_click(lambda _: restart())
         self._serial: int | None = None
@@ -63,6 +67,7 @@ class Banner:
                 self._panel.visible = False
             self._serial = None
             return
+        self._fit_views()
         stopped = view.state == "stopped"
         if self._restart.visible != stopped:
             self._restart.visible = stopped
@@ -72,6 +77,15 @@ class Banner:
             self._html.content = banner_html(problem, view)
             self._panel.visible = True
             self._panel.expand()
+
+
+    def _fit_views(self) -> None:
+        views = [client.camera.image_width for client in self._server.get_clients().values()]
+        narrowest = min((width for width in views if width > 0), default=WIDEST)
+        width = int(min(max(narrowest - 2 * GAP, NARROWEST), WIDEST))
+        if width != self._width:
+            self._width = width
+            self._panel.set_width(width)
 
 
 def banner_html(problem: Problem, view: SessionView) -> str:

@@ -8,25 +8,11 @@ with a ``<script>`` in it would run there. Everything that is shown as HTML ther
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import jinja2
 
-import workbench
-
-
-@cache
-def asset_folder() -> Path:
-    """The folder of files for the browser: inside the package once installed, beside it in the repo."""
-    package = Path(workbench.__file__).parent
-    for folder in (package / "web_assets", package.parent / "web_assets"):
-        if (folder / "panels").is_dir():
-            return folder
-    raise FileNotFoundError(
-        f"web_assets/panels is neither in {package} nor beside it: the installation is incomplete, "
-        "install the package again"
-    )
+from workbench.web_assets import web_assets_folder
 
 
 def render(template: str, **values: Any) -> str:
@@ -36,14 +22,14 @@ def render(template: str, **values: Any) -> str:
 
 def style_sheet() -> str:
     """The page's own CSS as one ``<style>`` element."""
-    css = (asset_folder() / "panels" / "page.css").read_text(encoding="utf-8")
+    css = (web_assets_folder() / "panels" / "page.css").read_text(encoding="utf-8")
     return f"<style>{css}</style>"
 
 
 @cache
 def _environment() -> jinja2.Environment:
     return jinja2.Environment(
-        loader=jinja2.FileSystemLoader(asset_folder() / "panels"),
+        loader=jinja2.FileSystemLoader(web_assets_folder() / "panels"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,

@@ -60,7 +60,7 @@ class Page:
         self._task_serial = -1
         self._built: tuple[bool, int] | None = None
         self._framed: object = None
-        self._num_clients = -1
+        self._clients: set[int] = set()
 
         server.scene.set_up_direction("+z")
         light(server)
@@ -149,11 +149,22 @@ class Page:
         self._record.draw(view)
 
     def _count_clients(self) -> int:
-        count = len(self._server.get_clients())
-        if count != self._num_clients:
-            self._num_clients = count
-            self._session.set_clients(count)
-        return count
+        clients = self._server.get_clients()
+        if clients.keys() != self._clients:
+            for number in clients.keys() - self._clients:
+                self._welcome(clients[number])
+            self._clients = set(clients)
+            self._session.set_clients(len(clients))
+        return len(clients)
+
+    def _welcome(self, client: viser.ClientHandle) -> None:
+        """Frame the scene for the shape of this page's view.
+
+        Not if the page looks from somewhere else already: then it is one that lost its connection and
+        came back, and its view belongs to the person.
+        """
+        if np.allclose(client.camera.position, self._server.initial_camera.position, atol=0.02):
+            self._point(client, self._session.view())
 
     # --- the 3-D view ----------------------------------------------------------------------------
 
@@ -202,10 +213,13 @@ class Page:
         self._server.initial_camera.position = initial.position
         self._server.initial_camera.look_at = initial.look_at
         for client in self._server.get_clients().values():
-            viewpoint = self._viewpoint(view, client)
-            if viewpoint is not None:
-                client.camera.position = viewpoint.position
-                client.camera.look_at = viewpoint.look_at
+            self._point(client, view)
+
+    def _point(self, client: viser.ClientHandle, view: SessionView) -> None:
+        viewpoint = self._viewpoint(view, client)
+        if viewpoint is not None:
+            client.camera.position = viewpoint.position
+            client.camera.look_at = viewpoint.look_at
 
     def _viewpoint(self, view: SessionView, client: viser.ClientHandle | None) -> Viewpoint | None:
         if self._layout is None or view.task is None:

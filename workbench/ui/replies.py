@@ -36,7 +36,6 @@ _EVERY_REPLY = {
     "Referrer-Policy": "no-referrer",
     "X-Frame-Options": "SAMEORIGIN",
     "Cross-Origin-Resource-Policy": "same-origin",
-    "Cross-Origin-Opener-Policy": "same-origin",
     "Connection": "close",
 }
 _PAGE_OF_OURS = {

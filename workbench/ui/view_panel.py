@@ -11,7 +11,7 @@ DETAILS = {"fine": 1_000_000, "normal": 200_000, "coarse": 50_000}
 """Triangles in the view. A browser without a graphics card wants the fewest."""
 ALL, ONE = "all envs", "the selected env"
 DARK, LIGHT = "dark", "light"
-BRAND = (25, 100, 170)
+BRAND = (28, 112, 190)
 
 
 class ViewPanel:

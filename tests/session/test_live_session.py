@@ -1,0 +1,164 @@
+"""A page's wishes, carried out by a real worker on the example task."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.session.conftest import wait_until
+from workbench.recording.read import read_properties
+from workbench.recording.verify import verify_rrd
+from workbench.session.messages import CameraRequest
+from workbench.session.session import Session
+
+
+def settle(session: Session) -> None:
+    session.pause()
+    session.set_action_source("random")
+    session.set_episode_end("reset")
+    session.set_seed(0)
+    wait_until(session, lambda v: not v.playing and v.step is not None and not v.step.elapsed_steps.any(), "rest")
+
+
+def test_a_single_step_moves_every_env_once(session: Session) -> None:
+    settle(session)
+    session.step()
+    view = wait_until(session, lambda v: v.step.elapsed_steps.any(), "a step")
+    assert view.step.elapsed_steps.tolist() == [1, 1]
+    assert view.step.poses.shape == (2, len(view.task.geometry.body_names), 7)
+    assert {"success", "fail"} <= view.step.evaluate.keys()
+    assert view.curves.reward.shape[1] == 2
+
+
+def test_playing_goes_on_until_paused(session: Session) -> None:
+    settle(session)
+    session.set_speed(4.0)
+    session.play()
+    wait_until(session, lambda v: v.step.elapsed_steps.max() >= 10 and v.state == "running", "ten steps")
+    session.pause()
+    view = wait_until(session, lambda v: v.state == "paused", "the pause")
+    session.set_speed(1.0)
+    settled = view.step_serial
+    session.reset((1,))
+    after = wait_until(session, lambda v: v.step_serial > settled, "the reset")
+    assert after.step.elapsed_steps[1] == 0
+
+
+def test_resetting_one_env_leaves_the_other(session: Session) -> None:
+    settle(session)
+    for count in (1, 2, 3):
+        session.step()
+        wait_until(session, lambda v, n=count: v.step.elapsed_steps[0] == n, f"step {count}")
+    before = session.view().step
+    session.reset((1,))
+    after = wait_until(session, lambda v: v.step.elapsed_steps[1] == 0, "the reset of env 1").step
+    assert after.elapsed_steps.tolist() == [3, 0]
+    assert np.array_equal(after.poses[0], before.poses[0], equal_nan=True)
+    assert not np.array_equal(after.poses[1], before.poses[1], equal_nan=True)
+
+
+def test_the_same_seed_gives_the_same_start(session: Session) -> None:
+    settle(session)
+    first = session.view().step.poses
+    session.set_seed(7)
+    other = wait_until(session, lambda v: not np.allclose(v.step.poses, first, equal_nan=True), "another start")
+    session.set_seed(0)
+    again = wait_until(
+        session, lambda v: np.array_equal(v.step.poses, first, equal_nan=True), "the first start again"
+    )
+    assert other.step_serial < again.step_serial
+
+
+def test_sliders_are_the_action_of_every_env_and_are_kept_in_bounds(session: Session) -> None:
+    settle(session)
+    count = len(session.view().task.actions)
+    session.set_action_source("sliders")
+    session.set_sliders((5.0,) + (0.25,) * (count - 1))
+    session.step()
+    view = wait_until(session, lambda v: v.step.elapsed_steps.any(), "a step")
+    assert view.step.action.shape == (2, count)
+    assert np.allclose(view.step.action[:, 0], view.task.actions[0].high)
+    assert np.allclose(view.step.action[:, 1:], 0.25)
+
+
+def test_holding_still_keeps_the_robot_where_it_is(session: Session) -> None:
+    settle(session)
+    session.set_action_source("hold")
+    names = session.view().task.geometry.body_names
+    hand = next(i for i, name in enumerate(names) if name.endswith("panda_hand"))
+    start = session.view().step.poses[:, hand, :3]
+    for count in range(1, 6):
+        session.step()
+        wait_until(session, lambda v, n=count: v.step.elapsed_steps[0] == n, "a step")
+    assert np.abs(session.view().step.poses[:, hand, :3] - start).max() < 2e-3
+
+
+def test_a_policy_from_a_file_is_called_with_the_observation(session: Session, tmp_path) -> None:
+    settle(session)
+    policy = tmp_path / "policy.py"
+    policy.write_text("def act(obs):\n    return obs[:, :8] * 0 + 0.5\n")
+    session.set_action_source("policy", f"{policy}:act")
+    session.step()
+    view = wait_until(session, lambda v: v.step.elapsed_steps.any(), "a step")
+    assert np.allclose(view.step.action, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("text", "reference", "says"),
+    [
+        ("def act(obs):\n    return 1 / 0\n", "act", "ZeroDivisionError"),
+        ("def act(obs):\n    return obs[:, :3]\n", "act", "expected \\(2, 8\\)"),
+        ("def act(obs):\n    return obs[:, :8] * float('nan')\n", "act", "NaN"),
+        ("def act(obs):\n    return None\n", "missing", "no function missing"),
+    ],
+)
+def test_a_policy_that_fails_says_so_and_the_session_goes_on(
+    session: Session, tmp_path, text: str, reference: str, says: str
+) -> None:
+    settle(session)
+    policy = tmp_path / "policy.py"
+    policy.write_text(text)
+    session.set_action_source("policy", f"{policy}:{reference}")
+    if reference == "act":
+        session.step()
+    view = wait_until(session, lambda v: v.problem is not None, "a problem")
+    assert view.problem.stage == "policy"
+    assert np.any([word in view.problem.message for word in [says.replace("\\", "")]])
+    session.set_action_source("random")
+    session.step()
+    wait_until(session, lambda v: v.problem is None, "the problem's end")
+
+
+def test_pictures_come_of_the_selected_env_and_only_while_somebody_looks(session: Session) -> None:
+    settle(session)
+    sensor = next(c for c in session.view().task.cameras if c.kind == "sensor")
+    wanted = CameraRequest(sensor.name, "sensor", ("rgb", "depth", "segmentation"))
+    session.watch_cameras((wanted,))
+    session.step()
+    wait_until(session, lambda v: v.step.elapsed_steps[0] == 1, "a step")
+    assert not session.view().pictures, "nobody looks yet"
+    session.set_clients(1)
+    session.select_env(1)
+    view = wait_until(session, lambda v: bool(v.pictures), "a picture")
+    picture = view.pictures["sensor", sensor.name]
+    assert picture.env == 1
+    assert picture.rgb.shape == (sensor.height, sensor.width, 3) and picture.rgb.std() > 5
+    assert picture.depth.shape == (sensor.height, sensor.width) and picture.depth.max() > 0.1
+    assert set(np.unique(picture.segmentation)) - {0} <= view.task.segmentation.keys()
+    session.watch_cameras(())
+    session.set_clients(0)
+    session.select_env(0)
+
+
+def test_recording_writes_an_episode_that_rerun_verifies(session: Session) -> None:
+    settle(session)
+    session.start_recording((1,))
+    wait_until(session, lambda v: v.recording.active and v.step.elapsed_steps[1] == 0, "a fresh episode")
+    for count in (1, 2, 3, 4):
+        session.step()
+        wait_until(session, lambda v, n=count: v.recording.steps == n, f"recorded step {count}")
+    session.stop_recording()
+    view = wait_until(session, lambda v: v.recording.episodes_written == 1, "the file")
+    assert not view.recording.active and view.recording.problem is None
+    assert verify_rrd(view.recording.last_file) is None
+    assert "WorkbenchPushCube-v1" in str(read_properties(view.recording.last_file))
