@@ -13,7 +13,7 @@ import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
-from mani_skill.utils.structs import Actor
+from mani_skill.utils.structs import Actor, Pose
 
 from workbench.core.body_table import BodyTable, build_body_table, read_poses
 from workbench.core.task_env import EnvOptions, make_env
@@ -71,7 +71,7 @@ def test_poses_are_those_of_the_physics(task: str) -> None:
     env = batched(task)
     table = build_body_table(env)
     env.step(torch.from_numpy(env.action_space.sample()))
-    env.reset(options=dict(env_idx=torch.tensor([1, 3])))
+    env.reset(options={"env_idx": torch.tensor([1, 3])})
     poses = read_poses(env, table)
     for e in range(env.num_envs):
         for b in range(len(table.names)):
@@ -124,7 +124,7 @@ class SparseBodiesEnv(PushCubeEnv):
         def ball(name: str, scene_idxs: list[int] | None = None) -> Actor:
             builder = self.scene.create_actor_builder()
             builder.add_sphere_collision(radius=0.02)
-            builder.initial_pose = sapien.Pose([0.3, 0.3, 1.0 + 0.1 * len(name)])
+            builder.initial_pose = Pose.create(sapien.Pose([0.3, 0.3, 1.0 + 0.1 * len(name)]))
             builder.set_scene_idxs(scene_idxs)
             return builder.build_dynamic(name=name)
 
@@ -160,7 +160,7 @@ def test_a_stock_env_may_gain_an_entity() -> None:
 def test_a_table_of_an_old_scene_is_refused() -> None:
     env = stock("PushCube-v1")
     table = build_body_table(env)
-    env.reset(seed=0, options=dict(reconfigure=True))
+    env.reset(seed=0, options={"reconfigure": True})
     with pytest.raises(ValueError, match="build_body_table"):
         read_poses(env, table)
     env.close()

@@ -15,6 +15,7 @@ import trimesh
 from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
 from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
 from mani_skill.utils.registration import REGISTERED_ENVS
+from mani_skill.utils.structs import Pose
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
@@ -46,11 +47,6 @@ def stock(task: str, **kwargs: Any) -> Any:
     return env
 
 
-def matrices(poses: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(..., 4, 4) of (..., 7) poses."""
-    return np.array([sapien.Pose(p[:3], p[3:]).to_transformation_matrix() for p in poses.reshape(-1, 7)])
-
-
 # --- what it looks like ----------------------------------------------------------------------------
 
 
@@ -59,7 +55,7 @@ def painted(
 ) -> NDArray[np.int64]:
     """(size, size) body index (or -1) of triangles painted from far to near, in pure numpy and PIL."""
     fine = 4  # PIL also paints pixels that a triangle only touches; on a finer grid that matters less
-    to_camera = np.linalg.inv(sapien.Pose(pose[:3], pose[3:]).to_transformation_matrix())
+    to_camera = np.linalg.inv(sapien.Pose(pose[:3].tolist(), pose[3:].tolist()).to_transformation_matrix())
     triangles, depths, bodies = [], [], []
     for visual in visuals:
         for body in visual.bodies[visual.envs == env]:
@@ -83,7 +79,7 @@ def painted(
 @pytest.mark.parametrize("detail", [EVERYTHING, Detail()], ids=["whole", "reduced"])
 def test_silhouettes_are_those_of_the_renderer(detail: Detail) -> None:
     size = 512
-    env = batched("PickCube-v1", 2, sensor_configs=dict(width=size, height=size))
+    env = batched("PickCube-v1", 2, sensor_configs={"width": size, "height": size})
     env.step(None)
     table = build_body_table(env)
     geometry, poses = read_geometry(env, table, detail), read_poses(env, table)
@@ -123,6 +119,7 @@ def redrawn(geometry: SceneGeometry, poses: NDArray[np.float32], env: Any, shade
             material.base_color_texture = sapien.render.RenderTexture2D(
                 look.texture, "R8G8B8A8Unorm", mipmap_levels=4 if "ground" in visual.name else 1, srgb=True
             )
+        assert mesh.normals is not None
         uvs = np.zeros((len(mesh.vertices), 2)) if mesh.uvs is None else mesh.uvs
         shape = sapien.render.RenderShapeTriangleMesh(mesh.vertices, mesh.faces, mesh.normals, uvs, material)
         for body in visual.bodies[visual.envs == 0]:
@@ -146,7 +143,7 @@ def redrawn(geometry: SceneGeometry, poses: NDArray[np.float32], env: Any, shade
 
 
 def test_a_plain_scene_drawn_from_its_geometry_is_the_same_picture() -> None:
-    env = stock("MS-CartpoleBalance-v1", human_render_camera_configs=dict(shader_pack="minimal"))
+    env = stock("MS-CartpoleBalance-v1", human_render_camera_configs={"shader_pack": "minimal"})
     table = build_body_table(env)
     geometry = read_geometry(env, table, EVERYTHING)
     (picture,) = take_pictures(env, 0, [("render_camera", "human", ["rgb"])])
@@ -159,7 +156,7 @@ def test_a_plain_scene_drawn_from_its_geometry_is_the_same_picture() -> None:
 
 def test_colours_and_textures_are_those_of_the_renderer() -> None:
     """Albedo: colour before light, so that only colours, textures, uvs and shapes can differ."""
-    env = stock("PickCube-v1", human_render_camera_configs=dict(shader_pack="default"))
+    env = stock("PickCube-v1", human_render_camera_configs={"shader_pack": "default"})
     table = build_body_table(env)
     geometry = read_geometry(env, table, EVERYTHING)
     textured = {v.name.split("/")[0] for v in geometry.visuals if v.material.texture is not None}
@@ -244,7 +241,7 @@ class OddShapesEnv(PushCubeEnv):
 
         def kinematic(name: str, add: Any) -> Any:
             builder = self.scene.create_actor_builder()
-            builder.initial_pose = sapien.Pose([0, 0, 2])
+            builder.initial_pose = Pose.create(sapien.Pose([0, 0, 2]))
             add(builder)
             return builder.build_kinematic(name)
 
@@ -313,7 +310,7 @@ def test_an_edited_mesh_file_is_read_again(odd_shapes: Any) -> None:
     assert width(odd_shapes) == pytest.approx(2.0)
     trimesh.creation.box(extents=[3.0, 1.0, 1.0]).export(OddShapesEnv.mesh_file)
     sapien.render.clear_cache()  # SAPIEN keeps files by name; whoever reloads a task must say so
-    odd_shapes.reset(options=dict(reconfigure=True))
+    odd_shapes.reset(options={"reconfigure": True})
     assert width(odd_shapes) == pytest.approx(6.0)
 
 
@@ -332,14 +329,14 @@ def test_without_a_renderer_the_collision_shapes_are_drawn() -> None:
     np.testing.assert_allclose(hull.vertices.min(0), link.min(0), atol=0.02)
     np.testing.assert_allclose(hull.vertices.max(0), link.max(0), atol=0.02)
     assert trimesh.Trimesh(hull.vertices, hull.faces).volume > 0
-    for env in (env, rendered):
-        env.close()
+    env.close()
+    rendered.close()
 
 
 def test_geometry_of_an_old_scene_is_refused() -> None:
     env = stock("MS-CartpoleBalance-v1")
     table = build_body_table(env)
-    env.reset(seed=0, options=dict(reconfigure=True))
+    env.reset(seed=0, options={"reconfigure": True})
     with pytest.raises(ValueError, match="build_body_table"):
         read_geometry(env, table)
     env.close()

@@ -118,7 +118,6 @@ def record_stock(task: str, size: int = SIZE, steps: int = STEPS, **kwargs: Any)
 def _play(env: gym.Env, task: str, steps: int) -> Recorded:
     base: Any = env.unwrapped
     obs, _ = env.reset(seed=SEED)
-    env.action_space.seed(SEED)
     table = build_body_table(base)
     seen = [obs]
     builder = EpisodeBuilder(
@@ -136,9 +135,10 @@ def _play(env: gym.Env, task: str, steps: int) -> Recorded:
         ),
         read_geometry(base, table),
         {int(key): body.name for key, body in base.segmentation_id_map.items()},
-        [f"action{index}" for index in range(env.action_space.shape[-1])],
+        [f"action{index}" for index in range(len(env.action_space.sample()))],
         [_camera_info(name, sensor, obs) for name, sensor in base._sensors.items()],
     )
+    env.action_space.seed(SEED)
     builder.start(_state(base, table), 0, _pictures(base, obs))
     for _ in range(steps):
         action = env.action_space.sample()

@@ -106,6 +106,7 @@ def test_a_name_that_is_too_long_is_said(make_episode: Maker, tmp_path: Path) ->
     assert os.listdir(tmp_path) == []
 
 
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
 @pytest.mark.parametrize("room", [0, 1000, 20_000])
 def test_a_file_that_cannot_grow_is_not_left_behind(make_episode: Maker, tmp_path: Path, room: int) -> None:
     noise = np.random.default_rng(0).random((3, 2000)).astype(np.float32)

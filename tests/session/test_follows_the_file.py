@@ -128,7 +128,8 @@ def test_a_module_beside_the_task_is_followed_too(session: Session, task_file: P
     beside = task_file.parent / "beside.py"
     beside.write_text("SHIFT = 1\n")
     before = session.view().task_serial
-    task_file.write_text("from beside import SHIFT\n" + good)
+    imported = "from __future__ import annotations\nfrom beside import SHIFT  # noqa"
+    task_file.write_text(good.replace("from __future__ import annotations", imported))
     view = wait_until(session, lambda v: v.task_serial > before, "the version with a module")
     assert str(beside) in view.task.source_files
     beside.write_text("SHIFT = 2\n")

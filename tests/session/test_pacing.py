@@ -43,7 +43,7 @@ def test_a_long_pause_is_not_caught_up_with() -> None:
     pacer = Pacer(control_dt=0.05, speed=1.0)
     pacer.start(0.0)
     steps_taken(pacer, [0.0])
-    assert steps_taken(pacer, [60.0]) <= 2
+    assert steps_taken(pacer, [60.0]) <= 3
 
 
 def test_as_fast_as_possible_is_always_due_and_never_waits() -> None:

@@ -63,8 +63,8 @@ def _shape(shape: Any) -> tuple[Hashable, Callable[[], Mesh]]:
         return ("plane",), _plane
     if isinstance(shape, physx.PhysxCollisionShapeConvexMesh | physx.PhysxCollisionShapeTriangleMesh):
         vertices, triangles, scale = shape.vertices, shape.get_triangles(), shape.scale
-        digest = hashlib.blake2b(np.ascontiguousarray(vertices), digest_size=16)
-        digest.update(np.ascontiguousarray(triangles))
+        digest = hashlib.blake2b(vertices.tobytes(), digest_size=16)
+        digest.update(triangles.tobytes())
         return ("mesh", digest.hexdigest(), *scale.tolist()), lambda: _oriented(vertices * scale, triangles)
     raise TypeError(f"{type(shape).__name__} is a collision shape that the workbench does not know")
 

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from workbench.core.geometry import Mesh
 
@@ -34,7 +34,7 @@ _CLUSTER_CELLS = 64
 _COARSEST_CELLS = 16
 _WELD_CELLS = 1_000_000
 _MOST_PIECES = 200
-_LEAST_FACES = 24
+_LEAST_FACES = 48
 
 
 def reduce_mesh(mesh: Mesh, max_faces: int) -> Mesh:
@@ -43,7 +43,7 @@ def reduce_mesh(mesh: Mesh, max_faces: int) -> Mesh:
     One of many loose pieces may keep up to twice as many, and a textured one more, because the edges of
     its pieces of texture are kept as they are.
     """
-    if len(mesh.faces) <= max_faces:
+    if len(mesh.faces) <= max_faces or not np.ptp(mesh.vertices, axis=0).any():
         return mesh
     cells = _WELD_CELLS if mesh.uvs is not None or len(mesh.faces) <= _DENSE else _CLUSTER_CELLS
     welded = _weld(mesh.vertices, mesh.faces, mesh.uvs, cells)
@@ -87,7 +87,7 @@ def with_normals(mesh: Mesh) -> Mesh:
     smooth = np.einsum("ij,ij->i", unit[a // 3], unit[b // 3]) >= _CREASE_COSINE
     normals = np.stack(
         [np.bincount(a[smooth], weighted[b[smooth] // 3, k], minlength=len(corners)) for k in range(3)], axis=1
-    )
+    ).astype(np.float64)
     # A face without area sums to nothing, and a zero normal is drawn black.
     empty = np.linalg.norm(normals, axis=1) < 1e-20
     normals[empty] = [0.0, 0.0, 1.0]
@@ -153,11 +153,14 @@ def _normals_of_source(reduced: Mesh, source: Mesh) -> NDArray[np.float32]:
     """
     assert reduced.normals is not None and source.normals is not None
     count = min(8, len(source.vertices))
-    _, near = cKDTree(source.vertices).query(reduced.vertices, k=count)
-    candidates = source.normals[near.reshape(-1, count)]
-    agree = np.einsum("vkj,vj->vk", candidates, reduced.normals) > _CREASE_COSINE
-    chosen = candidates[np.arange(len(near)), agree.argmax(axis=1)]
-    return np.where(agree.any(axis=1)[:, None], chosen, reduced.normals).astype(np.float32)
+    near = np.asarray(KDTree(source.vertices).query(reduced.vertices, k=count)[1]).reshape(-1, count)
+    candidates = source.normals[near]
+    alike = np.einsum("vkj,vj->vk", candidates, reduced.normals)
+    # The nearest that agrees; where a face was folded over none does, and the most alike is taken.
+    choice = np.where((alike > _CREASE_COSINE).any(axis=1), (alike > _CREASE_COSINE).argmax(axis=1), alike.argmax(axis=1))
+    every = np.arange(len(near))
+    chosen = candidates[every, choice]
+    return np.where(alike[every, choice][:, None] > 0, chosen, reduced.normals).astype(np.float32)
 
 
 def _weld(
@@ -192,14 +195,14 @@ def _collapse(
     if uvs is None:
         new_points, new_faces = _collapse_pieces(points, triangles, max_faces)
         # Where a quadric is nearly singular its optimum can lie anywhere: a spike out of the surface.
-        distance, nearest = cKDTree(points).query(new_points)
+        distance, nearest = (np.asarray(x) for x in KDTree(points).query(new_points))
         spike = distance > 0.04
         new_points[spike] = points[nearest[spike]]
         return (new_points * extent).astype(np.float32), new_faces, None
     # The edge of a piece of texture is a border of the welded mesh; moved, it would open a gap.
-    _, _, collapses = fast_simplification.simplify(
+    collapses = fast_simplification.simplify(
         points, triangles, target_count=max_faces, return_collapses=True, preserve_border=True
-    )
+    )[-1]
     new_points, new_faces, new_index = fast_simplification.replay_simplification(points, triangles, collapses)
     # The old vertex that lies nearest to where its group ended up lends its uv.
     order = np.argsort(-np.linalg.norm(points - new_points[new_index], axis=1), kind="stable")
@@ -229,7 +232,8 @@ def _collapse_pieces(
         index, flat = np.unique(own, return_inverse=True)
         vertices, triangles = points[index], flat.reshape(-1, 3).astype(np.int32)
         if len(triangles) > target:
-            vertices, triangles = fast_simplification.simplify(vertices, triangles, target_count=target)
+            simpler = fast_simplification.simplify(vertices, triangles, target_count=target)
+            vertices, triangles = simpler[0], simpler[1]
         new_points.append(vertices)
         new_faces.append(triangles.astype(np.int64) + used)
         used += len(vertices)

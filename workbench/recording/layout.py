@@ -44,9 +44,10 @@ FRUSTUM_METRES = 0.12
 MILLIMETRES_PER_METRE = 1000.0
 SERIES_COLORS = (
     (86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167), (213, 94, 0), (0, 114, 178), (150, 150, 150),
+    (136, 100, 220),
 )
-"""Okabe and Ito's palette, which the colour-blind can tell apart, but for its black and yellow: the
-viewer comes dark and light, and each would vanish on one of the two."""
+"""Okabe and Ito's palette, which the colour-blind can tell apart, with grey and violet for its black and
+yellow: the viewer comes dark and light, and each of those vanishes on one of the two."""
 
 _OPTICAL_FROM_CAMERA = (0.5, -0.5, 0.5, -0.5)
 """wxyz of the OpenCV camera axes (x right, y down, z forward) within ManiSkill's (x forward, y left,
@@ -88,6 +89,21 @@ class _Log:
         ]
         self._recording.send_columns(entity, times, columns)
         self.account.rows[entity] += len(steps)
+
+    def pose(
+        self,
+        entity: str,
+        steps: NDArray[np.int64],
+        translation: NDArray[np.float32],
+        xyzw: NDArray[np.float32],
+        still: bool,
+    ) -> None:
+        """`translation` (len(steps), 3) and `xyzw` (len(steps), 4); their first row alone if `still`."""
+        if still:
+            quaternion = rr.Quaternion(xyzw=xyzw[0])
+            self.static(entity, rr.Transform3D(translation=translation[0], quaternion=quaternion))
+        else:
+            self.columns(entity, steps, rr.Transform3D.columns(translation=translation, quaternion=xyzw))
 
     def scalars(
         self, entity: str, steps: NDArray[np.int64], values: NDArray, names: Sequence[str], first_color: int = 0
@@ -164,11 +180,8 @@ def _log_bodies(log: _Log, episode: Episode) -> None:
         if not present[body]:
             continue
         poses = episode.poses[:, body]
-        if episode.geometry.body_kinds[body] == "static" and (poses == poses[0]).all():
-            log.static(entity, rr.Transform3D(translation=poses[0, :3], quaternion=xyzw(poses[0, 3:])))
-        else:
-            columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=xyzw(poses[:, 3:]))
-            log.columns(entity, steps, columns)
+        still = episode.geometry.body_kinds[body] == "static" and is_constant(poses)
+        log.pose(entity, steps, poses[:, :3], xyzw(poses[:, 3:]), still)
     worn: Counter[int] = Counter()
     for visual in episode.geometry.visuals:
         mesh = _mesh(visual.mesh, visual.material) if episode.info.env_index in visual.envs else None
@@ -184,14 +197,13 @@ def _mesh(mesh: Mesh, material: Material) -> rr.Mesh3D | None:
     if len(mesh.faces) == 0:
         return None
     # SAPIEN and rerun agree on uv: v = 0 is the first row of the texture, and beyond 0..1 it repeats.
-    texture = material.texture
-    textured = texture is not None and mesh.uvs is not None
+    texture = None if material.texture is None or mesh.uvs is None else material.texture[..., :3]
     return rr.Mesh3D(
         vertex_positions=mesh.vertices,
         triangle_indices=mesh.faces,
         vertex_normals=mesh.normals,
-        vertex_texcoords=mesh.uvs if textured else None,
-        albedo_texture=np.ascontiguousarray(texture[..., :3]) if textured else None,
+        vertex_texcoords=None if texture is None else mesh.uvs,
+        albedo_texture=None if texture is None else np.ascontiguousarray(texture),
         albedo_factor=np.rint(np.clip(material.base_color, 0.0, 1.0) * 255).astype(np.uint8),
     )
 
@@ -208,11 +220,7 @@ def _log_cameras(log: _Log, episode: Episode) -> None:
     log.static(CAMERAS, rr.AnnotationContext([(*c, (0, 0, 0)) if c[0] == 0 else c for c in classes]))
     for camera, entity in zip(episode.cameras, camera_entities(episode.cameras)):
         translation, quaternion = optical_pose(camera.pose)
-        if (camera.pose == camera.pose[0]).all():
-            log.static(entity, rr.Transform3D(translation=translation[0], quaternion=quaternion[0]))
-        else:
-            columns = rr.Transform3D.columns(translation=translation, quaternion=quaternion)
-            log.columns(entity, camera.frame, columns)
+        log.pose(entity, camera.frame, translation, quaternion, still=is_constant(camera.pose))
         pinhole = rr.Pinhole(
             image_from_camera=camera.info.intrinsic,
             resolution=[camera.info.width, camera.info.height],
@@ -323,6 +331,10 @@ def _log_events(log: _Log, episode: Episode) -> None:
     steps, levels, texts = zip(*events(episode))
     columns = rr.TextLog.columns(text=list(texts), level=list(levels))
     log.columns(EVENTS, np.array(steps, dtype=np.int64), columns)
+
+
+def is_constant(rows: NDArray) -> bool:
+    return bool(np.all(rows == rows[:1]))
 
 
 # --- frames ---------------------------------------------------------------------------------------

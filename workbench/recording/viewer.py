@@ -170,9 +170,9 @@ def _handler(
             self._answer(body=False)
 
         def _answer(self, body: bool) -> None:
-            host, port = self.server.server_address[:2]
+            port = self.server.server_address[1]
             # A foreign page whose name was made to point here (DNS rebinding) sends its own name along.
-            if self.headers.get("Host") not in (f"{host}:{port}", f"localhost:{port}"):
+            if self.headers.get("Host") not in (f"{LOOPBACK}:{port}", f"localhost:{port}"):
                 return self.send_error(HTTPStatus.FORBIDDEN)
             parts = urllib.parse.unquote(urllib.parse.urlsplit(self.path).path).lstrip("/").split("/")
             if not secrets.compare_digest(parts[0].encode(), token.encode()):

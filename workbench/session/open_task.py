@@ -9,7 +9,7 @@ passes is handed over. The page, ``workbench record`` and the benchmarks open ta
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -83,8 +83,7 @@ def _build(
         on_activity("trying a reset and a step")
         rehearse(task, loaded, options.seed)
         clock.lap("rehearse")
-        with _blamed("reset", loaded):
-            first = task.reset(seed=options.seed)
+        first = reset_checked(task, loaded, options.seed)
         clock.lap("reset")
         on_activity("reading the shapes")
         loaded = with_late_imports(loaded)
@@ -98,39 +97,27 @@ def _build(
 
 def rehearse(task: TaskEnv, loaded: LoadedTask, seed: int) -> None:
     """One reset, one step and one partial reset; raises TaskError where the task fails in one."""
-    with _blamed("reset", loaded):
-        task.reset(seed=seed)
+    reset_checked(task, loaded, seed)
     step_checked(task, loaded, actions.hold_action(task.parts, task.num_envs))
     if task.num_envs > 1:
-        with _blamed("reset", loaded):
-            task.reset(env_idx=[0])
+        reset_checked(task, loaded, env_idx=[0])
 
 
 def step_checked(task: TaskEnv, loaded: LoadedTask, action: Any) -> StepResult:
-    """`TaskEnv.step`, with what goes wrong told as the author's own mistake.
-
-    ManiSkill trips over an unbatched ``success`` in its own code; the author's line is then not in the
-    traceback at all, so what ``evaluate`` returns is looked at before the traceback is believed.
-    """
-    try:
+    """`TaskEnv.step`; what goes wrong is raised as a TaskError with the author's line."""
+    with _blamed("step", loaded, task):
         return task.step(action if task.parts else None)
-    except TaskError:
-        raise
-    except Exception as error:
-        problem = problem_from_exception(error, "step", loaded.source_files, loaded.cls)
-        if problem.line is None or problem.stage == "step":
-            blamed = _unbatched(task, loaded)
-            if blamed is not None:
-                raise TaskError(blamed) from error
-        raise TaskError(problem) from error
 
 
-def _unbatched(task: TaskEnv, loaded: LoadedTask) -> Problem | None:
-    try:
-        returned = task.env.evaluate()
-    except Exception as error:
-        return problem_from_exception(error, "evaluate", loaded.source_files, loaded.cls)
-    return check_step_returns(loaded.cls, task.num_envs, returned, None, loaded.source_files)
+def reset_checked(
+    task: TaskEnv,
+    loaded: LoadedTask,
+    seed: int | Sequence[int] | None = None,
+    env_idx: Sequence[int] | None = None,
+) -> StepResult:
+    """`TaskEnv.reset`; what goes wrong is raised as a TaskError with the author's line."""
+    with _blamed("reset", loaded, task):
+        return task.reset(seed=seed, env_idx=env_idx)
 
 
 def describe(loaded: LoadedTask, task: TaskEnv) -> TaskDescription:
@@ -189,8 +176,8 @@ def _asset_ids(loaded: LoadedTask) -> list[str]:
 class _blamed:
     """Turns what the author's code raises into a TaskError that names their line."""
 
-    def __init__(self, stage: str, loaded: LoadedTask) -> None:
-        self._stage, self._loaded = stage, loaded
+    def __init__(self, stage: str, loaded: LoadedTask, task: TaskEnv | None = None) -> None:
+        self._stage, self._loaded, self._task = stage, loaded, task
 
     def __enter__(self) -> None:
         pass
@@ -198,10 +185,36 @@ class _blamed:
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         # SystemExit as well: an author's exit() must not take the worker along.
         if isinstance(error, (Exception, SystemExit)) and not isinstance(error, TaskError):
-            problem = problem_from_exception(
-                error, self._stage, self._loaded.source_files, self._loaded.cls
-            )
-            raise TaskError(problem) from error
+            raise TaskError(self._problem(error)) from error
+
+    def _problem(self, error: BaseException) -> Problem:
+        loaded = self._loaded
+        problem = problem_from_exception(error, self._stage, loaded.source_files)
+        if problem.line is not None:
+            return problem
+        # ManiSkill tripped over something in its own code, with no line of the author's on the
+        # traceback: most often over what evaluate() returned.
+        env = self._task.env if self._task is not None else _env_on_traceback(error, loaded.cls)
+        if env is not None:
+            try:
+                returned = env.evaluate()
+            except Exception as second:
+                return problem_from_exception(second, "evaluate", loaded.source_files, loaded.cls)
+            blamed = check_step_returns(loaded.cls, env.num_envs, returned, None, loaded.source_files)
+            if blamed is not None:
+                return blamed
+        return problem_from_exception(error, self._stage, loaded.source_files, loaded.cls)
+
+
+def _env_on_traceback(error: BaseException, cls: type) -> Any:
+    """The env whose constructor raised: ``BaseEnv.__init__`` resets, so hooks run before it returns."""
+    trace = error.__traceback__
+    while trace is not None:
+        owner = trace.tb_frame.f_locals.get("self")
+        if isinstance(owner, cls):
+            return owner
+        trace = trace.tb_next
+    return None
 
 
 class _Clock:

@@ -37,7 +37,7 @@ class Pacer:
         if math.isinf(self.speed):
             return True
         earned = (now - self._last) * self.speed
-        most = max(self.control_dt, _LONGEST_DEBT * self.speed)
+        most = self.control_dt + _LONGEST_DEBT * self.speed
         self._budget, self._last = min(self._budget + earned, most), now
         return self._budget >= self.control_dt * (1 - 1e-9)
 

@@ -24,7 +24,7 @@ from workbench.recording.episode import Episode
 from workbench.recording.rrd import episode_filename, write_rrd
 from workbench.session.episodes import EpisodeGatherer, recorded_modalities
 from workbench.session.messages import Stepped, TaskOptions
-from workbench.session.open_task import OpenedTask, open_task, step_checked, zero_action
+from workbench.session.open_task import OpenedTask, open_task, reset_checked, step_checked, zero_action
 from workbench.session.policy import load_policy
 
 _STEPS_WITHOUT_LIMIT = 200
@@ -122,12 +122,7 @@ def _run(
 
 
 def _begin(opened: OpenedTask, gatherer: EpisodeGatherer, index: int, seed: int, pictures: bool) -> None:
-    try:
-        step = opened.env.reset(seed=seed, env_idx=[index])
-    except TaskError:
-        raise
-    except Exception as error:
-        raise TaskError(problem_from_exception(error, "reset", opened.loaded.source_files)) from error
+    step = reset_checked(opened.env, opened.loaded, seed, [index])
     gatherer.take(_stepped(opened, step, index, [index] if pictures else [], opened.env.episode_seeds))
 
 

@@ -48,7 +48,7 @@ from workbench.session.messages import (
     Stepped,
     WatchCameras,
 )
-from workbench.session.open_task import OpenedTask, open_task, step_checked, zero_action
+from workbench.session.open_task import OpenedTask, open_task, reset_checked, step_checked, zero_action
 from workbench.session.pacing import Pacer, Rate
 from workbench.session.episodes import recorded_modalities
 from workbench.session.policy import Policy, load_policy
@@ -213,8 +213,6 @@ class Worker:
             do(self._opened)
         except TaskError as error:
             self._fail(error.problem)
-        except (Exception, SystemExit) as error:
-            self._fail(problem_from_exception(error, "step", self._opened.loaded.source_files))
 
     def _fail(self, problem: Problem) -> None:
         self._playing = False
@@ -242,13 +240,7 @@ class Worker:
     def _reset_envs(
         self, opened: OpenedTask, env_idx: tuple[int, ...] | None, seed: int | list[int] | None
     ) -> None:
-        try:
-            step = opened.env.reset(seed=seed, env_idx=env_idx)
-        except TaskError:
-            raise
-        except (Exception, SystemExit) as error:
-            problem = problem_from_exception(error, "reset", opened.loaded.source_files)
-            raise TaskError(problem) from error
+        step = reset_checked(opened.env, opened.loaded, seed, env_idx)
         mask = np.ones(opened.env.num_envs, bool)
         if env_idx is not None:
             mask[:] = False

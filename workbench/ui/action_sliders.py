@@ -22,7 +22,7 @@ class ActionSliders:
         self._server = server
         self._session = session
         self._dimensions: tuple[ActionDimension, ...] = ()
-        self._controls: list[Control[float]] = []
+        self._controls: list[Control[viser.GuiSliderHandle, float]] = []
         self._folder = server.gui.add_folder(None, visible=False)
         with self._folder:
             self._centre = server.gui.add_button("Centre all", color="gray")
@@ -48,8 +48,8 @@ class ActionSliders:
                             step=(high - low) / 200,
                             initial_value=min(max(start, low), high),
                         ),
-                        read=lambda value, low=low, high=high: checked_number(
-                            value, low, high, (low + high) / 2
+                        read=lambda value, low=low, high=high, name=dimension.name: checked_number(
+                            value, low, high, name
                         ),
                         send=lambda _: self._send(),
                     )
@@ -68,7 +68,7 @@ class ActionSliders:
         values = []
         for dimension, control in zip(self._dimensions, self._controls, strict=True):
             low, high = slider_bounds(dimension)
-            values.append(checked_number(control.handle.value, low, high, (low + high) / 2))
+            values.append(checked_number(control.handle.value, low, high, dimension.name))
         self._session.set_sliders(tuple(values))
 
     def _send_centre(self) -> None:

@@ -78,7 +78,6 @@ class Banner:
             self._panel.visible = True
             self._panel.expand()
 
-
     def _fit_views(self) -> None:
         views = [client.camera.image_width for client in self._server.get_clients().values()]
         narrowest = min((width for width in views if width > 0), default=WIDEST)

@@ -18,12 +18,13 @@ from typing import Any, Generic, TypeVar
 import viser
 
 T = TypeVar("T")
+Handle = TypeVar("Handle", bound=viser.GuiInputHandle)
 
 HANDS_OFF = 0.5
 """Seconds after a person touched an input in which it is not written to."""
 
 
-class Control(Generic[T]):
+class Control(Generic[Handle, T]):
     """Ties one viser input to one setting of the session.
 
     Args:
@@ -37,7 +38,7 @@ class Control(Generic[T]):
 
     def __init__(
         self,
-        handle: viser.GuiInputHandle[Any],
+        handle: Handle,
         read: Callable[[Any], T],
         send: Callable[[T], None],
         shown: Callable[[T], Any] = lambda value: value,
@@ -84,9 +85,7 @@ class Control(Generic[T]):
     def _apply(self, client: viser.ClientHandle) -> None:
         # Callbacks run in a pool of threads and finish in any order: the handle has the newest.
         try:
-            value = self._read(self.handle.value)
+            self._send(self._read(self.handle.value))
         except ValueError as error:
             self._touched = -1e9
             client.add_notification("Not possible", str(error), color="orange", auto_close_seconds=6.0)
-            return
-        self._send(value)

@@ -61,7 +61,7 @@ def fingerprint(visuals: tuple[Visual, ...]) -> str:
         mesh, material = visual.mesh, visual.material
         for array in (mesh.vertices, mesh.faces, mesh.normals, mesh.uvs, material.texture):
             if array is not None:
-                digest.update(np.ascontiguousarray(array))
+                digest.update(np.ascontiguousarray(array).data)
             digest.update(b"|")
         digest.update(repr((material.base_color, material.metallic, material.roughness)).encode())
     return digest.hexdigest()
@@ -103,7 +103,9 @@ def as_glb(parts: list[tuple[Mesh, Material]]) -> bytes:
         uvs = mesh.uvs if mesh.uvs is not None else np.zeros((len(mesh.vertices), 2), np.float32)
         solid.visual = TextureVisuals(uv=uvs if textured else None, material=_pbr(material, number))
         scene.add_geometry(solid, geom_name=str(number))
-    return bytes(scene.export(file_type="glb", include_normals=True))
+    glb = scene.export(file_type="glb", include_normals=True)
+    assert isinstance(glb, bytes)
+    return glb
 
 
 def lift_painted_layers(meshes: list[Mesh]) -> list[Mesh]:

@@ -34,13 +34,15 @@ from workbench.ui.scene_view import SceneView
 from workbench.ui.selection_mark import SelectionMark
 from workbench.ui.status_line import StatusLine
 from workbench.ui.view_panel import ViewPanel
-from workbench.ui.viewpoint import FOV, Viewpoint, frame_all, frame_one
+from workbench.ui.viewpoint import FOV, USUAL_ASPECT, Viewpoint, frame_all, frame_one
 
 log = logging.getLogger(__name__)
 
 FRAME = 1 / 30
 """Seconds. Faster pushes make a browser slower (measured: 350 a second leave it 13 to 30)."""
 PANEL_WIDTH = 340
+SETTLES = 4.0
+"""Seconds after a page has come in which its panels may still take their places."""
 
 
 class Page:
@@ -60,7 +62,8 @@ class Page:
         self._task_serial = -1
         self._built: tuple[bool, int] | None = None
         self._framed: object = None
-        self._clients: set[int] = set()
+        self._arrivals: dict[int, float] = {}
+        self._pointed: dict[int, tuple[np.ndarray, float]] = {}
 
         server.scene.set_up_direction("+z")
         light(server)
@@ -150,29 +153,24 @@ class Page:
 
     def _count_clients(self) -> int:
         clients = self._server.get_clients()
-        if clients.keys() != self._clients:
-            for number in clients.keys() - self._clients:
-                self._welcome(clients[number])
-            self._clients = set(clients)
+        if clients.keys() != self._arrivals.keys():
+            now = time.monotonic()
+            self._arrivals = {number: self._arrivals.get(number, now) for number in clients}
             self._session.set_clients(len(clients))
         return len(clients)
-
-    def _welcome(self, client: viser.ClientHandle) -> None:
-        """Frame the scene for the shape of this page's view.
-
-        Not if the page looks from somewhere else already: then it is one that lost its connection and
-        came back, and its view belongs to the person.
-        """
-        if np.allclose(client.camera.position, self._server.initial_camera.position, atol=0.02):
-            self._point(client, self._session.view())
 
     # --- the 3-D view ----------------------------------------------------------------------------
 
     def _draw_scene(self, view: SessionView) -> None:
         task, step = view.task, view.step
-        if task is None or step is None or step.poses.shape[:2] != (
-            task.num_envs,
-            len(task.geometry.body_names),
+        if (
+            task is None
+            or step is None
+            or step.poses.shape[:2]
+            != (
+                task.num_envs,
+                len(task.geometry.body_names),
+            )
         ):
             # Between two versions a step of the old one may stand beside the new task.
             return
@@ -204,33 +202,48 @@ class Page:
         if framing != self._framed:
             self._framed = framing
             self.frame(view)
+        self._frame_arrivals(view)
 
     def frame(self, view: SessionView) -> None:
         """Point every open page, and those to come, at what is shown."""
-        initial = self._viewpoint(view, None)
-        if initial is None:
+        viewpoint = self._viewpoint(view, USUAL_ASPECT)
+        if viewpoint is None:
             return
-        self._server.initial_camera.position = initial.position
-        self._server.initial_camera.look_at = initial.look_at
+        self._server.initial_camera.position = viewpoint.position
+        self._server.initial_camera.look_at = viewpoint.look_at
         for client in self._server.get_clients().values():
             self._point(client, view)
 
+    def _frame_arrivals(self, view: SessionView) -> None:
+        """Frame the scene for the shape of a page that has just come, which is known only after a moment.
+
+        Not if it looks from somewhere else already: then it lost its connection and came back, or the
+        person was quicker, and the view is theirs.
+        """
+        for number, client in self._server.get_clients().items():
+            if time.monotonic() - self._arrivals.get(number, 0.0) > SETTLES:
+                continue
+            usual, aspect = self._pointed.get(number, (None, USUAL_ASPECT))
+            if usual is None:
+                usual = self._server.initial_camera.position
+            untouched = np.allclose(client.camera.position, usual, atol=0.02)
+            if untouched and abs(aspect_of(client) / aspect - 1) > 0.05:
+                self._point(client, view)
+
     def _point(self, client: viser.ClientHandle, view: SessionView) -> None:
-        viewpoint = self._viewpoint(view, client)
+        viewpoint = self._viewpoint(view, aspect_of(client))
         if viewpoint is not None:
+            self._pointed[client.client_id] = (viewpoint.position, aspect_of(client))
             client.camera.position = viewpoint.position
             client.camera.look_at = viewpoint.look_at
 
-    def _viewpoint(self, view: SessionView, client: viser.ClientHandle | None) -> Viewpoint | None:
+    def _viewpoint(self, view: SessionView, aspect: float) -> Viewpoint | None:
         if self._layout is None or view.task is None:
             return None
-        aspect = {}
-        if client is not None and client.camera.image_height:
-            aspect = {"aspect": client.camera.image_width / client.camera.image_height}
         if self._view_panel.only_selected or view.task.num_envs == 1:
             human = next((p for (kind, _), p in view.pictures.items() if kind == "human"), None)
-            return frame_one(self._layout, human, **aspect)
-        return frame_all(self._layout, **aspect)
+            return frame_one(self._layout, human, aspect)
+        return frame_all(self._layout, aspect)
 
     def _on_scene_click(self, event: viser.SceneClickEvent) -> None:
         layout, view = self._layout, self._session.view()
@@ -257,3 +270,11 @@ class Page:
             Command("Load the file again", session.reload, "L"),
             Command("Dark or light", self._view_panel.toggle_dark, "D"),
         ]
+
+
+def aspect_of(client: viser.ClientHandle) -> float:
+    """Width over height of the view in this page."""
+    camera = client.camera
+    if not camera.image_height or not camera.image_width:
+        return USUAL_ASPECT
+    return camera.image_width / camera.image_height

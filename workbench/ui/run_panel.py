@@ -59,7 +59,7 @@ class RunPanel:
         with self._env_folder:
             self._env = Control(
                 gui.add_slider("Selected", min=0, max=1, step=1, initial_value=0),
-                read=lambda value: checked_int(value, 0, self._num_envs() - 1, self._session.view().selected_env),
+                read=lambda value: checked_int(value, 0, self._num_envs() - 1, "env"),
                 send=session.select_env,
             )
             self._neighbours = gui.add_button_group("", (PREVIOUS, NEXT))
@@ -72,7 +72,7 @@ class RunPanel:
                 gui.add_dropdown(
                     "Speed", tuple(SPEEDS), initial_value="1 ×", hint="Simulated seconds in one second."
                 ),
-                read=lambda value: SPEEDS[checked_choice(value, SPEEDS, "1 ×")],
+                read=lambda value: SPEEDS[checked_choice(value, SPEEDS, "speed")],
                 send=session.set_speed,
                 shown=self._speed_shown,
             )
@@ -80,13 +80,13 @@ class RunPanel:
                 gui.add_number(
                     "Seed", 0, min=0, max=LARGEST_SEED, step=1, hint="A new seed resets every env with it."
                 ),
-                read=lambda value: checked_int(value, 0, LARGEST_SEED, self._session.view().seed),
+                read=lambda value: checked_int(value, 0, LARGEST_SEED, "seed"),
                 send=session.set_seed,
                 settle=0.6,
             )
             self._end = Control(
                 gui.add_dropdown("At its end", tuple(EPISODE_ENDS), initial_value="reset that env"),
-                read=lambda value: EPISODE_ENDS[checked_choice(value, EPISODE_ENDS, "reset that env")],
+                read=lambda value: EPISODE_ENDS[checked_choice(value, EPISODE_ENDS, "rule")],
                 send=session.set_episode_end,
                 shown=lambda rule: _name_of(EPISODE_ENDS, rule),
             )
@@ -94,12 +94,14 @@ class RunPanel:
         with gui.add_folder("Actions"):
             self._source = Control(
                 gui.add_dropdown("Source", tuple(SOURCES), initial_value="hold still"),
-                read=lambda value: SOURCES[checked_choice(value, SOURCES, "hold still")],
+                read=lambda value: SOURCES[checked_choice(value, SOURCES, "source of actions")],
                 send=self._choose_source,
                 shown=self._source_shown,
             )
             self._policy = Control(
-                gui.add_text("Policy", "", hint="module:function or file.py:function, given obs, returns the action."),
+                gui.add_text(
+                    "Policy", "", hint="module:function or file.py:function, given obs, returns the action."
+                ),
                 read=self._read_policy,
                 send=lambda policy: session.set_action_source("policy", policy),
                 settle=0.8,
@@ -206,7 +208,7 @@ class RunPanel:
             self._choosing_policy = True
 
     def _read_policy(self, value: object) -> str:
-        text = checked_text(value, 500, "")
+        text = checked_text(value, 500, "policy").strip()
         if ":" not in text:
             raise ValueError("A policy is written module:function or file.py:function.")
         return text

@@ -5,7 +5,6 @@ from __future__ import annotations
 import viser
 
 from workbench.session.view import SessionView
-from workbench.ui.checked import checked_choice
 
 DETAILS = {"fine": 1_000_000, "normal": 200_000, "coarse": 50_000}
 """Triangles in the view. A browser without a graphics card wants the fewest."""
@@ -25,7 +24,9 @@ class ViewPanel:
                 initial_value="normal",
                 hint="How finely shapes are drawn. Choose coarse if the view is slow.",
             )
-            self._theme = server.gui.add_dropdown("Theme", (DARK, LIGHT), initial_value=DARK if dark else LIGHT)
+            self._theme = server.gui.add_dropdown(
+                "Theme", (DARK, LIGHT), initial_value=DARK if dark else LIGHT
+            )
         self._theme.on_update(lambda _: self._apply_theme())
         self._apply_theme()
 
@@ -35,7 +36,7 @@ class ViewPanel:
 
     @property
     def triangles(self) -> int:
-        return DETAILS[checked_choice(self._detail.value, DETAILS, "normal")]
+        return DETAILS.get(self._detail.value, DETAILS["normal"])
 
     def toggle_only_selected(self) -> None:
         self._show.value = ALL if self.only_selected else ONE

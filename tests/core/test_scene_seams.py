@@ -1,0 +1,65 @@
+"""Every private name of ManiSkill that drawing and pictures rely upon: an upgrade fails here first."""
+
+from __future__ import annotations
+
+import inspect
+
+import numpy as np
+import pytest
+import sapien
+from mani_skill.envs import sapien_env
+from mani_skill.envs.scene import ManiSkillScene
+from mani_skill.sensors.camera import Camera, CameraConfig
+from mani_skill.utils.structs import Actor
+from mani_skill.utils.structs.base import BaseStruct, PhysxRigidBodyComponentStruct
+from mani_skill.utils.structs.render_camera import RenderCamera
+
+
+@pytest.mark.parametrize("name", ["_objs", "_scene_idxs"])
+def test_structs_know_their_objects_and_envs(name: str) -> None:
+    assert name in BaseStruct.__dataclass_fields__
+
+
+def test_bodies_know_their_rows() -> None:
+    assert "_body_data_index" in PhysxRigidBodyComponentStruct.__dict__
+
+
+def test_hiding_in_gpu_simulation_keeps_the_pose_aside_and_moves_the_actor() -> None:
+    source = inspect.getsource(Actor.hide_visual)
+    assert "self.before_hide_pose = self.pose.raw_pose.clone()" in source
+    assert "self.scene.gpu_sim_enabled" in source and "visibility = 0" in source
+    assert {"hidden", "px_body_type"} <= set(Actor.__dataclass_fields__)
+
+
+@pytest.mark.parametrize("name", ["_sensors", "_human_render_cameras", "_hidden_objects"])
+def test_envs_hold_their_cameras_and_hidden_objects(name: str) -> None:
+    assert name in sapien_env.BaseEnv.__annotations__
+    assert f"self.{name}" in inspect.getsource(sapien_env)
+
+
+def test_sensors_see_without_and_human_cameras_with_hidden_objects() -> None:
+    assert "obj.hide_visual()" in inspect.getsource(sapien_env.BaseEnv._get_obs_sensor_data)
+    human = inspect.getsource(sapien_env.BaseEnv.render_rgb_array)
+    assert human.index("obj.show_visual()") < human.index("self.scene.update_render")
+
+
+def test_cameras_hold_one_component_an_env() -> None:
+    assert {"_render_cameras", "mount"} <= set(RenderCamera.__dataclass_fields__)
+    assert "shader_config" in CameraConfig.__dataclass_fields__
+    assert "self.camera" in inspect.getsource(Camera.__init__)
+
+
+@pytest.mark.parametrize("name", ["actors", "articulations", "actor_views", "articulation_views", "sub_scenes"])
+def test_a_scene_lists_its_objects_and_views(name: str) -> None:
+    assert f"self.{name}" in inspect.getsource(ManiSkillScene.__init__)
+
+
+def test_packed_poses_are_quaternion_then_position_of_every_entity_in_order() -> None:
+    scene = sapien.Scene([sapien.physx.PhysxCpuSystem()])
+    for i in range(3):
+        entity = sapien.Entity()
+        entity.pose = sapien.Pose([i, 2, 3], [0.5, 0.5, -0.5, 0.5])
+        scene.add_entity(entity)
+    packed = np.frombuffer(scene.pack_poses(), np.float32).reshape(-1, 7)
+    np.testing.assert_allclose(packed, [[0.5, 0.5, -0.5, 0.5, i, 2, 3] for i in range(3)])
+    assert [e.pose.p[0] for e in scene.entities] == [0, 1, 2]

@@ -1,0 +1,35 @@
+from __future__ import annotations
+
+import numpy as np
+import viser
+import viser.transforms
+
+from tests.ui.scenes import camera
+from workbench.core.pictures import Picture
+from workbench.ui.camera_frustums import CameraFrustums, frustum_pose
+
+POSE = np.array([1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0], np.float32)
+GREY = np.full((6, 8, 3), 128, np.uint8)
+
+
+def test_camera_that_looks_along_x_looks_along_opencv_s_z() -> None:
+    wxyz, position = frustum_pose(Picture("c", "sensor", 0, POSE), np.array([10, 0, 0], np.float32))
+    turn = viser.transforms.SO3(wxyz)
+    np.testing.assert_allclose(turn.apply(np.array([0.0, 0.0, 1.0])), [1, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(turn.apply(np.array([0.0, 1.0, 0.0])), [0, 0, -1], atol=1e-9)
+    np.testing.assert_allclose(position, [11, 2, 3])
+
+
+def test_frustums_follow_their_pictures_and_leave_with_them(server: viser.ViserServer) -> None:
+    frustums = CameraFrustums(server)
+    cameras = (camera("base"), camera("hand"))
+    offset = np.zeros(3, np.float32)
+    pictures = {("sensor", name): Picture(name, "sensor", 0, POSE, GREY) for name in ("base", "hand")}
+    frustums.draw(cameras, pictures, offset)
+    assert len(frustums._drawn) == 2
+    moved = Picture("base", "sensor", 0, POSE + [1, 0, 0, 0, 0, 0, 0], GREY)
+    frustums.draw(cameras, {("sensor", "base"): moved}, offset)
+    assert list(frustums._drawn) == [("sensor", "base")]
+    np.testing.assert_allclose(frustums._drawn["sensor", "base"].position, [2, 2, 3])
+    frustums.draw((), {("sensor", "base"): moved}, offset)
+    assert frustums._drawn == {}

@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from tests.ui.scenes import step_of, table_scene
+from workbench.ui.fragments import render
+from workbench.ui.numbers_table import NumberRow, number_rows
+
+_, POSES = table_scene(4)
+
+
+def rows_of(selected_env: int = 1, **evaluate: object) -> dict[str, NumberRow]:
+    return {row.name: row for row in number_rows(step_of(POSES, **evaluate), selected_env, 50)}
+
+
+def test_bools_are_counted_and_numbers_averaged() -> None:
+    rows = rows_of(success=[True, True, False, True], distance=np.array([0.0, 1.0, 2.0, 3.0]))
+    assert (rows["success"].selected, rows["success"].batch) == ("yes", "3 of 4")
+    assert (rows["distance"].selected, rows["distance"].batch) == ("1.000", "mean 1.500")
+    assert rows["elapsed steps"].selected == "7 / 50"
+
+
+def test_success_and_fail_come_before_the_rest() -> None:
+    names = [row.name for row in number_rows(step_of(POSES, a=[0] * 4, fail=[False] * 4, success=[False] * 4), 0, None)]
+    assert names == ["elapsed steps", "reward", "success", "fail", "a"]
+
+
+def test_mood_is_that_of_the_selected_env() -> None:
+    success, fail = [True, False, False, False], [False, True, False, False]
+    assert rows_of(0, success=success, fail=fail)["success"].mood == "good"
+    assert rows_of(1, success=success, fail=fail)["fail"].mood == "bad"
+    assert rows_of(2, success=success, fail=fail)["success"].mood == ""
+
+
+def test_long_vector_is_shortened() -> None:
+    assert rows_of(pose=np.zeros((4, 7)))["pose"].selected == "[0.000, 0.000, 0.000, 0.000, … 7]"
+
+
+def test_nan_is_said_and_not_hidden() -> None:
+    assert rows_of(distance=np.full(4, np.nan))["distance"].selected == "nan"
+
+
+@given(
+    hnp.arrays(
+        st.sampled_from([np.bool_, np.int32, np.float32, np.dtype("U3")]),
+        hnp.array_shapes(min_dims=0, max_dims=3, max_side=6),
+    ),
+    st.integers(0, 7),
+)
+def test_whatever_evaluate_returns_has_a_row(values: np.ndarray, env: int) -> None:
+    rows = {row.name: row for row in number_rows(step_of(POSES, surprise=values), env, None)}
+    assert rows["surprise"].selected != ""
+
+
+def test_names_from_the_author_s_file_are_escaped() -> None:
+    rows = number_rows(step_of(POSES, **{"<script>alert(1)</script>": [True] * 4}), 0, None)
+    html = render("numbers", rows=rows, env=0, num_envs=4, has_success=False)
+    assert "<script>" not in html
+    assert "&lt;script&gt;" in html

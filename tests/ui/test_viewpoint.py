@@ -1,0 +1,50 @@
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.ui.scenes import table_scene
+from workbench.core.pictures import Picture
+from workbench.ui.env_layout import lay_out
+from workbench.ui.viewpoint import FOV, frame_all, frame_box, frame_one
+
+
+@given(
+    size=st.tuples(st.floats(0.05, 60), st.floats(0.05, 60), st.floats(0.05, 10)),
+    aspect=st.floats(0.35, 3.5),
+)
+@settings(deadline=None, max_examples=80)
+def test_whole_box_is_in_the_picture(size: tuple[float, float, float], aspect: float) -> None:
+    low, high = -np.array(size) / 2, np.array(size) / 2
+    viewpoint = frame_box(low, high, aspect)
+    forward = viewpoint.look_at - viewpoint.position
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    up = np.cross(right, forward)
+    picks = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
+    corners = np.where(picks == 0, low, high) - viewpoint.position
+    depth = corners @ forward
+    assert (depth > 0).all()
+    assert (np.abs(corners @ up) <= np.tan(FOV / 2) * depth).all()
+    assert (np.abs(corners @ right) <= np.tan(FOV / 2) * aspect * depth).all()
+
+
+def test_more_envs_are_seen_from_further_away() -> None:
+    def distance(num_envs: int) -> float:
+        geometry, poses = table_scene(num_envs)
+        viewpoint = frame_all(lay_out(geometry, poses))
+        return float(np.linalg.norm(viewpoint.position - viewpoint.look_at))
+
+    assert distance(1) < distance(4) < distance(64)
+
+
+def test_one_env_is_seen_through_the_task_s_own_human_camera() -> None:
+    geometry, poses = table_scene(1)
+    # At x = 1.5, turned half round z: it looks along -x.
+    pose = np.array([1.5, 0.2, 0.4, 0, 0, 0, 1], np.float32)
+    viewpoint = frame_one(lay_out(geometry, poses), Picture("render_camera", "human", 0, pose))
+    np.testing.assert_allclose(viewpoint.position, pose[:3], atol=1e-6)
+    towards = viewpoint.look_at - viewpoint.position
+    np.testing.assert_allclose(towards / np.linalg.norm(towards), [-1, 0, 0], atol=1e-6)
