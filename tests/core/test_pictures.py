@@ -174,9 +174,9 @@ class FarWallEnv(PickCubeEnv):
     def _load_scene(self, options: dict) -> None:
         super()._load_scene(options)
         for i, distance in enumerate([10.0, 32.7, 40.0, 70.0]):
-            builder = self.scene.create_actor_builder()
+            builder: Any = self.scene.create_actor_builder()
             half = 0.05 * distance
-            builder.add_box_visual(half_size=np.array([0.001, half, half]))
+            builder.add_box_visual(half_size=[0.001, half, half])
             builder.initial_pose = Pose.create(sapien.Pose([distance, 50 + (i - 1.5) * 2 * half, 0]))
             builder.build_kinematic(f"wall_{i}")
 

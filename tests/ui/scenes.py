@@ -153,4 +153,6 @@ def running(num_envs: int, **changes: object) -> SessionView:
 
 
 def problem(message: str = "KeyError: 'goal'") -> Problem:
-    return Problem("evaluate", message, "/home/me/push.py", 88, "return goal[<0>]", "Traceback ...\nKeyError: 'goal'")
+    return Problem(
+        "evaluate", message, "/home/me/push.py", 88, "return goal[<0>]", "Traceback ...\nKeyError: 'goal'"
+    )

@@ -60,7 +60,9 @@ def test_wide_table_is_no_floor_and_a_moving_plate_is_none_either() -> None:
     geometry, _ = table_scene(1)
     assert is_floor(geometry.visuals[0], geometry)
     assert not is_floor(geometry.visuals[1], geometry)
-    moving = SceneGeometry(1, ("plate",), ("dynamic",), (False,), (visual("p", box_mesh((40, 40, 0.01)), 1, 0),))
+    moving = SceneGeometry(
+        1, ("plate",), ("dynamic",), (False,), (visual("p", box_mesh((40, 40, 0.01)), 1, 0),)
+    )
     assert not is_floor(moving.visuals[0], moving)
 
 

@@ -41,7 +41,7 @@ def test_any_depth_gives_a_picture(depth: np.ndarray) -> None:
 def test_floor_to_the_horizon_does_not_flatten_the_table() -> None:
     depth = np.full((100, 100), 1.0, np.float32)
     depth[:20] = 80.0
-    depth[50:, :] = 0.5
+    depth[60:, :] = 0.5
     span = depth_range(depth)
     assert span is not None
     assert span.near == pytest.approx(0.5)
@@ -59,7 +59,8 @@ def test_segment_has_one_colour_everywhere_and_neighbours_differ() -> None:
     colours = {segment_colour(identity) for identity in range(1, 60)}
     assert len(colours) == 59
     apart = [
-        np.abs(np.subtract(segment_colour(identity), segment_colour(identity + 1))).sum() for identity in range(1, 60)
+        np.abs(np.subtract(segment_colour(identity), segment_colour(identity + 1))).sum()
+        for identity in range(1, 60)
     ]
     assert min(apart) > 60
 

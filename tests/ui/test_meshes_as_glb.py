@@ -8,7 +8,14 @@ import trimesh
 
 from tests.ui.scenes import box_mesh, table_scene
 from workbench.core.geometry import Material, Mesh
-from workbench.ui.meshes_as_glb import LAYER, as_glb, face_limit, fingerprint, group_by_wearers, lift_painted_layers
+from workbench.ui.meshes_as_glb import (
+    LAYER,
+    as_glb,
+    face_limit,
+    fingerprint,
+    group_by_wearers,
+    lift_painted_layers,
+)
 
 
 def read_back(glb: bytes) -> list[trimesh.Trimesh]:
@@ -41,7 +48,12 @@ def test_part_without_texture_beside_a_textured_one_gets_uvs_too() -> None:
     uvs = np.random.default_rng(0).random((len(plain.vertices), 2)).astype(np.float32)
     texture = np.full((4, 4, 4), 200, np.uint8)
     parts = read_back(
-        as_glb([(replace(plain, uvs=uvs), Material((1, 1, 1, 1), texture=texture)), (plain, Material((0, 0, 1, 1)))])
+        as_glb(
+            [
+                (replace(plain, uvs=uvs), Material((1, 1, 1, 1), texture=texture)),
+                (plain, Material((0, 0, 1, 1))),
+            ]
+        )
     )
     assert all(part.visual.uv is not None for part in parts)
     np.testing.assert_allclose(parts[0].visual.uv, uvs, atol=1e-6)

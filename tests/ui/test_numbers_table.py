@@ -24,7 +24,10 @@ def test_bools_are_counted_and_numbers_averaged() -> None:
 
 
 def test_success_and_fail_come_before_the_rest() -> None:
-    names = [row.name for row in number_rows(step_of(POSES, a=[0] * 4, fail=[False] * 4, success=[False] * 4), 0, None)]
+    names = [
+        row.name
+        for row in number_rows(step_of(POSES, a=[0] * 4, fail=[False] * 4, success=[False] * 4), 0, None)
+    ]
     assert names == ["elapsed steps", "reward", "success", "fail", "a"]
 
 

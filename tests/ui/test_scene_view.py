@@ -81,7 +81,7 @@ def test_reload_keeps_the_nodes_that_look_as_before(server: viser.ViserServer) -
     blue = replace(again.visuals[4], material=Material((0.0, 0.0, 1.0, 1.0)))
     again = replace(again, visuals=(*again.visuals[:4], blue))
     view.build(again, layout, poses)
-    assert set(before[:3]) == set(view.handles[:3])
+    assert all(new is old for new, old in zip(view.handles[:3], before[:3], strict=True))
     assert view.handles[3] is not before[3]
 
 

@@ -13,7 +13,10 @@ def html(view) -> str:
 
 def test_running_says_rates_envs_and_backend() -> None:
     text = html(running(16))
-    assert all(word in text for word in ("running", "16 envs", "cpu (batched)", "<b>20</b> steps/s", "1.00 × real time"))
+    assert all(
+        word in text
+        for word in ("running", "16 envs", "cpu (batched)", "<b>20</b> steps/s", "1.00 × real time")
+    )
 
 
 def test_one_env_is_one_env() -> None:

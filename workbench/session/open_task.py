@@ -9,8 +9,10 @@ passes is handed over. The page, ``workbench record`` and the benchmarks open ta
 from __future__ import annotations
 
 import time
+import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -189,21 +191,23 @@ class _blamed:
 
     def _problem(self, error: BaseException) -> Problem:
         loaded = self._loaded
-        problem = problem_from_exception(error, self._stage, loaded.source_files)
-        if problem.line is not None:
-            return problem
-        # ManiSkill tripped over something in its own code, with no line of the author's on the
-        # traceback: most often over what evaluate() returned.
         env = self._task.env if self._task is not None else _env_on_traceback(error, loaded.cls)
-        if env is not None:
+        if env is not None and not _raised_in(error, loaded.source_files):
+            # Raised in ManiSkill's own code, most often over what evaluate() returned; the last line of
+            # the author's on the traceback is then only their call of super().__init__().
             try:
                 returned = env.evaluate()
             except Exception as second:
-                return problem_from_exception(second, "evaluate", loaded.source_files, loaded.cls)
+                return problem_from_exception(second, self._stage, loaded.source_files, loaded.cls)
             blamed = check_step_returns(loaded.cls, env.num_envs, returned, None, loaded.source_files)
             if blamed is not None:
                 return blamed
         return problem_from_exception(error, self._stage, loaded.source_files, loaded.cls)
+
+
+def _raised_in(error: BaseException, files: Sequence[Path]) -> bool:
+    frames = traceback.extract_tb(error.__traceback__)
+    return bool(frames) and Path(frames[-1].filename) in files
 
 
 def _env_on_traceback(error: BaseException, cls: type) -> Any:

@@ -40,13 +40,14 @@ def depth_range(depth: NDArray[np.float32]) -> DepthRange | None:
     if not met.size:
         return None
     near, median, far = np.percentile(met, (1, 50, 98))
-    return DepthRange(float(near), float(max(min(far, 3 * median), near + 1e-3)))
+    return DepthRange(float(near), float(max(min(far, 3 * median), near * 1.001 + 1e-3)))
 
 
 def colour_depth(depth: NDArray[np.float32], span: DepthRange) -> NDArray[np.uint8]:
     """(H, W) metres as (H, W, 3) RGB; what is out of the span takes the colour of its end."""
     met = np.isfinite(depth) & (depth > 0)
-    place = np.clip((np.where(met, depth, span.near) - span.near) / (span.far - span.near), 0, 1)
+    metres = np.where(met, depth, span.near).astype(np.float64)
+    place = np.clip((metres - span.near) / (span.far - span.near), 0, 1)
     place = place * (len(VIRIDIS) - 1)
     below = np.minimum(place.astype(np.int64), len(VIRIDIS) - 2)
     part = (place - below)[..., None]

@@ -67,7 +67,7 @@ def _one(value: NDArray) -> str:
         if not np.isfinite(number):
             return str(number)
         return f"{number:.3f}" if 1e-3 <= abs(number) < 1e4 or number == 0 else f"{number:.2e}"
-    return str(value)
+    return repr(value.item())
 
 
 def _batch(values: NDArray) -> str:
