@@ -229,7 +229,9 @@ def _say(event: Event) -> None:
 
 def _print_problem(problem: Problem) -> None:
     place = "" if problem.file is None else f"{problem.file}:{problem.line or 1}: "
-    err.print(f"[red]{escape(problem.stage)} failed[/] {escape(place)}{escape(problem.message)}", soft_wrap=True)
+    err.print(
+        f"[red]{escape(problem.stage)} failed[/] {escape(place)}{escape(problem.message)}", soft_wrap=True
+    )
     if problem.code:
         err.print(f"    {escape(problem.code)}", soft_wrap=True)
     if problem.traceback:

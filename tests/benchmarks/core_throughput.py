@@ -31,13 +31,12 @@ class Options:
 def batched(options: Options) -> float:
     """Env-steps per second of the batched core; bodies are kept awake by random actions."""
     import mani_skill.envs  # noqa: F401
+    import numpy as np
     import torch
     from mani_skill.utils.registration import REGISTERED_ENVS
 
     from workbench.core import actions
     from workbench.core.task_env import EnvOptions, TaskEnv, make_env
-
-    import numpy as np
 
     torch.set_num_threads(1)
     spec = REGISTERED_ENVS[options.env_id]
@@ -71,7 +70,9 @@ def asynchronous(options: Options) -> float:
     envs = gym.vector.AsyncVectorEnv([make] * options.num_envs, context="spawn")
     envs.reset(seed=0)
     envs.action_space.seed(0)
-    rate = options.num_envs * _steps_per_second(lambda: envs.step(envs.action_space.sample()), options.seconds)
+    rate = options.num_envs * _steps_per_second(
+        lambda: envs.step(envs.action_space.sample()), options.seconds
+    )
     envs.close()
     return rate
 

@@ -71,7 +71,10 @@ def test_a_dense_assembly_of_loose_pieces_is_reduced_too() -> None:
 def test_texture_coordinates_survive_reduction_and_the_seam_stays_closed() -> None:
     u, v = np.meshgrid(np.linspace(0, 1, 161), np.linspace(0, 1, 81))
     radius = 1 + 0.05 * np.sin(16 * np.pi * u) * np.sin(np.pi * v) ** 2
-    x, y = radius * np.sin(np.pi * v) * np.cos(2 * np.pi * u), radius * np.sin(np.pi * v) * np.sin(2 * np.pi * u)
+    x, y = (
+        radius * np.sin(np.pi * v) * np.cos(2 * np.pi * u),
+        radius * np.sin(np.pi * v) * np.sin(2 * np.pi * u),
+    )
     points = np.stack([x, y, radius * np.cos(np.pi * v)], -1).reshape(-1, 3).astype(np.float32)
     i = np.arange(80 * 160)
     a = i // 160 * 161 + i % 160
@@ -122,8 +125,12 @@ def grid(width: int, uv: NDArray | None = None) -> Mesh:
     points = np.stack([x, y, np.full_like(x, -0.9)], -1).reshape(-1, 3).astype(np.float32)
     i = np.arange(width * width)
     a = i // width * (width + 1) + i % width
-    faces = np.concatenate([np.stack([a, a + 1, a + width + 1], 1), np.stack([a + 1, a + width + 2, a + width + 1], 1)])
-    return Mesh(points, faces.astype(np.uint32), uvs=None if uv is None else (points[:, :2] @ uv).astype(np.float32))
+    faces = np.concatenate(
+        [np.stack([a, a + 1, a + width + 1], 1), np.stack([a + 1, a + width + 2, a + width + 1], 1)]
+    )
+    return Mesh(
+        points, faces.astype(np.uint32), uvs=None if uv is None else (points[:, :2] @ uv).astype(np.float32)
+    )
 
 
 @pytest.mark.parametrize("turned", [False, True])

@@ -51,7 +51,12 @@ def stock(task: str, **kwargs: Any) -> Any:
 
 
 def painted(
-    visuals: list[Visual], poses: NDArray[np.float32], env: int, pose: NDArray[np.float32], k: NDArray, size: int
+    visuals: list[Visual],
+    poses: NDArray[np.float32],
+    env: int,
+    pose: NDArray[np.float32],
+    k: NDArray,
+    size: int,
 ) -> NDArray[np.int64]:
     """(size, size) body index (or -1) of triangles painted from far to near, in pure numpy and PIL."""
     fine = 4  # PIL also paints pixels that a triangle only touches; on a finer grid that matters less
@@ -104,7 +109,9 @@ def test_silhouettes_are_those_of_the_renderer(detail: Detail) -> None:
     env.close()
 
 
-def redrawn(geometry: SceneGeometry, poses: NDArray[np.float32], env: Any, shader: str, texture: str) -> NDArray:
+def redrawn(
+    geometry: SceneGeometry, poses: NDArray[np.float32], env: Any, shader: str, texture: str
+) -> NDArray:
     """`texture` of the env's human camera, in a scene made anew from env 0 of `geometry`."""
     scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(sapien.Device("cpu"))])
     scene.set_ambient_light([0.3, 0.3, 0.3])
@@ -189,7 +196,9 @@ def test_equal_shapes_of_all_envs_are_one_visual() -> None:
     assert len(ground.mesh.faces) == 2
     panda = [v for v in geometry.visuals if v.name.startswith("panda/")]
     assert 10_000 < sum(len(v.mesh.faces) for v in panda) < 25_000
-    assert max(max(v.material.texture.shape) for v in geometry.visuals if v.material.texture is not None) == 1024
+    assert (
+        max(max(v.material.texture.shape) for v in geometry.visuals if v.material.texture is not None) == 1024
+    )
     assert [n for n, h in zip(geometry.body_names, geometry.body_hidden, strict=True) if h] == ["goal_site"]
     assert "goal_site/0" in {v.name for v in geometry.visuals}
     env.close()
@@ -249,7 +258,9 @@ class OddShapesEnv(PushCubeEnv):
         kinematic("ball", lambda b: b.add_sphere_visual(turned, radius=0.1, material=color))
         kinematic("pill", lambda b: b.add_capsule_visual(turned, radius=0.1, half_length=0.3, material=color))
         kinematic("can", lambda b: b.add_cylinder_visual(turned, radius=0.1, half_length=0.3, material=color))
-        kinematic("mirrored", lambda b: b.add_visual_from_file(self.mesh_file, turned, [-2.0, 1.0, 0.5], color))
+        kinematic(
+            "mirrored", lambda b: b.add_visual_from_file(self.mesh_file, turned, [-2.0, 1.0, 0.5], color)
+        )
         ghost = kinematic("ghost", lambda b: b.add_box_visual(half_size=[0.1, 0.1, 0.1], material=color))
         ghost._objs[0].find_component_by_type(sapien.render.RenderBodyComponent).visibility = 0.25
         grey = sapien.render.RenderMaterial()
@@ -261,7 +272,9 @@ class OddShapesEnv(PushCubeEnv):
 
 @pytest.fixture
 def odd_shapes(tmp_path: Path) -> Any:
-    wedge = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    wedge = trimesh.Trimesh(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]
+    )
     wedge.export(tmp_path / "wedge.obj")
     OddShapesEnv.mesh_file = str(tmp_path / "wedge.obj")
     env: Any = OddShapesEnv(render_backend="cpu", reward_mode="none")
@@ -273,7 +286,12 @@ def odd_shapes(tmp_path: Path) -> Any:
 def test_primitives_have_their_size_and_place(odd_shapes: Any) -> None:
     table = build_body_table(odd_shapes)
     visual = {v.name: v for v in read_geometry(odd_shapes, table).visuals}
-    half = {"box/0": [0.3, 0.1, 0.2], "ball/0": [0.1] * 3, "pill/0": [0.1, 0.4, 0.1], "can/0": [0.1, 0.3, 0.1]}
+    half = {
+        "box/0": [0.3, 0.1, 0.2],
+        "ball/0": [0.1] * 3,
+        "pill/0": [0.1, 0.4, 0.1],
+        "can/0": [0.1, 0.3, 0.1],
+    }
     for name, size in half.items():
         points = visual[name].mesh.vertices
         np.testing.assert_allclose(np.ptp(points, axis=0) / 2, size, atol=2e-3, err_msg=name)
@@ -291,7 +309,9 @@ def test_a_ghost_is_transparent_and_linear_textures_are_encoded(odd_shapes: Any)
 
 
 def test_a_mesh_with_uneven_scale_has_normals_across_its_faces(odd_shapes: Any) -> None:
-    (visual,) = [v for v in read_geometry(odd_shapes, build_body_table(odd_shapes)).visuals if "mirrored" in v.name]
+    (visual,) = [
+        v for v in read_geometry(odd_shapes, build_body_table(odd_shapes)).visuals if "mirrored" in v.name
+    ]
     mesh = visual.mesh
     np.testing.assert_allclose(np.sort(np.ptp(mesh.vertices, axis=0)), [0.5, 1.0, 2.0], atol=1e-5)
     corner = mesh.vertices[mesh.faces].astype(float)

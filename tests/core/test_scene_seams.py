@@ -49,7 +49,9 @@ def test_cameras_hold_one_component_an_env() -> None:
     assert "self.camera" in inspect.getsource(Camera.__init__)
 
 
-@pytest.mark.parametrize("name", ["actors", "articulations", "actor_views", "articulation_views", "sub_scenes"])
+@pytest.mark.parametrize(
+    "name", ["actors", "articulations", "actor_views", "articulation_views", "sub_scenes"]
+)
 def test_a_scene_lists_its_objects_and_views(name: str) -> None:
     assert f"self.{name}" in inspect.getsource(ManiSkillScene.__init__)
 

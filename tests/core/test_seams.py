@@ -72,7 +72,13 @@ def test_the_env_builds_its_scene_and_seeds_where_the_core_does() -> None:
     for name in ("_setup_scene", "_set_scene_config", "_set_episode_rng"):
         assert callable(getattr(sapien_env.BaseEnv, name)), name
     source = inspect.getsource(sapien_env.BaseEnv)
-    for name in ("_episode_seed", "_batched_episode_rng", "_batched_rng_backend", "_episode_rng", "_sim_freq"):
+    for name in (
+        "_episode_seed",
+        "_batched_episode_rng",
+        "_batched_rng_backend",
+        "_episode_rng",
+        "_sim_freq",
+    ):
         assert name in source, name
     assert callable(BatchedRNG.from_seeds)
 

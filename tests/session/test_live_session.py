@@ -1,5 +1,9 @@
 """A page's wishes, carried out by a real worker on the example task."""
 
+# The fixture hands over a session whose task is loaded: what may be None before is not here.
+# pyright: reportOptionalMemberAccess=false, reportOptionalSubscript=false, reportArgumentType=false
+# pyright: reportAttributeAccessIssue=false, reportCallIssue=false
+
 from __future__ import annotations
 
 import numpy as np
@@ -17,7 +21,9 @@ def settle(session: Session) -> None:
     session.set_action_source("random")
     session.set_episode_end("reset")
     session.set_seed(0)
-    wait_until(session, lambda v: not v.playing and v.step is not None and not v.step.elapsed_steps.any(), "rest")
+    wait_until(
+        session, lambda v: not v.playing and v.step is not None and not v.step.elapsed_steps.any(), "rest"
+    )
 
 
 def test_a_single_step_moves_every_env_once(session: Session) -> None:
@@ -61,7 +67,9 @@ def test_the_same_seed_gives_the_same_start(session: Session) -> None:
     settle(session)
     first = session.view().step.poses
     session.set_seed(7)
-    other = wait_until(session, lambda v: not np.allclose(v.step.poses, first, equal_nan=True), "another start")
+    other = wait_until(
+        session, lambda v: not np.allclose(v.step.poses, first, equal_nan=True), "another start"
+    )
     session.set_seed(0)
     again = wait_until(
         session, lambda v: np.array_equal(v.step.poses, first, equal_nan=True), "the first start again"

@@ -9,7 +9,7 @@ import trimesh
 
 from workbench.authoring.problem import Problem
 from workbench.core.geometry import BodyKind, Material, Mesh, SceneGeometry, Visual
-from workbench.core.pictures import CameraInfo
+from workbench.core.pictures import CameraInfo, CameraKind
 from workbench.core.step import StepResult
 from workbench.session.messages import ActionDimension, TaskDescription
 from workbench.session.view import RecordingStatus, SessionView
@@ -73,10 +73,10 @@ def step_of(poses: np.ndarray, **evaluate: object) -> StepResult:
     )
 
 
-def camera(name: str = "base_camera", kind: str = "sensor") -> CameraInfo:
+def camera(name: str = "base_camera", kind: CameraKind = "sensor") -> CameraInfo:
     return CameraInfo(
         name, kind, 8, 6, 1.0, 0.01, 10.0, np.eye(3, dtype=np.float32), None, ("rgb", "depth", "segmentation")
-    )  # type: ignore[arg-type]
+    )
 
 
 def description(geometry: SceneGeometry, cameras: tuple[CameraInfo, ...] = ()) -> TaskDescription:

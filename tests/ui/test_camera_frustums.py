@@ -5,7 +5,7 @@ import viser
 import viser.transforms
 
 from tests.ui.scenes import camera
-from workbench.core.pictures import Picture
+from workbench.core.pictures import CameraKind, Picture
 from workbench.ui.camera_frustums import CameraFrustums, frustum_pose
 
 POSE = np.array([1.0, 2.0, 3.0, 1.0, 0.0, 0.0, 0.0], np.float32)
@@ -24,7 +24,9 @@ def test_frustums_follow_their_pictures_and_leave_with_them(server: viser.ViserS
     frustums = CameraFrustums(server)
     cameras = (camera("base"), camera("hand"))
     offset = np.zeros(3, np.float32)
-    pictures = {("sensor", name): Picture(name, "sensor", 0, POSE, GREY) for name in ("base", "hand")}
+    pictures: dict[tuple[CameraKind, str], Picture] = {
+        ("sensor", name): Picture(name, "sensor", 0, POSE, GREY) for name in ("base", "hand")
+    }
     frustums.draw(cameras, pictures, offset)
     assert len(frustums._drawn) == 2
     moved = Picture("base", "sensor", 0, POSE + [1, 0, 0, 0, 0, 0, 0], GREY)

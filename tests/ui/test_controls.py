@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 import viser
 from viser._messages import GuiUpdateMessage
+from viser.infra import ClientId
 
 from workbench.ui import controls
 from workbench.ui.checked import checked_int
@@ -25,7 +26,9 @@ class Page:
     def moves(self, handle: viser.GuiInputHandle, value: object) -> None:
         message = GuiUpdateMessage(handle._impl.uuid, {"value": value})
         loop = self.server.gui._event_loop
-        asyncio.run_coroutine_threadsafe(self.server.gui._handle_gui_updates(1, message), loop).result(5)
+        asyncio.run_coroutine_threadsafe(
+            self.server.gui._handle_gui_updates(ClientId(1), message), loop
+        ).result(5)
 
 
 @pytest.fixture

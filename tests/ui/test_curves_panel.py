@@ -44,7 +44,7 @@ def test_other_env_shows_its_own_past(server: viser.ViserServer) -> None:
     chart = panel._charts["reward"]
     assert len(chart.data[0]) == 50
     np.testing.assert_array_equal(chart.data[2], past.reward[:, 3])
-    assert chart.series[2]["label"] == "env 3"
+    assert chart.series[2].get("label") == "env 3"
 
 
 def test_task_without_success_has_no_curve_of_it(server: viser.ViserServer) -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -18,7 +19,7 @@ from workbench.ui.meshes_as_glb import (
 )
 
 
-def read_back(glb: bytes) -> list[trimesh.Trimesh]:
+def read_back(glb: bytes) -> list[Any]:
     scene = trimesh.load_scene(io.BytesIO(glb), file_type="glb")
     return [mesh for mesh in scene.geometry.values() if isinstance(mesh, trimesh.Trimesh)]
 
@@ -36,6 +37,7 @@ def test_glb_keeps_triangles_normals_and_colours() -> None:
     first, second = read_back(as_glb([(mesh, red), (mesh, see_through)]))
     np.testing.assert_allclose(first.vertices, mesh.vertices, atol=1e-6)
     np.testing.assert_array_equal(first.faces, mesh.faces)
+    assert mesh.normals is not None
     np.testing.assert_allclose(first.vertex_normals, mesh.normals, atol=1e-5)
     np.testing.assert_allclose(first.visual.material.baseColorFactor[:3], [255, 0, 0], atol=1)
     assert first.visual.material.alphaMode == "OPAQUE"

@@ -59,7 +59,9 @@ def bounds(parts: tuple[ActionPart, ...]) -> tuple[NDArray[np.float32], NDArray[
     return np.concatenate([p.low for p in parts]), np.concatenate([p.high for p in parts])
 
 
-def random_action(parts: tuple[ActionPart, ...], num_envs: int, rng: np.random.Generator) -> NDArray[np.float32]:
+def random_action(
+    parts: tuple[ActionPart, ...], num_envs: int, rng: np.random.Generator
+) -> NDArray[np.float32]:
     """(N, A) uniform within the bounds; dimensions without bounds are drawn from -1 to 1."""
     low, high = bounds(parts)
     bounded = np.isfinite(low) & np.isfinite(high)

@@ -32,11 +32,14 @@ _FROM_PACKED_POSE = np.array([4, 5, 6, 0, 1, 2, 3])
 class Layout:
     """Where everything lies: rows of the tensors, and positions in the concatenated packs."""
 
-    bodies: list[physx.PhysxRigidDynamicComponent]
+    bodies: list[Any]
+    """PhysxRigidDynamicComponent. Any, here and below: SAPIEN's stubs want arrays of a literal shape."""
     body_rows: NDArray[np.int64]
-    links: list[physx.PhysxArticulationLinkComponent]
+    links: list[Any]
+    """PhysxArticulationLinkComponent."""
     link_rows: NDArray[np.int64]
-    articulations: list[physx.PhysxArticulation]
+    articulations: list[Any]
+    """PhysxArticulation."""
     root_rows: NDArray[np.int64]
     dofs: NDArray[np.int64]
     body_at: NDArray[np.int64]

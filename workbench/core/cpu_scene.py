@@ -108,8 +108,10 @@ class BatchedCpuMixin:
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         if kwargs.get("parallel_in_single_scene"):
-            raise ValueError("parallel_in_single_scene is not possible with the batched CPU core: the page "
-                             "shows all envs side by side without it.")
+            raise ValueError(
+                "parallel_in_single_scene is not possible with the batched CPU core: the page "
+                "shows all envs side by side without it."
+            )
         kwargs["sim_backend"] = "physx_cpu"
         super().__init__(*args, **kwargs)
 
@@ -139,7 +141,10 @@ class BatchedCpuMixin:
                 systems.append(sapien.render.RenderSystem(self.backend.render_device))
             sub_scenes.append(sapien.Scene(systems))
         self.scene = BatchedCpuScene(
-            sub_scenes, sim_config=self.sim_config, device=self.device, backend=self.backend  # type: ignore
+            sub_scenes,
+            sim_config=self.sim_config,
+            device=self.device,
+            backend=self.backend,  # type: ignore
         )
         self.scene.px.timestep = 1.0 / self._sim_freq
 

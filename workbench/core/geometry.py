@@ -53,7 +53,9 @@ class Material:
     @property
     def srgb_color(self) -> tuple[float, float, float, float]:
         """`base_color` as a colour picker or CSS would say it: RGB sRGB encoded, alpha unchanged."""
-        r, g, b = (12.92 * c if c <= 0.0031308 else 1.055 * c ** (1 / 2.4) - 0.055 for c in self.base_color[:3])
+        r, g, b = (
+            12.92 * c if c <= 0.0031308 else 1.055 * c ** (1 / 2.4) - 0.055 for c in self.base_color[:3]
+        )
         return r, g, b, self.base_color[3]
 
 

@@ -86,7 +86,8 @@ def with_normals(mesh: Mesh) -> Mesh:
     b = order[np.repeat(start[corners[order]], sharing) + step]
     smooth = np.einsum("ij,ij->i", unit[a // 3], unit[b // 3]) >= _CREASE_COSINE
     normals = np.stack(
-        [np.bincount(a[smooth], weighted[b[smooth] // 3, k], minlength=len(corners)) for k in range(3)], axis=1
+        [np.bincount(a[smooth], weighted[b[smooth] // 3, k], minlength=len(corners)) for k in range(3)],
+        axis=1,
     ).astype(np.float64)
     # A face without area sums to nothing, and a zero normal is drawn black.
     empty = np.linalg.norm(normals, axis=1) < 1e-20
@@ -157,7 +158,9 @@ def _normals_of_source(reduced: Mesh, source: Mesh) -> NDArray[np.float32]:
     candidates = source.normals[near]
     alike = np.einsum("vkj,vj->vk", candidates, reduced.normals)
     # The nearest that agrees; where a face was folded over none does, and the most alike is taken.
-    choice = np.where((alike > _CREASE_COSINE).any(axis=1), (alike > _CREASE_COSINE).argmax(axis=1), alike.argmax(axis=1))
+    choice = np.where(
+        (alike > _CREASE_COSINE).any(axis=1), (alike > _CREASE_COSINE).argmax(axis=1), alike.argmax(axis=1)
+    )
     every = np.arange(len(near))
     chosen = candidates[every, choice]
     return np.where(alike[every, choice][:, None] > 0, chosen, reduced.normals).astype(np.float32)
@@ -219,7 +222,9 @@ def _collapse_pieces(
     To a quadric a flat disc costs nothing to lose; taken together with a round housing, the lid goes first.
     """
     count = len(points)
-    edges = coo_matrix((np.ones(2 * len(faces)), (faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())), (count, count))
+    edges = coo_matrix(
+        (np.ones(2 * len(faces)), (faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())), (count, count)
+    )
     pieces, label = connected_components(edges, directed=False)
     label = label[faces[:, 0]]
     corner = points[faces]

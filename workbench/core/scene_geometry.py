@@ -189,7 +189,9 @@ class _Placement:
         p, q = shape.local_pose.p.tolist(), shape.local_pose.q.tolist()
         scaled = isinstance(shape, sapien.render.RenderShapeTriangleMesh)
         x, y, z = shape.scale.tolist() if scaled else (1.0, 1.0, 1.0)
-        return _Placement((x, y, z), (p[0], p[1], p[2]), (q[0], q[1], q[2], q[3]), shape.front_face == "clockwise")
+        return _Placement(
+            (x, y, z), (p[0], p[1], p[2]), (q[0], q[1], q[2], q[3]), shape.front_face == "clockwise"
+        )
 
     @property
     def key(self) -> Hashable:

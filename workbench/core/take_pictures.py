@@ -143,7 +143,9 @@ def _body_name(mount: Any, table: BodyTable) -> str | None:
     return None if slot is None else table.names[slot % len(table.names)]
 
 
-def _check(name: str, kind: str, modalities: Sequence[str], cameras: dict[tuple[CameraKind, str], Any]) -> None:
+def _check(
+    name: str, kind: str, modalities: Sequence[str], cameras: dict[tuple[CameraKind, str], Any]
+) -> None:
     camera = cameras.get((kind, name))  # type: ignore[call-overload]
     if camera is None:
         there = ", ".join(f"{n} ({k})" for k, n in cameras) or "none"

@@ -61,7 +61,11 @@ def make_env(
     """
     require_assets(task.__name__, asset_ids)
     backend = choose_backend(options.backend, options.render)
-    kwargs: dict[str, Any] = {**(default_kwargs or {}), "reward_mode": default_reward_mode(task), **options.kwargs}
+    kwargs: dict[str, Any] = {
+        **(default_kwargs or {}),
+        "reward_mode": default_reward_mode(task),
+        **options.kwargs,
+    }
     kwargs["render_backend"] = backend.render_backend
     kwargs["num_envs"] = options.num_envs
     if backend.render_backend != "none":
@@ -121,7 +125,9 @@ class TaskEnv:
         """Simulated seconds in one control step."""
         return self.env.control_timestep
 
-    def reset(self, seed: int | Sequence[int] | None = None, env_idx: Sequence[int] | None = None) -> StepResult:
+    def reset(
+        self, seed: int | Sequence[int] | None = None, env_idx: Sequence[int] | None = None
+    ) -> StepResult:
         """Start new episodes in all envs, or in those of `env_idx`.
 
         All at once is ManiSkill's own ``reset(seed=[...])``. For a subset, ManiSkill seeds torch with the

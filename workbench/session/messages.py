@@ -165,8 +165,17 @@ class Quit:
 
 
 Request = (
-    Load | Play | SingleStep | Reset | SetSpeed | SetEpisodeEnd | SetActionSource | SetSliders
-    | WatchCameras | SetCapture | Quit
+    Load
+    | Play
+    | SingleStep
+    | Reset
+    | SetSpeed
+    | SetEpisodeEnd
+    | SetActionSource
+    | SetSliders
+    | WatchCameras
+    | SetCapture
+    | Quit
 )
 
 

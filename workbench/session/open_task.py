@@ -23,9 +23,9 @@ from workbench.authoring.problem import Problem, TaskError, problem_from_excepti
 from workbench.authoring.returns import check_step_returns
 from workbench.core import actions
 from workbench.core.backends import find_renderer
-from workbench.core.take_pictures import list_cameras, segmentation_names
 from workbench.core.scene_geometry import read_geometry
 from workbench.core.step import StepResult
+from workbench.core.take_pictures import list_cameras, segmentation_names
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env
 from workbench.session.messages import ActionDimension, TaskDescription, TaskOptions
 

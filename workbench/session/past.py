@@ -35,11 +35,15 @@ class Past:
         self._tick[row] = self._count
         self._reward[row] = stepped.step.reward
         success = stepped.step.evaluate.get("success")
-        self._success[row] = np.nan if success is None else success.reshape(len(stepped.step.reward), -1)[:, 0]
+        self._success[row] = (
+            np.nan if success is None else success.reshape(len(stepped.step.reward), -1)[:, 0]
+        )
         self._started[row] = self._new_episode
         self._new_episode = np.zeros_like(self._new_episode)
         self._count += 1
 
     def curves(self) -> Curves:
         rows = np.arange(max(0, self._count - self._length), self._count) % self._length
-        return Curves(self._count, self._tick[rows], self._reward[rows], self._success[rows], self._started[rows])
+        return Curves(
+            self._count, self._tick[rows], self._reward[rows], self._success[rows], self._started[rows]
+        )

@@ -343,8 +343,14 @@ class Session:
                 s.wants_play = False
                 tail = "\n".join(list(s.printed)[-20:])
                 self._set_problem(
-                    Problem("worker", f"the worker process {describe_exit(code)}", s.task and s.task.file,
-                            None, None, tail)
+                    Problem(
+                        "worker",
+                        f"the worker process {describe_exit(code)}",
+                        s.task and s.task.file,
+                        None,
+                        None,
+                        tail,
+                    )
                 )
             s.state, s.activity = "starting", "starting another worker"
         self._note()
@@ -463,7 +469,9 @@ class Session:
         self._state.problem_serial += 1
 
     def _load_request(self, source: dict[str, str] | None) -> Load:
-        options = TaskOptions(self._options.num_envs, self._options.backend, self._seed, self._options.env_kwargs)
+        options = TaskOptions(
+            self._options.num_envs, self._options.backend, self._seed, self._options.env_kwargs
+        )
         return Load(self._task, options, source)
 
     def _watch_request(self) -> WatchCameras:

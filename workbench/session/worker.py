@@ -22,8 +22,9 @@ import torch
 from workbench.authoring.problem import Problem, TaskError, problem_from_exception
 from workbench.core import actions
 from workbench.core.pictures import Picture
-from workbench.core.take_pictures import take_pictures
 from workbench.core.step import StepResult
+from workbench.core.take_pictures import take_pictures
+from workbench.session.episodes import recorded_modalities
 from workbench.session.messages import (
     ActionSource,
     CameraRequest,
@@ -50,7 +51,6 @@ from workbench.session.messages import (
 )
 from workbench.session.open_task import OpenedTask, open_task, reset_checked, step_checked, zero_action
 from workbench.session.pacing import Pacer, Rate
-from workbench.session.episodes import recorded_modalities
 from workbench.session.policy import Policy, load_policy
 
 _STATUS_PERIOD = 0.25
@@ -264,9 +264,7 @@ class Worker:
             return np.broadcast_to(action, (env.num_envs, len(low))).copy()
         return actions.hold_action(env.parts, env.num_envs)
 
-    def _send_step(
-        self, step: StepResult, reset_mask: np.ndarray, seeds: np.ndarray | None = None
-    ) -> None:
+    def _send_step(self, step: StepResult, reset_mask: np.ndarray, seeds: np.ndarray | None = None) -> None:
         self._pictures_stale = True
         captured: tuple[Picture, ...] = ()
         if self._capture.env_idx and self._opened is not None:
