@@ -6,6 +6,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import gymnasium as gym
 import mani_skill.envs  # noqa: F401  registers the ids
 import numpy as np
@@ -13,6 +16,7 @@ import pytest
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
+from mani_skill.utils.structs.pose import Pose
 from torch.utils import _pytree as pytree
 
 from workbench.core.cpu_scene import batched_class
@@ -80,7 +84,7 @@ def test_every_env_follows_the_stock_single_env(env_id: str, num_envs: int) -> N
 
 
 @pytest.fixture(scope="module")
-def pick_cubes() -> BaseEnv:
+def pick_cubes() -> Iterator[BaseEnv]:
     env = batched("PickCube-v1", 4)
     yield env
     env.close()
@@ -101,7 +105,7 @@ def test_a_partial_reset_moves_only_the_envs_that_are_reset(pick_cubes: BaseEnv)
 def test_a_reset_env_goes_on_as_if_its_neighbours_had_not_been_reset(pick_cubes: BaseEnv) -> None:
     actions = np.random.default_rng(0).uniform(-1, 1, (20, 4, 8)).astype(np.float32)
 
-    def run(reset_others: bool) -> torch.Tensor:
+    def run(reset_others: bool) -> Any:
         pick_cubes.reset(seed=[1, 2, 3, 4])
         for step, action in enumerate(actions):
             if reset_others and step == 10:
@@ -230,3 +234,23 @@ def test_state_may_not_be_read_while_the_scene_is_loaded() -> None:
 
     with pytest.raises(RuntimeError, match="_initialize_episode"):
         batched_class(ReadsTooEarly)(num_envs=2, **STATE_ONLY)
+
+
+def test_every_env_has_its_own_ground() -> None:
+    class DropsACube(REGISTERED_ENVS["PickCube-v1"].cls):
+        """The cube falls beside the table, onto the floor that the table scene builds 0.92 m below."""
+
+        def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+            super()._initialize_episode(env_idx, options)
+            pose = self.cube.pose.raw_pose.clone()
+            pose[:, :3] = torch.tensor([-2.0, 0.0, -0.7])
+            self.cube.set_pose(Pose.create(pose[env_idx]))
+
+    env = batched_class(DropsACube)(num_envs=3, **STATE_ONLY)
+    env.reset(seed=[0, 1, 2])
+    for _ in range(20):
+        env.step(np.zeros((3, 8), np.float32))
+    heights = env.cube.pose.p[:, 2]
+    assert torch.allclose(heights, heights[:1]), heights
+    assert float(heights.min()) > -0.95, "fell through the floor"
+    env.close()

@@ -1,3 +1,4 @@
+# pyright: reportArgumentType=false, reportOptionalMemberAccess=false, reportAttributeAccessIssue=false
 """Every private name of ManiSkill and SAPIEN that the core relies upon: an upgrade fails here first."""
 
 from __future__ import annotations

@@ -106,13 +106,12 @@ def test_a_name_that_is_too_long_is_said(make_episode: Maker, tmp_path: Path) ->
     assert os.listdir(tmp_path) == []
 
 
-@pytest.mark.filterwarnings("ignore:RRD file has no footer")
 @pytest.mark.parametrize("room", [0, 1000, 20_000])
 def test_a_file_that_cannot_grow_is_not_left_behind(make_episode: Maker, tmp_path: Path, room: int) -> None:
     noise = np.random.default_rng(0).random((3, 2000)).astype(np.float32)
     episode = make_episode(action=noise, action_names=tuple(map(str, range(2000))))
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    # What a full disk does to rerun's writing thread: the call fails, and a line on stderr is all it says.
+    # A write that fails half way, as on a full disk.
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, hard))
     try:
         with pytest.raises(RecordingError, match=r"e\.rrd"):
@@ -121,6 +120,18 @@ def test_a_file_that_cannot_grow_is_not_left_behind(make_episode: Maker, tmp_pat
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert os.listdir(tmp_path) == []
     assert verify_rrd(write_rrd(episode, tmp_path / "e.rrd")) is None
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+@pytest.mark.parametrize("lost", [1, 100, 5000])
+def test_a_file_that_was_cut_short_is_not_given_its_name(
+    make_episode: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lost: int
+) -> None:
+    whole = rrd._write
+    monkeypatch.setattr(rrd, "_write", lambda path, content: whole(path, content[:-lost]))
+    with pytest.raises(RecordingError, match="could not be read back|not everything arrived"):
+        write_rrd(make_episode(), tmp_path / "e.rrd")
+    assert os.listdir(tmp_path) == []
 
 
 def test_an_encoder_that_raises_leaves_nothing_behind(

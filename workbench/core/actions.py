@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from mani_skill.agents.controllers.base_controller import BaseController, CombinedController
+from mani_skill.agents.controllers.base_controller import CombinedController
 from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
 from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController
 from mani_skill.envs.sapien_env import BaseEnv
@@ -27,7 +27,8 @@ class ActionPart:
 
     robot: str | None
     """Key of the action dict for several robots, else None."""
-    controller: BaseController
+    controller: Any
+    """A ManiSkill BaseController; its configuration is that of its own class."""
     names: tuple[str, ...]
     low: NDArray[np.float32]
     high: NDArray[np.float32]
@@ -37,14 +38,14 @@ def action_parts(env: BaseEnv) -> tuple[ActionPart, ...]:
     """The parts in the order of the flat action; empty for a task without a robot."""
     if env.agent is None:
         return ()
-    controllers = env.agent.controller
+    controllers: Any = env.agent.controller
     robots = controllers.items() if isinstance(controllers, dict) else [(None, controllers)]
     parts = []
     for robot, controller in robots:
         combined = isinstance(controller, CombinedController)
         named = controller.controllers.items() if combined else [(None, controller)]
         for name, part in named:
-            space = part.single_action_space
+            space: Any = part.single_action_space
             prefix = "/".join(str(p) for p in (robot, name) if p is not None)
             dimensions = [f"{prefix}/{d}" if prefix else d for d in _dimension_names(part)]
             low, high = np.asarray(space.low, np.float32), np.asarray(space.high, np.float32)
@@ -117,10 +118,10 @@ def _numpy(values: Any) -> NDArray[np.float32]:
     return np.asarray(values, dtype=np.float32)
 
 
-def _dimension_names(controller: BaseController) -> list[str]:
+def _dimension_names(controller: Any) -> list[str]:
     count = controller.single_action_space.shape[0]
     if isinstance(controller, PDEEPosController):
-        names = list(_EE_AXES)
+        names: list[str] = list(_EE_AXES)
     else:
         names = [joint.name for joint in controller.joints]
         controlled = getattr(controller, "control_joint_indices", None)

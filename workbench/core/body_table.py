@@ -26,7 +26,7 @@ import sapien
 import torch
 from numpy.typing import NDArray
 
-from workbench.core import scene_seams
+from workbench.core import seams
 from workbench.core.geometry import BodyKind
 
 _PACKED_POSE = np.array([4, 5, 6, 0, 1, 2, 3])
@@ -108,9 +108,9 @@ def build_body_table(env: Any) -> BodyTable:
     shape = (env.num_envs, len(names))
     entities = np.full(shape, None, dtype=object)
     for b in bodies:
-        entities[b.env, b.body] = _entity(scene_seams.objects_of(b.struct)[b.position])
+        entities[b.env, b.body] = _entity(seams.objects_of(b.struct)[b.position])
     hidden_entities = {
-        id(entity) for actor in scene_seams.hidden_objects(env) for entity in scene_seams.objects_of(actor)
+        id(entity) for actor in seams.hidden_objects(env) for entity in seams.objects_of(actor)
     }
     table = BodyTable(
         scene=scene,
@@ -153,10 +153,10 @@ def read_poses(env: Any, table: BodyTable) -> NDArray[np.float32]:
 
 
 def _put_back(table: BodyTable, actor: Any, flat: NDArray[np.float32]) -> None:
-    kept = scene_seams.pose_before_hiding(actor)
+    kept = seams.pose_before_hiding(actor)
     if kept is None:
         return
-    objects = scene_seams.objects_of(actor)
+    objects = seams.objects_of(actor)
     true_poses = np.broadcast_to(kept.cpu().numpy(), (len(objects), 7))
     for entity, pose in zip(objects, true_poses, strict=True):
         slot = table.slot_of.get(id(entity))
@@ -168,9 +168,7 @@ def _find_rows(table: BodyTable, bodies: list[_Body]) -> None:
     slots, rows = [], []
     # Read whole, once a struct: on a GPU every number that is read by itself waits for the device.
     rows_of = {
-        id(b.struct): scene_seams.data_rows_of(b.struct).tolist()
-        for b in bodies
-        if table.kinds[b.body] != "static"
+        id(b.struct): seams.data_rows_of(b.struct).tolist() for b in bodies if table.kinds[b.body] != "static"
     }
     for b in bodies:
         slot = b.env * len(table.names) + b.body
@@ -210,13 +208,13 @@ def _named_parts(scene: Any) -> Iterator[tuple[str, BodyKind, list[tuple[Any, in
     for name, view in scene.actor_views.items():
         # Two objects of one env under one view (merging is not bound to one an env) cannot be one
         # column of the array: those keep their own names.
-        if len(set(scene_seams.envs_of(view))) != len(scene_seams.objects_of(view)):
+        if len(set(seams.envs_of(view))) != len(seams.objects_of(view)):
             continue
         label = str(name if name is not None else view.name)
-        for entity in scene_seams.objects_of(view):
+        for entity in seams.objects_of(view):
             covered.setdefault(id(entity), label)
     for name, actor in scene.actors.items():
-        labels = {covered.get(id(entity)) for entity in scene_seams.objects_of(actor)}
+        labels = {covered.get(id(entity)) for entity in seams.objects_of(actor)}
         label = labels.pop() if len(labels) == 1 else None
         merged.setdefault(label if label is not None else name, []).append(actor)
     for name, actors in merged.items():
@@ -225,11 +223,11 @@ def _named_parts(scene: Any) -> Iterator[tuple[str, BodyKind, list[tuple[Any, in
     grouped: dict[str, list[Any]] = {}
     part_of: dict[int, str] = {}
     for name, view in scene.articulation_views.items():
-        if len(set(scene_seams.envs_of(view))) == len(scene_seams.objects_of(view)):
-            for articulation in scene_seams.objects_of(view):
+        if len(set(seams.envs_of(view))) == len(seams.objects_of(view)):
+            for articulation in seams.objects_of(view):
                 part_of.setdefault(id(articulation), str(name if name is not None else view.name))
     for name, articulation in scene.articulations.items():
-        labels = {part_of.get(id(a)) for a in scene_seams.objects_of(articulation)}
+        labels = {part_of.get(id(a)) for a in seams.objects_of(articulation)}
         label = labels.pop() if len(labels) == 1 else None
         grouped.setdefault(label if label is not None else name, []).append(articulation)
     for name, articulations in grouped.items():
@@ -242,7 +240,7 @@ def _named_parts(scene: Any) -> Iterator[tuple[str, BodyKind, list[tuple[Any, in
 
 
 def _parts(structs: list[Any]) -> list[tuple[Any, int, int]]:
-    return [(s, i, int(env)) for s in structs for i, env in enumerate(scene_seams.envs_of(s))]
+    return [(s, i, int(env)) for s in structs for i, env in enumerate(seams.envs_of(s))]
 
 
 def _entity(thing: Any) -> sapien.Entity:

@@ -68,6 +68,11 @@ class BatchedCpuScene(ManiSkillScene):
         self.px = BatchedCpuSystem(sub_scenes)  # type: ignore[assignment]
         self.gpu_sim_enabled = True
 
+    def create_actor_builder(self) -> Any:
+        # ManiSkill adds a plane's collision shape once a builder, since on the GPU all envs share one
+        # physics scene: here every env but the first would lack its ground.
+        return super().create_actor_builder().set_allow_overlapping_plane_collisions(True)
+
     def _sapien_add_camera(self, *args: Any, **kwargs: Any) -> Any:
         # A camera on a link is given a GPU pose index in GPU simulation; a CPU body has none, and the
         # camera is moved with its entity anyway.
@@ -80,12 +85,14 @@ class BatchedCpuScene(ManiSkillScene):
     def _sapien_update_render(
         self, update_sensors: bool = True, update_human_render_cameras: bool = True
     ) -> None:
-        chosen = [self.sensors] * update_sensors + [self.human_render_cameras] * update_human_render_cameras
+        chosen: list[dict[str, Any]] = [self.sensors] * update_sensors + [
+            self.human_render_cameras
+        ] * update_human_render_cameras
         for cameras in chosen:
             for name, sensor in cameras.items():
                 if sensor.camera.camera_group is None:
                     group = CpuCameraGroup(sensor.camera._render_cameras)
-                    sensor.camera.camera_group = self.camera_groups[name] = group
+                    sensor.camera.camera_group = self.camera_groups[name] = group  # type: ignore
         for sub_scene in self.sub_scenes:
             sub_scene.update_render()
 
@@ -104,7 +111,7 @@ class BatchedCpuMixin:
     _sim_freq: int
     _set_scene_config: Any
     sim_config: Any
-    render_mode: str | None
+    device: torch.device
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         if kwargs.get("parallel_in_single_scene"):

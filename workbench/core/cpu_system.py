@@ -318,7 +318,7 @@ class BatchedCpuSystem:
             body, row = layout.bodies[i], now[i]
             _refuse_nan(row, body.entity.name)
             if differs[i, :7].any():
-                body.entity.pose = sapien.Pose(row[:3], row[3:7])
+                body.entity.pose = _pose(row)
             if differs[i, 7:].any() and not body.kinematic:
                 body.linear_velocity = row[7:10]
                 body.angular_velocity = row[10:13]
@@ -330,7 +330,7 @@ class BatchedCpuSystem:
         now, seen = self._data[layout.root_rows, :7], self._data_seen[layout.root_rows, :7]
         for i in np.flatnonzero((now != seen).any(axis=1)):
             _refuse_nan(now[i], layout.articulations[i].name)
-            layout.articulations[i].links[0].pose = sapien.Pose(now[i, :3], now[i, 3:7])
+            layout.articulations[i].links[0].pose = _pose(now[i])
             self.note_change()
         self._data_seen[layout.root_rows, :7] = now
 
@@ -434,6 +434,10 @@ def _twin(shape: tuple[int, ...]) -> tuple[NDArray[np.float32], NDArray[np.float
 
 def _array(values: NDArray[np.float32]) -> CpuArray:
     return CpuArray(torch.from_numpy(values))
+
+
+def _pose(row: NDArray[np.float32]) -> sapien.Pose:
+    return sapien.Pose(row[:3], row[3:7])  # type: ignore[arg-type]  # the stubs want a literal shape
 
 
 def _refuse_nan(values: NDArray[np.float32], name: str) -> None:

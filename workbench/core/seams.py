@@ -5,8 +5,9 @@ a CPU system raise on both. The structs are made deep inside ManiSkill's builder
 properties that ask are replaced, once a process, by ones that ask our system when (and only when) the
 struct belongs to a batched CPU scene. A stock scene in the same process gets the original code.
 
-``tests/core/test_seams.py`` names every attribute used here, so that an upgrade fails loudly there
-and not in the middle of an author's task.
+What drawing and pictures read of ManiSkill's structs is here too, one small function each.
+``tests/core/test_seams.py`` and ``tests/core/test_scene_seams.py`` name every attribute used here, so that an
+upgrade fails loudly there and not in the middle of an author's task.
 """
 
 from __future__ import annotations
@@ -18,10 +19,13 @@ import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
+from mani_skill.utils.structs.actor import Actor
 from mani_skill.utils.structs.articulation import Articulation
 from mani_skill.utils.structs.articulation_joint import ArticulationJoint
 from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct
 from mani_skill.utils.structs.link import Link
+from mani_skill.utils.structs.render_camera import RenderCamera
+from numpy.typing import NDArray
 
 from workbench.core.cpu_system import BatchedCpuSystem
 
@@ -103,3 +107,63 @@ def set_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: list[int]) -> Non
     env._episode_seed = every
     env._batched_episode_rng[env_idx] = BatchedRNG.from_seeds(seeds, backend=env._batched_rng_backend)
     env._episode_rng = env._batched_episode_rng[0]
+
+
+# --- what drawing and pictures read ----------------------------------------------------------------
+
+
+def objects_of(struct: Any) -> list[Any]:
+    """The SAPIEN objects behind an Actor, Link or Articulation: ``_objs``, one an env that has it.
+
+    An Actor's are entities, a Link's are link components, an Articulation's are physx articulations.
+    """
+    return struct._objs
+
+
+def envs_of(struct: Any) -> NDArray[np.int64]:
+    """The env of each of `objects_of`: ``_scene_idxs``."""
+    return struct._scene_idxs.cpu().numpy().astype(np.int64)
+
+
+def data_rows_of(struct: Any) -> torch.Tensor:
+    """The row of each of `objects_of` in ``px.cuda_rigid_body_data``: ``_body_data_index``.
+
+    Only where ``scene.gpu_sim_enabled``, for what is not static, and after ``gpu_init``.
+    """
+    return struct._body_data_index
+
+
+def hidden_objects(env: Any) -> list[Any]:
+    """What the task hides from its sensors: ``_hidden_objects``, Actors (merged ones too)."""
+    return env._hidden_objects
+
+
+def pose_before_hiding(actor: Actor) -> torch.Tensor | None:
+    """Where an actor that is hidden now really is, (M, 7) or (7,), or None if it is not hidden.
+
+    ``Actor.hide_visual`` cannot switch off drawing in GPU simulation: it keeps the pose in
+    ``before_hide_pose`` and moves the actor 99999 m away. On a stock CPU env nothing moves.
+    """
+    if not actor.hidden or not actor.scene.gpu_sim_enabled:
+        return None
+    return actor.before_hide_pose  # type: ignore[attr-defined]
+
+
+def sensors(env: Any) -> dict[str, Any]:
+    """``_sensors``; an env made without a render device has no such attribute."""
+    return getattr(env, "_sensors", {})
+
+
+def human_render_cameras(env: Any) -> dict[str, Any]:
+    """``_human_render_cameras``; an env made without a render device has no such attribute."""
+    return getattr(env, "_human_render_cameras", {})
+
+
+def camera_components(camera: Any) -> list[Any] | None:
+    """The ``RenderCameraComponent`` of every env behind a ManiSkill camera: ``camera._render_cameras``.
+
+    None for what is no plain camera: tactile sensors, or the stereo depth camera (which ManiSkill
+    3.0.1 cannot build: its constructor wants an argument that BaseEnv does not pass).
+    """
+    inner = getattr(camera, "camera", None)
+    return inner._render_cameras if isinstance(inner, RenderCamera) else None

@@ -23,7 +23,7 @@ import sapien.render
 import torch
 from numpy.typing import NDArray
 
-from workbench.core import scene_seams
+from workbench.core import seams
 from workbench.core.body_table import BodyTable, build_body_table
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 
@@ -121,23 +121,23 @@ def take_pictures(env: Any, env_index: int, requests: Sequence[Request]) -> tupl
 
 def _cameras(env: Any) -> dict[tuple[CameraKind, str], Any]:
     found: dict[tuple[CameraKind, str], Any] = {}
-    for name, sensor in scene_seams.sensors(env).items():
-        if scene_seams.camera_components(sensor) is not None:
+    for name, sensor in seams.sensors(env).items():
+        if seams.camera_components(sensor) is not None:
             found["sensor", name] = sensor
-    for name, camera in scene_seams.human_render_cameras(env).items():
-        if scene_seams.camera_components(camera) is not None:
+    for name, camera in seams.human_render_cameras(env).items():
+        if seams.camera_components(camera) is not None:
             found["human", name] = camera
     return found
 
 
 def _components(camera: Any) -> list[Any]:
-    components = scene_seams.camera_components(camera)
+    components = seams.camera_components(camera)
     assert components is not None, "only cameras that `_cameras` found come here"
     return components
 
 
 def _body_name(mount: Any, table: BodyTable) -> str | None:
-    thing = scene_seams.objects_of(mount)[0]
+    thing = seams.objects_of(mount)[0]
     entity = thing if isinstance(thing, sapien.Entity) else thing.entity
     slot = table.slot_of.get(id(entity))
     return None if slot is None else table.names[slot % len(table.names)]
@@ -165,9 +165,9 @@ def _hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]:
     was_visible: list[tuple[Any, float]] = []
     was_at: list[tuple[Any, sapien.Pose]] = []
     try:
-        for actor in scene_seams.hidden_objects(env):
-            kept = scene_seams.pose_before_hiding(actor)
-            here = zip(scene_seams.objects_of(actor), scene_seams.envs_of(actor), strict=True)
+        for actor in seams.hidden_objects(env):
+            kept = seams.pose_before_hiding(actor)
+            here = zip(seams.objects_of(actor), seams.envs_of(actor), strict=True)
             for row, (entity, env_of) in enumerate(here):
                 body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
                 if env_of != env_index or body is None:

@@ -1,11 +1,11 @@
 """Write an episode as one ``.rrd`` file that is either there, whole, or not there at all.
 
 A recording is the one thing that outlives a session, so the file must not lie: not half written
-after a full disk, not silently short of a camera, not written over yesterday's. Rerun writes on
-threads of its own and turns most errors into warnings. So the file is written under a temporary name
-in the same folder with rerun's strict mode on, read back and held against the account of what was
-handed over (`layout.Account`), flushed to the disk, and only then given its name, in one step
-that fails where the name exists.
+after a full disk, not silently short of a camera, not written over yesterday's. Rerun works on threads
+of its own and turns most errors into warnings. So it encodes in memory with its strict mode on; the
+bytes go to a temporary name in the same folder, are flushed to the disk, read back and held against
+the account of what was handed over (`layout.Account`), and only then get their name, in one step that
+fails where the name exists.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from rerun.error_utils import catch_and_log_exceptions
 from workbench.recording.blueprint import episode_blueprint
 from workbench.recording.episode import Episode, EpisodeInfo
 from workbench.recording.layout import Account, flag, log_episode
-from workbench.recording.rerun_seam import release_streams, save_to
+from workbench.recording.rerun_seam import encode_recording, release_streams
 
 _NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EACCES}
 
@@ -52,19 +52,20 @@ def write_rrd(episode: Episode, path: Path) -> Path:
     path = Path(path)
     _check_lengths(episode)
     try:
+        content, account = _encode(episode)
+    finally:
+        release_streams()
+    try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = path.parent / f".{uuid.uuid4().hex}.rrd.part"
-        # Rerun makes the file too, but says what went wrong in a bare RuntimeError.
-        temporary.touch(exist_ok=False)
         try:
-            account = _write(episode, temporary)
+            _write(temporary, content)
             _check_written(temporary, account)
-            _sync(temporary)
             final = _publish(temporary, path)
         finally:
-            temporary.unlink(missing_ok=True)
-            release_streams()
-        _sync(path.parent)
+            if temporary.exists():
+                temporary.unlink()
+        _sync_folder(path.parent)
         return final
     except OSError as error:
         raise RecordingError(f"Cannot write {path}: {_reason(error, path)}") from error
@@ -82,25 +83,17 @@ def episode_filename(info: EpisodeInfo, when: datetime.datetime | None = None) -
     return f"{task}_{seed}_env{info.env_index:02d}_{when:%Y-%m-%dT%H-%M-%S}.rrd"
 
 
-def _write(episode: Episode, path: Path) -> Account:
-    blueprint = episode_blueprint(episode)
+def _encode(episode: Episode) -> tuple[bytes, Account]:
+    def fill(recording: rr.RecordingStream) -> Account:
+        account = log_episode(recording, episode)
+        for name, values in properties(episode).items():
+            recording.send_property(name, rr.AnyValues(**values))
+        recording.send_recording_name(_title(episode))
+        return account
+
     # Without strict mode a mesh that rerun refuses is a warning, and the file lacks it.
     with catch_and_log_exceptions(strict=True):
-        # Rerun derives a default id from the process, so two episodes of one process would be taken for one.
-        recording = rr.RecordingStream(_application_id(episode.info), recording_id=uuid.uuid4().hex)
-        try:
-            save_to(recording, path, blueprint)
-            account = log_episode(recording, episode)
-            for name, values in properties(episode).items():
-                recording.send_property(name, rr.AnyValues(**values))
-            recording.send_recording_name(_title(episode))
-        except RuntimeError as error:
-            # How rerun's native half reports a file that it cannot write: "... (os error 28)".
-            number = re.search(r"os error (\d+)", str(error))
-            raise OSError(int(number[1]) if number else errno.EIO, str(error)) from error
-        finally:
-            recording.disconnect()
-    return account
+        return encode_recording(_application_id(episode.info), episode_blueprint(episode), fill)
 
 
 def _application_id(info: EpisodeInfo) -> str:
@@ -243,7 +236,15 @@ def _candidates(path: Path) -> Iterator[Path]:
         number += 1
 
 
-def _sync(path: Path) -> None:
+def _write(path: Path, content: bytes) -> None:
+    with path.open("xb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _sync_folder(path: Path) -> None:
+    """Make a new name last: without this a power cut may take it, though not the file's content."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 
-from workbench.core.pictures import CameraInfo, Picture
+from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.core.step import StepResult
 from workbench.recording.columns import EpisodeBuilder
 from workbench.recording.episode import Episode, EpisodeInfo
@@ -18,10 +18,14 @@ from workbench.session.messages import Stepped, TaskDescription
 _PACKAGES = ("maniskill-workbench", "mani_skill", "sapien", "torch", "rerun-sdk")
 
 
-def recorded_modalities(camera: CameraInfo) -> tuple[str, ...]:
-    """What an episode keeps of a camera: of a sensor what a policy may see, of a human camera colour."""
-    wanted = ("rgb", "depth", "segmentation") if camera.kind == "sensor" else ("rgb",)
-    return tuple(modality for modality in wanted if modality in camera.modalities)
+def recorded_pictures(cameras: Iterable[CameraInfo]) -> tuple[tuple[str, CameraKind, tuple[str, ...]], ...]:
+    """What an episode keeps: of a sensor what a policy may see, of a human camera colour."""
+    asked = []
+    for camera in cameras:
+        wanted = ("rgb", "depth", "segmentation") if camera.kind == "sensor" else ("rgb",)
+        kept = tuple(modality for modality in wanted if modality in camera.modalities)
+        asked.append((camera.name, camera.kind, kept))
+    return tuple(asked)
 
 
 class EpisodeGatherer:

@@ -22,7 +22,7 @@ from workbench.core.step import StepResult
 from workbench.core.take_pictures import take_pictures
 from workbench.recording.episode import Episode
 from workbench.recording.rrd import episode_filename, write_rrd
-from workbench.session.episodes import EpisodeGatherer, recorded_modalities
+from workbench.session.episodes import EpisodeGatherer, recorded_pictures
 from workbench.session.messages import Stepped, TaskOptions
 from workbench.session.open_task import OpenedTask, open_task, reset_checked, step_checked, zero_action
 from workbench.session.policy import load_policy
@@ -132,7 +132,7 @@ def _stepped(
     mask = np.zeros(opened.env.num_envs, bool)
     if reset is not None:
         mask[reset] = True
-    wanted = tuple((c.name, c.kind, recorded_modalities(c)) for c in opened.description.cameras)
+    wanted = recorded_pictures(opened.description.cameras)
     captured: tuple[Picture, ...] = ()
     for index in pictured:
         captured += take_pictures(opened.env.env, index, wanted)

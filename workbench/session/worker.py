@@ -24,7 +24,7 @@ from workbench.core import actions
 from workbench.core.pictures import Picture
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import take_pictures
-from workbench.session.episodes import recorded_modalities
+from workbench.session.episodes import recorded_pictures
 from workbench.session.messages import (
     ActionSource,
     CameraRequest,
@@ -268,10 +268,7 @@ class Worker:
         self._pictures_stale = True
         captured: tuple[Picture, ...] = ()
         if self._capture.env_idx and self._opened is not None:
-            wanted = tuple(
-                (camera.name, camera.kind, recorded_modalities(camera))
-                for camera in self._opened.description.cameras
-            )
+            wanted = recorded_pictures(self._opened.description.cameras)
             for env in self._capture.env_idx:
                 captured += take_pictures(self._opened.env.env, env, wanted)
         self._send(Stepped(step, reset_mask, captured, seeds))

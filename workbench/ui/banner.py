@@ -103,7 +103,9 @@ def banner_html(problem: Problem, view: SessionView) -> str:
         kept = "The last good version stays on the page."
     return render(
         "banner",
-        subject=task or (Path(problem.file).name if problem.file else "The task"),
+        subject="The file"
+        if problem.stage == "syntax"
+        else task or (Path(problem.file).name if problem.file else "The task"),
         doing=DOING.get(problem.stage, f"failed in {problem.stage}"),
         where=where,
         path=problem.file,
