@@ -10,6 +10,7 @@ from functools import cached_property
 import pytest
 import sapien
 import sapien.physx as physx
+from mani_skill.agents.controllers.utils.kinematics import Kinematics
 from mani_skill.envs import sapien_env
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
@@ -82,6 +83,12 @@ def test_the_env_builds_its_scene_and_seeds_where_the_core_does() -> None:
     ):
         assert name in source, name
     assert callable(BatchedRNG.from_seeds)
+
+
+def test_kinematics_choose_their_solver_by_device() -> None:
+    assert 'self.device.type == "cuda"' in inspect.getsource(Kinematics.__init__)
+    assert "self.use_gpu_ik = True" in inspect.getsource(Kinematics._setup_gpu)
+    assert callable(Kinematics._setup_cpu)
 
 
 def test_cpu_systems_can_be_packed() -> None:

@@ -131,9 +131,9 @@ def _dimension_names(controller: Any) -> list[str]:
 
 
 def _hold(part: ActionPart, num_envs: int) -> NDArray[np.float32]:
-    controller, count = part.controller, len(part.names)
-    absolute = isinstance(controller, PDJointPosController) and not isinstance(controller, PDEEPosController)
-    if not absolute or controller.config.use_delta:
+    controller: Any = part.controller
+    count = len(part.names)
+    if not _is_joint_position(controller) or controller.config.use_delta:
         return np.zeros((num_envs, count), np.float32)
     qpos = controller.qpos
     controlled = getattr(controller, "control_joint_indices", None)
@@ -143,3 +143,7 @@ def _hold(part: ActionPart, num_envs: int) -> NDArray[np.float32]:
         low, high = controller.action_space_low, controller.action_space_high
         qpos = (2 * qpos - (high + low)) / (high - low)
     return np.clip(qpos.cpu().numpy(), part.low, part.high).astype(np.float32)
+
+
+def _is_joint_position(controller: object) -> bool:
+    return isinstance(controller, PDJointPosController) and not isinstance(controller, PDEEPosController)

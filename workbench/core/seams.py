@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from mani_skill.agents.controllers.utils.kinematics import Kinematics
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from mani_skill.utils.structs.actor import Actor
@@ -48,6 +49,7 @@ def install_index_seams() -> None:
     stock_body_index = PhysxRigidBodyComponentStruct.__dict__["_body_data_index"].func
     stock_body_data = PhysxRigidBodyComponentStruct.__dict__["_body_data"].fget
     stock_articulation_index = Articulation.__dict__["_data_index"].func
+    stock_set_up_kinematics = Kinematics._setup_cpu
     stock_joint_index = ArticulationJoint.__dict__["_data_index"].func
 
     def body_index(self: Any) -> torch.Tensor:
@@ -78,10 +80,18 @@ def install_index_seams() -> None:
         indices = [system.index_of(articulation) for articulation in self._physx_articulations]
         return torch.tensor(indices, device=self.device, dtype=torch.int32)
 
+    def set_up_kinematics(self: Any) -> None:
+        # Chosen by device: the CPU solver takes one env's pose; the GPU's is plain torch and batched.
+        if batched_system(self.articulation.scene) is None:
+            stock_set_up_kinematics(self)
+        else:
+            self._setup_gpu()
+
     _replace(PhysxRigidBodyComponentStruct, "_body_data_index", cached_property(body_index))
     _replace(Articulation, "_data_index", cached_property(articulation_index))
     _replace(ArticulationJoint, "_data_index", cached_property(joint_index))
     Link._body_data = property(link_data)  # type: ignore[method-assign,assignment]
+    Kinematics._setup_cpu = set_up_kinematics
     _installed = True
 
 

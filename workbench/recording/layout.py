@@ -175,7 +175,7 @@ def _log_bodies(log: _Log, episode: Episode) -> None:
     log.static(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     steps = np.arange(len(episode.poses), dtype=np.int64)
     entities = body_entities(episode.geometry)
-    present = np.isfinite(episode.poses).any(axis=(0, 2))
+    present: NDArray[np.bool_] = np.any(np.isfinite(episode.poses), axis=(0, 2))
     for body, entity in enumerate(entities):
         if not present[body]:
             continue

@@ -35,17 +35,18 @@ def encode_recording(
             application_id=application_id, make_default=False, make_thread_default=False, default_enabled=True
         )
     )
-    sinks = [stream.memory_recording().storage for stream in (recording, layout)]
+    content, arrangement = (stream.memory_recording().storage for stream in (recording, layout))
     try:
-        result = fill(recording)
         layout.set_time("blueprint", sequence=0)
         blueprint._log_to_stream(layout)
-        return sinks[0].concat_as_bytes(sinks[1]), result
+        # The blueprint's messages alone are not enough: this adds the one that says to use them.
+        rerun_bindings.send_blueprint(arrangement, False, True, recording.to_native())
+        result = fill(recording)
+        return content.drain_as_bytes(), result
     finally:
-        for sink in sinks:
+        for stream, sink in ((recording, content), (layout, arrangement)):
             sink.drain_as_bytes()  # what is still in a sink when it is cut off gives a warning
-        recording.disconnect()
-        layout.disconnect()
+            stream.disconnect()
 
 
 def release_streams() -> None:

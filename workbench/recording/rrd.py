@@ -93,7 +93,8 @@ def _encode(episode: Episode) -> tuple[bytes, Account]:
 
     # Without strict mode a mesh that rerun refuses is a warning, and the file lacks it.
     with catch_and_log_exceptions(strict=True):
-        return encode_recording(_application_id(episode.info), episode_blueprint(episode), fill)
+        encoded = encode_recording(_application_id(episode.info), episode_blueprint(episode), fill)
+    return encoded
 
 
 def _application_id(info: EpisodeInfo) -> str:

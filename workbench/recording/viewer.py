@@ -170,7 +170,7 @@ def _handler(
             self._answer(body=False)
 
         def _answer(self, body: bool) -> None:
-            port = self.server.server_address[1]
+            port = self.connection.getsockname()[1]
             # A foreign page whose name was made to point here (DNS rebinding) sends its own name along.
             if self.headers.get("Host") not in (f"{LOOPBACK}:{port}", f"localhost:{port}"):
                 return self.send_error(HTTPStatus.FORBIDDEN)
@@ -228,7 +228,7 @@ def _await_port(process: subprocess.Popen[bytes], port: int) -> None:
     deadline = time.monotonic() + _START_SECONDS
     while time.monotonic() < deadline:
         if process.poll() is not None:
-            raise RuntimeError(f"rerun ended with {process.returncode} before it was ready; what it said is above.")
+            raise RuntimeError(f"rerun ended with {process.returncode} before it was ready.")
         try:
             socket.create_connection((LOOPBACK, port), timeout=1.0).close()
             return

@@ -25,7 +25,7 @@ from workbench.ui.cameras_panel import CamerasPanel
 from workbench.ui.commands import Command, register
 from workbench.ui.curves_panel import CurvesPanel
 from workbench.ui.env_layout import EnvLayout, env_under_ray, lay_out
-from workbench.ui.fragments import style_sheet
+from workbench.ui.fragments import render, style_sheet
 from workbench.ui.lights import light
 from workbench.ui.numbers_panel import NumbersPanel
 from workbench.ui.record_panel import RecordPanel
@@ -62,6 +62,7 @@ class Page:
         self._task_serial = -1
         self._built: tuple[bool, int] | None = None
         self._framed: object = None
+        self._waits_for_human = False
         self._arrivals: dict[int, float] = {}
         self._pointed: dict[int, tuple[np.ndarray, float]] = {}
 
@@ -79,7 +80,8 @@ class Page:
         server.gui.add_html(style_sheet())
         self._status = StatusLine(server)
         tabs = server.gui.add_tab_group()
-        with tabs.add_tab("Run", viser.Icon.PLAYER_PLAY):
+        run_tab = tabs.add_tab("Run", viser.Icon.PLAYER_PLAY)
+        with run_tab:
             self._run = RunPanel(server, session)
             self._view_panel = ViewPanel(server)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
@@ -94,7 +96,10 @@ class Page:
         self._scene = SceneView(server)
         self._mark = SelectionMark(server)
         self._frustums = CameraFrustums(server)
-        register(server, self._commands())
+        commands = self._commands()
+        register(server, commands)
+        with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
+            server.gui.add_html(render("keys", commands=commands))
         server.scene.on_click()(self._on_scene_click)
 
     # --- life ------------------------------------------------------------------------------------
@@ -200,19 +205,30 @@ class Page:
         size = np.round(np.concatenate([self._layout.low, self._layout.high]), 0).tobytes()
         framing = (task.env_id, task.num_envs, one, size)
         if framing != self._framed:
-            self._framed = framing
+            self._framed, self._waits_for_human = framing, alone
             self.frame(view)
+        if self._waits_for_human and any(kind == "human" for kind, _ in view.pictures):
+            # The human camera's place comes with its first picture, after the scene.
+            self._waits_for_human = False
+            self.frame(view, untouched_only=True)
         self._frame_arrivals(view)
 
-    def frame(self, view: SessionView) -> None:
-        """Point every open page, and those to come, at what is shown."""
+    def frame(self, view: SessionView, untouched_only: bool = False) -> None:
+        """Point every open page (or those whose view nobody has moved), and those to come, at the scene."""
         viewpoint = self._viewpoint(view, USUAL_ASPECT)
         if viewpoint is None:
             return
         self._server.initial_camera.position = viewpoint.position
         self._server.initial_camera.look_at = viewpoint.look_at
         for client in self._server.get_clients().values():
-            self._point(client, view)
+            if not untouched_only or self._is_untouched(client):
+                self._point(client, view)
+
+    def _is_untouched(self, client: viser.ClientHandle) -> bool:
+        """True while the page looks from where it was last pointed."""
+        pointed = self._pointed.get(client.client_id)
+        usual = self._server.initial_camera.position if pointed is None else pointed[0]
+        return np.allclose(client.camera.position, usual, atol=0.02)
 
     def _frame_arrivals(self, view: SessionView) -> None:
         """Frame the scene for the shape of a page that has just come, which is known only after a moment.
@@ -223,11 +239,8 @@ class Page:
         for number, client in self._server.get_clients().items():
             if time.monotonic() - self._arrivals.get(number, 0.0) > SETTLES:
                 continue
-            usual, aspect = self._pointed.get(number, (None, USUAL_ASPECT))
-            if usual is None:
-                usual = self._server.initial_camera.position
-            untouched = np.allclose(client.camera.position, usual, atol=0.02)
-            if untouched and abs(aspect_of(client) / aspect - 1) > 0.05:
+            _, aspect = self._pointed.get(number, (None, USUAL_ASPECT))
+            if self._is_untouched(client) and abs(aspect_of(client) / aspect - 1) > 0.05:
                 self._point(client, view)
 
     def _point(self, client: viser.ClientHandle, view: SessionView) -> None:

@@ -12,6 +12,9 @@ from workbench.ui.fragments import render
 REDRAW_EVERY = 0.25
 """Seconds. Rates that change faster cannot be read."""
 
+NEWS = 6.0
+"""Seconds for which a new version is announced."""
+
 WORDS = {
     "starting": "starting",
     "loading": "loading",
@@ -27,18 +30,25 @@ class StatusLine:
         self._handle = server.gui.add_html("")
         self._drawn_at = 0.0
         self._state = ""
+        self._task_serial = 0
+        self._loaded_at = 0.0
 
     def draw(self, view: SessionView) -> None:
         now = time.monotonic()
-        state = f"{view.state} {view.stale} {view.activity} {view.task_serial}"
+        if view.task_serial != self._task_serial:
+            # The first version is no news.
+            self._loaded_at = now if self._task_serial else 0.0
+            self._task_serial = view.task_serial
+        fresh = now - self._loaded_at < NEWS
+        state = f"{view.state} {view.stale} {view.activity} {view.task_serial} {fresh} {view.problem_serial}"
         if state == self._state and now - self._drawn_at < REDRAW_EVERY:
             return
         self._drawn_at, self._state = now, state
-        self._handle.content = render("status_line", **status_values(view))
+        self._handle.content = render("status_line", **status_values(view, fresh))
 
 
-def status_values(view: SessionView) -> dict[str, object]:
-    """What the template is given."""
+def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
+    """What the template is given; `fresh` when a new version of the file has just come in."""
     task = view.task
     moving = view.playing and view.state in ("running", "error") and task is not None
     return {
@@ -47,6 +57,7 @@ def status_values(view: SessionView) -> dict[str, object]:
         "problem": view.problem is not None,
         "stale": view.stale and view.state not in ("starting", "loading"),
         "activity": view.activity,
+        "news": f"new version in {sum(view.load_milliseconds.values()) / 1000:.1f} s" if fresh else "",
         "task": None if task is None else task.env_id,
         "backend": "" if task is None else task.backend,
         "device": "" if task is None else task.device,

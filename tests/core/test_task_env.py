@@ -1,0 +1,217 @@
+"""The plain-array interface over a running task, and how tasks are made."""
+
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportOptionalMemberAccess=false
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import gymnasium as gym
+import mani_skill.envs  # noqa: F401  registers the ids
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.registration import REGISTERED_ENVS
+
+from workbench.core import actions
+from workbench.core.assets import MissingAssets, refuse_download_prompts, require_assets
+from workbench.core.backends import BackendUnavailable, choose_backend, why_no_gpu_simulation
+from workbench.core.task_env import EnvOptions, TaskEnv, default_reward_mode, make_env
+
+N = 4
+
+
+def opened(env_id: str, num_envs: int = N, **kwargs: object) -> TaskEnv:
+    spec = REGISTERED_ENVS[env_id]
+    options = EnvOptions(num_envs, "cpu", render=False, kwargs=kwargs)
+    return TaskEnv(make_env(spec.cls, options), spec.max_episode_steps)
+
+
+@pytest.fixture(scope="module")
+def push() -> Iterator[TaskEnv]:
+    env = opened("PushCube-v1")
+    yield env
+    env.close()
+
+
+def test_a_step_is_plain_arrays_with_the_envs_first(push: TaskEnv) -> None:
+    first = push.reset(seed=0)
+    assert first.action is None and not first.reward.any()
+    action = np.zeros((N, 8), np.float32)
+    step = push.step(action)
+    assert step.elapsed_steps.tolist() == [1] * N
+    assert step.reward.dtype == np.float32 and step.reward.shape == (N,)
+    assert step.terminated.dtype == np.bool_ and step.truncated.dtype == np.bool_
+    assert all(isinstance(v, np.ndarray) and len(v) == N for v in step.evaluate.values())
+    assert step.poses.shape == (N, len(push.table.names), 7) and step.poses.dtype == np.float32
+
+
+def test_what_a_step_returned_does_not_change_with_the_next(push: TaskEnv) -> None:
+    push.reset(seed=0)
+    step = push.step(np.ones((N, 8), np.float32))
+    copies = step.poses.copy(), step.reward.copy(), step.elapsed_steps.copy()
+    push.step(-np.ones((N, 8), np.float32))
+    assert np.array_equal(step.poses, copies[0], equal_nan=True)
+    assert np.array_equal(step.reward, copies[1]) and np.array_equal(step.elapsed_steps, copies[2])
+
+
+def test_the_time_limit_truncates(push: TaskEnv) -> None:
+    push.reset(seed=0)
+    results = [push.step(np.zeros((N, 8), np.float32)) for _ in range(push.max_episode_steps)]
+    assert not results[-2].truncated.any() and results[-1].truncated.all()
+
+
+def test_a_seed_for_one_env_starts_the_episode_of_a_stock_single_env(push: TaskEnv) -> None:
+    push.reset(seed=0)
+    push.reset(seed=123, env_idx=[2])
+    stock = gym.make("PushCube-v1", num_envs=1, obs_mode="state", render_backend="none").unwrapped
+    stock.reset(seed=123)
+    assert torch.equal(push.env.obj.pose.p[2], stock.obj.pose.p[0])
+    assert push.episode_seeds.tolist() == [0, 1, 123, 3]
+    stock.close()
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    subset=st.sets(st.integers(0, N - 1), min_size=1, max_size=N),
+    seed=st.integers(0, 2**31 - N - 1),
+    steps=st.integers(0, 3),
+)
+def test_a_partial_reset_touches_its_subset_only(
+    push: TaskEnv, subset: set[int], seed: int, steps: int
+) -> None:
+    push.reset(seed=7)
+    before = push.reset(seed=7)
+    for _ in range(steps):
+        before = push.step(np.full((N, 8), 0.3, np.float32))
+    after = push.reset(seed=seed, env_idx=sorted(subset))
+    others = [i for i in range(N) if i not in subset]
+    assert np.array_equal(after.poses[others], before.poses[others], equal_nan=True)
+    assert [int(after.elapsed_steps[i]) for i in subset] == [0] * len(subset)
+    assert [int(after.elapsed_steps[i]) for i in others] == [steps] * len(others)
+
+
+@pytest.mark.parametrize("wrong", [[], [N], [-1], [0, 99]])
+def test_env_indices_that_are_not_there_are_refused(push: TaskEnv, wrong: list[int]) -> None:
+    with pytest.raises((ValueError, IndexError)):
+        push.reset(env_idx=wrong)
+
+
+def test_a_number_of_seeds_that_does_not_fit_is_refused(push: TaskEnv) -> None:
+    with pytest.raises(ValueError, match="2 seeds for 4 envs"):
+        push.reset(seed=[1, 2])
+
+
+def test_the_check_sees_what_the_task_returned_and_can_refuse_it() -> None:
+    seen: list[tuple[object, object]] = []
+    env = opened("PushCube-v1", 2)
+    checked = TaskEnv(env.env, 50, check=lambda evaluate, reward: seen.append((evaluate, reward)))
+    checked.reset(seed=0)
+    checked.step(np.zeros((2, 8), np.float32))
+    assert seen[0][1] is None and isinstance(seen[1][1], torch.Tensor)
+    env.close()
+
+
+# --- actions ---------------------------------------------------------------------------------------
+
+
+def test_dimensions_have_the_names_of_joints_and_the_bounds_of_the_space(push: TaskEnv) -> None:
+    names = [name for part in push.parts for name in part.names]
+    assert names[0] == "arm/panda_joint1" and names[-1].startswith("gripper/")
+    low, high = actions.bounds(push.parts)
+    assert np.array_equal(low, push.env.single_action_space.low)
+    assert np.array_equal(high, push.env.single_action_space.high)
+
+
+@pytest.mark.parametrize(
+    "control_mode",
+    ["pd_joint_delta_pos", "pd_joint_pos", "pd_ee_delta_pose", "pd_ee_delta_pos", "pd_joint_vel"],
+)
+def test_holding_still_holds_still(control_mode: str) -> None:
+    env = opened("PickCube-v1", 2, control_mode=control_mode)
+    env.reset(seed=0)
+    start = env.env.agent.robot.get_qpos().clone()
+    for _ in range(10):
+        env.step(actions.hold_action(env.parts, 2))
+    assert (env.env.agent.robot.get_qpos() - start).abs().max() < 0.02
+    env.close()
+
+
+def test_the_action_of_two_robots_is_one_flat_vector_and_back() -> None:
+    env = opened("TwoRobotPickCube-v1", 2)
+    low, _ = actions.bounds(env.parts)
+    assert len(low) == 16
+    flat = actions.random_action(env.parts, 2, np.random.default_rng(0))
+    robots = actions.to_env_action(env.env, env.parts, flat)
+    assert set(robots) == set(env.env.single_action_space.spaces)
+    assert np.array_equal(actions.to_flat_action(env.env, env.parts, robots), flat)
+    env.reset(seed=0)
+    assert np.array_equal(env.step(flat).action, flat)
+    env.close()
+
+
+@pytest.mark.parametrize("given", [np.zeros(8), np.zeros((N, 8)), torch.zeros(N, 8)])
+def test_a_policys_action_may_be_one_for_all_or_one_each(push: TaskEnv, given: object) -> None:
+    assert actions.to_flat_action(push.env, push.parts, given).shape == (N, 8)
+
+
+@pytest.mark.parametrize("wrong", [np.zeros((N, 7)), np.zeros((2, 8)), np.full((N, 8), np.nan), 3.0])
+def test_a_policys_action_that_does_not_fit_is_refused(push: TaskEnv, wrong: object) -> None:
+    with pytest.raises(ValueError):
+        actions.to_flat_action(push.env, push.parts, wrong)
+
+
+# --- making ----------------------------------------------------------------------------------------
+
+
+def test_the_reward_is_the_richest_that_the_class_implements() -> None:
+    class NoReward(BaseEnv):
+        pass
+
+    class DenseOnly(BaseEnv):
+        def compute_dense_reward(self, obs: object, action: object, info: dict) -> torch.Tensor:
+            return torch.zeros(self.num_envs)
+
+    assert default_reward_mode(NoReward) == "sparse"
+    assert default_reward_mode(DenseOnly) == "dense"
+    assert default_reward_mode(REGISTERED_ENVS["PushCube-v1"].cls) == "normalized_dense"
+
+
+def test_missing_assets_are_named_with_the_command_and_nothing_is_asked() -> None:
+    with pytest.raises(MissingAssets, match="download_asset ycb"):
+        require_assets("PickSingleYCB-v1", ["ycb"])
+    from mani_skill.utils import download_asset
+
+    with refuse_download_prompts(), pytest.raises(MissingAssets, match="robot x is missing"):
+        download_asset.prompt_yes_no("robot x is missing. Would you like to download it now?")
+
+
+def test_a_task_whose_robot_is_not_downloaded_says_so() -> None:
+    spec = REGISTERED_ENVS["PickSingleYCB-v1"]
+    with pytest.raises(MissingAssets):
+        make_env(spec.cls, EnvOptions(2, "cpu", render=False), asset_ids=spec.asset_download_ids)
+
+
+@pytest.mark.skipif(why_no_gpu_simulation() is None, reason="this machine has GPU simulation")
+def test_gpu_simulation_is_refused_with_the_reason_where_it_cannot_be() -> None:
+    assert choose_backend("auto", render=False).simulation == "cpu"
+    with pytest.raises(BackendUnavailable, match="--backend cpu"):
+        choose_backend("gpu", render=False)
+
+
+@pytest.mark.gpu
+def test_gpu_simulation_gives_the_same_interface() -> None:
+    spec = REGISTERED_ENVS["PickCube-v1"]
+    env = TaskEnv(make_env(spec.cls, EnvOptions(N, "gpu")), spec.max_episode_steps)
+    env.reset(seed=0)
+    step = env.step(actions.hold_action(env.parts, N))
+    assert step.poses.shape == (N, len(env.table.names), 7) and np.isfinite(step.poses).all()
+    env.close()
+
+
+def test_a_number_of_envs_below_one_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least 1"):
+        EnvOptions(num_envs=0)
