@@ -7,7 +7,15 @@ from hypothesis import strategies as st
 
 from tests.ui.scenes import box_mesh, table_scene, visual
 from workbench.core.geometry import SceneGeometry
-from workbench.ui.env_layout import MARGIN, env_under_ray, grid_offsets, is_floor, lay_out, rotate
+from workbench.ui.env_layout import (
+    MARGIN,
+    env_under_ray,
+    grid_offsets,
+    lay_out,
+    place_of_plane,
+    plane_normal,
+    rotate,
+)
 
 
 def test_box_of_an_env_holds_what_stands_in_it_and_not_its_floor() -> None:
@@ -57,13 +65,34 @@ def test_scene_without_bodies_has_a_layout_too() -> None:
 
 
 def test_wide_table_is_no_floor_and_a_moving_plate_is_none_either() -> None:
-    geometry, _ = table_scene(1)
-    assert is_floor(geometry.visuals[0], geometry)
-    assert not is_floor(geometry.visuals[1], geometry)
-    moving = SceneGeometry(
-        1, ("plate",), ("dynamic",), (False,), (visual("p", box_mesh((40, 40, 0.01)), 1, 0),)
+    geometry, poses = table_scene(1)
+    normal = plane_normal(geometry.visuals[0], geometry, poses)
+    assert normal is not None
+    np.testing.assert_allclose(normal, [0, 0, 1], atol=1e-9)
+    assert plane_normal(geometry.visuals[1], geometry, poses) is None
+    plate = visual("p", box_mesh((40, 40, 0.01)), 1, 0)
+    moving = SceneGeometry(1, ("plate",), ("dynamic",), (False,), (plate,))
+    assert plane_normal(plate, moving, poses[:, :1]) is None
+
+
+def test_wall_counts_for_no_box_and_stands_behind_the_whole_grid() -> None:
+    geometry, poses = table_scene(9)
+    wall = visual("wall/0", box_mesh((40, 0.01, 20)), 9, len(geometry.body_names))
+    geometry = SceneGeometry(
+        9,
+        (*geometry.body_names, "wall"),
+        (*geometry.body_kinds, "static"),
+        (False,) * 5,
+        (*geometry.visuals, wall),
     )
-    assert not is_floor(moving.visuals[0], moving)
+    poses = np.concatenate([poses, np.tile(np.array([0, 2, 0, 1, 0, 0, 0], np.float32), (9, 1, 1))], axis=1)
+    layout = lay_out(geometry, poses)
+    assert layout.high[1] == pytest.approx(1.2)
+    normal = plane_normal(wall, geometry, poses)
+    assert normal is not None
+    place = place_of_plane(normal, wall, poses, layout)
+    assert place[1] + 2 > (layout.high + layout.offsets)[:, 1].max()
+    np.testing.assert_allclose(place[[0, 2]], 0, atol=1e-6)
 
 
 def test_click_finds_the_env_it_points_at() -> None:

@@ -204,7 +204,7 @@ def _mesh(mesh: Mesh, material: Material) -> rr.Mesh3D | None:
         vertex_normals=mesh.normals,
         vertex_texcoords=None if texture is None else mesh.uvs,
         albedo_texture=None if texture is None else np.ascontiguousarray(texture),
-        albedo_factor=np.rint(np.clip(material.base_color, 0.0, 1.0) * 255).astype(np.uint8),
+        albedo_factor=np.rint(np.clip(material.srgb_color, 0.0, 1.0) * 255).astype(np.uint8),
     )
 
 

@@ -47,11 +47,24 @@ class LiveRecorder:
             gatherer, self._gatherer = self._gatherer, None
             self._env_idx = ()
         if gatherer is not None:
-            gatherer.finish()
+            self._guarded(gatherer.finish)
 
     def take(self, stepped: Stepped) -> None:
-        if self._gatherer is not None:
-            self._gatherer.take(stepped)
+        """The next reset or step; a step that no episode can hold ends the recording, and is told."""
+        gatherer = self._gatherer
+        if gatherer is not None and not self._guarded(lambda: gatherer.take(stepped)):
+            with self._lock:
+                self._gatherer, self._env_idx = None, ()
+            self._guarded(gatherer.finish)
+
+    def _guarded(self, do: Callable[[], None]) -> bool:
+        try:
+            do()
+        except ValueError as error:  # an entry of evaluate() that is no number, a step that was lost
+            with self._lock:
+                self._problem = f"the recording ended: {error}"
+            return False
+        return True
 
     def status(self) -> RecordingStatus:
         with self._lock:

@@ -89,7 +89,10 @@ class Banner:
 
 def banner_html(problem: Problem, view: SessionView) -> str:
     """The banner's content; every value escaped."""
-    task = None if view.task is None else (view.task.class_name or view.task.env_id)
+    if problem.stage == "syntax" or (view.task is None and problem.file is not None):
+        subject = "The file"
+    else:
+        subject = "The task" if view.task is None else view.task.class_name or view.task.env_id
     where = None
     if problem.file is not None:
         where = Path(problem.file).name + (f":{problem.line}" if problem.line is not None else "")
@@ -103,9 +106,7 @@ def banner_html(problem: Problem, view: SessionView) -> str:
         kept = "The last good version stays on the page."
     return render(
         "banner",
-        subject="The file"
-        if problem.stage == "syntax"
-        else task or (Path(problem.file).name if problem.file else "The task"),
+        subject=subject,
         doing=DOING.get(problem.stage, f"failed in {problem.stage}"),
         where=where,
         path=problem.file,

@@ -83,3 +83,19 @@ def frustum_pose(picture: Picture, offset: NDArray[np.float32]) -> tuple[NDArray
     """wxyz and position of the camera in the view, in OpenCV's frame (z forward, y down)."""
     turned = viser.transforms.SO3(picture.pose[3:].astype(np.float64)) @ CAMERA_TO_OPENCV
     return turned.wxyz, (picture.pose[:3] + offset).astype(np.float64)
+
+
+def without_the_viewpoint(
+    pictures: dict[tuple[CameraKind, str], Picture], seen: dict[tuple[CameraKind, str], Picture]
+) -> dict[tuple[CameraKind, str], Picture]:
+    """The pictures to draw while one env is alone in the view.
+
+    The view then starts at the task's human camera (see `viewpoint`); its own picture, or that of a
+    sensor at the same place, would fill it.
+    """
+    eyes = [picture.pose[:3] for (kind, _), picture in seen.items() if kind == "human"]
+    return {
+        key: picture
+        for key, picture in pictures.items()
+        if all(np.linalg.norm(picture.pose[:3] - eye) > 2 * LARGE for eye in eyes)
+    }

@@ -57,9 +57,12 @@ class CamerasPanel:
         self._env = -1
         self._drawn_at = 0.0
         self._asked: tuple[CameraRequest, ...] | None = None
-        self._note = server.gui.add_html("")
+        self._note = server.gui.add_html(render("note", text="Pictures appear when the task is loaded."))
         self._frustums = server.gui.add_checkbox(
-            "In the view", True, hint="Draw these cameras, with their pictures, in the 3-D view."
+            "In the view",
+            True,
+            visible=False,
+            hint="Draw these cameras, with their pictures, in the 3-D view.",
         )
         self._folder = server.gui.add_folder(None)
 

@@ -2,7 +2,7 @@
 
 Every env has its own world frame and all of them sit on top of each other at its origin; a person
 wants to see them side by side. So each env is given an offset on a grid whose spacing comes from
-what stands in one env (its table and robot, not its endless floor), and a pose in the page is the
+what stands in one env (its table and robot, not its endless floor or backdrop), and a pose in the page is the
 env's own pose plus that offset. Floors are wide enough for the whole grid and are drawn once:
 sixteen overlapping floors would flicker where they meet and cost sixteen times the triangles.
 
@@ -22,6 +22,8 @@ FLOOR_WIDTH = 8.0
 """Metres. A flat static thing wider than this in both directions is a floor: ManiSkill's ground is
 40 to 100 m wide, the largest table 2.4 m."""
 FLOOR_THICKNESS = 0.05
+LEVEL = 0.9
+"""Upward part of the normal from which on a plane is a floor and not a wall."""
 WIDER = 1.4
 """A view is wider than it is tall, and depth is foreshortened in it."""
 MARGIN = 0.35
@@ -54,12 +56,33 @@ def rotate(wxyz: NDArray, points: NDArray) -> NDArray:
     return points + w * across + np.cross(axis, across)
 
 
-def is_floor(visual: Visual, geometry: SceneGeometry) -> bool:
-    """True for a flat, very wide thing that never moves: drawn once for all envs."""
+def plane_normal(visual: Visual, geometry: SceneGeometry, poses: NDArray) -> NDArray[np.float64] | None:
+    """The normal (3,), in the env's frame, of a flat, very wide thing that never moves; else None.
+
+    Floors and the walls that tasks put up as a backdrop: they are wide enough for the whole grid.
+    """
     if any(geometry.body_kinds[b] not in ("static", "kinematic") for b in np.unique(visual.bodies)):
-        return False
-    size = np.sort(_extent(visual.mesh))
-    return bool(size[0] < FLOOR_THICKNESS and size[1] > FLOOR_WIDTH)
+        return None
+    extent = _extent(visual.mesh)
+    thin = int(extent.argmin())
+    if extent[thin] > FLOOR_THICKNESS or np.sort(extent)[1] < FLOOR_WIDTH:
+        return None
+    worn = poses[visual.envs[0], visual.bodies[0]].astype(np.float64)
+    return rotate(worn[3:], np.eye(3)[thin]) if np.isfinite(worn).all() else None
+
+
+def place_of_plane(normal: NDArray, visual: Visual, poses: NDArray, layout: EnvLayout) -> NDArray[np.float32]:
+    """(3,) added to a plane that is drawn once, so that it serves the whole grid.
+
+    A floor lies under the middle; a wall goes behind the last env on its side, or it would cut through
+    the envs in between.
+    """
+    normal = np.asarray(normal, np.float64)
+    if abs(normal[2]) > LEVEL:
+        return np.zeros(3, np.float32)
+    point = poses[visual.envs[0], visual.bodies[0], :3]
+    outwards = normal if (point - (layout.low + layout.high) / 2) @ normal >= 0 else -normal
+    return (outwards * (layout.offsets @ outwards).max()).astype(np.float32)
 
 
 def lay_out(geometry: SceneGeometry, poses: NDArray[np.float32]) -> EnvLayout:
@@ -77,8 +100,10 @@ def lay_out(geometry: SceneGeometry, poses: NDArray[np.float32]) -> EnvLayout:
         corners = _corners_in_env(visual, poses)
         if not len(corners):
             continue
-        if is_floor(visual, geometry):
-            floors.append(float(corners[..., 2].max()))
+        normal = plane_normal(visual, geometry, poses)
+        if normal is not None:
+            if abs(normal[2]) > LEVEL:
+                floors.append(float(corners[..., 2].max()))
         else:
             lows.append(corners.min(axis=1))
             highs.append(corners.max(axis=1))

@@ -100,7 +100,10 @@ def as_glb(parts: list[tuple[Mesh, Material]]) -> bytes:
         if mesh.normals is None:
             # Asking for them puts them in the cache, and only cached normals are exported.
             _ = solid.vertex_normals
-        uvs = mesh.uvs if mesh.uvs is not None else np.zeros((len(mesh.vertices), 2), np.float32)
+        uvs = np.zeros((len(mesh.vertices), 2), np.float32) if mesh.uvs is None else mesh.uvs.copy()
+        # trimesh counts v from the bottom of the picture and turns it round when it writes glTF, which
+        # counts from the top, as SAPIEN does: unturned, every texture would stand on its head.
+        uvs[:, 1] = 1.0 - uvs[:, 1]
         solid.visual = TextureVisuals(uv=uvs if textured else None, material=_pbr(material, number))
         scene.add_geometry(solid, geom_name=str(number))
     glb = scene.export(file_type="glb", include_normals=True)

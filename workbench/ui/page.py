@@ -20,7 +20,7 @@ import viser
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.banner import Banner
-from workbench.ui.camera_frustums import LARGE, SMALL, CameraFrustums
+from workbench.ui.camera_frustums import LARGE, SMALL, CameraFrustums, without_the_viewpoint
 from workbench.ui.cameras_panel import CamerasPanel
 from workbench.ui.commands import Command, register
 from workbench.ui.curves_panel import CurvesPanel
@@ -197,8 +197,7 @@ class Page:
         pictures = self._cameras.shown_pictures(view) if self._cameras.show_frustums else {}
         alone = one or task.num_envs == 1
         if alone:
-            # The view of one env starts at its human camera, whose picture would then fill it.
-            pictures = {key: picture for key, picture in pictures.items() if key[0] != "human"}
+            pictures = without_the_viewpoint(pictures, view.pictures)
         offset = np.zeros(3, np.float32) if one else self._layout.offsets[env]
         self._frustums.draw(task.cameras, pictures, offset, SMALL if alone else LARGE)
         # A scene of another size is framed anew; a reload that keeps the size never moves the view.

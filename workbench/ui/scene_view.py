@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from workbench.core.geometry import SceneGeometry
 from workbench.core.mesh_detail import reduce_mesh
-from workbench.ui.env_layout import EnvLayout, is_floor
+from workbench.ui.env_layout import EnvLayout, place_of_plane, plane_normal
 from workbench.ui.meshes_as_glb import WornTogether, as_glb, face_limit, fingerprint, group_by_wearers
 
 
@@ -55,12 +55,16 @@ class SceneView:
         for group in group_by_wearers(geometry):
             looks = fingerprint(group.visuals)
             key = (looks, limit, sum(looks == known for known, _, _ in self._drawn))
-            floor = all(is_floor(visual, geometry) for visual in group.visuals)
+            first = group.visuals[0]
+            normals = [plane_normal(visual, geometry, poses) for visual in group.visuals]
+            once = None if normals[0] is None else place_of_plane(normals[0], first, poses, layout)
+            if any(normal is None for normal in normals):
+                once = None
             drawn = before.pop(key, None)
             if drawn is None:
                 self._number += 1
                 drawn = _DrawnGroup(self._server, self._number, group, limit)
-            drawn.wear(group, floor)
+            drawn.wear(group, once)
             self._drawn[key] = drawn
         for drawn in before.values():
             drawn.handle.remove()
@@ -119,19 +123,18 @@ class _DrawnGroup:
             cast_shadow=False,
             receive_shadow=False,
         )
-        self.wear(group, floor=False)
+        self.wear(group, None)
 
-    def wear(self, group: WornTogether, floor: bool) -> None:
-        """From now on these (env, body) pairs wear it."""
-        self._group, self._floor = group, floor
+    def wear(self, group: WornTogether, once: NDArray[np.float32] | None) -> None:
+        """From now on these (env, body) pairs wear it; a floor or wall is drawn `once`, moved by that."""
+        self._group, self._once = group, once
 
     def move(self, poses: NDArray[np.float32], layout: EnvLayout, only_env: int | None) -> None:
         envs, bodies = self._group.envs, self._group.bodies
-        if self._floor:
-            # One floor for all: the first wearer's, under the middle of the grid.
+        if self._once is not None:
             envs, bodies = envs[:1], bodies[:1]
             worn = poses[envs, bodies]
-            positions = worn[:, :3]
+            positions = worn[:, :3] + (self._once if only_env is None else 0)
         elif only_env is None:
             worn = poses[envs, bodies]
             positions = worn[:, :3] + layout.offsets[envs]

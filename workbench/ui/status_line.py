@@ -55,7 +55,7 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
         "state": view.state,
         "word": WORDS[view.state],
         "problem": view.problem is not None,
-        "stale": view.stale and view.state not in ("starting", "loading"),
+        "stale": view.stale and task is not None and view.state not in ("starting", "loading"),
         "activity": view.activity,
         "news": f"new version in {sum(view.load_milliseconds.values()) / 1000:.1f} s" if fresh else "",
         "task": None if task is None else task.env_id,
