@@ -1,0 +1,105 @@
+"""``workbench open`` as a person types it, and a real Chromium in front of it."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from playwright.sync_api import Browser, ConsoleMessage, Page, Playwright
+
+CHROMIUM_ARGUMENTS = (
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    # Without these Chromium looks up its maker's hosts at every start.
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+)
+START_SECONDS = 60.0
+
+
+@dataclass
+class Opened:
+    """A running ``workbench open``."""
+
+    process: subprocess.Popen[str]
+    url: str
+    lines: list[str] = field(default_factory=list)
+    """What it printed so far, stdout and stderr."""
+
+    def wait_for_line(self, pattern: str, seconds: float = 60.0) -> str:
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            for line in list(self.lines):
+                if re.search(pattern, line):
+                    return line
+            time.sleep(0.05)
+        raise AssertionError(
+            f"no line like {pattern!r} within {seconds} s; it printed:\n" + "\n".join(self.lines)
+        )
+
+
+@contextmanager
+def open_workbench(*arguments: str, cwd: Path) -> Iterator[Opened]:
+    """Start it on a free port; end it with Ctrl-C's signal and insist that it ends."""
+    command = [sys.executable, "-m", "workbench.cli", "open", *arguments, "--port", "0"]
+    process = subprocess.Popen(
+        command,
+        cwd=cwd,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "COLUMNS": "200", "PYTHONUNBUFFERED": "1"},
+    )
+    opened = Opened(process, "")
+    stream = process.stdout
+    assert stream is not None
+
+    def read() -> None:
+        for line in stream:
+            opened.lines.append(line.rstrip())
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    try:
+        opened.url = opened.wait_for_line(r"page +http", START_SECONDS).split()[-1]
+        yield opened
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(timeout=20)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise
+        reader.join(timeout=5)
+
+
+def launch(playwright: Playwright, chromium: str) -> Browser:
+    return playwright.chromium.launch(executable_path=chromium, args=list(CHROMIUM_ARGUMENTS))
+
+
+def new_page(browser: Browser, width: int = 1280, height: int = 720) -> tuple[Page, list[str]]:
+    """A page, and the console errors and uncaught exceptions that it has so far."""
+    page = browser.new_page(viewport={"width": width, "height": height})
+    errors: list[str] = []
+
+    def on_console(message: ConsoleMessage) -> None:
+        if message.type == "error":
+            errors.append(message.text)
+
+    page.on("console", on_console)
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.set_default_timeout(60_000)
+    return page, errors

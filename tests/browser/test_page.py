@@ -1,0 +1,198 @@
+"""The page in a real Chromium, driven as a person drives it, on the example task."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page, expect, sync_playwright
+
+from tests.browser.opened import Opened, launch, new_page, open_workbench
+from workbench.recording.verify import verify_rrd
+
+pytestmark = pytest.mark.browser
+expect.set_options(timeout=60_000)
+TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
+
+
+@dataclass
+class Desk:
+    """What a person has in front of them: the page, the file, and the terminal."""
+
+    page: Page
+    errors: list[str]
+    file: Path
+    opened: Opened
+    recordings: Path
+
+    def tab(self, name: str) -> None:
+        self.page.get_by_role("tab", name=name).click()
+
+    def button(self, name: str):  # noqa: ANN201  a playwright locator
+        return self.page.get_by_role("button", name=name, exact=True)
+
+    def row(self, name: str) -> list[str]:
+        """The cells of a row of the numbers table on the Reward tab."""
+        row = self.page.locator("tr", has=self.page.get_by_text(name, exact=True))
+        return [cell.strip() for cell in row.first.locator("td, th").all_inner_texts()]
+
+    def elapsed(self) -> int:
+        return int(self.row("elapsed steps")[1].split("/")[0])
+
+
+def until(reached: Callable[[], bool], what: str, seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not reached():
+        assert time.monotonic() < deadline, f"{what} did not come within {seconds} s"
+        time.sleep(0.05)
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Iterator[Desk]:
+    folder = tmp_path_factory.mktemp("author")
+    file = Path(shutil.copy(TASK, folder / "push_cube.py"))
+    recordings = folder / "kept"
+    arguments = (str(file), "--num-envs", "2", "--recordings", str(recordings))
+    with open_workbench(*arguments, cwd=folder) as opened, sync_playwright() as playwright:
+        browser = launch(playwright, chromium_path)
+        page, errors = new_page(browser)
+        page.goto(opened.url)
+        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=90_000)
+        yield Desk(page, errors, file, opened, recordings)
+        browser.close()
+
+
+@pytest.fixture
+def calm(desk: Desk) -> Desk:
+    """The desk with the good file, paused at the start of an episode, on the Run tab."""
+    good = TASK.read_text()
+    if desk.file.read_text() != good:
+        desk.file.write_text(good)
+    expect(
+        desk.page.get_by_text("paused", exact=True).or_(desk.page.get_by_text("running", exact=True))
+    ).to_be_visible()
+    desk.tab("Run")
+    if desk.button("Pause").count():
+        desk.button("Pause").click()
+    expect(desk.button("Play")).to_be_visible()
+    desk.button("Reset all").click()
+    return desk
+
+
+def test_the_page_opens_with_the_task_and_without_an_error(desk: Desk) -> None:
+    expect(desk.page.get_by_text("WorkbenchPushCube-v1")).to_be_visible()
+    expect(desk.page.get_by_text("2 envs on cpu (batched)")).to_be_visible()
+    assert "token" not in desk.page.url
+    assert desk.page.locator("canvas").count() >= 1
+    assert desk.errors == []
+
+
+def test_tabs_that_have_nothing_to_show_are_not_there(desk: Desk) -> None:
+    assert desk.page.get_by_role("tab").all_inner_texts() == ["Run", "Cameras", "Reward", "Episodes"]
+
+
+def test_play_runs_and_pause_stops(calm: Desk) -> None:
+    calm.button("Play").click()
+    expect(calm.page.get_by_text("running", exact=True)).to_be_visible()
+    calm.tab("Reward")
+    until(lambda: calm.elapsed() >= 3, "three steps")
+    calm.tab("Run")
+    calm.button("Pause").click()
+    expect(calm.page.get_by_text("paused", exact=True)).to_be_visible()
+    calm.tab("Reward")
+    stopped = calm.elapsed()
+    time.sleep(1.0)
+    assert calm.elapsed() == stopped
+
+
+def test_a_single_step_is_one_step(calm: Desk) -> None:
+    calm.button("Step").click()
+    calm.tab("Reward")
+    until(lambda: calm.elapsed() == 1, "the step")
+    assert re.fullmatch(r"-?\d+\.\d+", calm.row("reward")[1])
+    assert calm.row("success")[2] == "0 of 2"
+
+
+def test_keys_step_and_reset(calm: Desk) -> None:
+    calm.tab("Reward")
+    until(lambda: calm.elapsed() == 0, "the reset")
+    calm.page.keyboard.press("s")
+    until(lambda: calm.elapsed() == 1, "the step")
+    calm.page.keyboard.press("r")
+    until(lambda: calm.elapsed() == 0, "the reset")
+
+
+def test_choosing_an_env_shows_its_numbers(calm: Desk) -> None:
+    calm.button("next ›").click()
+    calm.tab("Reward")
+    expect(calm.page.get_by_role("columnheader", name="env 1")).to_be_visible()
+    calm.tab("Run")
+    calm.button("‹ previous").click()
+    calm.tab("Reward")
+    expect(calm.page.get_by_role("columnheader", name="env 0")).to_be_visible()
+
+
+def test_the_sensor_and_human_pictures_arrive(calm: Desk) -> None:
+    calm.tab("Cameras")
+    expect(calm.page.get_by_text("base_camera")).to_be_visible()
+    expect(calm.page.get_by_text(re.compile(r"rendered in \d+ ms")).first).to_be_visible()
+    until(lambda: calm.page.locator("img").count() >= 2, "two pictures")
+
+
+def test_a_saved_edit_appears_by_itself(calm: Desk) -> None:
+    text = TASK.read_text()
+    assert '"cube_to_goal"' in text
+    calm.tab("Reward")
+    calm.file.write_text(text.replace('"cube_to_goal"', '"cube_to_goal_v2"'))
+    expect(calm.page.get_by_text("cube_to_goal_v2", exact=True)).to_be_visible()
+
+
+def test_a_broken_edit_shows_a_banner_and_the_last_good_version_stays_usable(calm: Desk) -> None:
+    lines = TASK.read_text().splitlines()
+    place = next(i for i, line in enumerate(lines) if '"cube_to_goal"' in line)
+    lines[place] = lines[place].replace('"cube_to_goal"', '"cube_to_goal_" + 1')
+    calm.file.write_text("\n".join(lines))
+    banner = calm.page.get_by_text(re.compile(rf"push_cube\.py:{place + 1}\b"))
+    expect(banner.first).to_be_visible()
+    expect(calm.page.get_by_text("TypeError").first).to_be_visible()
+    expect(calm.page.get_by_text("last good version").first).to_be_visible()
+    assert f"push_cube.py:{place + 1}" in calm.opened.wait_for_line("TypeError")
+    calm.tab("Reward")
+    before = calm.elapsed()
+    calm.tab("Run")
+    calm.button("Step").click()
+    calm.tab("Reward")
+    until(lambda: calm.elapsed() == before + 1, "a step of the last good version")
+    calm.file.write_text(TASK.read_text())
+    expect(banner).to_have_count(0)
+
+
+def test_a_message_with_markup_is_text_in_the_banner(calm: Desk) -> None:
+    calm.file.write_text("raise ValueError('<img src=x onerror=window.hacked=1><b>bold</b>')\n")
+    expect(calm.page.get_by_text("<b>bold</b>").first).to_be_visible()
+    assert calm.page.evaluate("window.hacked") is None
+
+
+def test_record_keeps_an_episode(calm: Desk) -> None:
+    calm.tab("Episodes")
+    calm.button("Record").click()
+    stop = calm.page.get_by_role("button", name=re.compile("Stop"))
+    expect(stop).to_be_visible()
+    for _ in range(3):
+        calm.page.keyboard.press("s")
+        time.sleep(0.5)
+    until(lambda: bool(re.search(r"\b[1-9]\d* steps?\b", calm.page.inner_text("body"))), "recorded steps")
+    stop.click()
+    until(lambda: calm.recordings.is_dir() and any(calm.recordings.glob("*.rrd")), "the file")
+    (written,) = calm.recordings.glob("*.rrd")
+    assert verify_rrd(written) is None
+    expect(calm.page.get_by_text(written.name).first).to_be_visible()
+
+
+def test_nothing_went_wrong_in_the_console(desk: Desk) -> None:
+    assert desk.errors == []
