@@ -58,7 +58,7 @@ def version(number: int) -> str:
     """The example task with another colour of the cube and another name of an entry."""
     text = TASK.read_text()
     blue = "base_color=[0.05, "
-    assert text.count('"cube_to_goal"') == 1 and text.count(blue) == 1
+    assert '"cube_to_goal"' in text and text.count(blue) == 1
     shade = 0.1 + 0.8 * (number % 5) / 4
     text = text.replace('"cube_to_goal"', f'"seen_{number}"')
     return text.replace(blue, f"base_color=[{shade}, ")

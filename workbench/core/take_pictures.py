@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -32,6 +33,7 @@ _TAKEN = ("rgb", "depth", "segmentation")
 _INT16_END = 32.767
 """Metres. The minimal shader writes positions as int16 millimetres."""
 
+KINDS: tuple[CameraKind, ...] = ("sensor", "human")
 Request = tuple[str, CameraKind, Sequence[str]]
 """Name, kind and modalities of a camera whose picture is wanted."""
 
@@ -95,28 +97,64 @@ def take_pictures(env: Any, env_index: int, requests: Sequence[Request]) -> tupl
         ValueError: there is no such camera, or it cannot give what is asked of it.
         RuntimeError: the renderer failed.
     """
+    pictures: dict[int, Picture] = {}
+    for kind in KINDS:
+        chosen = [i for i, request in enumerate(requests) if request[1] == kind]
+        begun = begin_pictures(env, env_index, [requests[i] for i in chosen])
+        pictures.update(zip(chosen, begun.finish(), strict=True))
+    return tuple(pictures[i] for i in range(len(requests)))
+
+
+@dataclass(frozen=True)
+class BegunPictures:
+    """Pictures that the renderer is at work on; see `begin_pictures`."""
+
+    _taken: tuple[tuple[Any, str, CameraKind, int, tuple[str, ...], NDArray[np.float32]], ...]
+
+    def finish(self) -> tuple[Picture, ...]:
+        """The pictures, in the order asked; waits until the renderer is done."""
+        return tuple(_read(*taken) for taken in self._taken)
+
+
+def begin_pictures(env: Any, env_index: int, requests: Sequence[Request]) -> BegunPictures:
+    """Set the renderer to work on the cameras asked for, and return at once.
+
+    SAPIEN hands a picture to the driver in 0.05 ms and waits for it only when it is read: a GPU, or the
+    threads of a software driver, draw while the simulation steps on (measured on two cores with
+    lavapipe: 26 control steps of 16 envs in 151 ms beside a picture that takes 51 ms alone). The scene is
+    drawn as it is now; it must not be closed, or shown to another camera, before `finish`.
+
+    Args:
+        requests: all of one kind, since sensors and human cameras see different objects.
+
+    Raises:
+        As `take_pictures`.
+    """
     if not 0 <= env_index < env.num_envs:
         raise IndexError(f"env {env_index} is out of range for {env.num_envs} envs")
-    if not requests:
-        return ()
+    kinds = {kind for _, kind, _ in requests}
+    if len(kinds) > 1:
+        raise ValueError("pictures of sensors and of human cameras cannot be begun together")
     cameras = _cameras(env)
     for name, kind, modalities in requests:
         _check(name, kind, modalities, cameras)
+    if not requests:
+        return BegunPictures(())
     scene = env.scene
     if scene.gpu_sim_enabled:
         scene.px.sync_poses_gpu_to_cpu()
     sub_scene = scene.sub_scenes[env_index]
-    pictures: dict[int, Picture] = {}
-    for kind in ("sensor", "human"):
-        chosen = [i for i, request in enumerate(requests) if request[1] == kind]
-        if not chosen:
-            continue
-        with _hidden_objects(env, env_index, shown=kind == "human"):
-            sub_scene.update_render()
-            for i in chosen:
-                name, _, modalities = requests[i]
-                pictures[i] = _take(cameras[kind, name], name, kind, env_index, modalities)
-    return tuple(pictures[i] for i in range(len(requests)))
+    taken = []
+    with _hidden_objects(env, env_index, shown=kinds == {"human"}):
+        sub_scene.update_render()
+        for name, kind, modalities in requests:
+            camera = cameras[kind, name]
+            component = _components(camera)[env_index]
+            component.take_picture()
+            pose = component.get_global_pose()
+            where = np.array([*pose.p, *pose.q], dtype=np.float32)
+            taken.append((camera, name, kind, env_index, tuple(modalities), where))
+    return BegunPictures(tuple(taken))
 
 
 def _cameras(env: Any) -> dict[tuple[CameraKind, str], Any]:
@@ -188,10 +226,16 @@ def _hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]:
             entity.pose = pose
 
 
-def _take(camera: Any, name: str, kind: CameraKind, env_index: int, modalities: Sequence[str]) -> Picture:
+def _read(
+    camera: Any,
+    name: str,
+    kind: CameraKind,
+    env_index: int,
+    modalities: tuple[str, ...],
+    pose: NDArray[np.float32],
+) -> Picture:
     component = _components(camera)[env_index]
     config = camera.config.shader_config
-    component.take_picture()
     made: dict[str, torch.Tensor] = {}
     depth = None
     for texture, gives in config.texture_names.items():
@@ -202,13 +246,12 @@ def _take(camera: Any, name: str, kind: CameraKind, env_index: int, modalities: 
         made.update({m: image[0] for m, image in transformed.items() if m in modalities})
         if "depth" in gives and "depth" in modalities:
             depth = _depth(texture, data, made["depth"].numpy()[..., 0], component)
-    pose = component.get_global_pose()
     segmentation = made.get("segmentation")
     return Picture(
         camera=name,
         kind=kind,
         env=env_index,
-        pose=np.array([*pose.p, *pose.q], dtype=np.float32),
+        pose=pose,
         rgb=np.ascontiguousarray(made["rgb"].numpy()) if "rgb" in made else None,
         depth=depth,
         segmentation=None if segmentation is None else segmentation.numpy()[..., 0].astype(np.int32),

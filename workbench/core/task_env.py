@@ -174,6 +174,11 @@ class TaskEnv:
         return self._result(info, to_numpy(reward).astype(np.float32), to_numpy(terminated), action)
 
     @property
+    def observes_pictures(self) -> bool:
+        """Whether every step draws the scene for the observation."""
+        return self.env.obs_mode not in ("state", "state_dict", "none")
+
+    @property
     def episode_seeds(self) -> NDArray[np.int64]:
         """(N,) the seeds that the envs were last reset with."""
         return np.array(episode_seeds(self.env), dtype=np.int64)

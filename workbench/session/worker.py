@@ -23,11 +23,11 @@ from workbench.authoring.problem import Problem, TaskError, problem_from_excepti
 from workbench.core import actions
 from workbench.core.pictures import Picture
 from workbench.core.step import StepResult
+from workbench.core.take_pictures import Request as PictureRequest
 from workbench.core.take_pictures import take_pictures
 from workbench.session.episodes import recorded_pictures
 from workbench.session.messages import (
     ActionSource,
-    CameraRequest,
     EpisodeEnd,
     Event,
     Failed,
@@ -51,10 +51,10 @@ from workbench.session.messages import (
 )
 from workbench.session.open_task import OpenedTask, open_task, reset_checked, step_checked, zero_action
 from workbench.session.pacing import Pacer, Rate
+from workbench.session.picture_maker import PictureMaker
 from workbench.session.policy import Policy, load_policy
 
 _STATUS_PERIOD = 0.25
-_PICTURE_PERIOD = 1 / 15
 _IDLE = 0.5
 """Seconds to sleep when nothing is due; a request ends the sleep at once."""
 
@@ -74,9 +74,7 @@ class Worker:
         self._rate = Rate()
         self._rng = np.random.default_rng(0)
         self._watch = WatchCameras(0, ())
-        self._pictures_stale = False
-        self._pictures_done = 0.0
-        self._picture_cost = 0.0
+        self._pictures = PictureMaker()
         self._renderer_ready = False
         self._capture = SetCapture(())
         self._status_sent = 0.0
@@ -113,8 +111,9 @@ class Worker:
         waits = [_IDLE]
         if self._playing:
             waits.append(self._pacer.wait())
-        if self._pictures_wanted():
-            waits.append(max(0.0, self._pictures_due() - time.monotonic()))
+        picture = self._pictures.wait(time.monotonic())
+        if picture is not None and self._opened is not None:
+            waits.append(picture)
         return min(waits)
 
     def _requests(self, timeout: float) -> list[Request]:
@@ -145,12 +144,13 @@ class Worker:
         except TaskError as error:
             self._send(Failed(error.problem, kept=self._opened is not None))
             return
+        self._pictures.settle()
         before, self._opened = self._opened, opened
         self._pacer = Pacer(opened.env.control_dt, self._pacer.speed)
         self._rng = np.random.default_rng(request.options.seed)
         self._rate.clear()
         self._sliders = ()
-        self._pictures_stale = True
+        self._watch_cameras(self._watch)
         self._capture = SetCapture(())
         self._send(Loaded(opened.description, opened.first, opened.milliseconds))
         if before is not None:
@@ -193,7 +193,15 @@ class Worker:
         self._sliders = request.action
 
     def _watch_cameras(self, request: WatchCameras) -> None:
-        self._watch, self._pictures_stale = request, True
+        self._watch = request
+        self._pictures.settle()
+        if self._opened is None:
+            return
+        known = {(camera.name, camera.kind) for camera in self._opened.description.cameras}
+        wanted: list[PictureRequest] = [
+            (c.name, c.kind, c.modalities) for c in request.cameras if (c.name, c.kind) in known
+        ]
+        self._pictures.watch(min(request.env, self._opened.env.num_envs - 1), wanted)
 
     def _set_capture(self, request: SetCapture) -> None:
         self._capture = request
@@ -220,6 +228,8 @@ class Worker:
         self._send_status(None)
 
     def _step_once(self, opened: OpenedTask) -> None:
+        if opened.env.observes_pictures:
+            self._pictures.settle()  # the observation is about to draw the same scene
         action = self._next_action(opened)
         step = step_checked(opened.env, opened.loaded, action)
         self._rate.tick(time.monotonic())
@@ -240,6 +250,7 @@ class Worker:
     def _reset_envs(
         self, opened: OpenedTask, env_idx: tuple[int, ...] | None, seed: int | list[int] | None
     ) -> None:
+        self._pictures.settle()  # a reset may build the scene anew
         step = reset_checked(opened.env, opened.loaded, seed, env_idx)
         mask = np.ones(opened.env.num_envs, bool)
         if env_idx is not None:
@@ -265,9 +276,10 @@ class Worker:
         return actions.hold_action(env.parts, env.num_envs)
 
     def _send_step(self, step: StepResult, reset_mask: np.ndarray, seeds: np.ndarray | None = None) -> None:
-        self._pictures_stale = True
+        self._pictures.scene_changed()
         captured: tuple[Picture, ...] = ()
         if self._capture.env_idx and self._opened is not None:
+            self._pictures.settle()
             wanted = recorded_pictures(self._opened.description.cameras)
             for env in self._capture.env_idx:
                 captured += take_pictures(self._opened.env.env, env, wanted)
@@ -275,39 +287,24 @@ class Worker:
 
     # --- pictures and status -----------------------------------------------------------------------
 
-    def _pictures_wanted(self) -> bool:
-        return self._pictures_stale and bool(self._watch.cameras) and self._opened is not None
-
-    def _pictures_due(self) -> float:
-        # At most half of the time goes into pictures, or a slow renderer would stall the player.
-        pause = max(_PICTURE_PERIOD - self._picture_cost, self._picture_cost if self._playing else 0.0)
-        return self._pictures_done + pause
-
     def _make_pictures(self) -> None:
-        if not self._pictures_wanted() or time.monotonic() < self._pictures_due():
+        if self._opened is None or self._pictures.wait(time.monotonic()) is None:
             return
-        opened = self._opened
-        assert opened is not None
-        env = min(self._watch.env, opened.env.num_envs - 1)
-        known = {(camera.name, camera.kind) for camera in opened.description.cameras}
-        wanted = [c for c in self._watch.cameras if (c.name, c.kind) in known]
-        if not self._renderer_ready:
+        if not self._renderer_ready and self._pictures.idle:
             # The first picture of a process compiles the shaders: 5 to 19 s on a software renderer.
             self._send_status(None, "compiling the renderer's shaders, once")
-        started = time.monotonic()
         try:
-            pictures = take_pictures(opened.env.env, env, [_as_tuple(c) for c in wanted])
+            made = self._pictures.poll(self._opened.env, time.monotonic())
         except RuntimeError as error:
-            self._watch = WatchCameras(env, ())
-            self._fail(problem_from_exception(error, "pictures", opened.loaded.source_files))
+            self._pictures.watch(0, ())
+            self._fail(problem_from_exception(error, "pictures", self._opened.loaded.source_files))
             return
-        self._pictures_done = time.monotonic()
-        self._picture_cost = self._pictures_done - started
-        self._pictures_stale = False
-        self._send(Pictures(pictures, 1000 * self._picture_cost))
+        if made is None:
+            return
+        pictures, seconds = made
+        self._send(Pictures(pictures, 1000 * seconds))
         if not self._renderer_ready:
             self._renderer_ready = True
-            self._picture_cost = 0.0
             self._pacer.start(time.monotonic())
             self._send_status(None)
 
@@ -319,10 +316,6 @@ class Worker:
         self._status_sent = moment
         steps = self._rate.per_second(moment) if self._playing else 0.0
         self._send(Status(self._playing, steps, steps * self._pacer.control_dt, activity))
-
-
-def _as_tuple(request: CameraRequest) -> tuple[str, Any, tuple[str, ...]]:
-    return request.name, request.kind, request.modalities
 
 
 def main() -> None:

@@ -1,0 +1,104 @@
+"""Pictures of the cameras on screen, made beside the simulation and never in its way.
+
+A picture takes 25 to 90 ms on a software renderer; made in one go between two steps it would halve the
+rate of the player. But the renderer works on its own threads (see `begin_pictures`): so a picture is
+begun, steps go on, and it is fetched when it should be ready, by what the last ones took. Sensors come
+before human cameras, since the two see different objects and cannot be drawn at once. No more than 15
+rounds a second are made, and after each there is a pause in proportion, so that the browser on the same
+machine gets its share.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+from workbench.core.pictures import CameraKind, Picture
+from workbench.core.take_pictures import KINDS, BegunPictures, Request, begin_pictures
+from workbench.core.task_env import TaskEnv
+
+_PERIOD = 1 / 15
+_PAUSE_SHARE = 0.3
+"""Of the time a round took."""
+
+
+class PictureMaker:
+    """Rounds of pictures of what `watch` named; `poll` moves the present one on."""
+
+    def __init__(self) -> None:
+        self._env_index = 0
+        self._requests: tuple[Request, ...] = ()
+        self._wanted = False
+        self._next_round = 0.0
+        self._begun: BegunPictures | None = None
+        self._begun_at = 0.0
+        self._ready_at = 0.0
+        self._kinds_left: list[CameraKind] = []
+        self._made: list[Picture] = []
+        self._round_began = 0.0
+        self._expected: dict[CameraKind, float] = {"sensor": 0.0, "human": 0.0}
+
+    def watch(self, env_index: int, requests: Sequence[Request]) -> None:
+        """From now on these cameras of this env."""
+        self._env_index, self._requests = env_index, tuple(requests)
+        self._wanted = bool(requests)
+
+    def scene_changed(self) -> None:
+        """What was drawn is old."""
+        self._wanted = bool(self._requests)
+
+    @property
+    def idle(self) -> bool:
+        """Whether the renderer is at work on nothing of ours."""
+        return self._begun is None
+
+    def wait(self, now: float) -> float | None:
+        """Seconds until `poll` has something to do; None while nobody looks."""
+        if self._begun is not None:
+            return max(0.0, self._ready_at - now)
+        return max(0.0, self._next_round - now) if self._wanted else None
+
+    def poll(self, env: TaskEnv, now: float) -> tuple[tuple[Picture, ...], float] | None:
+        """Begin or fetch what is due; the pictures of a round and its seconds when it is complete."""
+        if self._begun is None:
+            if not self._wanted or now < self._next_round:
+                return None
+            self._wanted, self._round_began, self._made = False, now, []
+            self._kinds_left = [kind for kind in KINDS if any(r[1] == kind for r in self._requests)]
+            self._begin_next(env)
+            return None
+        if now < self._ready_at:
+            return None
+        self._fetch()
+        if self._kinds_left:
+            self._begin_next(env)
+            return None
+        seconds = time.monotonic() - self._round_began
+        self._next_round = max(self._round_began + _PERIOD, time.monotonic() + _PAUSE_SHARE * seconds)
+        return tuple(self._made), seconds
+
+    def settle(self) -> None:
+        """Wait for the renderer and give up the round: the scene is about to be closed or drawn anew."""
+        if self._begun is not None:
+            self._begun.finish()
+            self._begun = None
+            self._wanted = bool(self._requests)
+
+    def _begin_next(self, env: TaskEnv) -> None:
+        kind = self._kinds_left.pop(0)
+        chosen = [request for request in self._requests if request[1] == kind]
+        self._begun = begin_pictures(env.env, self._env_index, chosen)
+        self._kind: CameraKind = kind
+        self._begun_at = time.monotonic()
+        self._ready_at = self._begun_at + self._expected[kind]
+
+    def _fetch(self) -> None:
+        begun, self._begun = self._begun, None
+        assert begun is not None
+        asked = time.monotonic()
+        self._made += begun.finish()
+        done = time.monotonic()
+        waited = done - asked > 0.004
+        # Fetched too early, the wait tells how long it takes; otherwise it may take less than expected.
+        took = done - self._begun_at
+        self._expected[self._kind] = min(took, 1.0) if waited else 0.9 * self._expected[self._kind]
