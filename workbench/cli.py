@@ -75,7 +75,7 @@ def open_page(
     for line in (door.warning, door.notice):
         if line:
             err.print(f"[yellow]{escape(line)}[/]")
-    session = Session(task, options, recordings=recordings, on_event=_say)
+    session = Session(task, options, recordings=recordings, on_event=_say, on_line=_echo)
     page = Page(door.server, session)
     stop = threading.Event()
 
@@ -225,6 +225,11 @@ def _say(event: Event) -> None:
         _print_problem(event.problem)
         if event.kept:
             err.print("[dim]the last good version keeps running[/]")
+
+
+def _echo(line: str) -> None:
+    """What the author's code printed, told apart from the workbench's own lines."""
+    print(f"  | {line}", flush=True)
 
 
 def _print_problem(problem: Problem) -> None:

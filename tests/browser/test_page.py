@@ -33,7 +33,7 @@ class Desk:
     def tab(self, name: str) -> None:
         self.page.get_by_role("tab", name=name).click()
 
-    def button(self, name: str):  # noqa: ANN201  a playwright locator
+    def button(self, name: str):
         return self.page.get_by_role("button", name=name, exact=True)
 
     def row(self, name: str) -> list[str]:

@@ -144,7 +144,9 @@ def _play(env: gym.Env, task: str, steps: int) -> Recorded:
         action = env.action_space.sample()
         obs, reward, ended, cut, _ = env.step(action)
         seen.append(obs)
-        builder.append(_state(base, table, action, float(reward), bool(ended), bool(cut)), 0, _pictures(base, obs))
+        builder.append(
+            _state(base, table, action, float(reward), bool(ended), bool(cut)), 0, _pictures(base, obs)
+        )
 
     def of_cameras(group: str, key: str) -> dict[str, NDArray]:
         return {name: np.stack([o[group][name][key][0].numpy() for o in seen]) for name in base._sensors}

@@ -56,7 +56,10 @@ def test_every_body_has_its_poses(written: tuple[Episode, Path, Entities]) -> No
     episode, _, entities = written
     moved = 0
     for body, entity in enumerate(body_entities(episode.geometry)):
-        translation, quaternion = entities[entity]["Transform3D:translation"], entities[entity]["Transform3D:quaternion"]
+        translation, quaternion = (
+            entities[entity]["Transform3D:translation"],
+            entities[entity]["Transform3D:quaternion"],
+        )
         wxyz = np.stack(quaternion.values)[:, 0, [3, 0, 1, 2]]
         expected = episode.poses[:, body]
         if episode.geometry.body_kinds[body] == "static":
@@ -136,7 +139,9 @@ def test_pictures_come_back(written: tuple[Episode, Path, Entities], recorded: A
             assert np.abs(image.astype(int) - track.rgb[state]).mean() < 6
             millimetres = np.asarray(Image.open(io.BytesIO(depth.values[state][0])))
             np.testing.assert_array_equal(millimetres, recorded.depth_mm[track.info.name][state])
-            ids = np.frombuffer(segmentation.values[state][0], dtype=np.uint16).reshape(track.segmentation[state].shape)
+            ids = np.frombuffer(segmentation.values[state][0], dtype=np.uint16).reshape(
+                track.segmentation[state].shape
+            )
             np.testing.assert_array_equal(ids, track.segmentation[state])
     (context,) = entities["/world/cameras"]["AnnotationContext:context"].values[0]
     labels = {entry["class_id"]: entry["class_description"]["info"]["label"] for entry in context}
@@ -166,7 +171,10 @@ def test_properties_tell_the_episode(written: tuple[Episode, Path, Entities]) ->
         "source_hash": "0123456789ab",
     }
     assert properties["versions"] == {"mani_skill": "3.0.1", "rerun-sdk": "0.41.0"}
-    assert properties["source"] == {"files": ["task.py", "parts.py"], "texts": ["class Task: ...\n", "SIZE = 2\n"]}
+    assert properties["source"] == {
+        "files": ["task.py", "parts.py"],
+        "texts": ["class Task: ...\n", "SIZE = 2\n"],
+    }
     assert properties[""]["name"] == "PickCube-v1 seed 3 env 0: no success, 8 steps"
 
 
@@ -185,7 +193,12 @@ def test_events_name_the_moments(make_episode: Callable[..., Episode], tmp_path:
     steps, texts = log["TextLog:text"].steps, [value[0] for value in log["TextLog:text"].values]
     assert steps is not None
     assert sorted(zip(steps.tolist(), texts)) == [
-        (0, "reset with seed 7"), (2, "success"), (2, "terminated"), (3, "fail"), (5, "success"), (5, "truncated"),
+        (0, "reset with seed 7"),
+        (2, "success"),
+        (2, "terminated"),
+        (3, "fail"),
+        (5, "success"),
+        (5, "truncated"),
     ]
     told = read_properties(path)["episode"]
     assert (told["success"], told["success_once"], told["fail"], told["fail_once"]) == (True,) * 4
@@ -197,7 +210,9 @@ def test_only_what_this_env_wears_is_written(make_episode: Callable[..., Episode
     elsewhere = dataclasses.replace(visual, envs=np.array([0, 1], dtype=np.int32))
     episode.geometry = dataclasses.replace(episode.geometry, num_envs=2, visuals=(elsewhere,))
     episode.poses[:, 1] = np.nan
-    for env, (worn, bare) in enumerate((("/world/floor", "/world/robot/hand"), ("/world/robot/hand", "/world/floor"))):
+    for env, (worn, bare) in enumerate(
+        (("/world/floor", "/world/robot/hand"), ("/world/robot/hand", "/world/floor"))
+    ):
         episode.info = dataclasses.replace(episode.info, env_index=env)
         entities = read_rrd(write_rrd(episode, tmp_path / f"{env}.rrd"))
         assert f"{bare}/0" not in entities
@@ -222,7 +237,8 @@ def test_any_episode_comes_back(
     make_episode: Callable[..., Episode], data: st.DataObject, steps: int, entries: Any, lost: int
 ) -> None:
     evaluate = {
-        name: data.draw(hnp.arrays(dtype, (steps + 1, *shape)), label=name) for name, (dtype, shape) in entries.items()
+        name: data.draw(hnp.arrays(dtype, (steps + 1, *shape)), label=name)
+        for name, (dtype, shape) in entries.items()
     }
     episode = make_episode(steps, evaluate=evaluate)
     episode.poses[lost : lost + 2, 1] = np.nan
@@ -257,11 +273,15 @@ def test_cameras_of_one_name_and_far_depths(make_episode: Callable[..., Episode]
 
     negative = np.array([[[-1, 0], [1, 70_000]]], dtype=np.int32)
     small = np.array([[[0, 0], [1, 65_535]]], dtype=np.int32)
-    episode = make_episode(cameras=[track("human", negative), track("sensor", small)], segmentation={70_000: "far"})
+    episode = make_episode(
+        cameras=[track("human", negative), track("sensor", small)], segmentation={70_000: "far"}
+    )
     entities = read_rrd(write_rrd(episode, tmp_path / "e.rrd"))
     depth = entities["/world/cameras/eye/depth"]["EncodedDepthImage:blob"]
     np.testing.assert_array_equal(depth.steps, [2])
-    np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(depth.values[0][0]))), [[0, 0], [0, 65535]])
+    np.testing.assert_array_equal(
+        np.asarray(Image.open(io.BytesIO(depth.values[0][0]))), [[0, 0], [0, 65535]]
+    )
     for entity, dtype, ids in (("eye", np.uint16, small), ("eye_human", np.int32, negative)):
         buffer = entities[f"/world/cameras/{entity}/segmentation"]["SegmentationImage:buffer"].values[0][0]
         np.testing.assert_array_equal(np.frombuffer(buffer, dtype=dtype).reshape(1, 2, 2), ids)

@@ -41,7 +41,15 @@ def page(file: Path) -> Iterator[Viewer]:
 def headless(file: Path) -> Iterator[ViewerClient]:
     """Rerun's viewer without a window; `ViewerClient.spawn` would listen on every address."""
     port = viewer.free_port()
-    command = [*rerun_command(), "--headless", "--hide-welcome-screen", "--bind", "127.0.0.1", "--port", str(port)]
+    command = [
+        *rerun_command(),
+        "--headless",
+        "--hide-welcome-screen",
+        "--bind",
+        "127.0.0.1",
+        "--port",
+        str(port),
+    ]
     process = subprocess.Popen(command, env=quiet_environment(), stderr=subprocess.DEVNULL)
     try:
         viewer._await_port(process, port)
@@ -64,12 +72,24 @@ def test_the_native_viewer_shows_the_whole_layout(headless: ViewerClient, file: 
     headless.set_time("step", sequence=5)
     state = headless.get_state()
     (recording,) = state.recordings
-    assert {(t.name, t.start, t.end) for t in recording.timelines} == {("step", 0, 8), ("sim_time", 0, 400_000_000)}
+    assert {(t.name, t.start, t.end) for t in recording.timelines} == {
+        ("step", 0, 8),
+        ("sim_time", 0, 400_000_000),
+    }
     assert recording.current_timeline == "step"
     views = {view.name: view for view in state.views}
     assert views.keys() == {
-        "Scene", "base_camera rgb", "base_camera depth", "base_camera segmentation", "hand_camera rgb",
-        "hand_camera depth", "hand_camera segmentation", "Reward", "Evaluate", "Action", "Events",
+        "Scene",
+        "base_camera rgb",
+        "base_camera depth",
+        "base_camera segmentation",
+        "hand_camera rgb",
+        "hand_camera depth",
+        "hand_camera segmentation",
+        "Reward",
+        "Evaluate",
+        "Action",
+        "Events",
     }
     assert not [report for view in state.views for report in view.reports]
     for name, colours in (("Scene", 100), ("hand_camera rgb", 100), ("base_camera segmentation", 5)):
@@ -100,7 +120,9 @@ def test_the_page_opens_the_recording_and_talks_to_nobody_else(page: Viewer, chr
         with tab.expect_response(lambda answer: "/recordings/" in answer.url, timeout=120_000) as recording:
             tab.goto(page.url, wait_until="commit")
         assert recording.value.status == 200
-        tab.wait_for_function("document.querySelector('canvas').classList.contains('visible')", timeout=60_000)
+        tab.wait_for_function(
+            "document.querySelector('canvas').classList.contains('visible')", timeout=60_000
+        )
         browser.close()
     asked = {request.url for request in requests}
     assert ours + "re_viewer_bg.wasm" in asked
@@ -131,7 +153,13 @@ def test_the_page_serves_its_files_and_no_others(page: Viewer, file: Path) -> No
     for path in ("", "recordings/0-x.rrd", "etc/passwd"):
         assert get(f"http://{host}/{path}")[0] == 404
         assert get(f"http://{host}/{'x' * 22}/{path}")[0] == 404
-    for path in ("../", "recordings/../../etc/passwd", "recordings/%2e%2e%2f%2e%2e", "recordings/", "nothing.js"):
+    for path in (
+        "../",
+        "recordings/../../etc/passwd",
+        "recordings/%2e%2e%2f%2e%2e",
+        "recordings/",
+        "nothing.js",
+    ):
         assert get(root + path)[0] == 404
     assert get(root, Host="evil.example")[0] == 403
     assert get(root, Host=f"localhost:{host.split(':')[1]}")[0] == 200
@@ -177,7 +205,9 @@ def test_a_window_without_a_screen_is_refused(file: Path, monkeypatch: pytest.Mo
         open_in_rerun([file], web=False)
 
 
-def test_a_window_that_cannot_open_is_said_and_leaves_no_process(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_window_that_cannot_open_is_said_and_leaves_no_process(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     monkeypatch.setenv("DISPLAY", ":4711")  # nobody is there
     before = psutil.Process().children()
@@ -187,7 +217,9 @@ def test_a_window_that_cannot_open_is_said_and_leaves_no_process(file: Path, mon
     assert psutil.Process().children() == before
 
 
-def test_rerun_is_told_to_send_no_statistics(file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rerun_is_told_to_send_no_statistics(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name, folder in (("HOME", ""), ("XDG_CONFIG_HOME", "config"), ("XDG_DATA_HOME", "data")):
         monkeypatch.setenv(name, str(tmp_path / folder))
     monkeypatch.setenv("FORCE_RERUN_ANALYTICS", "1")

@@ -164,7 +164,9 @@ def test_what_rerun_refuses_is_an_error_out_of_strict_mode_too(make_episode: Mak
     episode = make_episode()
     (visual,) = episode.geometry.visuals
     flat = Mesh(np.zeros((3, 2), dtype=np.float32), visual.mesh.faces)  # vertices without z
-    episode.geometry = dataclasses.replace(episode.geometry, visuals=(dataclasses.replace(visual, mesh=flat),))
+    episode.geometry = dataclasses.replace(
+        episode.geometry, visuals=(dataclasses.replace(visual, mesh=flat),)
+    )
     with pytest.raises(ValueError):
         write_rrd(episode, tmp_path / "e.rrd")
     assert os.listdir(tmp_path) == []
@@ -179,7 +181,9 @@ def test_what_rerun_refuses_is_an_error_out_of_strict_mode_too(make_episode: Mak
         ("evaluate", {"success": np.zeros(3, dtype=bool)}),
     ],
 )
-def test_columns_that_do_not_fit_are_refused(make_episode: Maker, tmp_path: Path, field: str, value: Any) -> None:
+def test_columns_that_do_not_fit_are_refused(
+    make_episode: Maker, tmp_path: Path, field: str, value: Any
+) -> None:
     with pytest.raises(ValueError, match=field):
         write_rrd(make_episode(**{field: value}), tmp_path / "e.rrd")
     assert os.listdir(tmp_path) == []
@@ -206,7 +210,9 @@ def test_filenames_sort_by_seed_then_env_then_time() -> None:
     noon = datetime.datetime(2026, 11, 21, 12, 0, 0)
     infos = [(2, 0), (2, 3), (2, 11), (10, 0), (100, 0)]
     names = [
-        episode_filename(dataclasses.replace(INFO, seed=seed, env_index=env), noon + datetime.timedelta(seconds=s))
+        episode_filename(
+            dataclasses.replace(INFO, seed=seed, env_index=env), noon + datetime.timedelta(seconds=s)
+        )
         for seed, env in infos
         for s in (0, 70)
     ]

@@ -29,7 +29,10 @@ def episode_blueprint(episode: Episode) -> rrb.Blueprint:
         name="Scene",
         origin=WORLD,
         # A depth picture in a 3-D view is a cloud of points over the very meshes that it shows.
-        contents=["$origin/**", *(f"- {camera}/{m}" for camera in cameras for m in ("depth", "segmentation"))],
+        contents=[
+            "$origin/**",
+            *(f"- {camera}/{m}" for camera in cameras for m in ("depth", "segmentation")),
+        ],
         eye_controls=_eye(episode),
         line_grid=False,
     )
@@ -74,11 +77,15 @@ def _camera(camera: CameraTrack, entity: str, alone: bool) -> rrb.ContainerLike:
 
 
 def _curves(episode: Episode) -> rrb.ContainerLike:
-    drawn = [evaluate_entity(k) for k, v in episode.evaluate.items() if 0 < math.prod(v.shape[1:]) <= MAX_SERIES]
+    drawn = [
+        evaluate_entity(k) for k, v in episode.evaluate.items() if 0 < math.prod(v.shape[1:]) <= MAX_SERIES
+    ]
     legend = rrb.PlotLegend(visible=True)
     views: list[rrb.View] = [rrb.TimeSeriesView(name="Reward", origin="/reward", plot_legend=legend)]
     if drawn:
-        views.append(rrb.TimeSeriesView(name="Evaluate", origin="/evaluate", contents=drawn, plot_legend=legend))
+        views.append(
+            rrb.TimeSeriesView(name="Evaluate", origin="/evaluate", contents=drawn, plot_legend=legend)
+        )
     if episode.action_names:
         views.append(rrb.TimeSeriesView(name="Action", origin="/action", plot_legend=legend))
     columns = rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
@@ -103,4 +110,3 @@ def _eye(episode: Episode) -> rrb.EyeControls3D:
         look_target=middle,
         eye_up=(0.0, 0.0, 1.0),
     )
-

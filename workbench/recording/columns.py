@@ -131,7 +131,9 @@ class EpisodeBuilder:
             truncated=np.array(self._truncated, dtype=np.bool_),
             evaluate=_columns_of(self._evaluate),
             cameras=[
-                _track(self._cameras[key], self._pictures[key]) for key in self._cameras if key in self._pictures
+                _track(self._cameras[key], self._pictures[key])
+                for key in self._cameras
+                if key in self._pictures
             ],
         )
         self._clear()
@@ -164,7 +166,9 @@ class EpisodeBuilder:
         key = (picture.kind, picture.camera)
         if key not in self._cameras:
             known = ", ".join(f"{name} ({kind})" for kind, name in self._cameras) or "none"
-            raise ValueError(f"picture of an unknown camera {picture.camera} ({picture.kind}); known: {known}.")
+            raise ValueError(
+                f"picture of an unknown camera {picture.camera} ({picture.kind}); known: {known}."
+            )
         info = self._cameras[key]
         for modality in MODALITIES:
             image = getattr(picture, modality)

@@ -43,7 +43,13 @@ FRUSTUM_METRES = 0.12
 """How far in front of a camera its picture is drawn in the 3-D view."""
 MILLIMETRES_PER_METRE = 1000.0
 SERIES_COLORS = (
-    (86, 180, 233), (230, 159, 0), (0, 158, 115), (204, 121, 167), (213, 94, 0), (0, 114, 178), (150, 150, 150),
+    (86, 180, 233),
+    (230, 159, 0),
+    (0, 158, 115),
+    (204, 121, 167),
+    (213, 94, 0),
+    (0, 114, 178),
+    (150, 150, 150),
     (136, 100, 220),
 )
 """Okabe and Ito's palette, which the colour-blind can tell apart, with grey and violet for its black and
@@ -85,7 +91,9 @@ class _Log:
         times = [
             rr.TimeColumn(STEP, sequence=steps),
             # Whole nanoseconds by rounding: rerun itself cuts off, and 3 * 0.05 s would be 149999999 ns.
-            rr.TimeColumn(SIM_TIME, duration=np.rint(steps * self._control_dt * 1e9).astype("timedelta64[ns]")),
+            rr.TimeColumn(
+                SIM_TIME, duration=np.rint(steps * self._control_dt * 1e9).astype("timedelta64[ns]")
+            ),
         ]
         self._recording.send_columns(entity, times, columns)
         self.account.rows[entity] += len(steps)
@@ -106,7 +114,12 @@ class _Log:
             self.columns(entity, steps, rr.Transform3D.columns(translation=translation, quaternion=xyzw))
 
     def scalars(
-        self, entity: str, steps: NDArray[np.int64], values: NDArray, names: Sequence[str], first_color: int = 0
+        self,
+        entity: str,
+        steps: NDArray[np.int64],
+        values: NDArray,
+        names: Sequence[str],
+        first_color: int = 0,
     ) -> None:
         """`values` (len(steps), ...) as one batched entity with a name and a colour a series."""
         flat = np.asarray(values, dtype=np.float64).reshape(len(steps), len(names))
@@ -235,7 +248,9 @@ def _log_pictures(log: _Log, entity: str, camera: CameraTrack) -> None:
     if camera.rgb is not None:
         rgb = f"{entity}/rgb"
         log.static(rgb, rr.EncodedImage.from_fields(media_type="image/jpeg"))
-        log.columns(rgb, camera.frame, rr.EncodedImage.columns(blob=[encode_jpeg(image) for image in camera.rgb]))
+        log.columns(
+            rgb, camera.frame, rr.EncodedImage.columns(blob=[encode_jpeg(image) for image in camera.rgb])
+        )
     if camera.depth is not None:
         depth = f"{entity}/depth"
         meter = rr.EncodedDepthImage.from_fields(media_type="image/png", meter=MILLIMETRES_PER_METRE)

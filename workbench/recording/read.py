@@ -59,7 +59,9 @@ def read_rrd(path: Path) -> dict[str, dict[str, Column]]:
     for (entity, component), pairs in rows.items():
         timed = sorted(((step, value) for step, value in pairs if step is not None), key=lambda pair: pair[0])
         if timed:
-            column = Column(np.array([step for step, _ in timed], dtype=np.int64), [value for _, value in timed])
+            column = Column(
+                np.array([step for step, _ in timed], dtype=np.int64), [value for _, value in timed]
+            )
         else:
             column = Column(None, [value for _, value in pairs])
         recording.setdefault(entity, {})[component] = column
@@ -106,6 +108,10 @@ def _instances(values: pa.Array) -> Any:
         offsets = values.offsets.to_numpy()
         flat = values.values.to_numpy()
         return [flat[begin:end].tobytes() for begin, end in zip(offsets[:-1], offsets[1:])]
-    elif pa.types.is_boolean(values.type) or pa.types.is_floating(values.type) or pa.types.is_integer(values.type):
+    elif (
+        pa.types.is_boolean(values.type)
+        or pa.types.is_floating(values.type)
+        or pa.types.is_integer(values.type)
+    ):
         return values.to_numpy(zero_copy_only=False)
     return values.to_pylist()

@@ -103,7 +103,9 @@ def _application_id(info: EpisodeInfo) -> str:
 
 
 def _title(episode: Episode) -> str:
-    outcome = "success" if flag(episode, "success")[-1] else "fail" if flag(episode, "fail")[-1] else "no success"
+    outcome = (
+        "success" if flag(episode, "success")[-1] else "fail" if flag(episode, "fail")[-1] else "no success"
+    )
     info = episode.info
     seed = f"seed {info.seed}" if info.seed >= 0 else "no seed"
     return f"{info.task} {seed} env {info.env_index}: {outcome}, {len(episode.action)} steps"
@@ -173,7 +175,9 @@ def _check_lengths(episode: Episode) -> None:
         found[f"poses of camera {camera.info.name}"] = (camera.pose.shape, (len(camera.frame), 7))
     for name, (shape, expected) in found.items():
         if shape != expected:
-            raise ValueError(f"Episode of {steps} steps and {bodies} bodies: {name} is {shape}, not {expected}.")
+            raise ValueError(
+                f"Episode of {steps} steps and {bodies} bodies: {name} is {shape}, not {expected}."
+            )
 
 
 def _check_written(path: Path, account: Account) -> None:
@@ -190,7 +194,9 @@ def _check_written(path: Path, account: Account) -> None:
                 rows[chunk.entity_path] += chunk.num_rows
     except (ValueError, RuntimeError, OSError) as error:
         raise OSError(errno.EIO, f"the file could not be read back ({error})") from error
-    short = [f"{name}: {rows[name]} of {count} rows" for name, count in account.rows.items() if rows[name] != count]
+    short = [
+        f"{name}: {rows[name]} of {count} rows" for name, count in account.rows.items() if rows[name] != count
+    ]
     short += [f"{name}: missing" for name in sorted(account.statics - statics)]
     if short:
         raise OSError(errno.EIO, f"not everything arrived on the disk ({'; '.join(short[:3])})")

@@ -36,7 +36,11 @@ CONTENT_SECURITY_POLICY = (
 )
 """Inline scripts and ``wasm-unsafe-eval`` are how rerun's page starts its program (rerun 0.41)."""
 
-_VIEWER_FILES = {"index.html": "text/html", "re_viewer.js": "text/javascript", "re_viewer_bg.wasm": "application/wasm"}
+_VIEWER_FILES = {
+    "index.html": "text/html",
+    "re_viewer.js": "text/javascript",
+    "re_viewer_bg.wasm": "application/wasm",
+}
 _START_SECONDS = 20.0
 
 
@@ -91,7 +95,9 @@ def open_in_rerun(paths: Sequence[Path], *, web: bool | None = None) -> Viewer:
         web = not has_screen(os.environ)
     elif not web and not has_screen(os.environ):
         # Rerun would listen, load and only then find out.
-        raise RuntimeError("There is no screen here (DISPLAY and WAYLAND_DISPLAY are empty); open the page instead.")
+        raise RuntimeError(
+            "There is no screen here (DISPLAY and WAYLAND_DISPLAY are empty); open the page instead."
+        )
     return serve_web_viewer(files) if web else _open_window(files)
 
 
@@ -105,7 +111,9 @@ def has_screen(environment: Mapping[str, str]) -> bool:
 def _open_window(files: Sequence[Path]) -> Viewer:
     port = free_port()
     command = [*rerun_command(), "--bind", LOOPBACK, "--port", str(port), "--hide-welcome-screen"]
-    process = subprocess.Popen([*command, *map(os.fspath, files)], env=quiet_environment(), stdin=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        [*command, *map(os.fspath, files)], env=quiet_environment(), stdin=subprocess.DEVNULL
+    )
     _await_port(process, port)
     return Viewer(url=None, _process=process)
 
@@ -154,7 +162,9 @@ def web_viewer_files() -> dict[str, bytes]:
                 files[name] = answer.read()
         return files
     except (urllib.error.URLError, OSError) as error:
-        raise RuntimeError(f"rerun's web viewer could not be read ({error}); open the file on a desktop.") from error
+        raise RuntimeError(
+            f"rerun's web viewer could not be read ({error}); open the file on a desktop."
+        ) from error
     finally:
         _end(process)
 

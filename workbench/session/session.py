@@ -99,17 +99,20 @@ class Session:
         *,
         recordings: Path,
         on_event: Callable[[Event], None] = lambda event: None,
+        on_line: Callable[[str], None] = lambda line: None,
     ) -> None:
         """
         Args:
             task: a file, ``file.py:ClassName``, or a registered env id.
             recordings: folder that recorded episodes go to; made when the first is written.
             on_event: called with every event of the worker on the session's thread (the terminal).
+            on_line: called with every line that the worker printed, from its own threads.
         """
         self._task = task
         self._options = options
         self._seed = options.seed
         self._on_event = on_event
+        self._print = on_line
         self._lock = threading.Lock()
         self._changed = threading.Condition(self._lock)
         self._change = 0
@@ -454,6 +457,7 @@ class Session:
         with self._lock:
             self._state.printed.append(line)
         self._note()
+        self._print(line)
 
     def _follow(self, paths: Iterable[str], texts: Mapping[str, str]) -> None:
         """Watch the task's own file, whether or not it ever loaded, and `paths` beside it."""

@@ -13,6 +13,8 @@ CAMERA_TO_OPENCV = viser.transforms.SO3.from_matrix(
     # Columns: OpenCV's right, down and forward in ManiSkill's camera frame (x forward, y left, z up).
     np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 )
+LARGEST_IMAGE = 128
+"""Pixels along the longer side of the picture on a frustum."""
 SMALL, LARGE = 0.07, 0.14
 """Depth of a frustum, metres: small beside one env, larger where the whole grid is looked at."""
 COLOURS: dict[CameraKind, tuple[int, int, int]] = {"sensor": (245, 159, 0), "human": (132, 94, 247)}
@@ -24,6 +26,7 @@ class CameraFrustums:
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
         self._drawn: dict[tuple[CameraKind, str], viser.CameraFrustumHandle] = {}
+        self._worn: dict[tuple[CameraKind, str], Picture] = {}
 
     def draw(
         self,
@@ -43,6 +46,7 @@ class CameraFrustums:
         known = {(camera.kind, camera.name): camera for camera in cameras}
         for key in [key for key in self._drawn if key not in pictures or key not in known]:
             self._drawn.pop(key).remove()
+            del self._worn[key]
         for key, picture in pictures.items():
             if key in known:
                 self._draw_one(known[key], picture, offset, size)
@@ -65,7 +69,7 @@ class CameraFrustums:
                 thickness=2.0,
                 thickness_units="screen",
                 color=COLOURS[camera.kind],
-                image=picture.rgb,
+                image=small_image(picture),
                 format="jpeg",
                 jpeg_quality=75,
                 wxyz=wxyz,
@@ -73,10 +77,25 @@ class CameraFrustums:
                 cast_shadow=False,
                 receive_shadow=False,
             )
+            self._worn[key] = picture
             return
         handle.wxyz, handle.position, handle.scale = wxyz, position, size
-        if picture.rgb is not None:
-            handle.image = picture.rgb
+        if picture is not self._worn[key] and picture.rgb is not None:
+            # Assigning encodes and sends it, also when it is the picture that is there already.
+            self._worn[key] = picture
+            handle.image = small_image(picture)
+
+
+def small_image(picture: Picture) -> NDArray[np.uint8] | None:
+    """What a frustum wears: every n-th pixel, since it is drawn some hundred pixels wide at most.
+
+    A texture of 512 x 512 that changes fifteen times a second is what a browser without a graphics card
+    spends its time on.
+    """
+    if picture.rgb is None:
+        return None
+    stride = max(1, max(picture.rgb.shape[:2]) // LARGEST_IMAGE)
+    return np.ascontiguousarray(picture.rgb[::stride, ::stride])
 
 
 def frustum_pose(picture: Picture, offset: NDArray[np.float32]) -> tuple[NDArray, NDArray]:
