@@ -160,6 +160,19 @@ def test_a_worker_that_is_killed_comes_back_with_the_last_good_version(
     wait_until(session, lambda v: v.problem is None, "the banner's end")
 
 
+def test_a_file_that_is_mended_gets_past_a_worker_that_hangs(
+    session: Session, task_file: Path, good: str
+) -> None:
+    before = session.view().task_serial
+    text, _ = edited(good, "evaluate", "while True: pass")
+    task_file.write_text(text)
+    wait_until(session, lambda v: v.activity.startswith("building"), "the hanging load")
+    hanging = session.worker_pid
+    task_file.write_text(good)
+    view = wait_until(session, lambda v: v.task_serial > before, "the mended version")
+    assert view.problem is None and session.worker_pid != hanging
+
+
 def test_the_authors_prints_are_kept(session: Session, task_file: Path, good: str) -> None:
     text, _ = edited(good, "_load_scene", "print('hello from the author')")
     task_file.write_text(text)

@@ -9,6 +9,7 @@ last version that ran, and the page never goes away.
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -50,6 +51,8 @@ from workbench.session.record_live import LiveRecorder
 from workbench.session.view import Curves, SessionView, State
 
 _PRINTED_LINES = 200
+_LONGEST_SILENCE = 5.0
+"""Seconds in which a worker must begin a load that it was sent, or it hangs and is replaced."""
 _MOST_RESTARTS = 3
 """Workers that may die one after the other without a load in between, before we stop starting them."""
 
@@ -123,6 +126,7 @@ class Session:
         self._worker: WorkerProcess | None = None
         self._last_good: dict[str, str] | None = None
         self._restoring = False
+        self._load_sent: float | None = None
         self._recorder = LiveRecorder(recordings, self._note)
         self._watcher = SourceWatcher(self._on_files_changed)
         self._own_file = named_file(task)
@@ -183,7 +187,8 @@ class Session:
     # --- what the page asks for --------------------------------------------------------------------
 
     def reload(self) -> None:
-        """Load the file again."""
+        """Load the file again. A worker that does not take it up (an endless loop) is replaced."""
+        self._load_sent = self._load_sent or time.monotonic()
         self._send(self._load_request(None))
 
     def restart_worker(self) -> None:
@@ -300,6 +305,7 @@ class Session:
 
     def _run(self) -> None:
         while not self._closing:
+            self._load_sent = None
             worker = WorkerProcess(self._on_line)
             with self._lock:
                 self._worker = worker
@@ -311,9 +317,11 @@ class Session:
             self._greet(worker)
             try:
                 while True:
-                    event = worker.receive()
+                    event = worker.receive(timeout=1.0)
                     if event is not None:
                         self._handle(event)
+                    elif self._load_sent is not None and time.monotonic() - self._load_sent > _LONGEST_SILENCE:
+                        self._replace_hanging(worker)
             except EOFError:
                 self._on_death(worker)
             if not self._wait_for_restart():
@@ -358,6 +366,24 @@ class Session:
             s.state, s.activity = "starting", "starting another worker"
         self._note()
 
+    def _replace_hanging(self, worker: WorkerProcess) -> None:
+        """The author mended what hangs: what hung must not keep the mended file waiting."""
+        with self._lock:
+            s = self._state
+            self._restart_asked, self._last_good = True, None
+            doing = s.activity or "running the task"
+            self._set_problem(
+                Problem(
+                    "worker",
+                    f"the worker was ended: it did not answer for {_LONGEST_SILENCE:.0f} s while {doing}",
+                    None if s.task is None else s.task.file,
+                    None,
+                    None,
+                    "",
+                )
+            )
+        worker.kill()
+
     def _wait_for_restart(self) -> bool:
         """False when the session ends. After too many deaths in a row, wait to be asked."""
         with self._changed:
@@ -370,6 +396,8 @@ class Session:
             return not self._closing
 
     def _handle(self, event: Event) -> None:
+        if isinstance(event, Loading):
+            self._load_sent = None
         if isinstance(event, Loaded):
             self._on_loaded(event)
         elif isinstance(event, Stepped):

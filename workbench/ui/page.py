@@ -280,6 +280,7 @@ class Page:
             Command("Frame what is shown", lambda: self.frame(session.view()), "F"),
             Command("Start or stop recording", self._record.toggle, "C"),
             Command("Load the file again", session.reload, "L"),
+            Command("Restart the worker", session.restart_worker, "L", "shift"),
             Command("Dark or light", self._view_panel.toggle_dark, "D"),
         ]
 

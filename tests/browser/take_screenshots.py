@@ -1,0 +1,77 @@
+"""Takes the README's screenshots anew, from the running page: python tests/browser/take_screenshots.py
+
+Not a test: pictures are looked at by people. It writes ``web_assets/screenshots/*.jpg``.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from playwright.sync_api import Page, expect, sync_playwright
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from tests.browser.opened import launch, new_page, open_workbench  # noqa: E402
+from workbench.machine.chromium import find_chromium, how_to_get_chromium  # noqa: E402
+
+ROOT = Path(__file__).parents[2]
+OUT = ROOT / "web_assets" / "screenshots"
+TASK = ROOT / "tasks" / "push_cube.py"
+
+
+def shoot(page: Page, name: str) -> None:
+    time.sleep(4.0)  # a browser that draws in software needs some seconds for a frame
+    page.screenshot(path=OUT / f"{name}.jpg", type="jpeg", quality=82)
+    print(OUT / f"{name}.jpg")
+
+
+def tab(page: Page, name: str) -> None:
+    page.get_by_role("tab", name=name).click()
+
+
+def main() -> None:
+    chromium = find_chromium()
+    if chromium is None:
+        sys.exit(how_to_get_chromium())
+    OUT.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(shutil.copy(TASK, Path(folder) / "push_cube.py"))
+        with (
+            open_workbench(str(file), "--num-envs", "16", cwd=Path(folder)) as opened,
+            sync_playwright() as playwright,
+        ):
+            page, _ = new_page(launch(playwright, chromium))
+            page.goto(opened.url)
+            expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
+            tab(page, "Cameras")
+            expect(page.get_by_text("rendered in").first).to_be_visible(timeout=60_000)
+            notice = page.locator(".mantine-Notification-closeButton")
+            if notice.count():
+                notice.first.click()
+            tab(page, "Run")
+            page.get_by_role("button", name="Play", exact=True).click()
+            tab(page, "Reward")
+            time.sleep(25)
+            shoot(page, "page")
+            tab(page, "Run")
+            shoot(page, "run")
+            page.get_by_role("button", name="Pause", exact=True).click()
+            tab(page, "Cameras")
+            for tick in page.locator("input[type=checkbox]:visible").all()[1:4]:
+                tick.check(force=True)
+            time.sleep(4)
+            shoot(page, "cameras")
+            lines = TASK.read_text().splitlines()
+            place = next(i for i, line in enumerate(lines) if '"cube_to_goal": distance' in line)
+            lines[place] = lines[place].replace("distance", "distanec")
+            file.write_text("\n".join(lines) + "\n")
+            expect(page.get_by_text("NameError").first).to_be_visible(timeout=60_000)
+            tab(page, "Reward")
+            shoot(page, "banner")
+
+
+if __name__ == "__main__":
+    main()
