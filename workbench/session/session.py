@@ -1,15 +1,14 @@
 """The session on the server's side: what the page asks for, and what it sees.
 
 The page's controls call methods here; each only notes the wish and sends a message, so none waits for
-the env. One thread starts the worker, takes its events one by one and turns them into the state from
-which `Session.view` makes a snapshot. When the worker dies, that same thread starts another with the
-last version that ran, and the page never goes away.
+the env. The worker's events come one by one on one thread and are turned into the state from which
+`Session.view` makes a snapshot. When the worker dies, `KeptWorker` starts another, which is greeted with
+the last version that ran, and the page never goes away.
 """
 
 from __future__ import annotations
 
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -20,6 +19,7 @@ from workbench.authoring.reference import named_file
 from workbench.authoring.watch import SourceWatcher
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.step import StepResult
+from workbench.session.kept_worker import Death, KeptWorker
 from workbench.session.messages import (
     ActionSource,
     CameraRequest,
@@ -46,15 +46,10 @@ from workbench.session.messages import (
     WatchCameras,
 )
 from workbench.session.past import Past
-from workbench.session.process import WorkerProcess, describe_exit
 from workbench.session.record_live import LiveRecorder
 from workbench.session.view import Curves, SessionView, State
 
 _PRINTED_LINES = 200
-_LONGEST_SILENCE = 5.0
-"""Seconds in which a worker must begin a load that it was sent, or it hangs and is replaced."""
-_MOST_RESTARTS = 3
-"""Workers that may die one after the other without a load in between, before we stop starting them."""
 
 
 @dataclass
@@ -89,7 +84,6 @@ class _State:
     cameras: tuple[CameraRequest, ...] = ()
     clients: int = 0
     printed: deque[str] = field(default_factory=lambda: deque(maxlen=_PRINTED_LINES))
-    deaths: int = 0
 
 
 class Session:
@@ -122,17 +116,14 @@ class Session:
         self._state = _State()
         self._curves: Curves | None = None
         self._closing = False
-        self._restart_asked = False
-        self._worker: WorkerProcess | None = None
         self._last_good: dict[str, str] | None = None
         self._restoring = False
-        self._load_sent: float | None = None
+        self._worker = KeptWorker(self._greeting, self._handle, self._on_death, self._on_line)
         self._recorder = LiveRecorder(recordings, self._note)
         self._watcher = SourceWatcher(self._on_files_changed)
         self._own_file = named_file(task)
         self._follow((), {})
-        self._thread = threading.Thread(target=self._run, name="session", daemon=True)
-        self._thread.start()
+        self._worker.start()
 
     # --- what the page reads -----------------------------------------------------------------------
 
@@ -181,25 +172,18 @@ class Session:
     @property
     def worker_pid(self) -> int | None:
         """Process id of the worker; None while there is none."""
-        with self._lock:
-            return None if self._worker is None else self._worker.pid
+        return self._worker.pid
 
     # --- what the page asks for --------------------------------------------------------------------
 
     def reload(self) -> None:
         """Load the file again. A worker that does not take it up (an endless loop) is replaced."""
-        self._load_sent = self._load_sent or time.monotonic()
         self._send(self._load_request(None))
 
     def restart_worker(self) -> None:
         """End the worker, whatever it is doing, and start another with the file as it is now."""
-        with self._lock:
-            self._restart_asked = True
-            self._state.deaths = 0
-            self._last_good = None
-            worker = self._worker
-        if worker is not None:
-            worker.kill()
+        self._last_good = None
+        self._worker.replace()
 
     def play(self) -> None:
         self._set(playing=True, wants_play=True)
@@ -294,110 +278,48 @@ class Session:
         with self._changed:
             self._closing = True
             self._changed.notify_all()
-            worker = self._worker
         self._watcher.stop()
-        if worker is not None:
-            worker.stop()
-        self._thread.join()
+        self._worker.stop()
         self._recorder.close()
 
-    # --- the session's thread ------------------------------------------------------------------------
+    # --- what the worker says, on the session's thread -------------------------------------------
 
-    def _run(self) -> None:
-        while not self._closing:
-            self._load_sent = None
-            worker = WorkerProcess(self._on_line)
-            with self._lock:
-                self._worker = worker
-                self._restart_asked = False
-                closing = self._closing
-            if closing:
-                worker.stop()
-                return
-            self._greet(worker)
-            try:
-                while True:
-                    event = worker.receive(timeout=1.0)
-                    if event is not None:
-                        self._handle(event)
-                    elif self._load_sent is not None and time.monotonic() - self._load_sent > _LONGEST_SILENCE:
-                        self._replace_hanging(worker)
-            except EOFError:
-                self._on_death(worker)
-            if not self._wait_for_restart():
-                return
-
-    def _greet(self, worker: WorkerProcess) -> None:
-        """Tell a new worker everything that the one before it knew."""
+    def _greeting(self) -> list[Request]:
+        """Everything that a worker before this one knew."""
         s = self._state
-        worker.send(SetSpeed(s.speed))
-        worker.send(SetEpisodeEnd(s.episode_end))
-        worker.send(SetActionSource(s.action_source, s.policy))
         self._restoring = self._last_good is not None
-        worker.send(self._load_request(self._last_good))
+        requests: list[Request] = [
+            SetSpeed(s.speed),
+            SetEpisodeEnd(s.episode_end),
+            SetActionSource(s.action_source, s.policy),
+            self._load_request(self._last_good),
+        ]
         if s.wants_play:
-            worker.send(Play(True))
-        worker.send(self._watch_request())
+            requests.append(Play(True))
+        return [*requests, self._watch_request()]
 
-    def _on_death(self, worker: WorkerProcess) -> None:
-        code = worker.exit_code()
-        worker.stop(grace=0.0)
+    def _on_death(self, death: Death) -> None:
         self._recorder.stop()
         with self._lock:
-            self._worker = None
-            if self._closing:
-                return
             s = self._state
             s.playing, s.steps_per_second, s.real_time_factor = False, 0.0, 0.0
-            if not self._restart_asked:
-                s.deaths += 1
-                s.wants_play = False
+            if death.why is not None:
+                doing = f" while {s.activity}" if s.activity else ""
+                file = None if s.task is None else s.task.file
                 tail = "\n".join(list(s.printed)[-20:])
                 self._set_problem(
-                    Problem(
-                        "worker",
-                        f"the worker process {describe_exit(code)}",
-                        s.task and s.task.file,
-                        None,
-                        None,
-                        tail,
-                    )
+                    Problem("worker", f"the worker process {death.why}{doing}", file, None, None, tail)
                 )
-            s.state, s.activity = "starting", "starting another worker"
+            if death.hung:
+                # A load was waiting behind it: that file is what the next worker is to load.
+                self._last_good = None
+            elif death.why is not None:
+                s.wants_play = False
+            s.state = "stopped" if death.gives_up else "starting"
+            s.activity = "" if death.gives_up else "starting another worker"
         self._note()
 
-    def _replace_hanging(self, worker: WorkerProcess) -> None:
-        """The author mended what hangs: what hung must not keep the mended file waiting."""
-        with self._lock:
-            s = self._state
-            self._restart_asked, self._last_good = True, None
-            doing = s.activity or "running the task"
-            self._set_problem(
-                Problem(
-                    "worker",
-                    f"the worker was ended: it did not answer for {_LONGEST_SILENCE:.0f} s while {doing}",
-                    None if s.task is None else s.task.file,
-                    None,
-                    None,
-                    "",
-                )
-            )
-        worker.kill()
-
-    def _wait_for_restart(self) -> bool:
-        """False when the session ends. After too many deaths in a row, wait to be asked."""
-        with self._changed:
-            if self._state.deaths >= _MOST_RESTARTS:
-                self._state.state = "stopped"
-                self._state.activity = ""
-                self._change += 1
-                self._changed.notify_all()
-                self._changed.wait_for(lambda: self._restart_asked or self._closing)
-            return not self._closing
-
     def _handle(self, event: Event) -> None:
-        if isinstance(event, Loading):
-            self._load_sent = None
         if isinstance(event, Loaded):
             self._on_loaded(event)
         elif isinstance(event, Stepped):
@@ -436,6 +358,7 @@ class Session:
                 s.state, s.activity = "running" if event.playing else "paused", ""
 
     def _on_loaded(self, event: Loaded) -> None:
+        self._worker.ran()
         # Episodes of the version before end here: their steps and the new ones do not belong together.
         recording = self._recorder.status()
         self._recorder.stop()
@@ -450,7 +373,7 @@ class Session:
             s.pictures, s.sliders = {}, ()
             s.pictures_serial += 1
             s.selected_env = min(s.selected_env, task.num_envs - 1)
-            s.activity, s.deaths = "", 0
+            s.activity = ""
             # The last good version came back after a worker's death: what killed it still stands.
             s.stale = self._restoring
             if not self._restoring:
@@ -516,10 +439,7 @@ class Session:
         self._send(request)
 
     def _send(self, request: Request) -> None:
-        with self._lock:
-            worker = self._worker
-        if worker is not None:
-            worker.send(request)
+        self._worker.send(request)
 
     def _set(self, **values: object) -> None:
         with self._lock:
