@@ -14,8 +14,8 @@ from pathlib import Path
 from playwright.sync_api import Page, expect, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.browser.opened import launch, new_page, open_workbench  # noqa: E402
-from workbench.machine.chromium import find_chromium, how_to_get_chromium  # noqa: E402
+from tests.browser.opened import launch, new_page, open_workbench
+from workbench.machine.chromium import find_chromium, how_to_get_chromium
 
 ROOT = Path(__file__).parents[2]
 OUT = ROOT / "web_assets" / "screenshots"
