@@ -85,10 +85,12 @@ $(VENV)/pyvenv.cfg: $(BROKEN_VENV)
 	$(PYTHON) -m venv --clear $(VENV)
 
 $(VENV)/.installed: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
+	@echo "Installing into $(VENV): some minutes the first time, nothing the next."
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e .
 	@touch $@
 
 $(VENV)/.installed-test: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
+	@echo "Installing into $(VENV): some minutes the first time, nothing the next."
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[test]'
 	@touch $(VENV)/.installed $@
 

@@ -61,8 +61,13 @@ def open_page(
         recordings: folder for recorded episodes.
         env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
     """
+    from workbench.authoring.reference import named_file
+    from workbench.session.messages import Failed
     from workbench.ui.door import DoorError, DoorOptions, open_door
 
+    file = named_file(task)
+    if file is not None and not file.is_file():
+        return _refuse(f"there is no file {file}")
     try:
         options = _task_options(num_envs, backend, seed, env)
         door = open_door(DoorOptions(host=host, port=port, token=token), label="Workbench")
@@ -75,9 +80,19 @@ def open_page(
     for line in (door.warning, door.notice):
         if line:
             err.print(f"[yellow]{escape(line)}[/]")
-    session = Session(task, options, recordings=recordings, on_event=_say, on_line=_echo)
-    page = Page(door.server, session)
     stop = threading.Event()
+    code = 0
+
+    def on_event(event: Event) -> None:
+        nonlocal code
+        _say(event)
+        # A broken file is mended and saved; an env id that cannot be opened has nothing to wait for.
+        if isinstance(event, Failed) and not event.kept and file is None:
+            code = 1
+            stop.set()
+
+    session = Session(task, options, recordings=recordings, on_event=on_event, on_line=_echo)
+    page = Page(door.server, session)
 
     def on_signal(number: int, frame: FrameType | None) -> None:
         stop.set()
@@ -86,7 +101,9 @@ def open_page(
         signal.signal(number, on_signal)
     try:
         page.start()
-        out.print(f"[bold]Workbench[/] {workbench.__version__}: {escape(task)}, {num_envs} envs")
+        out.print(
+            f"[bold]Workbench[/] {workbench.__version__}: {escape(task)}, {num_envs} envs", soft_wrap=True
+        )
         # Not through rich, which would break the address in a narrow terminal.
         print(f"  page    {door.url}", flush=True)
         print(f"  remote  {door.ssh_hint}", flush=True)
@@ -97,7 +114,7 @@ def open_page(
         page.stop()
         session.close()
         door.close()
-    return 0
+    return code
 
 
 @app.command
@@ -220,7 +237,10 @@ def _say(event: Event) -> None:
     if isinstance(event, Loaded):
         parts = ", ".join(f"{name} {ms:.0f}" for name, ms in event.milliseconds.items())
         total = sum(event.milliseconds.values())
-        out.print(f"[green]loaded[/] {escape(event.task.env_id)} in {total:.0f} ms [dim]({parts})[/]")
+        out.print(
+            f"[green]loaded[/] {escape(event.task.env_id)} in {total:.0f} ms [dim]({parts})[/]",
+            soft_wrap=True,
+        )
     elif isinstance(event, Failed):
         _print_problem(event.problem)
         if event.kept:

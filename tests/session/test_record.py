@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import mani_skill.envs  # noqa: F401  registers the ids
@@ -41,7 +42,7 @@ def test_every_episode_is_a_file_that_rerun_verifies(written: Path) -> None:
 
 
 def test_an_episode_starts_as_the_stock_env_starts_with_its_seed(written: Path) -> None:
-    stock = gym.make("PushCube-v1", num_envs=1, obs_mode="state", render_backend="none").unwrapped
+    stock: Any = gym.make("PushCube-v1", num_envs=1, obs_mode="state", render_backend="none").unwrapped
     seeds = set()
     for file in sorted(written.iterdir()):
         properties = str(read_properties(file))
@@ -82,6 +83,8 @@ def test_a_task_that_fails_while_recording_says_where(tmp_path: Path) -> None:
     [
         (["record", "nothing_here.py"], "nothing_here.py"),
         (["record", "PickCub-v1"], "PickCube-v1"),
+        (["open", "PickCub-v1", "--port", "0"], "PickCube-v1"),
+        (["open", "nothing_here.py", "--port", "0"], "nothing_here.py"),
         (["record", "PickCube-v1", "--num-envs", "0"], "num-envs"),
         (["open", "PickCube-v1", "--host", "0.0.0.0", "--no-token"], "token"),
         (["open", "PickCube-v1", "--env", "robot"], "name=value"),

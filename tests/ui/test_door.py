@@ -235,7 +235,7 @@ def test_a_viser_that_starts_its_server_another_way_opens_no_door(monkeypatch):
         import websockets
 
         # Not by monkeypatch, which would put the seam's look-alike back at the end, for good.
-        viser.infra._infra.websockets = websockets
+        viser.infra._infra.websockets = websockets  # pyright: ignore[reportPrivateImportUsage]
         worker(self, ready)
 
     monkeypatch.setattr(viser.infra._infra.WebsockServer, "_background_worker", as_a_later_viser_might)

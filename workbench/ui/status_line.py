@@ -61,6 +61,7 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
         "task": None if task is None else task.env_id,
         "backend": "" if task is None else task.backend,
         "device": "" if task is None else task.device,
+        "at": _where(view),
         "envs": "" if task is None else ("1 env" if task.num_envs == 1 else f"{task.num_envs} envs"),
         "moving": moving,
         "steps_per_second": f"{view.steps_per_second:.0f}",
@@ -71,3 +72,13 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
         "behind": moving and view.speed != float("inf") and view.real_time_factor < 0.85 * view.speed,
         "speed": f"{view.speed:g}",
     }
+
+
+def _where(view: SessionView) -> str:
+    """How far the selected env is into its episode: a single step is too small to be seen in the view."""
+    task, step = view.task, view.step
+    if task is None or step is None or view.selected_env >= len(step.elapsed_steps):
+        return ""
+    limit = f" / {task.max_episode_steps}" if task.max_episode_steps else ""
+    env = "" if task.num_envs == 1 else f"env {view.selected_env}: "
+    return f"{env}step {int(step.elapsed_steps[view.selected_env])}{limit}"
