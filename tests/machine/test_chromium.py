@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from workbench.machine.chromium import chromium_version, find_chromium, how_to_get_chromium
+from workbench.machine.chromium import chromium_version, driver_complaint, find_chromium, how_to_get_chromium
 
 
 def test_the_chromium_of_this_machine_tells_its_version(chromium_path: str) -> None:
@@ -30,3 +30,7 @@ def test_a_browser_that_was_named_and_does_not_run_is_not_replaced_by_another(
     monkeypatch.setenv("PLAYWRIGHT_CHROMIUM", "/nonexistent/chromium")
     assert find_chromium() is None
     assert "/nonexistent/chromium" in how_to_get_chromium()
+
+
+def test_playwrights_own_node_starts() -> None:
+    assert driver_complaint() is None

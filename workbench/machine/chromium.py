@@ -7,10 +7,12 @@ is what users have. Ubuntu's ``chromium-browser`` is a snap behind a shell scrip
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 from workbench.machine.apt import AptFailed, apt_get, can_install_packages, has_apt, os_release
 
@@ -71,5 +73,37 @@ def ensure_chromium() -> str | None:
     return found
 
 
+def driver_complaint() -> str | None:
+    """Why Playwright's own Node does not start here; None if it does, or if Playwright is not installed."""
+    package = importlib.util.find_spec("playwright")
+    if package is None or package.origin is None:
+        return None
+    node = Path(package.origin).parent / "driver" / "node"
+    try:
+        done = subprocess.run(
+            [node, "--version"], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=20
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return str(error)
+    return None if done.returncode == 0 else done.stderr.strip()
+
+
+def ensure_driver() -> None:
+    """Bring the one library that Playwright's Node loads and a bare Debian lacks."""
+    complaint = driver_complaint()
+    if complaint is not None and "libatomic" in complaint and can_install_packages():
+        try:
+            apt_get(["update"])
+            apt_get(["install", "--no-install-recommends", "libatomic1"])
+        except AptFailed as failure:
+            print(failure, file=sys.stderr)
+        complaint = driver_complaint()
+    if complaint is not None:
+        print(f"The browser tests will fail, Playwright does not start: {complaint}", file=sys.stderr)
+        if "libatomic" in complaint:
+            print("Type: sudo apt-get install libatomic1", file=sys.stderr)
+
+
 if __name__ == "__main__":
     ensure_chromium()
+    ensure_driver()
