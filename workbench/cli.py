@@ -1,4 +1,4 @@
-"""The commands: ``workbench open``, ``workbench record``, ``workbench doctor``.
+"""The commands: ``workbench open``, ``workbench record``, ``workbench view``, ``workbench doctor``.
 
 Only what a terminal needs lives here: arguments in, lines out, exit codes. Heavy imports wait until a
 command is chosen, so that ``--help`` and a mistyped option answer at once.
@@ -180,6 +180,33 @@ def record(
         ended = {None: "", True: "success", False: "no success"}[episode.success]
         print(f"{episode.path}  {episode.steps} steps  return {episode.total_reward:.3f}  {ended}".rstrip())
     print(f"Open one with: rerun {written[0].path}")
+    return 0
+
+
+@app.command
+def view(files: Annotated[tuple[Path, ...], tyro.conf.Positional], /, web: bool = False) -> int:
+    """Open recordings in rerun's own viewer: a window, or a page where there is no screen.
+
+    Args:
+        files: one or more .rrd files.
+        web: a page, also where there is a screen; it is served on this machine only and asks no other.
+    """
+    from workbench.recording.viewer import open_in_rerun
+
+    try:
+        viewer = open_in_rerun(files, web=True if web else None)
+    except (OSError, ValueError, RuntimeError) as error:
+        return _refuse(str(error))
+    if viewer.url is not None:
+        print(f"  page    {viewer.url}\n  Ctrl-C ends it.", flush=True)
+    try:
+        viewer.wait()
+    except RuntimeError as error:
+        return _refuse(str(error))
+    except KeyboardInterrupt:
+        print("closing", flush=True)
+    finally:
+        viewer.close()
     return 0
 
 

@@ -86,6 +86,7 @@ def test_a_task_that_fails_while_recording_says_where(tmp_path: Path) -> None:
         (["open", "PickCub-v1", "--port", "0"], "PickCube-v1"),
         (["open", "nothing_here.py", "--port", "0"], "nothing_here.py"),
         (["record", "PickCube-v1", "--num-envs", "0"], "num-envs"),
+        (["view", "nothing_here.rrd"], "nothing_here.rrd"),
         (["open", "PickCube-v1", "--host", "0.0.0.0", "--no-token"], "token"),
         (["open", "PickCube-v1", "--env", "robot"], "name=value"),
     ],

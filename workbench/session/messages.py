@@ -237,12 +237,4 @@ class Status:
     """What keeps the worker from its requests for a while, if anything does."""
 
 
-@dataclass(frozen=True)
-class Printed:
-    """A line that the author's code wrote to stdout or stderr."""
-
-    stream: Literal["stdout", "stderr"]
-    text: str
-
-
-Event = Loading | Loaded | Failed | Stepped | Pictures | Status | Printed
+Event = Loading | Loaded | Failed | Stepped | Pictures | Status
