@@ -179,7 +179,7 @@ def record(
     for episode in written:
         ended = {None: "", True: "success", False: "no success"}[episode.success]
         print(f"{episode.path}  {episode.steps} steps  return {episode.total_reward:.3f}  {ended}".rstrip())
-    print(f"Open one with: rerun {written[0].path}")
+    print(f"Open one with: workbench view {written[0].path}")
     return 0
 
 

@@ -151,8 +151,8 @@ def describe(loaded: LoadedTask, task: TaskEnv) -> TaskDescription:
         control_dt=task.control_dt,
         actions=tuple(dimensions),
         geometry=read_geometry(env, task.table),
-        cameras=list_cameras(env),
-        segmentation=segmentation_names(env),
+        cameras=list_cameras(env, task.table),
+        segmentation=segmentation_names(env, task.table),
         can_render=can_render,
     )
 
