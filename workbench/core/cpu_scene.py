@@ -25,7 +25,7 @@ from mani_skill.render.utils import can_render
 
 from workbench.core.contacts import CpuArray
 from workbench.core.cpu_system import BatchedCpuSystem
-from workbench.core.seams import install_index_seams
+from workbench.core.seams import install_index_seams, substeps_are_unwatched
 
 SIM_BACKEND = "physx_cpu_batched"
 """Not among ManiSkill's ``CPU_SIM_BACKENDS``, the names for which it refuses more than one env."""
@@ -108,7 +108,10 @@ class BatchedCpuMixin:
     """Goes in front of a task class; see the module's text."""
 
     num_envs: int
+    _workbench_task: type[BaseEnv]
+    """The author's class, without this mixin."""
     _sim_freq: int
+    _sim_steps_per_control: int
     _set_scene_config: Any
     sim_config: Any
     device: torch.device
@@ -139,6 +142,13 @@ class BatchedCpuMixin:
     def _sim_device(self, value: sapien.Device) -> None:
         """BaseEnv sets the device that it parsed from the backend: the CPU, as asked in __init__."""
 
+    def _step_action(self, action: Any) -> Any:
+        # Substeps may be done in a row only if nothing of the author's runs between them.
+        px: BatchedCpuSystem = self.scene.px  # type: ignore[assignment]
+        unwatched = substeps_are_unwatched(self, self._workbench_task)
+        with px.merging(self._sim_steps_per_control if unwatched else 1):
+            return super()._step_action(action)  # type: ignore[misc]
+
     def _setup_scene(self) -> None:
         self._set_scene_config()
         sub_scenes = []
@@ -159,5 +169,10 @@ class BatchedCpuMixin:
 def batched_class(task: type[BaseEnv]) -> type[BaseEnv]:
     """`task` with the batched CPU simulation in front of it; `task` itself is left as it is."""
     install_index_seams()
-    namespace = {"__module__": task.__module__, "__doc__": task.__doc__, "__qualname__": task.__qualname__}
+    namespace = {
+        "__module__": task.__module__,
+        "__doc__": task.__doc__,
+        "__qualname__": task.__qualname__,
+        "_workbench_task": task,
+    }
     return type(task.__name__, (BatchedCpuMixin, task), namespace)

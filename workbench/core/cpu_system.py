@@ -19,7 +19,8 @@ What makes it quick:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,8 @@ from numpy.typing import NDArray
 
 from workbench.core.contacts import BodyImpulseQuery, ContactReader, CpuArray, PairImpulseQuery
 from workbench.core.cpu_layout import BODY, Layout, lay_out
+from workbench.core.gpu_members import applies_everything, uncommon_member
+from workbench.core.stepping import Stepper
 
 _TOO_EARLY = (
     "The simulation is not initialised yet: in _load_agent and _load_scene only initial poses "
@@ -44,9 +47,10 @@ class BatchedCpuSystem:
     D the largest number of degrees of freedom. Poses are world poses of each env's own frame.
     """
 
-    def __init__(self, scenes: Sequence[sapien.Scene]) -> None:
+    def __init__(self, scenes: Sequence[sapien.Scene], threads: int | None = None) -> None:
         self.scenes = list(scenes)
         self.systems: list[physx.PhysxCpuSystem] = [scene.physx_system for scene in scenes]  # pyright: ignore
+        self._stepper = Stepper(self.systems, self.scenes, threads)
         self.contacts = ContactReader(self.systems)
         self._layout: Layout | None = None
         self._packed: NDArray[np.float32] | None = None
@@ -96,9 +100,27 @@ class BatchedCpuSystem:
 
     def step(self) -> None:
         """One substep of every env."""
-        for system in self.systems:
-            system.step()
-        self.note_change()
+        if self._stepper.step():
+            self._moved()
+
+    @contextmanager
+    def merging(self, substeps: int) -> Iterator[None]:
+        """The next `substeps` calls of `step` may be done together; asking for state does them at once."""
+        with self._stepper.merging(substeps):
+            yield
+        self._catch_up()
+
+    def _catch_up(self) -> None:
+        if self._stepper.owes:
+            self._stepper.catch_up()
+            self._moved()
+
+    def step_start(self) -> None:
+        """A substep at once: without a GPU there is nothing to wait for in `step_finish`."""
+        self.step()
+
+    def step_finish(self) -> None:
+        """Nothing to do: `step_start` stepped."""
 
     def sync_poses_gpu_to_cpu(self) -> None:
         """Nothing to do: SAPIEN's entities are the simulation here."""
@@ -135,6 +157,8 @@ class BatchedCpuSystem:
         self.cuda_articulation_target_qvel = _array(self._target_qvel)
         self.cuda_rigid_body_force = _array(self._force)
         self.cuda_rigid_body_torque = _array(self._torque)
+        self.cuda_rigid_dynamic_force = self.cuda_rigid_body_force
+        self.cuda_rigid_dynamic_torque = self.cuda_rigid_body_torque
         self._check_layout()
         self._fetch_bodies()
         self._fetch_links()
@@ -151,6 +175,7 @@ class BatchedCpuSystem:
 
     @property
     def _laid_out(self) -> Layout:
+        self._catch_up()
         if self._layout is None:
             raise RuntimeError(_TOO_EARLY)
         return self._layout
@@ -159,7 +184,7 @@ class BatchedCpuSystem:
         # The tensors exist from `gpu_init` on: a task that asks earlier is told what it did wrong.
         if name.startswith("cuda_") and self.__dict__.get("_layout") is None:
             raise RuntimeError(_TOO_EARLY)
-        raise AttributeError(f"the batched CPU system has no '{name}'")
+        return uncommon_member(self, name)
 
     def _check_layout(self) -> None:
         """Compare the packs with the getters, since SAPIEN documents neither their order nor their size."""
@@ -216,16 +241,18 @@ class BatchedCpuSystem:
 
     @property
     def cuda_articulation_qacc(self) -> CpuArray:
+        layout = self._laid_out
         if self._qacc_fetched_at != self._version:
-            for i, articulation in enumerate(self._laid_out.articulations):
+            for i, articulation in enumerate(layout.articulations):
                 self._qacc[i, : articulation.dof] = articulation.qacc
             self._qacc_fetched_at = self._version
         return _array(self._qacc)
 
     @property
     def cuda_articulation_link_incoming_joint_forces(self) -> CpuArray:
+        layout = self._laid_out
         if self._forces_fetched_at != self._version:
-            for i, articulation in enumerate(self._laid_out.articulations):
+            for i, articulation in enumerate(layout.articulations):
                 forces = articulation.get_link_incoming_joint_forces()
                 self._joint_forces[i, : len(forces)] = forces
             self._forces_fetched_at = self._version
@@ -233,9 +260,9 @@ class BatchedCpuSystem:
 
     def fetch_link_velocities(self) -> None:
         """Velocities of all links into columns 7 to 12; two getters a link, so only when asked for."""
+        layout = self._laid_out
         if self._links_fetched_at == self._version:
             return
-        layout = self._laid_out
         for row, link in zip(layout.link_rows, layout.links, strict=True):
             self._data[row, 7:10] = link.linear_velocity
             self._data[row, 10:13] = link.angular_velocity
@@ -243,8 +270,9 @@ class BatchedCpuSystem:
         self._links_fetched_at = self._version
 
     def _pack(self) -> NDArray[np.float32]:
+        self._catch_up()
         if self._packed is None:
-            joined = b"".join([system.pack() for system in self.systems])
+            joined = b"".join(self._stepper.packs())
             self._packed = np.empty(len(joined) // 4 + 1, dtype=np.float32)
             self._packed[:-1] = np.frombuffer(joined, dtype=np.float32)
             self._packed[-1] = 0.0
@@ -254,7 +282,7 @@ class BatchedCpuSystem:
         """(L, 7) poses of all links: position, quaternion wxyz."""
         layout = self._laid_out
         if self._posed is None:
-            packs = [scene.pack_poses() for scene in self.scenes]
+            packs = self._stepper.pose_packs()
             lengths = [len(pack) // 4 for pack in packs]
             if lengths != self._pose_lengths:
                 # Cameras are added after the scene is laid out: each makes its env's pack longer.
@@ -265,7 +293,12 @@ class BatchedCpuSystem:
         return self._posed[self._link_pose_at]
 
     def note_change(self) -> None:
-        """The simulation moved on, here or by a call on one of `systems`: what was packed is old."""
+        """The simulation was written to, here or by a call on one of `systems`: what was packed is old."""
+        self._catch_up()
+        self._stepper.forget()
+        self._moved()
+
+    def _moved(self) -> None:
         self._packed = self._posed = None
         self._version += 1
         self.contacts.invalidate()
@@ -310,6 +343,7 @@ class BatchedCpuSystem:
             self._target_qvel, self._target_qvel_seen, self._set_velocity_target, self._velocity_driven, False
         )
 
+    @applies_everything
     def gpu_apply_rigid_dynamic_data(self) -> None:
         layout = self._laid_out
         now, seen = self._data[layout.body_rows], self._data_seen[layout.body_rows]
@@ -325,6 +359,7 @@ class BatchedCpuSystem:
             self.note_change()
         self._data_seen[layout.body_rows] = now
 
+    @applies_everything
     def gpu_apply_articulation_root_pose(self) -> None:
         layout = self._laid_out
         now, seen = self._data[layout.root_rows, :7], self._data_seen[layout.root_rows, :7]
@@ -334,6 +369,7 @@ class BatchedCpuSystem:
             self.note_change()
         self._data_seen[layout.root_rows, :7] = now
 
+    @applies_everything
     def gpu_apply_articulation_root_velocity(self) -> None:
         layout = self._laid_out
         now, seen = self._data[layout.root_rows, 7:], self._data_seen[layout.root_rows, 7:]
@@ -344,18 +380,23 @@ class BatchedCpuSystem:
             self.note_change()
         self._data_seen[layout.root_rows, 7:] = now
 
+    @applies_everything
     def gpu_apply_articulation_qpos(self) -> None:
         self._apply_joints(self._qpos, self._qpos_seen, "set_qpos")
 
+    @applies_everything
     def gpu_apply_articulation_qvel(self) -> None:
         self._apply_joints(self._qvel, self._qvel_seen, "set_qvel")
 
+    @applies_everything
     def gpu_apply_articulation_qf(self) -> None:
         self._apply_joints(self._qf, self._qf_seen, "set_qf")
 
+    @applies_everything
     def gpu_apply_articulation_target_position(self) -> None:
         self._apply_targets(self._target_qpos, self._target_qpos_seen, self._set_target, self._driven, True)
 
+    @applies_everything
     def gpu_apply_articulation_target_velocity(self) -> None:
         self._apply_targets(
             self._target_qvel, self._target_qvel_seen, self._set_velocity_target, self._velocity_driven, True
@@ -422,9 +463,11 @@ class BatchedCpuSystem:
         return self.contacts.create_pair_query(body_pairs)
 
     def gpu_query_contact_body_impulses(self, query: BodyImpulseQuery) -> None:
+        self._catch_up()
         self.contacts.query_bodies(query)
 
     def gpu_query_contact_pair_impulses(self, query: PairImpulseQuery) -> None:
+        self._catch_up()
         self.contacts.query_pairs(query)
 
 

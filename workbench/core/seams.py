@@ -17,7 +17,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from mani_skill.agents.controllers.utils.kinematics import Kinematics
+from mani_skill.agents.base_agent import BaseAgent
+from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
+from mani_skill.agents.multi_agent import MultiAgent
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from mani_skill.utils.structs.actor import Actor
@@ -49,7 +51,7 @@ def install_index_seams() -> None:
     stock_body_index = PhysxRigidBodyComponentStruct.__dict__["_body_data_index"].func
     stock_body_data = PhysxRigidBodyComponentStruct.__dict__["_body_data"].fget
     stock_articulation_index = Articulation.__dict__["_data_index"].func
-    stock_set_up_kinematics = Kinematics._setup_cpu
+    stock_set_ee_action = PDEEPosController.set_action
     stock_joint_index = ArticulationJoint.__dict__["_data_index"].func
 
     def body_index(self: Any) -> torch.Tensor:
@@ -80,25 +82,79 @@ def install_index_seams() -> None:
         indices = [system.index_of(articulation) for articulation in self._physx_articulations]
         return torch.tensor(indices, device=self.device, dtype=torch.int32)
 
-    def set_up_kinematics(self: Any) -> None:
-        # Chosen by device: the CPU solver takes one env's pose; the GPU's is plain torch and batched.
-        if batched_system(self.articulation.scene) is None:
-            stock_set_up_kinematics(self)
+    def set_ee_action(self: Any, action: torch.Tensor) -> None:
+        if batched_system(self.scene) is None:
+            stock_set_ee_action(self, action)
         else:
-            self._setup_gpu()
+            _set_ee_action_of_each_env(self, action)
 
     _replace(PhysxRigidBodyComponentStruct, "_body_data_index", cached_property(body_index))
     _replace(Articulation, "_data_index", cached_property(articulation_index))
     _replace(ArticulationJoint, "_data_index", cached_property(joint_index))
     Link._body_data = property(link_data)  # type: ignore[method-assign,assignment]
-    Kinematics._setup_cpu = set_up_kinematics
+    PDEEPosController.set_action = set_ee_action  # type: ignore[method-assign]
     _installed = True
+
+
+def _set_ee_action_of_each_env(controller: Any, action: torch.Tensor) -> None:
+    """``PDEEPosController.set_action`` as a single CPU env does it, for every env.
+
+    ManiSkill has two inverse kinematics: on the CPU a solver that runs until the pose is reached, for one
+    env; on the GPU one damped step along the Jacobian, for all. They differ by millimetres a step, and the
+    second takes any translation as one along the root's axes, whatever the config's ``frame``. An env here is
+    to equal stock's, so the first is called for each (0.1 ms an env and control step).
+    """
+    action = controller._preprocess_action(action)
+    controller._step = 0
+    start = controller._start_qpos = controller.qpos
+    use_target = controller.config.use_target
+    before = controller._target_pose if use_target else controller.ee_pose_at_base
+    goal = controller._target_pose = controller.compute_target_pose(before, action)
+    solver, qpos = controller.kinematics, controller.articulation.get_qpos()
+    solved = [solver.compute_ik(pose=goal[i : i + 1], q0=qpos[i : i + 1]) for i in range(len(qpos))]
+    # Where the pose cannot be reached the arm stays, as in stock.
+    target = torch.cat([start[i : i + 1] if row is None else row for i, row in enumerate(solved)])
+    controller._target_qpos = target.to(start.dtype)
+    if controller.config.interpolate:
+        controller._step_size = (controller._target_qpos - start) / controller._sim_steps
+    else:
+        controller.set_drive_targets(controller._target_qpos)
 
 
 def _replace(owner: type, name: str, value: cached_property) -> None:
     # A cached_property assigned after the class body has no name, and raises when it is first read.
     value.__set_name__(owner, name)
     setattr(owner, name, value)
+
+
+_BETWEEN_SUBSTEPS = ("_step_action", "_before_simulation_step", "_after_simulation_step")
+
+
+def substeps_are_unwatched(env: Any, task: type) -> bool:
+    """Whether only ManiSkill's own code runs between the substeps of a control step.
+
+    Its own hooks read and write nothing of the simulation there: ``BaseEnv``'s are empty, and its
+    controllers' ``before_simulation_step`` writes at most drive targets into a tensor that is not applied
+    before the next control step. A task, robot or controller that brings its own is taken to look.
+
+    Args:
+        task: the class of `env` without our mixin.
+    """
+    for hook in _BETWEEN_SUBSTEPS:
+        if getattr(task, hook) is not getattr(BaseEnv, hook) or hook in vars(env):
+            return False
+    agent = env.agent
+    if agent is None:
+        return True
+    agents = [agent, *agent.agents] if isinstance(agent, MultiAgent) else [agent]
+    of_agents = {type(a).before_simulation_step for a in agents}
+    if not of_agents <= {BaseAgent.before_simulation_step, MultiAgent.before_simulation_step}:
+        return False
+    return all(
+        type(part).before_simulation_step.__module__.startswith("mani_skill.agents.controllers.")
+        for robot in (agent.agents if isinstance(agent, MultiAgent) else [agent])
+        for part in (robot.controller, *getattr(robot.controller, "controllers", {}).values())
+    )
 
 
 def episode_seeds(env: BaseEnv) -> np.ndarray | None:
