@@ -17,7 +17,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 from workbench.core import actions
-from workbench.core.assets import MissingAssets, refuse_download_prompts, require_assets
+from workbench.core.assets import MissingAssets
 from workbench.core.backends import BackendUnavailable, choose_backend, why_no_gpu_simulation
 from workbench.core.task_env import EnvOptions, TaskEnv, default_reward_mode, make_env
 
@@ -180,15 +180,6 @@ def test_the_reward_is_the_richest_that_the_class_implements() -> None:
     assert default_reward_mode(REGISTERED_ENVS["PushCube-v1"].cls) == "normalized_dense"
 
 
-def test_missing_assets_are_named_with_the_command_and_nothing_is_asked() -> None:
-    with pytest.raises(MissingAssets, match="download_asset ycb"):
-        require_assets("PickSingleYCB-v1", ["ycb"])
-    from mani_skill.utils import download_asset
-
-    with refuse_download_prompts(), pytest.raises(MissingAssets, match="robot x is missing"):
-        download_asset.prompt_yes_no("robot x is missing. Would you like to download it now?")
-
-
 def test_a_task_whose_robot_is_not_downloaded_says_so() -> None:
     spec = REGISTERED_ENVS["PickSingleYCB-v1"]
     with pytest.raises(MissingAssets):
@@ -200,16 +191,6 @@ def test_gpu_simulation_is_refused_with_the_reason_where_it_cannot_be() -> None:
     assert choose_backend("auto", render=False).simulation == "cpu"
     with pytest.raises(BackendUnavailable, match="--backend cpu"):
         choose_backend("gpu", render=False)
-
-
-@pytest.mark.gpu
-def test_gpu_simulation_gives_the_same_interface() -> None:
-    spec = REGISTERED_ENVS["PickCube-v1"]
-    env = TaskEnv(make_env(spec.cls, EnvOptions(N, "gpu")), spec.max_episode_steps)
-    env.reset(seed=0)
-    step = env.step(actions.hold_action(env.parts, N))
-    assert step.poses.shape == (N, len(env.table.names), 7) and np.isfinite(step.poses).all()
-    env.close()
 
 
 def test_a_number_of_envs_below_one_is_refused() -> None:

@@ -50,7 +50,7 @@ class BatchedCpuSystem:
     def __init__(self, scenes: Sequence[sapien.Scene], threads: int | None = None) -> None:
         self.scenes = list(scenes)
         self.systems: list[physx.PhysxCpuSystem] = [scene.physx_system for scene in scenes]  # pyright: ignore
-        self._stepper = Stepper(self.systems, self.scenes, threads)
+        self.stepper = Stepper(self.systems, self.scenes, threads)
         self.contacts = ContactReader(self.systems)
         self._layout: Layout | None = None
         self._packed: NDArray[np.float32] | None = None
@@ -100,20 +100,20 @@ class BatchedCpuSystem:
 
     def step(self) -> None:
         """One substep of every env."""
-        if self._stepper.step():
-            self._moved()
+        if self.stepper.step():
+            self._stepped()
 
     @contextmanager
     def merging(self, substeps: int) -> Iterator[None]:
         """The next `substeps` calls of `step` may be done together; asking for state does them at once."""
-        with self._stepper.merging(substeps):
+        with self.stepper.merging(substeps):
             yield
         self._catch_up()
 
     def _catch_up(self) -> None:
-        if self._stepper.owes:
-            self._stepper.catch_up()
-            self._moved()
+        if self.stepper.owes:
+            self.stepper.catch_up()
+            self._stepped()
 
     def step_start(self) -> None:
         """A substep at once: without a GPU there is nothing to wait for in `step_finish`."""
@@ -272,7 +272,7 @@ class BatchedCpuSystem:
     def _pack(self) -> NDArray[np.float32]:
         self._catch_up()
         if self._packed is None:
-            joined = b"".join(self._stepper.packs())
+            joined = b"".join(self.stepper.packs())
             self._packed = np.empty(len(joined) // 4 + 1, dtype=np.float32)
             self._packed[:-1] = np.frombuffer(joined, dtype=np.float32)
             self._packed[-1] = 0.0
@@ -282,7 +282,7 @@ class BatchedCpuSystem:
         """(L, 7) poses of all links: position, quaternion wxyz."""
         layout = self._laid_out
         if self._posed is None:
-            packs = self._stepper.pose_packs()
+            packs = self.stepper.pose_packs()
             lengths = [len(pack) // 4 for pack in packs]
             if lengths != self._pose_lengths:
                 # Cameras are added after the scene is laid out: each makes its env's pack longer.
@@ -295,7 +295,11 @@ class BatchedCpuSystem:
     def note_change(self) -> None:
         """The simulation was written to, here or by a call on one of `systems`: what was packed is old."""
         self._catch_up()
-        self._stepper.forget()
+        self.stepper.forget()
+        self._moved()
+
+    def _stepped(self) -> None:
+        self.contacts.stepped()
         self._moved()
 
     def _moved(self) -> None:
@@ -327,6 +331,16 @@ class BatchedCpuSystem:
         layout, packed = self._laid_out, self._pack()
         self._target_qpos[:] = self._target_qpos_seen[:] = packed[layout.target_qpos_at]
         self._target_qvel[:] = self._target_qvel_seen[:] = packed[layout.target_qvel_at]
+
+    def packs(self) -> list[bytes]:
+        """``PhysxCpuSystem.pack()`` of every env, as it is now."""
+        self._catch_up()
+        return self.stepper.packs()
+
+    @property
+    def drive_flags(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """(A,), (A,) whether position, velocity targets were ever set; see `_apply_targets`."""
+        return self._driven, self._velocity_driven
 
     # --- writing: gpu_apply_* ----------------------------------------------------------------------
 
@@ -432,9 +446,13 @@ class BatchedCpuSystem:
         """
         changed = (now != seen).any(axis=1)
         driven |= changed
-        for i in np.flatnonzero(driven if keep_awake else changed):
-            _refuse_nan(now[i], self._laid_out.articulations[i].name)
-            for set_target, value in zip(setters[i], now[i].tolist(), strict=False):
+        chosen = np.flatnonzero(driven if keep_awake else changed).tolist()
+        if not np.isfinite(now).all():
+            for i in chosen:
+                _refuse_nan(now[i], self._laid_out.articulations[i].name)
+        values = now.tolist()
+        for i in chosen:
+            for set_target, value in zip(setters[i], values[i], strict=False):
                 set_target(value)
         if changed.any():
             self.note_change()

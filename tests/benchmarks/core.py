@@ -1,0 +1,232 @@
+"""The batched CPU core in figures: speed, its shares, pictures, snapshots and memory, as markdown.
+
+    python tests/benchmarks/core.py                       # everything, about 15 minutes on two cores
+    python tests/benchmarks/core.py --parts speed shares  # some of it
+    python tests/benchmarks/core.py --write               # also into web_assets/docs/benchmarks.md
+
+Both sides of every comparison run in this one call, in turns, each turn in a process of its own. Take the
+ratios; the absolute numbers are those of the machine. Run it on a machine that does nothing else.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import platform
+import statistics
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import core_sides as sides
+import tyro
+
+PAGE = Path(__file__).resolve().parents[2] / "web_assets" / "docs" / "benchmarks.md"
+Part = Literal["speed", "one", "shares", "scaling", "pictures", "snapshots", "memory"]
+PARTS: tuple[Part, ...] = ("speed", "one", "shares", "scaling", "pictures", "snapshots", "memory")
+MB = 1 << 20
+
+
+@dataclass(frozen=True)
+class Options:
+    parts: tuple[Part, ...] = PARTS
+    env_ids: tuple[str, ...] = ("PickCube-v1", "PushCube-v1", "StackCube-v1")
+    num_envs: int = 64
+    seconds: float = 5.0
+    """Of stepping, a turn."""
+    turns: int = 3
+    most_envs: int = 1024
+    """The scaling table doubles from 1 to this."""
+    resets: int = 1000
+    rebuilds: int = 100
+    write: bool = False
+    """Put the tables into the docs page instead of only printing them."""
+
+
+def _answer(function: Callable[..., Any], args: tuple[Any, ...], results: Any) -> None:
+    try:
+        results.put((True, function(*args)))
+    except BaseException as error:
+        results.put((False, repr(error)))
+        raise
+
+
+def in_own_process(function: Callable[..., Any], *args: Any) -> Any:
+    """A fresh process, so that no side inherits threads, caches or memory."""
+    context = multiprocessing.get_context("spawn")
+    results = context.Queue()
+    process = context.Process(target=_answer, args=(function, args, results))
+    process.start()
+    good, answer = results.get(timeout=1800)
+    process.join()
+    if not good:
+        raise RuntimeError(f"{function.__name__}{args}: {answer}")
+    return answer
+
+
+def table(head: list[str], rows: list[list[str]]) -> Iterator[str]:
+    yield "| " + " | ".join(head) + " |"
+    yield "|" + "---|" * len(head)
+    for row in rows:
+        yield "| " + " | ".join(row) + " |"
+    yield ""
+
+
+def spread(values: list[float]) -> str:
+    return f"{statistics.median(values):.0f} ({min(values):.0f} to {max(values):.0f})"
+
+
+def speed(options: Options) -> Iterator[str]:
+    n, rows = options.num_envs, []
+    for env_id in options.env_ids:
+        batched, stock, asynchronous = [], [], []
+        for _ in range(options.turns):
+            batched.append(in_own_process(sides.batched_rate, env_id, n, None, options.seconds))
+            stock.append(in_own_process(sides.stock_rate, env_id, options.seconds))
+            asynchronous.append(in_own_process(sides.async_rate, env_id, n, options.seconds))
+        middle = statistics.median(batched)
+        rows.append(
+            [
+                env_id,
+                spread(batched),
+                spread(stock),
+                spread(asynchronous),
+                f"{middle / statistics.median(stock):.1f}",
+                f"{middle / statistics.median(asynchronous):.1f}",
+            ]
+        )
+    yield f"## Stepping {n} envs, state observations, all cores"
+    yield ""
+    yield "Env-steps a second, median (lowest to highest) of the turns. The batched core in its default mode, which is exact."
+    yield ""
+    head = ["task", "batched core", "one stock env", f"AsyncVectorEnv of {n}", "x stock", "x AsyncVectorEnv"]
+    yield from table(head, rows)
+
+
+def one(options: Options) -> Iterator[str]:
+    rows = []
+    for env_id in options.env_ids:
+        batched, stock = [], []
+        for _ in range(options.turns):
+            batched.append(in_own_process(sides.batched_rate, env_id, 1, None, options.seconds))
+            stock.append(in_own_process(sides.stock_rate, env_id, options.seconds))
+        ratio = statistics.median(batched) / statistics.median(stock)
+        rows.append([env_id, spread(batched), spread(stock), f"{ratio:.2f}"])
+    yield "## One env"
+    yield ""
+    yield from table(["task", "batched core, N = 1", "one stock env", "ratio"], rows)
+
+
+def shares(options: Options) -> Iterator[str]:
+    rows = []
+    for env_id in options.env_ids:
+        share = in_own_process(sides.physics_share, env_id, options.num_envs)
+        rows.append([env_id, f"{100 * share['wall']:.0f} %", f"{100 * share['cores']:.0f} %"])
+    yield f"## What of a control step of {options.num_envs} envs is PhysX's own step()"
+    yield ""
+    yield "*Of the wall time*: at least one env is inside step(). *Of the cores*: time inside step(), summed over"
+    yield "the threads, of what all of them could have spent."
+    yield ""
+    yield from table(["task", "of the wall time", "of the cores"], rows)
+
+
+def scaling(options: Options) -> Iterator[str]:
+    from workbench.core.threads import usable_cores
+
+    cores = usable_cores()
+    threads = sorted({1, *(2**k for k in range(1, 12) if 2**k < cores), cores})
+    counts = [2**k for k in range(20) if 2**k <= options.most_envs]
+    rows = []
+    for count in counts:
+        rates = [
+            in_own_process(sides.batched_rate, options.env_ids[0], count, t, options.seconds / 2)
+            for t in threads
+        ]
+        rows.append([str(count), *(f"{rate:.0f}" for rate in rates), f"{rates[-1] / rates[0]:.2f}"])
+    yield f"## {options.env_ids[0]} over envs and threads"
+    yield ""
+    yield "Env-steps a second."
+    yield ""
+    yield from table(["envs", *(f"{t} thread{'s' * (t > 1)}" for t in threads), "all / 1"], rows)
+
+
+def pictures(options: Options) -> Iterator[str]:
+    took = in_own_process(sides.picture_seconds, options.env_ids[0], 16, 4 * options.seconds)
+    yield "## A picture, rgb 128 x 128, of 16 envs"
+    yield ""
+    rows = [
+        [name, f"{1e3 * took[side]:.1f} ms", f"{took[side] / took['bare']:.2f}"]
+        for name, side in (
+            ("batched observation", "batched"),
+            ("one stock env's observation", "stock"),
+            ("SAPIEN's take_picture and get_picture alone, all envs", "bare"),
+        )
+    ]
+    yield from table(["", "a picture", "to bare"], rows)
+
+
+def snapshots(options: Options) -> Iterator[str]:
+    took = in_own_process(sides.snapshot_seconds, options.env_ids[0], options.num_envs)
+    rows = [
+        [name, f"{1e3 * took[name]:.2f} ms", f"{100 * took[name] / took['step']:.1f} %"]
+        for name in ("step", "snapshot", "restore")
+    ]
+    yield f"## Snapshots of {options.num_envs} envs of {options.env_ids[0]}"
+    yield ""
+    yield from table(["", "median", "of a control step"], rows)
+
+
+def memory(options: Options) -> Iterator[str]:
+    env_id = options.env_ids[0]
+    counts = [16, 64, 256]
+    held = [in_own_process(sides.memory_of, env_id, count) for count in counts]
+    yield f"## Memory, {env_id}"
+    yield ""
+    rows = [[str(count), f"{b / MB:.0f} MB"] for count, b in zip(counts, held, strict=True)]
+    yield from table(["envs", "process holds"], rows)
+    each = (held[-1] - held[0]) / (counts[-1] - counts[0]) / MB
+    yield f"A further env costs {each:.2f} MB (from {counts[0]} to {counts[-1]})."
+    yield ""
+    for name, values in (
+        (
+            f"{options.resets} resets of 16 envs",
+            in_own_process(sides.memory_over_resets, env_id, 16, options.resets),
+        ),
+        (
+            f"{options.rebuilds} rebuilds of 4 envs",
+            in_own_process(sides.memory_over_rebuilds, env_id, 4, options.rebuilds),
+        ),
+    ):
+        yield f"After each tenth of {name}: " + ", ".join(f"{v / MB:.0f}" for v in values) + " MB."
+        yield ""
+
+
+def main(options: Options) -> None:
+    from workbench.core.threads import usable_cores
+
+    makers = {
+        "speed": speed,
+        "one": one,
+        "shares": shares,
+        "scaling": scaling,
+        "pictures": pictures,
+        "snapshots": snapshots,
+        "memory": memory,
+    }
+    lines = ["# The batched CPU core in figures", ""]
+    lines += [
+        f"Made by `python tests/benchmarks/core.py --write` on {usable_cores()} cores ({platform.machine()}), without a GPU."
+    ]
+    lines += ["Both sides of each comparison ran in that one call: take the ratios.", ""]
+    print("\n".join(lines), flush=True)
+    for part in options.parts:
+        for line in makers[part](options):
+            lines.append(line)
+            print(line, flush=True)
+    if options.write:
+        PAGE.parent.mkdir(exist_ok=True)
+        PAGE.write_text("\n".join(lines).rstrip() + "\n")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

@@ -1,0 +1,72 @@
+"""The interface of SAPIEN's GPU system, member by member."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import sapien.physx as physx
+
+from tests.core.single_env_judge import batch_of
+from tests.core.test_physics_settings import Collision
+
+MEMBERS = sorted(name for name in dir(physx.PhysxGpuSystem) if not name.startswith("_"))
+REFUSED = {"gpu_set_cuda_stream", "set_scene_offset", "set_scene_collision_id"}
+
+
+@pytest.fixture(scope="module")
+def px() -> Iterator[Any]:
+    env = batch_of(Collision, 3)
+    env.reset(seed=[0, 1, 2])
+    yield env.scene.px
+    env.close()
+
+
+@pytest.mark.parametrize("name", MEMBERS)
+def test_every_member_of_the_gpu_system_exists_or_is_refused_in_words(px: Any, name: str) -> None:
+    if name in REFUSED:
+        with pytest.raises(NotImplementedError, match="batched CPU simulation"):
+            getattr(px, name)
+    else:
+        getattr(px, name)
+
+
+def test_a_member_that_sapien_does_not_have_is_no_attribute(px: Any) -> None:
+    assert not hasattr(px, "gpu_fetch_everything")
+
+
+def test_members_that_maniskill_never_uses_mean_what_they_say(px: Any) -> None:
+    assert px.get_timestep() == px.timestep == px.systems[2].timestep
+    px.set_timestep(0.005)
+    assert [system.timestep for system in px.systems] == pytest.approx([0.005] * 3)
+    px.set_timestep(0.01)
+    assert px.config.gravity[2] == pytest.approx(-9.81)
+    assert px.get_config().gravity[2] == pytest.approx(-9.81)
+    assert not px.device.is_cuda()
+    assert len(px.get_rigid_dynamic_components()) == 2 * 3
+    assert len(px.get_rigid_static_components()) == 1 * 3
+    assert len(px.get_articulation_link_components()) == 3 * 3
+    assert px.cuda_rigid_dynamic_force.shape == px.cuda_rigid_body_force.shape
+
+
+def test_step_start_and_finish_are_one_substep(px: Any) -> None:
+    before = [system.pack() for system in px.systems]
+    px.step_start()
+    px.step_finish()
+    stepped = [system.pack() for system in px.systems]
+    for system, state in zip(px.systems, before):
+        system.unpack(state)
+    px.note_change()
+    px.step()
+    assert [system.pack() for system in px.systems] == stepped != before
+
+
+@pytest.mark.parametrize(
+    "name",
+    [name for name in MEMBERS if name.startswith("gpu_apply_") and not name.endswith(("force", "torque"))],
+)
+def test_an_index_buffer_is_refused_in_words(px: Any, name: str) -> None:
+    with pytest.raises(NotImplementedError, match="takes no index buffer"):
+        getattr(px, name)(px.cuda_rigid_body_data)
+    getattr(px, name)()

@@ -1,0 +1,113 @@
+"""Which bodies of an env touch, where, and how hard: for people who look, not for rewards.
+
+A task asks for the impulse on a body it knows (`contacts`); a person who wonders why the peg will not go in
+wants to see everything that touches anything. PhysX on the CPU has that list, and ManiSkill gives it for a
+single env only (``scene.get_contacts()``). Here it is read for one env at a time, with the names under which
+the rest of the workbench shows the bodies; the other envs cost nothing.
+
+A contact here is what PhysX calls one: two collision *shapes* that are nearer than their contact offsets
+(1 cm each unless the task says otherwise). So a pair of bodies may come more than once, and a contact with a
+positive `separation` and no impulse is two shapes that are near and do not touch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import sapien.physx as physx
+from numpy.typing import NDArray
+
+from workbench.core import seams
+from workbench.core.body_table import BodyTable, build_body_table
+
+
+@dataclass(frozen=True)
+class Contact:
+    """One pair of shapes in the last substep, with K points; float32, the env's own world frame."""
+
+    bodies: tuple[str, str]
+    """Names as in `BodyTable.names`; the name of the ``sapien.Entity`` for what ManiSkill does not manage."""
+    points: NDArray[np.float32]
+    """(K, 3) metres."""
+    normals: NDArray[np.float32]
+    """(K, 3) unit vectors from the second body towards the first."""
+    impulses: NDArray[np.float32]
+    """(K, 3) newton seconds ON the first body, BY the second, in the last substep; friction is in it."""
+    separations: NDArray[np.float32]
+    """(K,) metres between the surfaces; negative where they overlap."""
+    timestep: float
+    """Seconds of a substep."""
+
+    @property
+    def impulse(self) -> NDArray[np.float32]:
+        """(3,) newton seconds on the first body: the sum of `impulses`."""
+        return self.impulses.sum(axis=0)
+
+    @property
+    def force(self) -> NDArray[np.float32]:
+        """(3,) newtons on the first body, the mean over the last substep. On the second: its negative."""
+        return self.impulse / np.float32(self.timestep)
+
+
+def list_contacts(env: Any, env_idx: int, table: BodyTable | None = None) -> tuple[Contact, ...]:
+    """All contacts of one env in its last substep, ordered by their bodies' names, then by their points.
+
+    (SAPIEN's own order is that of memory addresses: it differs from run to run of the same episode.)
+
+    A state that was set since (a reset, a restored snapshot) has no contacts of its own until the next step:
+    the list is still that of the last substep, as in stock ManiSkill.
+
+    Args:
+        env: a ManiSkill env (unwrapped, reset at least once): batched on the CPU, or stock on the CPU.
+        table: the body table of the env's scene, if there is one already; making one costs milliseconds.
+
+    Raises:
+        IndexError: there is no such env.
+        NotImplementedError: the env is simulated on the GPU.
+        ValueError: the env was rebuilt since the table was made.
+    """
+    if not 0 <= env_idx < env.num_envs:
+        raise IndexError(f"env {env_idx} is out of range for {env.num_envs} envs")
+    batched = seams.batched_system(env.scene)
+    if batched is None and env.scene.gpu_sim_enabled:
+        raise NotImplementedError(
+            "PhysX on the GPU keeps no list of contacts that can be read: open the task with the CPU backend."
+        )
+    if table is None:
+        table = build_body_table(env)
+    elif table.scene is not env.scene:
+        raise ValueError("the scene was rebuilt since this table was made: call build_body_table(env) again")
+    system = env.scene.px if batched is None else batched.systems[env_idx]
+    timestep = env.scene.timestep
+    contacts = [_read(contact, table, timestep) for contact in system.get_contacts()]
+    return tuple(sorted(contacts, key=_place))
+
+
+def _place(contact: Contact) -> tuple[Any, ...]:
+    # Two shapes of one body may touch the same point: then they differ in depth.
+    return contact.bodies, contact.points.tolist(), contact.separations.tolist(), contact.impulses.tolist()
+
+
+def _read(contact: physx.PhysxContact, table: BodyTable, timestep: float) -> Contact:
+    first, second = contact.bodies
+    points = contact.points
+    return Contact(
+        bodies=(_name(first, table), _name(second, table)),
+        points=_rows([point.position for point in points]),
+        normals=_rows([point.normal for point in points]),
+        impulses=_rows([point.impulse for point in points]),
+        separations=np.array([point.separation for point in points], dtype=np.float32),
+        timestep=timestep,
+    )
+
+
+def _rows(vectors: Sequence[Any]) -> NDArray[np.float32]:
+    return np.array(vectors, dtype=np.float32).reshape(-1, 3)
+
+
+def _name(body: Any, table: BodyTable) -> str:
+    slot = table.slot_of.get(id(body.entity))
+    return body.entity.name if slot is None else table.names[slot % len(table.names)]
