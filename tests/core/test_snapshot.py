@@ -1,0 +1,406 @@
+"""Snapshots: an episode goes on as it would have, in its own env, in others, and in an env made anew."""
+
+# pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportOptionalMemberAccess=false
+# pyright: reportCallIssue=false
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterator
+from typing import Any
+
+import mani_skill.envs  # noqa: F401  registers the ids
+import numpy as np
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.building import actors
+from mani_skill.utils.registration import REGISTERED_ENVS
+from mani_skill.utils.structs.pose import Pose
+
+from workbench.core.snapshot import restore_snapshot, take_snapshot
+from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+
+N = 6
+PICK_CUBE: Any = REGISTERED_ENVS["PickCube-v1"].cls
+
+
+def made(task: str | type[BaseEnv], num_envs: int = N, **kwargs: object) -> BaseEnv:
+    cls = REGISTERED_ENVS[task].cls if isinstance(task, str) else task
+    options = {"obs_mode": "state", **kwargs}
+    return make_env(cls, EnvOptions(num_envs, "cpu", render=False, kwargs=options))
+
+
+def random_actions(env: BaseEnv, steps: int, seed: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    return [rng.uniform(-1, 1, env.action_space.shape).astype(np.float32) for _ in range(steps)]
+
+
+def packs(env: BaseEnv) -> list[bytes]:
+    return [system.pack() for system in env.scene.px.systems]
+
+
+def after(env: BaseEnv, actions: list[np.ndarray]) -> list[list[bytes]]:
+    """The state of every env after each of the actions."""
+    states = []
+    for action in actions:
+        env.step(action)
+        states.append(packs(env))
+    return states
+
+
+def difference(one: bytes, other: bytes) -> float:
+    return float(np.abs(np.frombuffer(one, np.float32) - np.frombuffer(other, np.float32)).max())
+
+
+@pytest.fixture(scope="module")
+def pick() -> Iterator[BaseEnv]:
+    env = made("PickCube-v1")
+    yield env
+    env.close()
+
+
+@pytest.fixture(scope="module")
+def stack() -> Iterator[BaseEnv]:
+    env = made("StackCube-v1", control_mode="pd_ee_target_delta_pose")
+    yield env
+    env.close()
+
+
+PROPERTY = settings(
+    max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+
+
+@PROPERTY
+@given(
+    seed=st.integers(0, 10_000),
+    before=st.integers(0, 8),
+    steps=st.integers(1, 10),
+    chosen=st.sets(st.integers(0, N - 1), min_size=1),
+)
+def test_a_restored_episode_goes_the_same_way_every_time(
+    stack: BaseEnv, seed: int, before: int, steps: int, chosen: set[int]
+) -> None:
+    stack.reset(seed=list(range(seed, seed + N)))
+    after(stack, random_actions(stack, before, seed))
+    subset = sorted(chosen)
+    snapshot = take_snapshot(stack, subset)
+    actions = random_actions(stack, steps, seed + 1)
+    live = after(stack, actions)
+
+    def again() -> list[list[bytes]]:
+        report = restore_snapshot(stack, snapshot)
+        assert not report.not_carried or len(subset) < N, report.not_carried
+        assert [int(stack.elapsed_steps[i]) for i in subset] == [before] * len(subset)
+        return after(stack, actions)
+
+    first, second = again(), again()
+    for env in subset:
+        assert [s[env] for s in first] == [s[env] for s in second]
+        # PhysX's contact caches and the last bit of a root pose are not in a snapshot; see its module.
+        assert difference(live[-1][env], first[-1][env]) < 1e-2
+
+
+@PROPERTY
+@given(seed=st.integers(0, 10_000), pairs=st.permutations(range(N)), count=st.integers(1, N))
+def test_a_state_goes_the_same_way_in_whichever_env_it_is_put(
+    stack: BaseEnv, seed: int, pairs: list[int], count: int
+) -> None:
+    stack.reset(seed=list(range(seed, seed + N)))
+    after(stack, random_actions(stack, 4, seed))
+    snapshot = take_snapshot(stack)
+    restore_snapshot(stack, snapshot)
+    actions = random_actions(stack, 6, seed + 1)
+    reference = after(stack, actions)
+    targets, sources = sorted(pairs[:count]), pairs[:count]
+    moved = [action.copy() for action in actions]
+    for action, was in zip(moved, actions, strict=True):
+        action[targets] = was[sources]
+    restore_snapshot(stack, snapshot, targets, sources)
+    result = after(stack, moved)
+    for target, source in zip(targets, sources, strict=True):
+        assert [s[target] for s in result] == [s[source] for s in reference]
+
+
+def test_one_env_into_all(pick: BaseEnv) -> None:
+    pick.reset(seed=list(range(N)))
+    after(pick, random_actions(pick, 5, 0))
+    snapshot = take_snapshot(pick, [3])
+    restore_snapshot(pick, snapshot, range(N))
+    assert len(set(packs(pick))) == 1
+    states = pick.get_state()
+    assert torch.equal(states, states[:1].expand(N, -1))
+    assert len(set(packs(pick))) == 1
+
+
+def test_other_envs_are_not_touched(pick: BaseEnv) -> None:
+    pick.reset(seed=list(range(N)))
+    after(pick, random_actions(pick, 5, 0))
+    snapshot = take_snapshot(pick, [1, 4])
+    actions = random_actions(pick, 3, 1)
+    after(pick, actions)
+    untouched = packs(pick)
+    elapsed = pick.elapsed_steps.clone()
+    restore_snapshot(pick, snapshot)
+    now = packs(pick)
+    for env in (0, 2, 3, 5):
+        assert now[env] == untouched[env] and pick.elapsed_steps[env] == elapsed[env]
+    assert pick.elapsed_steps.tolist() == [8, 5, 8, 8, 5, 8]
+
+
+def test_tensors_and_drawn_poses_are_those_of_the_restored_moment(pick: BaseEnv) -> None:
+    pick.reset(seed=list(range(N)))
+    after(pick, random_actions(pick, 5, 0))
+    restore_snapshot(pick, take_snapshot(pick))
+    state, poses = pick.get_state(), [s.pack_poses() for s in pick.scene.sub_scenes]
+    velocities = torch.stack([link.linear_velocity for link in pick.agent.robot.links])
+    snapshot = take_snapshot(pick)
+    after(pick, random_actions(pick, 5, 1))
+    restore_snapshot(pick, snapshot)
+    assert torch.equal(pick.get_state(), state)
+    assert [s.pack_poses() for s in pick.scene.sub_scenes] == poses
+    now = torch.stack([link.linear_velocity for link in pick.agent.robot.links])
+    torch.testing.assert_close(now, velocities, atol=1e-5, rtol=0)
+
+
+def test_what_was_evaluated_is_evaluated_again(pick: BaseEnv) -> None:
+    env = TaskEnv(pick, 50)
+    env.reset(seed=0)
+    state = pick.get_state_dict()
+    state["actors"]["cube"][:, :3] = pick.agent.tcp.pose.p
+    pick.set_state_dict(state)
+    close = np.zeros((N, 8), np.float32)
+    close[:, -1] = -1
+    for _ in range(4):
+        held = env.step(close)
+    assert held.evaluate["is_grasped"].any(), "nothing is grasped: the test would prove nothing"
+    snapshot = env.snapshot()
+    opened = -close
+    for _ in range(6):
+        let_go = env.step(opened)
+    assert not let_go.evaluate["is_grasped"].all()
+    restored, report = env.restore(snapshot)
+    assert not report.not_carried
+    for name, value in held.evaluate.items():
+        assert np.array_equal(restored.evaluate[name], value), name
+    np.testing.assert_allclose(restored.poses, held.poses, atol=1e-6)
+    assert restored.elapsed_steps.tolist() == held.elapsed_steps.tolist()
+    assert not restored.reward.any() and restored.action is None
+    later = env.step(close)
+    assert later.elapsed_steps.tolist() == [5] * N
+
+
+def test_a_restored_step_observes_the_restored_moment(pick: BaseEnv) -> None:
+    env = TaskEnv(pick, 50)
+    env.reset(seed=0)
+    env.step(random_actions(pick, 1, 0)[0])
+    seen, snapshot = env.obs.clone(), env.snapshot()
+    env.step(random_actions(pick, 1, 1)[0])
+    env.restore(snapshot)
+    torch.testing.assert_close(env.obs, seen, atol=1e-6, rtol=0)
+
+
+def test_a_snapshot_can_be_pickled_and_does_not_change_with_its_env(pick: BaseEnv) -> None:
+    pick.reset(seed=list(range(N)))
+    after(pick, random_actions(pick, 3, 0))
+    snapshot = take_snapshot(pick)
+    restore_snapshot(pick, snapshot)
+    actions = random_actions(pick, 4, 1)
+    reference = after(pick, actions)
+    copy = pickle.loads(pickle.dumps(snapshot))
+    assert not restore_snapshot(pick, copy).not_carried
+    assert after(pick, actions) == reference
+    restore_snapshot(pick, snapshot)
+    assert after(pick, actions) == reference
+
+
+def test_a_target_that_a_controller_goes_after_is_restored() -> None:
+    env = made("PickCube-v1", 3, control_mode="pd_joint_target_delta_pos")
+    env.reset(seed=[0, 1, 2])
+    actions = random_actions(env, 5, 0)
+    after(env, actions)
+    arm = env.agent.controller.controllers["arm"]
+    target, snapshot = arm._target_qpos.clone(), take_snapshot(env)
+    after(env, actions)
+    assert not torch.equal(arm._target_qpos, target)
+    restore_snapshot(env, snapshot, [1])
+    assert torch.equal(arm._target_qpos[1], target[1]) and not torch.equal(arm._target_qpos[0], target[0])
+    restore_snapshot(env, snapshot)
+    assert torch.equal(arm._target_qpos, target)
+    env.close()
+
+
+def test_the_next_unseeded_reset_draws_the_same_again(pick: BaseEnv) -> None:
+    pick.reset(seed=list(range(N)))
+    after(pick, random_actions(pick, 2, 0))
+    snapshot = take_snapshot(pick)
+
+    def draws() -> tuple[Any, ...]:
+        pick.reset()
+        return pick.get_state(), pick._batched_episode_rng.uniform(), pick._batched_episode_rng.normal()
+
+    first = draws()
+    pick._batched_episode_rng.normal()
+    restore_snapshot(pick, snapshot)
+    second = draws()
+    assert torch.equal(first[0], second[0])
+    assert np.array_equal(first[1], second[1]) and np.array_equal(first[2], second[2])
+
+
+def test_a_part_of_the_batch_leaves_the_processs_generators_alone(pick: BaseEnv) -> None:
+    pick.reset(seed=list(range(N)))
+    snapshot = take_snapshot(pick)
+    state = torch.get_rng_state(), np.random.get_state()[1].copy()
+    torch.rand(3)
+    np.random.rand(3)
+    moved = torch.get_rng_state()
+    restore_snapshot(pick, snapshot, [2])
+    assert torch.equal(torch.get_rng_state(), moved)
+    restore_snapshot(pick, snapshot)
+    assert torch.equal(torch.get_rng_state(), state[0])
+    assert np.array_equal(np.random.get_state()[1], state[1])
+
+
+def test_joint_forces_are_restored() -> None:
+    env = made("MS-CartpoleBalance-v1", 2, control_mode="pd_joint_delta_pos")
+    env.reset(seed=[0, 1])
+    robot = env.agent.robot
+    robot.set_qf(torch.full((2, robot.max_dof), 2.0))
+    env.scene.px.gpu_apply_articulation_qf()
+    snapshot = take_snapshot(env)
+    robot.set_qf(torch.zeros((2, robot.max_dof)))
+    env.scene.px.gpu_apply_articulation_qf()
+    restore_snapshot(env, snapshot, [1])
+    forces = [articulation.qf.tolist() for articulation in robot._objs]
+    assert forces == [[0.0] * robot.max_dof, [2.0] * robot.max_dof]
+    env.close()
+
+
+def test_what_slept_sleeps(pick: BaseEnv) -> None:
+    pick.reset(seed=list(range(N)))
+    cubes = [entity.find_component_by_type(type(pick.cube._bodies[0])) for entity in pick.cube._objs]
+    cubes[2].put_to_sleep()
+    snapshot = take_snapshot(pick)
+    cubes[2].wake_up()
+    restore_snapshot(pick, snapshot)
+    assert [cube.is_sleeping for cube in cubes] == [i == 2 for i in range(N)]
+
+
+def test_a_hidden_object_keeps_its_true_pose(pick: BaseEnv) -> None:
+    pick.reset(seed=list(range(N)))
+    pick.goal_site.show_visual()
+    goals = pick.goal_site.pose.raw_pose.clone()
+    pick.goal_site.hide_visual()
+    hidden = take_snapshot(pick)
+    pick.reset(seed=list(range(50, 50 + N)))
+    restore_snapshot(pick, hidden)
+    assert torch.equal(pick.goal_site.pose.raw_pose, goals)
+    pick.goal_site.show_visual()
+    torch.testing.assert_close(pick.goal_site.pose.raw_pose, goals)
+    pick.reset(seed=list(range(50, 50 + N)))
+    restore_snapshot(pick, hidden, [4], source=0)
+    torch.testing.assert_close(pick.goal_site.pose.raw_pose[4], goals[0])
+
+
+class EditedPickCube(PICK_CUBE):
+    """PickCube with the goal site gone by another name, a ball more, and no cube by the old name in ... none."""
+
+    def _load_scene(self, options: dict) -> None:
+        super()._load_scene(options)
+        self.ball = actors.build_sphere(
+            self.scene, 0.02, [1, 0, 0, 1], "ball", initial_pose=Pose.create_from_pq([0.3, 0.3, 0.02])
+        )
+
+
+def test_a_rebuilt_env_goes_the_same_way(pick: BaseEnv) -> None:
+    pick.reset(seed=list(range(N)))
+    after(pick, random_actions(pick, 5, 0))
+    snapshot = pickle.loads(pickle.dumps(take_snapshot(pick)))
+    restore_snapshot(pick, snapshot)
+    actions = random_actions(pick, 8, 1)
+    reference = after(pick, actions)
+    rebuilt = made("PickCube-v1")
+    rebuilt.reset(seed=list(range(100, 100 + N)))
+    report = restore_snapshot(rebuilt, snapshot)
+    assert {"actor cube", "actor goal_site", "articulation panda"} <= set(report.carried)
+    assert not report.not_carried
+    assert rebuilt.elapsed_steps.tolist() == [5] * N
+    assert after(rebuilt, actions) == reference
+    rebuilt.close()
+
+
+def test_an_edited_task_gets_what_still_fits_by_name_and_says_what_does_not(pick: BaseEnv) -> None:
+    pick.reset(seed=list(range(N)))
+    after(pick, random_actions(pick, 5, 0))
+    snapshot = take_snapshot(pick)
+    edited = made(EditedPickCube, 4)
+    edited.reset(seed=[0, 1, 2, 3])
+    ball = edited.ball.pose.raw_pose.clone()
+    report = restore_snapshot(edited, snapshot, [0, 2], source=[5, 1])
+    assert report.not_carried["actor ball"].startswith("the snapshot has none")
+    assert torch.equal(edited.ball.pose.raw_pose, ball)
+    cube, qpos = pick.cube.pose.raw_pose, pick.agent.robot.get_qpos()
+    torch.testing.assert_close(edited.cube.pose.raw_pose[[0, 2]], cube[[5, 1]])
+    torch.testing.assert_close(edited.agent.robot.get_qpos()[[0, 2]], qpos[[5, 1]])
+    assert edited.elapsed_steps.tolist() == [5, 0, 5, 0]
+    back = restore_snapshot(pick, take_snapshot(edited, [2]), [3])
+    assert back.not_carried["actor ball"] == "this env has none of this name"
+    edited.close()
+
+
+def test_an_articulation_with_other_joints_is_left_as_it_is(pick: BaseEnv) -> None:
+    pick.reset(seed=list(range(N)))
+    snapshot = take_snapshot(pick)
+    other = made("PickCube-v1", 2, robot_uids="fetch")
+    other.reset(seed=[0, 1])
+    qpos = other.agent.robot.get_qpos().clone()
+    report = restore_snapshot(other, snapshot, [0, 1])
+    assert "articulation fetch" in report.not_carried and "articulation panda" in report.not_carried
+    assert torch.equal(other.agent.robot.get_qpos(), qpos)
+    assert "actor cube" in report.carried
+    other.close()
+
+
+@pytest.mark.parametrize(
+    ("env_idx", "source", "error"),
+    [
+        ([], None, ValueError),
+        ([N], 0, IndexError),
+        ([0, 0], None, ValueError),
+        ([0, 1], [1], ValueError),
+        ([0], 5, IndexError),
+        (None, 1, ValueError),
+    ],
+)
+def test_wrong_envs_are_refused(pick: BaseEnv, env_idx: Any, source: Any, error: type[Exception]) -> None:
+    snapshot = take_snapshot(pick, [0, 1, 2])
+    with pytest.raises(error):
+        restore_snapshot(pick, snapshot, env_idx, source)
+
+
+def test_a_stock_env_is_refused_in_words() -> None:
+    import gymnasium as gym
+
+    stock = gym.make("PickCube-v1", num_envs=1, render_backend="none").unwrapped
+    with pytest.raises(NotImplementedError, match="workbench.make"):
+        take_snapshot(stock)
+    stock.close()
+
+
+@pytest.mark.gpu
+def test_a_gpu_env_goes_back_to_where_it_was() -> None:
+    options = EnvOptions(4, "gpu", render=False, kwargs={"obs_mode": "state"})
+    env = make_env(PICK_CUBE, options)
+    env.reset(seed=[0, 1, 2, 3])
+    after_reset = env.get_state()
+    snapshot = pickle.loads(pickle.dumps(take_snapshot(env)))
+    for action in random_actions(env, 5, 0):
+        env.step(action)
+    restore_snapshot(env, snapshot, [0, 2])
+    torch.testing.assert_close(env.get_state()[[0, 2]], after_reset[[0, 2]], atol=1e-5, rtol=0)
+    assert not torch.allclose(env.get_state()[1], after_reset[1])
+    assert env.elapsed_steps.tolist() == [0, 5, 0, 5]
+    env.close()

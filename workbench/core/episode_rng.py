@@ -1,0 +1,113 @@
+"""The random generators of a running task, to be put back later.
+
+ManiSkill gives every env two numpy generators: one that its episodes draw from and one that draws
+the seeds of episodes. ``RandomState.get_state`` converts 624 numbers one by one, 55 us a generator,
+which for 64 envs is a third of a control step. Few tasks draw between resets, so the generators are
+read in full only when their bytes in memory differ from those that were seen last (0.2 us a generator; numpy
+publishes the address, ``BitGenerator.ctypes.state_address``). One thing lies elsewhere: every second normal
+number is kept aside, and taking it changes no byte. While one is kept, all are read anew.
+
+torch, numpy and Python have one generator each for the whole process. They belong to no env, and to the
+author's training loop as much as to the task, so they are put back only when a whole batch is
+put back in its place: then the episode goes on with the draws that it had.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import random
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+_MEMORY = ctypes.c_char * (624 * 4 + 4)
+"""numpy's ``mt19937_state``: the key, then the position as an int."""
+_HAS_GAUSS = 3
+"""Where ``RandomState.get_state()`` tells whether a normal number is kept aside."""
+
+RngState = tuple[Any, ...]
+"""What ``RandomState.get_state()`` gives."""
+
+
+@dataclass(frozen=True)
+class SharedRng:
+    """The generators of the process."""
+
+    torch_cpu: np.ndarray
+    torch_device: np.ndarray | None
+    """The CUDA generator's, for an env whose tensors live there."""
+    numpy: RngState
+    python: Any
+
+
+@dataclass
+class _Seen:
+    generators: list[np.random.RandomState]
+    """Held: an address is somebody else's once its owner is gone."""
+    memory: list[ctypes.Array[ctypes.c_char]]
+    """Where the state of each lies; not a copy."""
+    copied: bytes
+    """What lay there."""
+    states: list[RngState]
+    settled: bool
+    """Whether none keeps a normal number aside."""
+
+
+class RngReader:
+    """Reads the generators of one env object, and remembers what it read."""
+
+    def __init__(self) -> None:
+        self._seen: dict[str, _Seen] = {}
+
+    def read(self, purpose: str, generators: list[np.random.RandomState]) -> list[RngState]:
+        """What ``get_state()`` of each gives. `purpose` tells one list of generators from another."""
+        seen = self._seen.get(purpose)
+        if seen is not None and seen.settled and seen.generators == generators:
+            if b"".join(seen.memory) == seen.copied:
+                return seen.states
+        states: list[RngState] = [generator.get_state() for generator in generators]  # type: ignore[misc]
+        bit_generators = [generator._bit_generator for generator in generators]
+        # A RandomState may be made over another bit generator, whose memory is laid out in its own way.
+        if all(isinstance(b, np.random.MT19937) for b in bit_generators):
+            memory = [_MEMORY.from_address(b.ctypes.state_address) for b in bit_generators]
+            settled = not any(state[_HAS_GAUSS] for state in states)
+            self._seen[purpose] = _Seen(list(generators), memory, b"".join(memory), states, settled)
+        return states
+
+    def write(
+        self,
+        purpose: str,
+        generators: list[np.random.RandomState],
+        env_idx: list[int],
+        states: list[RngState],
+    ) -> None:
+        """Put the generators of some envs back, in place: ManiSkill has more than one name for the first env's."""
+        now = list(self.read(purpose, generators))
+        for i, state in zip(env_idx, states, strict=True):
+            if now[i] is not state:
+                generators[i].set_state(state)
+                now[i] = state
+        seen = self._seen.get(purpose)
+        if seen is not None:
+            # So that putting back the same snapshot again finds the very states that it would write.
+            seen.states, seen.copied = now, b"".join(seen.memory)
+            seen.settled = not any(state[_HAS_GAUSS] for state in now)
+
+
+def read_shared_rng(device: torch.device) -> SharedRng:
+    return SharedRng(
+        torch.get_rng_state().numpy(),
+        torch.cuda.get_rng_state(device).numpy() if device.type == "cuda" else None,
+        np.random.get_state(),  # type: ignore[arg-type]
+        random.getstate(),
+    )
+
+
+def write_shared_rng(state: SharedRng, device: torch.device) -> None:
+    torch.set_rng_state(torch.from_numpy(state.torch_cpu.copy()))
+    if state.torch_device is not None and device.type == "cuda":
+        torch.cuda.set_rng_state(torch.from_numpy(state.torch_device.copy()), device)
+    np.random.set_state(state.numpy)
+    random.setstate(state.python)

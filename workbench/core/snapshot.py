@@ -1,0 +1,243 @@
+"""Snapshots of chosen envs: everything that decides how an episode goes on, kept and put back.
+
+A simulation state alone does not decide it. What does is gathered from five places: PhysX's bodies, joints
+and drive targets (`cpu_state`), controllers and whatever tensors the task keeps on itself (`task_buffers`), steps
+elapsed, and the random generators (`episode_rng`). All of it is copied a row an env, so the state of one env
+can be put back where it was, into another env, into all, or by name into an env that was built anew.
+
+How exact that is. *Two restores of a snapshot go on alike*, whatever the env did in between, because a restored
+env gets a PhysX scene without a past (`fresh_physics`). *A restore goes on as the uninterrupted run did* except
+for what PhysX keeps to itself: contact caches, the order in which it solves contacts, and the last bit of an
+articulation's root, which it holds by its centre of mass and rounds when it is set. Measured over all 46
+tasks that ship with ManiSkill, five control steps after a restore, as the largest difference of any number of the
+state (velocities included): nothing for a cart-pole, about 1e-7 in free motion (PushT 6e-6, PickCube 1e-5), 1e-4 to
+5e-3 where bodies press on each other, up to 9e-2 for hands and legged robots in full contact. In the three humanoid
+tasks two restores also differ, by up to 5e-2. ``web_assets/docs/task_ids.md`` has every task's two figures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from mani_skill.envs.sapien_env import BaseEnv
+from numpy.typing import NDArray
+
+from workbench.core import seams
+from workbench.core.cpu_state import (
+    CpuEnvState,
+    CpuStatePlan,
+    plan_cpu_state,
+    read_cpu_state,
+    write_cpu_state,
+)
+from workbench.core.episode_rng import RngReader, RngState, SharedRng, read_shared_rng, write_shared_rng
+from workbench.core.gpu_state import GpuEnvState, read_gpu_state, write_gpu_state
+from workbench.core.task_buffers import TaskState, read_task_state, write_task_state
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What is not in the simulation: n envs of a batch of N."""
+
+    elapsed_steps: NDArray[np.int32]
+    """(n,) control steps since each env's reset."""
+    episode_seeds: NDArray[np.int64]
+    """(n,) as `seams.episode_seeds`."""
+    rng: dict[str, list[RngState]]
+    """(n,) each: ManiSkill's generators of each env, by purpose."""
+    task: TaskState
+    shared_rng: SharedRng
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """Chosen envs at one moment. Holds copies only: it can be pickled, and outlives its env."""
+
+    num_envs: int
+    """N, of the env that it was taken of."""
+    env_idx: tuple[int, ...]
+    """(n,) which of them."""
+    simulation: tuple[CpuEnvState, ...] | tuple[GpuEnvState, ...]
+    """(n,)"""
+    memory: Memory
+
+    @property
+    def omitted(self) -> dict[str, str]:
+        """What the task remembers and could not be kept: path and reason."""
+        return self.memory.task.omitted
+
+
+@dataclass(frozen=True)
+class RestoreReport:
+    """What a restore carried: actors, articulations, and attributes of the task by path."""
+
+    carried: tuple[str, ...]
+    not_carried: dict[str, str]
+    """Name and reason; empty when a snapshot is put back where it was taken."""
+
+
+def take_snapshot(env: BaseEnv, env_idx: Sequence[int] | None = None) -> Snapshot:
+    """Copy the state of the envs in `env_idx`, or of all.
+
+    Args:
+        env: an unwrapped ManiSkill env, batched on the CPU or on the GPU, reset at least once.
+
+    Raises:
+        IndexError, ValueError: `env_idx` names envs that are not there, one twice, or none.
+        NotImplementedError: a stock CPU env.
+    """
+    chosen = _checked(range(env.num_envs) if env_idx is None else env_idx, env.num_envs)
+    px = seams.batched_system(env.scene)
+    if px is not None:
+        simulation: Any = read_cpu_state(env, _plan(env), chosen)
+    else:
+        _require_gpu(env)
+        simulation = read_gpu_state(env, chosen)
+    return Snapshot(env.num_envs, tuple(chosen), tuple(simulation), take_memory(env, chosen))
+
+
+def restore_snapshot(
+    env: BaseEnv,
+    snapshot: Snapshot,
+    env_idx: Sequence[int] | None = None,
+    source: int | Sequence[int] | None = None,
+    fresh_physics: bool = True,
+) -> RestoreReport:
+    """Put the state of envs of a snapshot into envs of `env`; its other envs are not touched.
+
+    ``restore_snapshot(env, s)`` puts every env back where it was; ``restore_snapshot(env, s, [7], source=3)`` env
+    3's state into env 7; ``restore_snapshot(env, s, range(env.num_envs), source=3)`` into all.
+
+    The env may be another: made anew, or of an edited task. Then actors and articulations are matched by
+    name, articulations also by the names of their joints, and attributes of the task by name and shape.
+    What holds for a whole batch (counters, the process's random generators) is put back when all envs
+    of the env go back where they were in a snapshot of as many.
+
+    Afterwards the tensors, poses and contact queries are those of the restored moment. ``env._last_obs`` is not:
+    ask ``env.get_obs(env.get_info())``, or use `TaskEnv.restore`, which does.
+
+    Args:
+        env_idx: the envs to be set; None for those that the snapshot was taken of.
+        source: whose state they get, as numbered in the env of the snapshot: one for all, or one each. None:
+            each its own; or if the snapshot has a single env, that one.
+        fresh_physics: whether the envs get a PhysX scene without a past, and so go on in the same way to the
+            last bit, whatever they did before. Without, a restore is several times as fast, and contacts that
+            an env has or gets later may be solved in another order (see `fresh_physics`).
+
+    Raises:
+        IndexError, ValueError: `env_idx` or `source` names envs that are not there, or the numbers differ.
+        TypeError: a GPU env's snapshot for a CPU env, or the other way round.
+    """
+    targets, positions = _pairs(env, snapshot, env_idx, source)
+    px = seams.batched_system(env.scene)
+    states: Any = [snapshot.simulation[k] for k in positions]
+    if isinstance(states[0], CpuEnvState) != (px is not None):
+        raise TypeError(
+            "a snapshot of CPU simulation cannot be put into GPU simulation, nor the other way round"
+        )
+    if px is not None:
+        carried, missed = write_cpu_state(env, _plan(env), targets, states, fresh_physics)
+    else:
+        _require_gpu(env)
+        carried, missed = write_gpu_state(env, targets, states)
+    whole = snapshot.num_envs == env.num_envs and [snapshot.env_idx[k] for k in positions] == list(
+        range(env.num_envs)
+    )
+    more, less = restore_memory(env, snapshot.memory, targets, positions, whole)
+    return RestoreReport((*carried, *more), {**missed, **less})
+
+
+def take_memory(env: BaseEnv, env_idx: list[int]) -> Memory:
+    """Copy what is not in the simulation; see `Memory`."""
+    seeds = seams.episode_seeds(env)
+    reader = _rng_readers.setdefault(env, RngReader())
+    generators = seams.episode_generators(env)
+    return Memory(
+        elapsed_steps=env.elapsed_steps.cpu().numpy()[env_idx].astype(np.int32),
+        episode_seeds=np.zeros(len(env_idx), np.int64)
+        if seeds is None
+        else np.array(seeds, np.int64)[env_idx],
+        rng={name: _chosen(reader.read(name, every), env_idx) for name, every in generators.items()},
+        task=read_task_state(env, env_idx),
+        shared_rng=read_shared_rng(env.device),
+    )
+
+
+def restore_memory(
+    env: BaseEnv, memory: Memory, env_idx: list[int], positions: list[int], whole: bool
+) -> tuple[dict[str, None], dict[str, str]]:
+    """Put entry ``positions[k]`` of `memory` into env ``env_idx[k]``; returns what was carried, and not.
+
+    Args:
+        whole: all envs go back where they were, so what holds for the batch does too.
+    """
+    steps = env.elapsed_steps
+    steps[env_idx] = steps.new_tensor(memory.elapsed_steps[positions])
+    seams.keep_episode_seeds(env, env_idx, memory.episode_seeds[positions])
+    reader = _rng_readers.setdefault(env, RngReader())
+    generators = seams.episode_generators(env)
+    for name, states in memory.rng.items():
+        reader.write(name, generators[name], env_idx, _chosen(states, positions))
+    if whole:
+        write_shared_rng(memory.shared_rng, env.device)
+    return write_task_state(env, memory.task, env_idx, positions, whole)
+
+
+_plans: WeakKeyDictionary[Any, CpuStatePlan] = WeakKeyDictionary()
+_rng_readers: WeakKeyDictionary[Any, RngReader] = WeakKeyDictionary()
+
+
+def _plan(env: BaseEnv) -> CpuStatePlan:
+    if env.scene not in _plans:
+        _plans[env.scene] = plan_cpu_state(env)
+    return _plans[env.scene]
+
+
+def _chosen(items: list[RngState], positions: list[int]) -> list[RngState]:
+    return [items[k] for k in positions]
+
+
+def _require_gpu(env: BaseEnv) -> None:
+    if not env.scene.gpu_sim_enabled:
+        raise NotImplementedError(
+            "snapshots are of envs that are batched: make this one with workbench.make, with num_envs=1 if need be"
+        )
+
+
+def _checked(env_idx: Sequence[int], num_envs: int) -> list[int]:
+    chosen = [int(i) for i in env_idx]
+    if not chosen:
+        raise ValueError("env_idx is empty: name the envs, or leave it out for all")
+    if any(not 0 <= i < num_envs for i in chosen):
+        raise IndexError(f"env_idx {chosen} is out of range for {num_envs} envs")
+    if len(set(chosen)) < len(chosen):
+        raise ValueError(f"env_idx {chosen} names an env twice")
+    return chosen
+
+
+def _pairs(
+    env: BaseEnv, snapshot: Snapshot, env_idx: Sequence[int] | None, source: int | Sequence[int] | None
+) -> tuple[list[int], list[int]]:
+    """The envs to be set, and for each the position of its source in the snapshot."""
+    if env_idx is None and source is not None:
+        raise ValueError("source says whose state to put; env_idx must say into which envs")
+    targets = _checked(snapshot.env_idx if env_idx is None else env_idx, env.num_envs)
+    if source is None:
+        sources = [snapshot.env_idx[0]] * len(targets) if len(snapshot.env_idx) == 1 else targets
+    elif isinstance(source, (int, np.integer)):
+        sources = [int(source)] * len(targets)
+    else:
+        sources = [int(i) for i in source]
+    if len(sources) != len(targets):
+        raise ValueError(f"{len(sources)} sources for {len(targets)} envs")
+    position = {i: k for k, i in enumerate(snapshot.env_idx)}
+    missing = sorted(set(sources) - set(position))
+    if missing:
+        raise IndexError(
+            f"the snapshot was taken of envs {list(snapshot.env_idx)}: it has no state of {missing}"
+        )
+    return targets, [position[i] for i in sources]
