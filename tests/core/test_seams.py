@@ -10,6 +10,7 @@ from functools import cached_property
 import pytest
 import sapien
 import sapien.physx as physx
+from mani_skill.agents.controllers import pd_ee_pose
 from mani_skill.agents.controllers.utils.kinematics import Kinematics
 from mani_skill.envs import sapien_env
 from mani_skill.envs.scene import ManiSkillScene
@@ -21,6 +22,7 @@ from mani_skill.utils.structs.articulation_joint import ArticulationJoint
 from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct
 from mani_skill.utils.structs.link import Link
 from mani_skill.utils.structs.render_camera import RenderCamera
+from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 
 from workbench.core.cpu_scene import SIM_BACKEND
 from workbench.core.cpu_system import BatchedCpuSystem
@@ -85,10 +87,25 @@ def test_the_env_builds_its_scene_and_seeds_where_the_core_does() -> None:
     assert callable(BatchedRNG.from_seeds)
 
 
-def test_kinematics_choose_their_solver_by_device() -> None:
+def test_end_effector_control_solves_by_device_and_aims_by_the_scene() -> None:
     assert 'self.device.type == "cuda"' in inspect.getsource(Kinematics.__init__)
-    assert "self.use_gpu_ik = True" in inspect.getsource(Kinematics._setup_gpu)
-    assert callable(Kinematics._setup_cpu)
+    solve = inspect.getsource(Kinematics.compute_ik)
+    assert "return None" in solve and "pose.sp" in solve  # what is done where no answer is found; one env
+    # What seams._set_ee_action_of_each_env says anew, for all envs: word for word as it was read.
+    action = inspect.getsource(pd_ee_pose)
+    for line in (
+        "ik_via_target_pose = self.config.use_target or not self.scene.gpu_sim_enabled",
+        "self._target_pose = self.compute_target_pose(prev_ee_pose_at_base, action)",
+        "q0=self.articulation.get_qpos()",
+        "self._target_qpos = self._start_qpos",
+        "self._step_size = (self._target_qpos - self._start_qpos) / self._sim_steps",
+    ):
+        assert line in action, line
+
+
+def test_one_wrapper_asks_for_a_gpu_by_asking_for_the_path() -> None:
+    assert "not self.base_env.gpu_sim_enabled" in inspect.getsource(CPUGymWrapper.__init__)
+    assert isinstance(sapien_env.BaseEnv.__dict__["gpu_sim_enabled"], property)
 
 
 def test_cpu_systems_can_be_packed() -> None:

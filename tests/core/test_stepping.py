@@ -1,6 +1,7 @@
 """Threads and merged substeps: the same bits as env after env, and no hook that can tell."""
 
 # pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportCallIssue=false
+# pyright: reportOptionalIterable=false
 
 from __future__ import annotations
 
@@ -23,7 +24,7 @@ PICK_CUBE = REGISTERED_ENVS["PickCube-v1"].cls
 
 def trajectory(task: type[BaseEnv], threads: int, steps: int = 30, num_envs: int = 5) -> list[bytes]:
     env = batched_class(task)(num_envs=num_envs, **STATE_ONLY)
-    env.scene.px._stepper.threads = threads
+    env.scene.px.stepper.threads = threads
     env.reset(seed=list(range(num_envs)))
     rng = np.random.default_rng(0)
     packs = []
@@ -144,5 +145,5 @@ def test_an_error_in_a_control_step_leaves_no_substep_owed() -> None:
     env.reset(seed=[0, 1])
     with pytest.raises(KeyError):
         env.step(np.zeros((2, 8), np.float32))
-    assert not env.scene.px._stepper.owes
+    assert not env.scene.px.stepper.owes
     env.close()

@@ -238,6 +238,7 @@ def _stage_of(exc: BaseException, stage: str) -> str:
 
 def _hook_definition(cls: type, stage: str, own: Collection[str]) -> tuple[str, int] | None:
     hooks = {
+        "reset": ("_initialize_episode",),
         "evaluate": ("evaluate",),
         "observation": ("_get_obs_extra", "_get_obs_agent"),
         "reward": ("compute_dense_reward", "compute_normalized_dense_reward", "compute_sparse_reward"),

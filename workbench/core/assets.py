@@ -1,47 +1,198 @@
-"""Robots and scenes that must be downloaded first: say which and how, and never ask on stdin.
+"""Robots, objects and scenes that must be downloaded first: say which and how; never ask, never fetch.
 
-ManiSkill asks "download now? (y|n)" on standard input and leaves the process with ``exit()`` when the
-answer is no. A worker has no standard input, and nobody asked for gigabytes; so the question becomes
-an error that names the asset and the command.
+A task says only in part what it needs: some name it in ``asset_download_ids``, a robot names its own,
+and the scene datasets name nothing and fail on a file that is not there, in the middle of building. Where
+ManiSkill notices, it asks "download now? (y|n)" on standard input, leaves the process with ``exit()`` when
+the answer is no, and takes the environment variable MS_SKIP_ASSET_DOWNLOAD_PROMPT for a yes. A worker has no
+standard input, and nobody asked for gigabytes.
+
+So what is known beforehand is checked beforehand, and while the task is built every question, every
+download and every missing file becomes one error that names the asset and the command. The name is
+looked up: ManiSkill's table of downloads says where each is kept, and the missing path lies within.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import inspect
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any
 
+from mani_skill import ASSET_DIR
+from mani_skill.agents import base_agent
+from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.utils import assets, download_asset
+from mani_skill.utils.assets import data
+
+_COMMAND = "python -m mani_skill.utils.download_asset"
+_A_PATH = re.compile(r"(?:/|[A-Za-z]:\\)[^\s'\"]+")
 
 
 class MissingAssets(RuntimeError):
     """The task cannot be built before something is downloaded."""
 
+    def __init__(self, message: str, names: Sequence[str] = ()) -> None:
+        super().__init__(message)
+        self.names = tuple(names)
+        """What ``python -m mani_skill.utils.download_asset`` takes, one for each missing asset."""
 
-def require_assets(task: str, asset_ids: Sequence[str]) -> None:
-    """Raise MissingAssets unless everything in ``asset_download_ids`` is on this machine."""
-    missing = []
-    for asset_id in asset_ids:
-        group = asset_id in assets.DATA_GROUPS
-        sources = assets.expand_data_group_into_individual_data_source_ids(asset_id) if group else [asset_id]
-        missing += [source for source in sources if not assets.is_data_source_downloaded(source)]
-    if missing:
-        commands = "\n".join(f"  python -m mani_skill.utils.download_asset {asset}" for asset in missing)
-        raise MissingAssets(f"{task} needs {', '.join(missing)}, which is not downloaded. Type:\n{commands}")
+
+def require_assets(task: str, asset_ids: Sequence[str], robot_uids: Any = None) -> None:
+    """Raise MissingAssets unless what the task and its robots declare is on this machine.
+
+    Args:
+        asset_ids: the ``asset_download_ids`` that the task was registered with.
+        robot_uids: as the task class takes them: an uid, an agent class, or a tuple of them; see `robots_of`.
+    """
+    names = [name for name in asset_ids if _sources_to_fetch(name)]
+    names += [name for uid in _uids(robot_uids) for name in _missing_for_robot(uid)]
+    if names:
+        raise _missing(task, names)
+
+
+def robots_of(task: type, kwargs: Mapping[str, Any]) -> Any:
+    """``robot_uids`` as the task class will see them: from `kwargs`, else its constructor's default.
+
+    None where the constructor does not name them: it may pass others on to the one that it overrides.
+    """
+    if "robot_uids" in kwargs:
+        return kwargs["robot_uids"]
+    parameter = inspect.signature(task.__init__).parameters.get("robot_uids")
+    return None if parameter is None or parameter.default is inspect.Parameter.empty else parameter.default
+
+
+def assets_at(path: str | Path) -> list[str]:
+    """Which of ManiSkill's downloads put something at `path`, the outermost first; empty if none does.
+
+    A dataset may be kept inside another one's folder, and downloading the outer one clears that folder.
+    """
+    wanted = Path(path)
+    found = []
+    for name, source in assets.DATA_SOURCES.items():
+        if source.target_path is not None:
+            kept_at = Path(source.output_dir) / source.target_path
+            if kept_at == wanted or kept_at in wanted.parents:
+                found.append((len(kept_at.parts), name))
+    return [name for _, name in sorted(found)]
 
 
 @contextmanager
-def refuse_download_prompts() -> Iterator[None]:
-    """While this is on, ManiSkill's download question raises MissingAssets instead of reading stdin."""
+def refuse_downloads(task: str) -> Iterator[None]:
+    """While this is on, whatever `task` still has to be downloaded for raises MissingAssets.
 
-    def refuse(message: str) -> bool:
-        raise MissingAssets(
-            f"{message.split(' Would you')[0]} It is not downloaded. "
-            "Type: python -m mani_skill.utils.download_asset NAME (a robot's or scene's name)"
-        )
+    ManiSkill's question is not asked and its download not begun, whatever the environment variable says.
+    An exception about a file that is not there, where a download would have put it, becomes the cause of
+    a MissingAssets; every other exception passes.
+    """
 
-    asked = download_asset.prompt_yes_no
-    download_asset.prompt_yes_no = refuse
+    def ask(message: str) -> bool:
+        robot = re.search(r"Robot (\S+) has assets", message)
+        if robot is None:
+            raise _missing(task, [], message.split(" Would you")[0])
+        raise _robot_without_file(task, robot[1])
+
+    def download(source: data.DataSource, *args: object, **kwargs: object) -> None:
+        names = [name for name, known in assets.DATA_SOURCES.items() if known is source]
+        raise _missing(task, names)
+
+    stock_ask, stock_download = download_asset.prompt_yes_no, download_asset.download
+    download_asset.prompt_yes_no, download_asset.download = ask, download  # type: ignore[assignment]
     try:
         yield
+    except MissingAssets:
+        raise
+    except Exception as error:
+        names = _named_by(error)
+        if names:
+            raise _missing(task, names) from error
+        path = _robot_file(error.__traceback__)
+        if path is not None and not path.exists():
+            raise MissingAssets(
+                f"{task}: the robot's file {path} does not exist, and ManiSkill has no download for it. "
+                "Correct urdf_path or mjcf_path of the robot's class."
+            ) from error
+        raise
     finally:
-        download_asset.prompt_yes_no = asked
+        download_asset.prompt_yes_no, download_asset.download = stock_ask, stock_download
+
+
+def _missing(task: str, names: Iterable[str], instead: str = "") -> MissingAssets:
+    names = list(dict.fromkeys(names))
+    if not names:
+        return MissingAssets(f"{task}: {instead} Nothing is downloaded by itself. Type: {_COMMAND} NAME")
+    commands = "\n".join(f"  {_COMMAND} {name}" for name in names)
+    are = "is" if len(names) == 1 else "are"
+    return MissingAssets(
+        f"{task} needs {', '.join(names)}, which {are} not downloaded. Type:\n{commands}", names
+    )
+
+
+def _sources_to_fetch(name: str) -> list[str]:
+    """The single downloads behind a name (an asset or a group of them) that are not on this machine."""
+    group = name in assets.DATA_GROUPS
+    sources = assets.expand_data_group_into_individual_data_source_ids(name) if group else [name]
+    return [source for source in sources if not assets.is_data_source_downloaded(source)]
+
+
+def _uids(robot_uids: Any) -> list[str]:
+    several = robot_uids if isinstance(robot_uids, (tuple, list)) else [robot_uids]
+    uids = [robot if isinstance(robot, str) else getattr(robot, "uid", None) for robot in several]
+    return [uid for uid in uids if uid in REGISTERED_AGENTS]
+
+
+def _file_of(uid: str) -> Path | None:
+    agent: Any = REGISTERED_AGENTS[uid].agent_cls
+    path = getattr(agent, "urdf_path", None) or getattr(agent, "mjcf_path", None)
+    return None if path is None else Path(str(path))
+
+
+def _missing_for_robot(uid: str) -> list[str]:
+    path = _file_of(uid)
+    if path is None or path.exists():
+        return []
+    return assets_at(path) or list(REGISTERED_AGENTS[uid].asset_download_ids)
+
+
+def _robot_without_file(task: str, uid: str) -> MissingAssets:
+    names = _missing_for_robot(uid) if uid in REGISTERED_AGENTS else []
+    if names:
+        return _missing(task, names)
+    path = _file_of(uid) if uid in REGISTERED_AGENTS else None
+    return MissingAssets(
+        f"{task}: the robot {uid}'s file {path} does not exist, and ManiSkill has no download for it. "
+        "Correct urdf_path or mjcf_path of the robot's class."
+    )
+
+
+def _named_by(error: Exception) -> list[str]:
+    """The downloads that would bring what the exception says is not there."""
+    text = str(error)
+    advised = re.search(r"mani_skill\.utils\.download_asset\s+([\w/\-]+)", text)
+    if advised is not None and advised[1] in {*assets.DATA_GROUPS, *assets.DATA_SOURCES}:
+        return [advised[1]]
+    paths = [Path(found.rstrip(".,:;)")) for found in _A_PATH.findall(text)]
+    if isinstance(error, OSError) and error.filename is not None:
+        paths.insert(0, Path(str(error.filename)))
+    for path in paths:
+        if Path(ASSET_DIR) in path.parents and not path.exists():
+            names = [name for name in assets_at(path) if not assets.is_data_source_downloaded(name)]
+            # A folder that is there with a file missing was fetched in part: fetch the innermost again.
+            return names or assets_at(path)[-1:]
+    return []
+
+
+def _robot_file(trace: TracebackType | None) -> Path | None:
+    """The path that a robot's loader was at when it failed.
+
+    An agent class that was never registered has no entry in ManiSkill's table of downloads, and the look-up
+    raises a bare KeyError with the robot's uid instead of a word about the file.
+    """
+    while trace is not None:
+        code = trace.tb_frame.f_code
+        if code.co_filename == base_agent.__file__ and "asset_path" in trace.tb_frame.f_locals:
+            return Path(str(trace.tb_frame.f_locals["asset_path"]))
+        trace = trace.tb_next
+    return None

@@ -11,8 +11,9 @@ reach it), and a picture of env i renders env i alone.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import sapien
 import sapien.physx as physx
@@ -25,10 +26,21 @@ from mani_skill.render.utils import can_render
 
 from workbench.core.contacts import CpuArray
 from workbench.core.cpu_system import BatchedCpuSystem
-from workbench.core.seams import install_index_seams, substeps_are_unwatched
+from workbench.core.partial_reset import KeptControllers, others, told_whose_fault
+from workbench.core.seams import asks_for_a_gpu, install_index_seams, substeps_are_unwatched
+from workbench.core.strict import StrictMixin
+from workbench.core.struct_access import install_struct_access
+from workbench.core.task_buffers import note_constructed, note_scene
 
 SIM_BACKEND = "physx_cpu_batched"
 """Not among ManiSkill's ``CPU_SIM_BACKENDS``, the names for which it refuses more than one env."""
+
+
+_NO_WINDOW = (
+    'render_mode="human" and render_human() open SAPIEN\'s viewer on one scene; batched on the CPU there are many, '
+    "and none is needed: `workbench open` with this task's file or id shows all envs in the browser. For pictures "
+    'use render_mode="rgb_array", "sensors" or "all" and render().'
+)
 
 
 class BatchedSimDevice:
@@ -63,9 +75,15 @@ class CpuCameraGroup:
 class BatchedCpuScene(ManiSkillScene):
     """N sub-scenes, each with its own CPU physics and render system, as one ManiSkill scene."""
 
-    def __init__(self, sub_scenes: list[sapien.Scene], **kwargs: Any) -> None:
+    def __init__(
+        self,
+        sub_scenes: list[sapien.Scene],
+        threads: int | None,
+        system_class: type[BatchedCpuSystem] = BatchedCpuSystem,
+        **kwargs: Any,
+    ) -> None:
         super().__init__(sub_scenes, **kwargs)
-        self.px = BatchedCpuSystem(sub_scenes)  # type: ignore[assignment]
+        self.px = system_class(sub_scenes, threads)  # type: ignore[assignment]
         self.gpu_sim_enabled = True
 
     def create_actor_builder(self) -> Any:
@@ -97,6 +115,12 @@ class BatchedCpuScene(ManiSkillScene):
             sub_scene.update_render()
 
     def _gpu_apply_all(self) -> None:
+        if self._needs_fetch:
+            raise RuntimeError(
+                "self.scene._gpu_apply_all() was called twice without self.scene._gpu_fetch_all() between: "
+                "on the GPU that is an error too. Fetch after every apply, and once before the end of "
+                "_initialize_episode, after which ManiSkill applies."
+            )
         self.px.apply_changes()  # type: ignore[union-attr]
         self._needs_fetch = True
 
@@ -108,8 +132,12 @@ class BatchedCpuMixin:
     """Goes in front of a task class; see the module's text."""
 
     num_envs: int
+    _system_class = BatchedCpuSystem
     _workbench_task: type[BaseEnv]
     """The author's class, without this mixin."""
+    _workbench_threads: int | None
+    """How many threads step the envs; None for all cores."""
+    _kept_controllers: KeptControllers | None = None
     _sim_freq: int
     _sim_steps_per_control: int
     _set_scene_config: Any
@@ -122,8 +150,19 @@ class BatchedCpuMixin:
                 "parallel_in_single_scene is not possible with the batched CPU core: the page "
                 "shows all envs side by side without it."
             )
+        if kwargs.get("render_mode") == "human":
+            raise ValueError(_NO_WINDOW)
         kwargs["sim_backend"] = "physx_cpu"
         super().__init__(*args, **kwargs)
+        note_constructed(self)  # type: ignore[arg-type]
+
+    @property
+    def gpu_sim_enabled(self) -> bool:
+        """True for ManiSkill's own code, which is to take its batched path; see `seams.asks_for_a_gpu`."""
+        return self.scene.gpu_sim_enabled and not asks_for_a_gpu(sys._getframe(1))
+
+    def render_human(self) -> Any:
+        raise RuntimeError(_NO_WINDOW)
 
     @property
     def backend(self) -> BackendInfo:
@@ -142,12 +181,45 @@ class BatchedCpuMixin:
     def _sim_device(self, value: sapien.Device) -> None:
         """BaseEnv sets the device that it parsed from the backend: the CPU, as asked in __init__."""
 
+    def reset(self, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
+        untouched = others(self, options)
+        self._kept_controllers = KeptControllers(self, untouched) if untouched else None
+        try:
+            with told_whose_fault(self, untouched):
+                return super().reset(seed=seed, options=options)  # type: ignore[misc]
+        except BaseException:
+            self._drop_writes()
+            raise
+        finally:
+            self._kept_controllers = None
+
+    def _after_reconfigure(self, options: dict[str, Any]) -> None:
+        super()._after_reconfigure(options)  # type: ignore[misc]
+        note_scene(self)  # type: ignore[arg-type]
+
+    def get_info(self) -> dict[str, Any]:
+        # In a reset BaseEnv asks for this right after it reset the controllers, of all envs.
+        if self._kept_controllers is not None:
+            self._kept_controllers.put_back()
+        return super().get_info()  # type: ignore[misc]
+
     def _step_action(self, action: Any) -> Any:
         # Substeps may be done in a row only if nothing of the author's runs between them.
         px: BatchedCpuSystem = self.scene.px  # type: ignore[assignment]
         unwatched = substeps_are_unwatched(self, self._workbench_task)
-        with px.merging(self._sim_steps_per_control if unwatched else 1):
-            return super()._step_action(action)  # type: ignore[misc]
+        try:
+            with px.merging(self._sim_steps_per_control if unwatched else 1):
+                return super()._step_action(action)  # type: ignore[misc]
+        except BaseException:
+            self._drop_writes()
+            raise
+
+    def _drop_writes(self) -> None:
+        # What a hook that raised had written (a NaN, say) would else be applied by every reset that follows,
+        # and what it had applied and not fetched would make the next one raise.
+        if self.scene is not None and self.scene._gpu_sim_initialized:
+            self.scene.px.drop_writes()
+            self.scene._gpu_fetch_all()
 
     def _setup_scene(self) -> None:
         self._set_scene_config()
@@ -159,6 +231,8 @@ class BatchedCpuMixin:
             sub_scenes.append(sapien.Scene(systems))
         self.scene = BatchedCpuScene(
             sub_scenes,
+            self._workbench_threads,
+            self._system_class,
             sim_config=self.sim_config,
             device=self.device,
             backend=self.backend,  # type: ignore
@@ -166,13 +240,24 @@ class BatchedCpuMixin:
         self.scene.px.timestep = 1.0 / self._sim_freq
 
 
-def batched_class(task: type[BaseEnv]) -> type[BaseEnv]:
-    """`task` with the batched CPU simulation in front of it; `task` itself is left as it is."""
+def batched_class(
+    task: type[BaseEnv], threads: int | None = None, strict: bool | Literal["warn"] = False
+) -> type[BaseEnv]:
+    """`task` with the batched CPU simulation in front of it; `task` itself is left as it is.
+
+    Args:
+        strict: True raises where the GPU would silently go wrong, ``"warn"`` only says so; see `strict`.
+    """
     install_index_seams()
+    install_struct_access()
     namespace = {
         "__module__": task.__module__,
         "__doc__": task.__doc__,
         "__qualname__": task.__qualname__,
         "_workbench_task": task,
+        "_workbench_threads": threads,
     }
+    if strict:
+        namespace["_strict_only_warns"] = strict == "warn"
+        return type(task.__name__, (StrictMixin, BatchedCpuMixin, task), namespace)
     return type(task.__name__, (BatchedCpuMixin, task), namespace)

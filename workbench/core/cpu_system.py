@@ -332,6 +332,16 @@ class BatchedCpuSystem:
         self._target_qpos[:] = self._target_qpos_seen[:] = packed[layout.target_qpos_at]
         self._target_qvel[:] = self._target_qvel_seen[:] = packed[layout.target_qvel_at]
 
+    def replace(self, env: int, scene: sapien.Scene) -> None:
+        """Another scene, over another system, has all entities of this env now, in the same order."""
+        self.scenes[env] = scene
+        self.systems[env] = scene.physx_system  # pyright: ignore
+        self.stepper.renew(env)
+
+    def articulation(self, index: int) -> Any:
+        """The PhysxArticulation in this row of the (A, D) tensors."""
+        return self._laid_out.articulations[index]
+
     def packs(self) -> list[bytes]:
         """``PhysxCpuSystem.pack()`` of every env, as it is now."""
         self._catch_up()
@@ -421,6 +431,13 @@ class BatchedCpuSystem:
 
     def gpu_apply_rigid_dynamic_torque(self) -> None:
         self._apply_forces(self._torque, "torque")
+
+    def drop_writes(self) -> None:
+        """Forget what was written to the tensors and not applied."""
+        if self._layout is not None:
+            self._data[:], self._qf[:] = self._data_seen, self._qf_seen
+            self._qpos[:], self._qvel[:] = self._qpos_seen, self._qvel_seen
+            self._target_qpos[:], self._target_qvel[:] = self._target_qpos_seen, self._target_qvel_seen
 
     def _apply_joints(self, now: NDArray[np.float32], seen: NDArray[np.float32], setter: str) -> None:
         for i in np.flatnonzero((now != seen).any(axis=1)):

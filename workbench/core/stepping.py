@@ -51,7 +51,7 @@ class Stepper:
         self._systems, self._scenes = systems, scenes
         native = native_step()
         self.threads = 1 if native is None else (threads or usable_cores())
-        self._step_once: list[Callable[[], None]] = [
+        self.step_once: list[Callable[[], None]] = [
             system.step if native is None else partial(native.call, native.address_of(system))
             for system in systems
         ]
@@ -59,6 +59,14 @@ class Stepper:
         self._in_a_row = 1
         self._packs: list[bytes] | None = None
         self._pose_packs: list[bytes] | None = None
+
+    def renew(self, env: int) -> None:
+        """Another system stands in the list for this env."""
+        native, system = native_step(), self._systems[env]
+        self.step_once[env] = (
+            system.step if native is None else partial(native.call, native.address_of(system))
+        )
+        self.forget()
 
     @property
     def owes(self) -> bool:
@@ -93,7 +101,7 @@ class Stepper:
         packing = count > 1
 
         def advance(env: int) -> None:
-            step = self._step_once[env]
+            step = self.step_once[env]
             for _ in range(count):
                 step()
             if packing:

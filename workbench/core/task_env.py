@@ -17,12 +17,21 @@ from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
 from workbench.core import actions
-from workbench.core.assets import refuse_download_prompts, require_assets
+from workbench.core.assets import refuse_downloads, require_assets, robots_of
 from workbench.core.backends import choose_backend
 from workbench.core.body_table import BodyTable, build_body_table, read_poses
+from workbench.core.contact_list import Contact, list_contacts
 from workbench.core.cpu_scene import batched_class
 from workbench.core.render_device import keep_render_device
-from workbench.core.seams import episode_seeds, set_episode_seeds
+from workbench.core.seams import episode_seeds, keep_observation, set_episode_seeds
+from workbench.core.snapshot import (
+    RestoreReport,
+    Snapshot,
+    restore_memory,
+    restore_snapshot,
+    take_memory,
+    take_snapshot,
+)
 from workbench.core.step import StepResult
 
 Backend = Literal["auto", "cpu", "gpu"]
@@ -37,12 +46,20 @@ class EnvOptions:
     """``cpu``: batched on the CPU. ``gpu``: ManiSkill's GPU simulation. ``auto``: the GPU if it works."""
     render: bool = True
     """False makes no render system: no pictures, and nothing asked of a graphics driver."""
+    threads: int | None = None
+    """Threads that step the envs of the CPU core; None for one on each core that the process may use."""
+    strict: bool | Literal["warn"] = False
+    """True raises where GPU simulation would silently go wrong, ``"warn"`` says so and goes on (on the CPU;
+    see `strict`, also for what it costs)."""
     kwargs: Mapping[str, Any] = field(default_factory=dict)
-    """Further keyword arguments of the task class: ``obs_mode``, ``robot_uids``, ``control_mode`` ..."""
+    """Further keyword arguments of the task class: ``obs_mode``, ``robot_uids``, ``control_mode`` ... A
+    ``render_backend`` among them is used instead of the one that is found."""
 
     def __post_init__(self) -> None:
         if self.num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, not {self.num_envs}")
+        if self.threads is not None and self.threads < 1:
+            raise ValueError(f"threads must be at least 1, or None for all cores, not {self.threads}")
 
 
 def make_env(
@@ -52,28 +69,42 @@ def make_env(
     asset_ids: Sequence[str] = (),
     default_kwargs: Mapping[str, Any] | None = None,
 ) -> BaseEnv:
-    """The task class with N envs, unwrapped, as ``gym.make(...).unwrapped`` would give it.
+    """The task class with N envs, unwrapped, and with a reward whatever its class implements.
 
     Raises:
         MissingAssets: the task or its robot needs a download; names it and the command.
         BackendUnavailable: ``backend="gpu"`` on a machine that cannot.
         Exception: whatever the author's class raises while it builds.
     """
-    require_assets(task.__name__, asset_ids)
-    backend = choose_backend(options.backend, options.render)
-    kwargs: dict[str, Any] = {
-        **(default_kwargs or {}),
-        "reward_mode": default_reward_mode(task),
-        **options.kwargs,
-    }
-    kwargs["render_backend"] = backend.render_backend
-    kwargs["num_envs"] = options.num_envs
-    if backend.render_backend != "none":
-        keep_render_device(backend.render_backend)
-    with refuse_download_prompts():
+    reward = {"reward_mode": default_reward_mode(task)}
+    return build_env(task, options, asset_ids=asset_ids, default_kwargs={**reward, **(default_kwargs or {})})
+
+
+def build_env(
+    task: type[BaseEnv],
+    options: EnvOptions,
+    *,
+    asset_ids: Sequence[str] = (),
+    default_kwargs: Mapping[str, Any] | None = None,
+) -> BaseEnv:
+    """The task class with N envs, unwrapped, as ``gym.make(...).unwrapped`` would give it; raises as `make_env`.
+
+    What is not among the keyword arguments is left to the class: the reward mode then is the first of
+    ``SUPPORTED_REWARD_MODES``, implemented or not.
+    """
+    kwargs = {**(default_kwargs or {}), **options.kwargs, "num_envs": options.num_envs}
+    require_assets(task.__name__, asset_ids, robots_of(task, kwargs))
+    # None is ManiSkill's other word for "none".
+    wanted = (kwargs.get("render_backend", "found") or "none") if options.render else "none"
+    # A process has one render device: another must not be looked for when one is named.
+    backend = choose_backend(options.backend, render=wanted == "found")
+    kwargs["render_backend"] = backend.render_backend if wanted == "found" else wanted
+    if kwargs["render_backend"] != "none":
+        keep_render_device(kwargs["render_backend"])
+    with refuse_downloads(task.__name__):
         if backend.simulation == "gpu":
             return task(sim_backend="physx_cuda", **kwargs)
-        return batched_class(task)(**kwargs)
+        return batched_class(task, options.threads, options.strict)(**kwargs)
 
 
 def default_reward_mode(task: type[BaseEnv]) -> str:
@@ -173,6 +204,31 @@ class TaskEnv:
             self._check(info, reward)
         return self._result(info, to_numpy(reward).astype(np.float32), to_numpy(terminated), action)
 
+    def snapshot(self, env_idx: Sequence[int] | None = None) -> Snapshot:
+        """Everything that decides how the episodes of these envs (None: of all) go on; see `snapshot`."""
+        return take_snapshot(self.env, env_idx)
+
+    def restore(
+        self,
+        snapshot: Snapshot,
+        env_idx: Sequence[int] | None = None,
+        source: int | Sequence[int] | None = None,
+        fresh_physics: bool = True,
+    ) -> tuple[StepResult, RestoreReport]:
+        """Put envs back, as `restore_snapshot` does, and observe and evaluate what is there now.
+
+        The step's reward is zero, as after a reset: a reward is for an action, and none was made.
+        """
+        report = restore_snapshot(self.env, snapshot, env_idx, source, fresh_physics)
+        # `evaluate` may count and draw, and asks about all envs: that must not happen to them twice.
+        every = list(range(self.num_envs))
+        memory = take_memory(self.env, every)
+        info = self.env.get_info()
+        self.obs = self.env.get_obs(info)
+        keep_observation(self.env, self.obs)
+        restore_memory(self.env, memory, every, every, whole=True)
+        return self._result(info, np.zeros(self.num_envs, np.float32), self._terminated(info), None), report
+
     @property
     def observes_pictures(self) -> bool:
         """Whether every step draws the scene for the observation."""
@@ -182,6 +238,10 @@ class TaskEnv:
     def episode_seeds(self) -> NDArray[np.int64]:
         """(N,) the seeds that the envs were last reset with."""
         return np.array(episode_seeds(self.env), dtype=np.int64)
+
+    def contacts(self, env: int) -> tuple[Contact, ...]:
+        """What touches what in one env, in its last substep; see `list_contacts`."""
+        return list_contacts(self.env, env, self.table)
 
     def close(self) -> None:
         self.env.close()

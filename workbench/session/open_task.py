@@ -20,11 +20,12 @@ import numpy as np
 from workbench.authoring import registry
 from workbench.authoring.load import LoadedTask, load_task, take_back, with_late_imports
 from workbench.authoring.problem import Problem, TaskError, problem_from_exception
-from workbench.authoring.returns import check_step_returns
+from workbench.authoring.returns import check_step_returns, problem_from_return
 from workbench.core import actions
 from workbench.core.backends import find_renderer
 from workbench.core.scene_geometry import read_geometry
 from workbench.core.step import StepResult
+from workbench.core.strict import BrokenRule, WrongReturn
 from workbench.core.take_pictures import list_cameras, segmentation_names
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env
 from workbench.session.messages import ActionDimension, TaskDescription, TaskOptions
@@ -74,7 +75,13 @@ def _build(
     with _blamed("build", loaded):
         env = make_env(
             loaded.cls,
-            EnvOptions(num_envs=options.num_envs, backend=options.backend, kwargs=options.env_kwargs),
+            EnvOptions(
+                num_envs=options.num_envs,
+                backend=options.backend,
+                # An installed task is not its reader's to mend: its faults are told, and it is shown.
+                strict=True if loaded.followed else "warn",
+                kwargs=options.env_kwargs,
+            ),
             asset_ids=_asset_ids(loaded),
             default_kwargs=loaded.default_kwargs,
         )
@@ -191,8 +198,11 @@ class _blamed:
 
     def _problem(self, error: BaseException) -> Problem:
         loaded = self._loaded
+        if isinstance(error, WrongReturn):
+            return problem_from_return(loaded.cls, error.hook, error.said, loaded.source_files)
         env = self._task.env if self._task is not None else _env_on_traceback(error, loaded.cls)
-        if env is not None and not _raised_in(error, loaded.source_files):
+        known = isinstance(error, BrokenRule) or _raised_in(error, loaded.source_files)
+        if env is not None and not known:
             # Raised in ManiSkill's own code, most often over what evaluate() returned; the last line of
             # the author's on the traceback is then only their call of super().__init__().
             try:

@@ -1,0 +1,125 @@
+"""A reset of some envs that leaves the others alone, and says whose fault it is when it cannot.
+
+Two things go wrong in ``BaseEnv.reset(options={"env_idx": ...})`` that a single env never meets. First,
+ManiSkill 3.0.1 resets the controllers of every env: it sets the reset mask back to all ones and only then
+calls ``controller.reset()``, though each controller asks that mask which envs it may touch. A controller with
+``use_target`` drives towards a target that it remembers, so in each env that was *not* reset the target jumps
+to where the joints happen to be, and the env no longer does what it would do alone. So what the
+controllers of the other envs remember is kept aside and put back before the first observation.
+
+Second, many tasks have never been reset in part: a hook that makes ``num_envs`` rows where ``len(env_idx)``
+are wanted, or replaces a buffer of N rows by one of the subset's. The exception is then a torch message
+about sizes, often raised in a hook that is right. The traceback stays as it is, and gets a note that names the
+task's line and the buffers that shrank.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from mani_skill.agents.controllers.base_controller import BaseController, CombinedController
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.structs import Pose
+
+_CORE = str(Path(__file__).parent)
+
+
+class KeptControllers:
+    """What the active controllers remember of some envs: start, target and whatever else has a row an env."""
+
+    def __init__(self, env: Any, kept_envs: list[int]) -> None:
+        self._rows = torch.tensor(kept_envs, dtype=torch.long, device=env.device)
+        self._kept: list[tuple[BaseController, str, torch.Tensor]] = []
+        for controller in active_controllers(env):
+            for name, value in vars(controller).items():
+                rows = value.raw_pose if isinstance(value, Pose) else value
+                if isinstance(rows, torch.Tensor) and rows.shape[:1] == (env.num_envs,):
+                    self._kept.append((controller, name, rows[self._rows].clone()))
+
+    def put_back(self) -> None:
+        for controller, name, rows in self._kept:
+            value = getattr(controller, name)
+            (value.raw_pose if isinstance(value, Pose) else value)[self._rows] = rows
+
+
+def active_controllers(env: Any) -> list[BaseController]:
+    """The controllers in use, those within combined ones singly; none for a task without a robot."""
+    agent = env.agent
+    if agent is None:
+        return []
+    several = agent.controller.values() if isinstance(agent.controller, dict) else [agent.controller]
+    single: list[BaseController] = []
+    for controller in several:
+        combined = isinstance(controller, CombinedController)
+        single += controller.controllers.values() if combined else [controller]
+    return single
+
+
+def others(env: Any, options: dict[str, Any] | None) -> list[int]:
+    """The envs that a reset with these options does not touch; empty for a reset of all."""
+    chosen = (options or {}).get("env_idx")
+    if chosen is None:
+        return []
+    return sorted(set(range(env.num_envs)) - {int(i) for i in chosen})
+
+
+@contextmanager
+def told_whose_fault(env: Any, untouched: list[int]) -> Iterator[None]:
+    """Add a note to an exception that leaves a reset by way of the task's own code."""
+    before = _buffers(env) if untouched else {}
+    try:
+        yield
+    except Exception as error:
+        line = _line_of_the_task(error, env)
+        rows = env.num_envs - len(untouched)
+        shrunk = [
+            name
+            for name, value in _buffers(env).items()
+            if untouched and name in before and len(before[name]) == env.num_envs and len(value) == rows
+        ]
+        if line is not None or shrunk:
+            error.add_note(_note(env, untouched, line, shrunk))
+        raise
+
+
+def _note(env: BaseEnv, untouched: list[int], line: traceback.FrameSummary | None, shrunk: list[str]) -> str:
+    where = "" if line is None else f" {Path(line.filename).name}:{line.lineno}, in {line.name}."
+    note = f"This error is {type(env).__name__}'s own, not the batched core's:{where or ' see below.'}"
+    if not untouched:
+        return note
+    chosen = [i for i in range(env.num_envs) if i not in untouched]
+    note += (
+        f" Envs {chosen} of {env.num_envs} were being reset: _initialize_episode must make len(env_idx) rows, "
+        "not num_envs, and write what it keeps on self as `self.x[env_idx] = ...`."
+    )
+    if shrunk:
+        names = ", ".join(f"self.{name}" for name in shrunk)
+        note += f" It replaced {names}: {env.num_envs} rows before, {len(chosen)} now."
+    return note + " ManiSkill's GPU simulation runs the same code."
+
+
+def _buffers(env: BaseEnv) -> dict[str, torch.Tensor]:
+    return {n: v for n, v in vars(env).items() if isinstance(v, torch.Tensor) and v.ndim > 0}
+
+
+def _line_of_the_task(error: Exception, env: BaseEnv) -> traceback.FrameSummary | None:
+    """The innermost line in a file of the task's classes; None where the core broke below it."""
+    files = _files_of_task(env)
+    found, below = None, False
+    for frame in traceback.extract_tb(error.__traceback__):
+        if frame.filename in files:
+            found, below = frame, False
+        below |= frame.filename.startswith(_CORE)
+    # A ValueError is how the core refuses what it is given; anything else from there may be its own mistake.
+    return None if below and not isinstance(error, ValueError) else found
+
+
+def _files_of_task(env: BaseEnv) -> set[str]:
+    classes = [c for c in type(env).__mro__ if issubclass(c, BaseEnv) and c is not BaseEnv]
+    functions = [v for c in classes for v in vars(c).values() if hasattr(v, "__code__")]
+    return {function.__code__.co_filename for function in functions}

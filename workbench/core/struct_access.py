@@ -1,0 +1,157 @@
+"""ManiSkill's setters and getters of state, with words for what goes wrong in them.
+
+In GPU simulation, and so here, the setter of an Actor writes the rows of the envs that are being reset,
+and a value of another batch size stops in torch: "shape mismatch: value tensor of shape [4, 7] cannot be
+broadcast to indexing result of shape [2, 7]". That names no actor and no reset. A static actor stops in
+an assertion, its velocity in a KeyError. The setters are therefore wrapped, once a process: the
+error comes from the author's own call, names the object, and says what batch was wanted. A stock scene
+gets the stock setter and nothing else.
+
+A scene in strict mode is told of every read and write besides (`StrictCpuSystem`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from mani_skill.utils import common
+from mani_skill.utils.structs.actor import Actor
+from mani_skill.utils.structs.articulation import Articulation
+from mani_skill.utils.structs.articulation_joint import ArticulationJoint
+from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct, PhysxRigidDynamicComponentStruct
+from mani_skill.utils.structs.link import Link
+from mani_skill.utils.structs.pose import vectorize_pose
+
+from workbench.core.seams import batched_system
+from workbench.core.strict_system import Group, StrictCpuSystem
+
+Index = Callable[[Any], torch.Tensor]
+
+STATE_PROPERTIES: tuple[tuple[type, str, Group], ...] = (
+    (Actor, "pose", "bodies"),
+    (PhysxRigidDynamicComponentStruct, "linear_velocity", "bodies"),
+    (PhysxRigidDynamicComponentStruct, "angular_velocity", "bodies"),
+    (Link, "pose", "links"),
+    (PhysxRigidBodyComponentStruct, "linear_velocity", "links"),
+    (PhysxRigidBodyComponentStruct, "angular_velocity", "links"),
+    (Articulation, "root_linear_velocity", "links"),
+    (Articulation, "root_angular_velocity", "links"),
+    (Articulation, "qpos", "joints"),
+    (Articulation, "qvel", "joints"),
+    (Articulation, "qf", "forces"),
+    (ArticulationJoint, "qpos", "joints"),
+    (ArticulationJoint, "qvel", "joints"),
+    (ArticulationJoint, "drive_target", "targets"),
+    (ArticulationJoint, "drive_velocity_target", "targets"),
+)
+"""Where ManiSkill keeps what an author reads and sets, and what it is fetched and applied with."""
+
+TARGET_SETTERS = ("set_joint_drive_targets", "set_joint_drive_velocity_targets")
+
+_installed = False
+
+
+def install_struct_access() -> None:
+    """Put the words into ManiSkill's setters and getters. Safe to call again."""
+    global _installed
+    if _installed:
+        return
+    for owner, name, group in STATE_PROPERTIES:
+        stock: property = owner.__dict__[name]
+        getter = _told_reads(stock.fget, name, group)  # type: ignore[arg-type]
+        setter = None if stock.fset is None else _told_writes(stock.fset, name, group)
+        setattr(owner, name, property(getter, setter, doc=stock.__doc__))
+    for name in TARGET_SETTERS:
+        setattr(Articulation, name, _told_targets(Articulation.__dict__[name]))
+    _installed = True
+
+
+def _strict(system: Any) -> StrictCpuSystem | None:
+    return system if type(system) is StrictCpuSystem else None
+
+
+def _rows(struct: Any, group: Group) -> torch.Tensor:
+    """Rows of the group's tensor that hold `struct`, one an env."""
+    if group in ("bodies", "links"):
+        body: Any = struct.root if isinstance(struct, Articulation) else struct
+        return body._body_data_index
+    return struct._data_index
+
+
+def _told_reads(stock: Callable[[Any], Any], name: str, group: Group) -> Callable[[Any], Any]:
+    velocity = name.endswith("velocity")
+
+    def get(self: Any) -> Any:
+        system = self.scene.px
+        if velocity and group == "bodies" and self.px_body_type == "static" and batched_system(self.scene):
+            raise RuntimeError(f"'{self.name}' is static: it has no velocity on the GPU, nor here.")
+        # A hidden actor's pose is not in the tensors, nor is a static one's.
+        if type(system) is StrictCpuSystem and group != "targets" and system.laid_out:
+            if not (group == "bodies" and (self.px_body_type == "static" or self.hidden)):
+                system.about_to_read(self, group, _rows(self, group))
+        return stock(self)
+
+    return get
+
+
+def _told_writes(stock: Callable[[Any, Any], None], name: str, group: Group) -> Callable[[Any, Any], None]:
+    def put(self: Any, value: Any) -> None:
+        system = batched_system(self.scene)
+        if system is None:
+            return stock(self, value)
+        if group == "bodies" and self.px_body_type == "static":
+            raise RuntimeError(
+                f"'{self.name}' is static: on the GPU, and here, a static actor cannot be moved once the scene "
+                "is built. Give it its initial_pose before build_static(), or build it with build_kinematic()."
+            )
+        strict = _strict(system)
+        if strict is not None and strict.laid_out and not (group == "bodies" and self.hidden):
+            strict.about_to_write(self, group, _rows(self, group)[_mask(self)])
+        try:
+            stock(self, value)
+        except (RuntimeError, IndexError) as error:
+            _explain(self, value, name, error)
+            raise
+
+    return put
+
+
+def _told_targets(stock: Callable[..., None]) -> Callable[..., None]:
+    def set_targets(self: Any, targets: Any, joints: Any = None, joint_indices: Any = None) -> None:
+        system = batched_system(self.scene)
+        if system is None:
+            return stock(self, targets, joints, joint_indices)
+        strict = _strict(system)
+        if strict is not None and strict.laid_out:
+            strict.about_to_write(self, "targets", self._data_index[_mask(self)])
+        try:
+            stock(self, targets, joints, joint_indices)
+        except (RuntimeError, IndexError) as error:
+            _explain(self, targets, "drive targets", error)
+            raise
+
+    return set_targets
+
+
+def _mask(struct: Any) -> torch.Tensor:
+    """(M,) which of the objects behind `struct` a setter writes now."""
+    return struct.scene._reset_mask[struct._scene_idxs.long()]
+
+
+def _explain(struct: Any, value: Any, name: str, error: Exception) -> None:
+    """Raise in better words if it was the batch size of `value` that `error` stopped at."""
+    wanted = int(_mask(struct).sum())
+    value = vectorize_pose(value) if name == "pose" else common.to_tensor(value)
+    if value.ndim < 2 or len(value) in (1, wanted):
+        return
+    reset = (
+        "one for each env that is being reset, len(env_idx)"
+        if wanted != len(struct._objs)
+        else "one for each env that has it"
+    )
+    raise ValueError(
+        f"The {name.replace('_', ' ')} of '{struct.name}' was set with a batch of {len(value)} (shape "
+        f"{tuple(value.shape)}), but {wanted} {'row is' if wanted == 1 else 'rows are'} wanted: {reset}."
+    ) from error
