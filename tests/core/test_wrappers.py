@@ -1,0 +1,478 @@
+"""ManiSkill's own wrappers, unchanged, around a batched CPU env."""
+
+# pyright: reportAttributeAccessIssue=false, reportOptionalMemberAccess=false, reportArgumentType=false
+# pyright: reportIndexIssue=false, reportOptionalSubscript=false, reportCallIssue=false
+# pyright: reportOptionalIterable=false
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import json
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import h5py
+import imageio.v2 as imageio
+import mani_skill.envs  # noqa: F401  registers the ids
+import numpy as np
+import pytest
+import torch
+from mani_skill.trajectory import replay_trajectory
+from mani_skill.utils import wrappers
+from mani_skill.utils.registration import REGISTERED_ENVS
+from mani_skill.utils.structs.pose import Pose
+from mani_skill.utils.visualization.misc import tile_images
+from mani_skill.utils.wrappers import (
+    ActionRepeatWrapper,
+    CachedResetWrapper,
+    CPUGymWrapper,
+    FlattenActionSpaceWrapper,
+    FlattenObservationWrapper,
+    FlattenRGBDObservationWrapper,
+    FrameStack,
+    RecordEpisode,
+)
+from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+
+import workbench
+from workbench.core.render_device import keep_render_device
+
+N = 4
+SMALL = {"sensor_configs": {"width": 32, "height": 32}}
+SMALL_HUMAN = {"human_render_camera_configs": {"width": 64, "height": 48}}
+
+
+def made(task: Any = "PushCube-v1", num_envs: int = N, render: bool = False, **kwargs: Any) -> Any:
+    if not render:
+        kwargs["render_backend"] = "none"
+    else:
+        keep_render_device("cpu")
+    return workbench.make(task, num_envs, backend="cpu", **kwargs)
+
+
+def test_every_wrapper_of_maniskill_is_tested_here() -> None:
+    offered = {name for name, value in vars(wrappers).items() if inspect.isclass(value)}
+    source = Path(__file__).read_text()
+    assert offered and all(f"{name}(" in source for name in offered), offered
+    # The one module that the package does not import itself needs packages that ManiSkill does not install.
+    assert importlib.util.find_spec("r3m") is None or importlib.util.find_spec("torchvision") is None
+
+
+# --- ManiSkillVectorEnv ----------------------------------------------------------------------------
+
+
+class SucceedsInTurn(REGISTERED_ENVS["PushCube-v1"].cls):
+    """Env i succeeds in its step 2 + i."""
+
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        return {"success": self.elapsed_steps == 2 + torch.arange(self.num_envs)}
+
+
+def test_auto_reset_resets_the_envs_that_ended_and_keeps_their_last_observation() -> None:
+    env = ManiSkillVectorEnv(made(SucceedsInTurn, obs_mode="state_dict", max_episode_steps=4))
+    plain = made(SucceedsInTurn, obs_mode="state_dict", max_episode_steps=4)
+    assert env.num_envs == N and env.action_space.shape == (N, 8) and env.single_action_space.shape == (8,)
+    assert env.device == torch.device("cpu")
+    env.reset(seed=[1, 2, 3, 4])
+    plain.reset(seed=[1, 2, 3, 4])
+    rng = np.random.default_rng(0)
+    lengths = np.zeros(N, int)
+    ended_once: set[int] = set()
+    for _ in range(6):
+        action = rng.uniform(-1, 1, (N, 8)).astype(np.float32)
+        obs, _, terminated, truncated, info = env.step(action)
+        lengths += 1
+        expected = (lengths == 2 + np.arange(N)) | (lengths == 4)
+        done = torch.as_tensor(terminated) | torch.as_tensor(truncated)
+        assert done.tolist() == expected.tolist()
+        assert terminated.tolist() == (lengths == 2 + np.arange(N)).tolist()
+        assert truncated.tolist() == (lengths == 4).tolist()
+        assert ("final_info" in info) == bool(done.any())
+        if not ended_once:
+            # The same steps without auto-reset: what was seen at the end is kept, the rest goes on.
+            plain_obs, _, _, _, plain_info = plain.step(action)
+            final = info["final_observation"] if done.any() else obs
+            qpos, plain_qpos = final["agent"]["qpos"], plain_obs["agent"]["qpos"]
+            assert torch.equal(qpos, plain_qpos)
+            if done.any():
+                assert torch.equal(obs["agent"]["qpos"][~done], plain_qpos[~done])
+                assert not torch.equal(obs["agent"]["qpos"][done], plain_qpos[done])
+                assert info["_final_observation"].tolist() == info["_final_info"].tolist() == done.tolist()
+                assert info["final_info"]["success"].tolist() == plain_info["success"].tolist()
+                assert info["final_info"]["elapsed_steps"].tolist() == lengths.tolist()
+        lengths[done.numpy()] = 0
+        ended_once |= set(np.flatnonzero(done).tolist())
+        assert info["elapsed_steps"].tolist() == lengths.tolist()
+        assert env.base_env.elapsed_steps.tolist() == lengths.tolist()
+    assert ended_once == set(range(N))
+    env.close()
+    plain.close()
+
+
+def test_ignored_terminations_do_not_end_an_episode_and_metrics_are_kept() -> None:
+    env = ManiSkillVectorEnv(
+        made(SucceedsInTurn, max_episode_steps=4, reward_mode="sparse"),
+        ignore_terminations=True,
+        record_metrics=True,
+    )
+    env.reset(seed=0)
+    total = torch.zeros(N)
+    for step in range(1, 5):
+        _, reward, terminated, truncated, info = env.step(env.action_space.sample())
+        total += torch.as_tensor(reward)
+        assert not terminated.any() and truncated.all() == (step == 4)
+    final = info["final_info"]["episode"]
+    assert final["success_once"].tolist() == [True, True, True, False]  # env 3 would have in its step 5
+    assert final["success_at_end"].tolist() == [False, False, True, False]
+    assert torch.equal(final["return"], total) and final["episode_len"].tolist() == [4] * N
+    assert not env.returns.any() and not env.success_once.any()
+    env.close()
+
+
+def test_without_auto_reset_chosen_envs_are_reset_by_hand() -> None:
+    env = ManiSkillVectorEnv(made(max_episode_steps=2), auto_reset=False, record_metrics=True)
+    env.reset(seed=0)
+    for _ in range(3):
+        _, _, _, truncated, info = env.step(env.action_space.sample())
+    assert truncated.all() and "final_info" not in info
+    before = env.base_env.get_state()
+    returns = env.returns.clone()
+    env.reset(options={"env_idx": torch.tensor([0, 2])})
+    assert env.base_env.elapsed_steps.tolist() == [0, 3, 0, 3]
+    assert torch.equal(env.base_env.get_state()[[1, 3]], before[[1, 3]])
+    assert env.returns.tolist() == [0, returns[1], 0, returns[3]]
+    env.close()
+
+
+def test_partial_resets_are_refused_where_the_scene_is_rebuilt() -> None:
+    env = made(reconfiguration_freq=1)
+    with pytest.raises(AssertionError, match="partial resets"):
+        ManiSkillVectorEnv(env)
+    vector = ManiSkillVectorEnv(env, ignore_terminations=True)
+    scene = env.unwrapped.scene
+    vector.reset(seed=0)
+    assert env.unwrapped.scene is not scene
+    vector.step(vector.action_space.sample())
+    env.close()
+
+
+def test_a_goal_that_is_hidden_moves_with_a_partial_reset() -> None:
+    # Hidden, an object stands 99999 m away and its pose is kept aside: a reset has to write there.
+    env = ManiSkillVectorEnv(
+        made("PickCube-v1", 3, render=True, obs_mode="rgb+state", max_episode_steps=3, **SMALL)
+    )
+    env.reset(seed=0)
+    goals = env.base_env.goal_site.pose.p.clone()
+    for _ in range(3):
+        env.step(env.action_space.sample())
+        assert env.base_env.goal_site.hidden
+    moved = env.base_env.goal_site.pose.p.clone()
+    assert (moved != goals).any(dim=1).all() and moved.abs().max() < 1.0
+    env.reset(options={"env_idx": torch.tensor([1])})
+    again = env.base_env.goal_site.pose.p
+    assert (again != moved).any(dim=1).tolist() == [False, True, False]
+    env.base_env.goal_site.show_visual()
+    assert torch.equal(env.base_env.goal_site.pose.p, again)
+    env.close()
+
+
+# --- RecordEpisode ---------------------------------------------------------------------------------
+
+
+def record(env: Any, tmp_path: Path, **kwargs: Any) -> Any:
+    return RecordEpisode(env, str(tmp_path), trajectory_name="episodes", **{"save_video": False, **kwargs})
+
+
+def test_recorded_episodes_are_what_happened(tmp_path: Path) -> None:
+    env = ManiSkillVectorEnv(record(made(max_episode_steps=5), tmp_path), ignore_terminations=True)
+    obs, _ = env.reset(seed=[3, 4, 5, 6])
+    seen, actions, states = [obs], [], [env.base_env.get_state_dict()]
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        actions.append(rng.uniform(-1, 1, (N, 8)).astype(np.float32))
+        seen.append(env.step(actions[-1])[0])
+        states.append(env.base_env.get_state_dict())
+    env.reset(options={"env_idx": torch.tensor([2])})  # ends one episode early
+    for _ in range(5):
+        env.step(rng.uniform(-1, 1, (N, 8)).astype(np.float32))
+    env.close()
+
+    about = json.loads((tmp_path / "episodes.json").read_text())
+    assert about["env_info"] == {
+        "env_id": "PushCube-v1",
+        "env_kwargs": {"num_envs": N, "render_backend": "none"},
+        "max_episode_steps": 5,
+    }
+    episodes = about["episodes"]
+    # Env 2 first; then the three others after their fifth step, in which env 2 began its second.
+    assert [e["elapsed_steps"] for e in episodes[:4]] == [4, 5, 5, 5]
+    assert [e["episode_seed"] for e in episodes[:4]] == [5, 3, 4, 6]
+    with h5py.File(tmp_path / "episodes.h5") as file:
+        assert len(file) == len(episodes)
+        for k, env_of in enumerate([2, 0, 1, 3]):
+            trajectory: Any = file[f"traj_{k}"]
+            steps = 4
+            assert np.array_equal(trajectory["obs"][: steps + 1], [o[env_of].numpy() for o in seen])
+            assert np.array_equal(trajectory["actions"][:steps], [a[env_of] for a in actions])
+            cube = trajectory["env_states"]["actors"]["cube"][: steps + 1]
+            assert np.array_equal(cube, [s["actors"]["cube"][env_of].numpy() for s in states])
+            assert trajectory["truncated"][:].tolist() == [False] * 4 + [True] * (env_of != 2)
+
+
+def test_stock_maniskill_replays_what_was_recorded(tmp_path: Path) -> None:
+    """With ManiSkill's own tool, in its own single CPU env, from the recorded first state."""
+    env = record(made(num_envs=2, max_episode_steps=6), tmp_path)
+    env.reset(seed=[3, 4])
+    rng = np.random.default_rng(1)
+    for _ in range(6):
+        env.step(rng.uniform(-1, 1, (2, 8)).astype(np.float32))
+    env.close()
+    replay_trajectory.main(
+        replay_trajectory.Args(
+            traj_path=str(tmp_path / "episodes.h5"),
+            save_traj=True,
+            obs_mode="state",
+            use_first_env_state=True,
+            allow_failure=True,
+            record_rewards=True,
+        )
+    )
+    (replayed,) = tmp_path.glob("episodes.state.*physx_cpu.h5")
+    with h5py.File(tmp_path / "episodes.h5") as ours, h5py.File(replayed) as stocks:
+        assert set(ours) == set(stocks) == {"traj_0", "traj_1"}
+        for name in ours:
+            a: Any = ours[name]
+            b: Any = stocks[name]
+            assert np.array_equal(a["actions"][:], b["actions"][:])
+            # set_state_dict rounds the root pose, so not to the last bit; and the drive targets of the
+            # first state are not recorded.
+            np.testing.assert_allclose(a["obs"][1:], b["obs"][1:], atol=2e-3)
+            np.testing.assert_allclose(a["rewards"][:], b["rewards"][:], atol=1e-4)
+
+
+@pytest.mark.parametrize("with_text", [False, True])
+def test_videos_of_all_envs_side_by_side(tmp_path: Path, with_text: bool) -> None:
+    env = made("PickCube-v1", render=True, render_mode="rgb_array", **SMALL_HUMAN)
+    with pytest.raises(AssertionError, match="max steps per video"):
+        RecordEpisode(env, str(tmp_path), save_trajectory=False)
+    env = RecordEpisode(
+        env,
+        str(tmp_path),
+        save_trajectory=False,
+        max_steps_per_video=3,
+        info_on_video=with_text,
+        video_fps=10,
+    )
+    env.reset(seed=0)
+    for _ in range(6):
+        env.step(env.action_space.sample())
+    last = tile_images(env.unwrapped.render_rgb_array(), nrows=2).numpy().astype(float)
+    env.close()
+    videos = sorted(tmp_path.glob("*.mp4"))
+    assert [v.name for v in videos] == ["0.mp4", "1.mp4"]
+    frames = imageio.mimread(videos[1], memtest=False)
+    assert len(frames) == 4 and frames[0].shape == last.shape  # the first state and three steps
+    loss = np.abs(frames[-1].astype(float) - last).mean()  # of H.264, and of the text that covers the rest
+    assert loss < 60 if with_text else loss < 8
+
+
+def test_substeps_are_filmed(tmp_path: Path) -> None:
+    # The wrapper replaces a hook on the env: substeps may then not be done in a row behind its back.
+    env = made("MS-CartpoleBalance-v1", 2, render=True, render_mode="rgb_array", **SMALL_HUMAN)
+    env = RecordEpisode(
+        env, str(tmp_path), save_trajectory=False, max_steps_per_video=100, render_substeps=True
+    )
+    base = env.unwrapped
+    env.reset(seed=0)
+    base.agent.robot.set_qvel(torch.tensor([[2.0, 5.0]] * 2))
+    base.scene._gpu_apply_all()
+    base.scene._gpu_fetch_all()
+    angles = []
+    stock_capture = env.capture_image
+
+    def capture(*args: Any) -> Any:
+        angles.append(float(base.agent.robot.get_qpos()[0, 1]))
+        return stock_capture(*args)
+
+    env.capture_image = capture
+    env.step(np.zeros((2, 1), np.float32))
+    substeps = base._sim_steps_per_control
+    assert len(env.render_images) == substeps + 2 and len(angles) == substeps + 2
+    assert substeps < 2 or len(set(angles)) == substeps + 1, "the same moment was filmed several times"
+    env.close()
+
+
+# --- spaces ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("num_envs", [1, 3])
+def test_the_actions_of_two_robots_as_one_vector(num_envs: int) -> None:
+    plain = made("TwoRobotPickCube-v1", num_envs)
+    env = FlattenActionSpaceWrapper(made("TwoRobotPickCube-v1", num_envs))
+    assert isinstance(plain.action_space, gym.spaces.Dict)
+    assert env.action_space.shape == ((num_envs, 16) if num_envs > 1 else (16,))
+    env.reset(seed=0)
+    plain.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        flat = torch.from_numpy(rng.uniform(-1, 1, (num_envs, 16)).astype(np.float32))
+        names = list(plain.unwrapped.single_action_space.spaces)
+        obs = env.step(flat)[0]
+        other = plain.step({names[0]: flat[:, :8], names[1]: flat[:, 8:]})[0]
+        assert torch.equal(obs, other)
+    env.close()
+    plain.close()
+
+
+def test_flat_observations() -> None:
+    # Of a dict of tensors. With nested ones, such as obs_mode="state_dict", the wrapper fails in stock too
+    # (mani_skill 3.0.1, common.flatten_state_dict: 'numpy.ndarray' object has no attribute 'nelement').
+    inner = made("PickCube-v1", 2, obs_mode="rgb", render=True, **SMALL)
+    env = FlattenObservationWrapper(FlattenRGBDObservationWrapper(inner, rgb=False, depth=False))
+    obs, _ = env.reset(seed=0)
+    assert obs.shape == env.unwrapped.observation_space.shape
+    raw = inner.unwrapped.get_obs()
+    torch.testing.assert_close(obs[:, :9], raw["agent"]["qpos"])
+    assert env.step(env.action_space.sample())[0].shape == obs.shape
+    env.close()
+    nested = [
+        made(obs_mode="state_dict"),
+        gym.make("PushCube-v1", obs_mode="state_dict", render_backend="none"),
+    ]
+    for each in nested:
+        with pytest.raises(AttributeError, match="nelement"):
+            FlattenObservationWrapper(each)
+        each.close()
+
+
+def test_stacked_frames() -> None:
+    env = FrameStack(made(), num_stack=3)
+    assert env.observation_space.shape == (N, 3, made().observation_space.shape[1])
+    first, _ = env.reset(seed=0)
+    assert torch.equal(first[:, 0], first[:, 2])
+    plain = made()
+    singles = [plain.reset(seed=0)[0]]
+    rng = np.random.default_rng(0)
+    for _ in range(4):
+        action = rng.uniform(-1, 1, (N, 8)).astype(np.float32)
+        stacked = env.step(action)[0]
+        singles.append(plain.step(action)[0])
+    assert torch.equal(stacked, torch.stack(singles[-3:], dim=1))
+    with pytest.raises(RuntimeError, match="partial environment reset"):
+        env.reset(options={"env_idx": torch.tensor([1])})
+    # Frames of whole episodes, with the vector env on top.
+    vector = ManiSkillVectorEnv(FrameStack(made(max_episode_steps=2), num_stack=2), ignore_terminations=True)
+    vector.reset(seed=0)
+    vector.step(vector.action_space.sample())
+    obs, _, _, _, info = vector.step(vector.action_space.sample())
+    assert torch.equal(obs[:, 0], obs[:, 1]) and not torch.equal(info["final_observation"][:, 1], obs[:, 1])
+    for each in (env, plain, vector):
+        each.close()
+
+
+@pytest.mark.parametrize("separate", [True, False])
+def test_flat_pictures(separate: bool) -> None:
+    kwargs: dict[str, Any] = {"obs_mode": "rgb+depth", "render": True, **SMALL}
+    env = FlattenRGBDObservationWrapper(made("PickCube-v1", 2, **kwargs), sep_depth=separate)
+    plain = made("PickCube-v1", 2, **kwargs)
+    (obs, _), (raw, _) = env.reset(seed=0), plain.reset(seed=0)
+    camera = raw["sensor_data"]["base_camera"]
+    assert env.observation_space["state"].shape == obs["state"].shape
+    if separate:
+        assert torch.equal(obs["rgb"], camera["rgb"]) and torch.equal(obs["depth"], camera["depth"])
+    else:
+        assert torch.equal(obs["rgbd"], torch.cat([camera["rgb"], camera["depth"]], dim=-1))
+    vector = ManiSkillVectorEnv(FrameStack(env, num_stack=2), ignore_terminations=True)
+    vector.reset(seed=0)
+    stacked = vector.step(vector.action_space.sample())[0]
+    assert stacked["state"].shape[:2] == (2, 2)
+    vector.close()
+    plain.close()
+
+
+# --- the others ------------------------------------------------------------------------------------
+
+
+def test_repeated_actions() -> None:
+    env, plain = ActionRepeatWrapper(made(SucceedsInTurn), repeat=3), made(SucceedsInTurn)
+    env.reset(seed=0)
+    plain.reset(seed=0)
+    action = np.random.default_rng(0).uniform(-1, 1, (N, 8)).astype(np.float32)
+    obs, reward, terminated, _, info = env.step(action)
+    each = [plain.step(action) for _ in range(3)]
+    assert terminated.tolist() == [True, True, False, False]  # env 0 succeeds in step 2, env 1 in step 3
+    assert info["elapsed_steps"].tolist() == [2, 3, 3, 3]
+    assert torch.equal(obs[0], each[1][0][0]) and torch.equal(obs[1:], each[2][0][1:])
+    expected = torch.stack([e[1] for e in each])
+    torch.testing.assert_close(reward[0], expected[:2, 0].sum())
+    torch.testing.assert_close(reward[1:], expected[:, 1:].sum(dim=0))
+    env.close()
+    plain.close()
+
+
+def test_cached_resets() -> None:
+    # A number that is no multiple of num_envs ends in an IndexError in stock too: mani_skill 3.0.1 counts
+    # whole batches (cached_reset.py, `_num_cached_resets += self.num_envs`) and keeps fewer.
+    env = CachedResetWrapper(made(), config={"num_resets": 2 * N, "seed": 3})
+    cubes = env._cached_resets_env_states["actors"]["cube"]
+    assert cubes.shape == (2 * N, 13) and len(torch.unique(cubes[:, 0])) == 2 * N
+    vector = ManiSkillVectorEnv(env, ignore_terminations=True)
+
+    def are_cached(rows: list[int]) -> bool:
+        now = env.base_env.obj.pose.p[rows]
+        return all((cubes[:, :3] - p).abs().max(dim=1).values.min() < 1e-6 for p in now)
+
+    vector.reset()
+    assert are_cached([0, 1, 2, 3])
+    for _ in range(3):
+        vector.step(vector.action_space.sample())
+    before = env.base_env.get_state()
+    obs, _ = vector.reset(options={"env_idx": torch.tensor([1, 2])})
+    assert are_cached([1, 2])
+    assert torch.equal(env.base_env.get_state()[[0, 3]], before[[0, 3]])
+    torch.testing.assert_close(obs, env.base_env.get_obs(), atol=1e-5, rtol=0)
+    vector.close()
+
+
+def test_one_env_as_a_plain_gymnasium_env() -> None:
+    stock = CPUGymWrapper(gym.make("PushCube-v1", render_backend="none"), record_metrics=True)
+    ours = CPUGymWrapper(made(num_envs=1), record_metrics=True)
+    assert ours.observation_space == stock.observation_space and ours.action_space == stock.action_space
+    assert ours.unwrapped.gpu_sim_enabled  # for everybody else
+    results = []
+    for env in (ours, stock):
+        obs, _ = env.reset(seed=7)
+        assert isinstance(obs, np.ndarray) and obs.shape == env.observation_space.shape
+        rng = np.random.default_rng(0)
+        for _ in range(3):
+            obs, reward, terminated, truncated, info = env.step(rng.uniform(-1, 1, 8).astype(np.float32))
+        assert np.ndim(reward) == 0 and not terminated and not truncated
+        results.append((obs, reward, info["episode"]["return"]))
+        env.close()
+    for a, b in zip(*results):
+        np.testing.assert_allclose(a, b, atol=1e-5)
+    with pytest.raises(AssertionError, match="without parallelization"):
+        CPUGymWrapper(made(num_envs=2))
+
+
+def test_gymnasiums_asynchronous_envs_of_one() -> None:
+    env = gym.vector.SyncVectorEnv([lambda: CPUGymWrapper(made(num_envs=1)) for _ in range(2)])
+    obs, _ = env.reset(seed=[1, 2])
+    assert obs.shape == (2, *env.single_observation_space.shape)
+    assert env.step(env.action_space.sample())[0].shape == obs.shape
+    env.close()
+
+
+def test_state_set_from_outside_under_a_tower_of_wrappers(tmp_path: Path) -> None:
+    env = made(max_episode_steps=3)
+    tower = ManiSkillVectorEnv(record(FrameStack(env, num_stack=2), tmp_path), ignore_terminations=True)
+    tower.reset(seed=0)
+    base = tower.unwrapped
+    base.obj.set_pose(Pose.create_from_pq(torch.tensor([[0.1, 0.2, 0.02]] * N)))
+    base.scene._gpu_apply_all()
+    base.scene._gpu_fetch_all()
+    tower.step(np.zeros((N, 8), np.float32))
+    torch.testing.assert_close(base.obj.pose.p[:, :2], torch.tensor([[0.1, 0.2]] * N), atol=5e-3, rtol=0)
+    tower.close()

@@ -1,0 +1,185 @@
+"""``workbench.make``: a ManiSkill task, batched on the CPU, as a standard gymnasium env.
+
+Training code, ManiSkill's wrappers and its baselines expect what ``gym.make`` gives: an env with a spec,
+ManiSkill's time limit around it, and the class underneath. So gymnasium's own ``make`` is called, with a spec
+made on the spot whose entry point builds the batched env. Nothing is registered and nothing replaced:
+``gym.make`` of the same id stays ManiSkill's, and the keyword arguments in ``env.spec`` are those that stock
+ManiSkill takes, so that what ``RecordEpisode`` writes can be replayed by ManiSkill's own tools.
+
+Where this differs from ``gym.make``, it is where stock would fail:
+
+* ``num_envs`` above 1 works without a GPU.
+* A task whose first reward mode is not implemented (its ``step`` raises NotImplementedError in stock) gets
+  the richest that is. In all other cases the default is stock's: the first of ``SUPPORTED_REWARD_MODES``.
+* ``render_backend`` is found when it is not given; where no driver is there, an env without pictures is made
+  as with ``render_backend="none"``, and one that needs them is refused.
+* ``max_episode_steps=-1`` gives an env without a limit; ManiSkill's wrapper takes it for one that is over.
+* What has to be downloaded is named in an error, and not asked for on standard input.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal
+
+import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec, WrapperSpec
+from mani_skill.envs.sapien_env import BaseEnv
+
+from workbench.authoring import registry
+from workbench.authoring.load import load_task
+from workbench.core.backends import BackendUnavailable, find_renderer
+from workbench.core.task_env import Backend, EnvOptions, build_env, default_reward_mode
+
+_STATE_MODES = {"state", "state_dict", "none"}
+"""The parts of an ``obs_mode`` for which nothing is drawn."""
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What `make` must know of a task, wherever it came from."""
+
+    cls: type[BaseEnv]
+    env_id: str
+    max_episode_steps: int | None
+    default_kwargs: Mapping[str, Any]
+    asset_ids: Sequence[str]
+
+
+def make(
+    task: str | Path | type[BaseEnv],
+    num_envs: int = 1,
+    *,
+    backend: Backend = "auto",
+    max_episode_steps: int | None = None,
+    threads: int | None = None,
+    strict: bool | Literal["warn"] = False,
+    **kwargs: Any,
+) -> gym.Env:
+    """A gymnasium env of `num_envs` envs, as ``gym.make`` gives it for a GPU.
+
+    Args:
+        task: a registered id (``PickCube-v1``), a file (``push.py``, ``push.py:PushEnv``) or a class that
+            inherits BaseEnv. A file is executed anew with each call, as the page does; an id that it
+            registers is then known to ``gym.make`` too.
+        num_envs: how many envs stand in the batch.
+        backend: ``cpu``: batched on the CPU. ``gpu``: ManiSkill's GPU simulation. ``auto``: the GPU where
+            CUDA and PhysX's GPU library are there, else the CPU. Takes the place of ``sim_backend``.
+        max_episode_steps: the time limit; None for the registered one, -1 for none.
+        threads: how many step the envs on the CPU; None for one on each core that the process may use.
+        strict: on the CPU, raise (or ``"warn"``) where GPU simulation would silently go wrong.
+        kwargs: whatever ``gym.make`` takes for the task: ``obs_mode``, ``reward_mode``, ``control_mode``,
+            ``render_mode``, ``robot_uids``, ``sensor_configs``, ``reconfiguration_freq``, ``sim_config`` ...
+
+    Raises:
+        TaskError: no such id, file or class, or the file cannot be imported; says where and why.
+        MissingAssets: a download is needed; names it and the command.
+        BackendUnavailable: no GPU simulation, or no renderer for what shall be drawn, on this machine.
+        ValueError, TypeError: arguments that contradict each other.
+    """
+    _refuse_contradictions(num_envs, kwargs)
+    found = _find(task)
+    given = {**found.default_kwargs, **kwargs}
+    if given.get("reward_mode") is None and not _stock_reward_works(found.cls):
+        # Among the spec's arguments, so that a replay by gym.make has a reward too.
+        kwargs["reward_mode"] = default_reward_mode(found.cls)
+    limits = ()
+    if max_episode_steps == -1:
+        max_episode_steps = limit = None
+    else:
+        limit = found.max_episode_steps
+        # As ``register_env`` has it. gymnasium's own limit, which gives one bool for all envs, is taken
+        # out again by this one.
+        entry = "mani_skill.utils.registration:TimeLimitWrapper"
+        limits = (WrapperSpec("MSTimeLimit", entry_point=entry, kwargs={"max_episode_steps": limit}),)
+    options = EnvOptions(num_envs=int(num_envs), backend=backend, threads=threads, strict=strict)
+    spec = EnvSpec(
+        id=found.env_id,
+        entry_point=partial(_build, found.cls, tuple(found.asset_ids), options),
+        max_episode_steps=limit,
+        disable_env_checker=True,  # it knows nothing of batches
+        kwargs=dict(found.default_kwargs),
+        additional_wrappers=limits,
+    )
+    return gym.make(spec, max_episode_steps=max_episode_steps, num_envs=int(num_envs), **kwargs)
+
+
+def _build(
+    cls: type[BaseEnv], asset_ids: Sequence[str], options: EnvOptions, num_envs: int, **kwargs: Any
+) -> BaseEnv:
+    if "render_backend" not in kwargs and find_renderer() is None:
+        needs = _what_needs_pictures(cls, kwargs)
+        if needs is not None:
+            raise BackendUnavailable(
+                f"{needs} needs a renderer, and SAPIEN finds no Vulkan driver on this machine: "
+                "`workbench doctor` says which one to install."
+            )
+    # The number again, since it is among the spec's arguments: gym.make(env.spec, num_envs=2) may change it.
+    return build_env(cls, replace(options, num_envs=num_envs, kwargs=kwargs), asset_ids=asset_ids)
+
+
+def _refuse_contradictions(num_envs: Any, kwargs: Mapping[str, Any]) -> None:
+    if isinstance(num_envs, bool) or int(num_envs) != num_envs or num_envs < 1:
+        raise ValueError(f"num_envs must be a whole number from 1 on, not {num_envs!r}")
+    if "sim_backend" in kwargs:
+        raise ValueError(
+            f"sim_backend={kwargs['sim_backend']!r}: leave it out. backend= names the simulation here: "
+            'backend="cpu" (batched on the CPU), "gpu" (ManiSkill\'s GPU simulation) or "auto". '
+            "For stock ManiSkill use gym.make."
+        )
+    if kwargs.get("render_backend", "found") in (None, "none"):
+        needs = _what_needs_pictures(None, kwargs)
+        if needs is not None:
+            raise ValueError(f"{needs} needs pictures, and render_backend='none' says that none are made")
+
+
+def _what_needs_pictures(cls: type[BaseEnv] | None, kwargs: Mapping[str, Any]) -> str | None:
+    """The argument for which something must be drawn, as it is written, or None."""
+    if kwargs.get("render_mode") is not None:
+        return f"render_mode={kwargs['render_mode']!r}"
+    obs_mode = kwargs.get("obs_mode") or (cls.SUPPORTED_OBS_MODES[0] if cls is not None else "state")
+    if set(obs_mode.split("+")) - _STATE_MODES:
+        return f"obs_mode={obs_mode!r}"
+    return None
+
+
+def _stock_reward_works(cls: type[BaseEnv]) -> bool:
+    """Whether the class implements the reward mode that ManiSkill takes when none is named."""
+    mode = cls.SUPPORTED_REWARD_MODES[0]
+    hook = f"compute_{mode}_reward"
+    return mode not in ("dense", "normalized_dense") or getattr(cls, hook) is not getattr(BaseEnv, hook)
+
+
+def _find(task: str | Path | type[BaseEnv]) -> _Found:
+    if isinstance(task, type):
+        return _registered_class(task)
+    if not isinstance(task, (str, Path)):
+        raise TypeError(
+            f"make() takes a registered id, a file or a class that inherits BaseEnv, not {type(task).__name__}"
+        )
+    loaded = load_task(str(task))
+    if loaded.replaced_ids:
+        ids = ", ".join(loaded.replaced_ids)
+        warnings.warn(
+            f"{task} registers {ids}, which belonged to another task: gym.make gives this file's class for it "
+            "from now on in this process. Register another id to have both.",
+            stacklevel=3,
+        )
+    spec = registry.environment(loaded.env_id)
+    asset_ids = () if spec is None else spec.asset_download_ids or ()
+    return _Found(loaded.cls, loaded.env_id, loaded.max_episode_steps, loaded.default_kwargs, asset_ids)
+
+
+def _registered_class(cls: type) -> _Found:
+    if not registry.is_task(cls):
+        raise TypeError(f"{cls.__name__} does not inherit mani_skill.envs.sapien_env.BaseEnv")
+    for env_id in registry.environment_ids():
+        spec = registry.environment(env_id)
+        if spec is not None and spec.cls is cls:
+            limit, assets = spec.max_episode_steps, spec.asset_download_ids or ()
+            return _Found(cls, env_id, limit, dict(spec.default_kwargs), assets)
+    return _Found(cls, cls.__name__, None, {}, ())
