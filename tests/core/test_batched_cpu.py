@@ -17,21 +17,9 @@ import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
-from torch.utils import _pytree as pytree
 
 from workbench.core.cpu_scene import batched_class
 
-IDS = (
-    "PushCube-v1",
-    "PickCube-v1",
-    "StackCube-v1",
-    "PegInsertionSide-v1",
-    "LiftPegUpright-v1",
-    "MS-CartpoleBalance-v1",
-)
-STEPS = 50
-TOLERANCE = 1e-5
-"""For rewards: torch sums a row of sixteen in another order than a row of one. States are bit for bit."""
 STATE_ONLY = {"obs_mode": "state", "render_backend": "none"}
 
 
@@ -52,35 +40,6 @@ def put_in_same_state(stock: BaseEnv, batch: BaseEnv, env: int) -> None:
     batch.scene._gpu_fetch_all()
     stock.agent.controller.reset()
     batch.agent.controller.reset()
-
-
-@pytest.mark.parametrize("num_envs", [1, 4, 16])
-@pytest.mark.parametrize("env_id", IDS)
-def test_every_env_follows_the_stock_single_env(env_id: str, num_envs: int) -> None:
-    batch = batched(env_id, num_envs)
-    rng = np.random.default_rng(num_envs)
-    for env in sorted({0, num_envs // 2, num_envs - 1}):
-        # PegInsertionSide builds another peg for every seed: both sides build for the same one.
-        batch.reset(seed=list(range(num_envs)), options={"reconfigure": True})
-        stock = gym.make(env_id, num_envs=1, **STATE_ONLY).unwrapped
-        stock.reset(seed=env, options={"reconfigure": True})
-        put_in_same_state(stock, batch, env)
-        shape = (num_envs, *stock.single_action_space.shape)
-        for step in range(STEPS):
-            action = rng.uniform(-1, 1, shape).astype(np.float32)
-            _, reward, terminated, _, info = batch.step(action)
-            _, stock_reward, stock_terminated, _, stock_info = stock.step(action[env : env + 1])
-            here = f"{env_id}, env {env} of {num_envs}, step {step}"
-            assert torch.equal(batch.get_state()[env], stock.get_state()[0]), here
-            assert abs(float(reward[env]) - float(stock_reward[0])) < TOLERANCE, here
-            assert bool(terminated[env]) == bool(stock_terminated[0]), here
-            assert info.keys() == stock_info.keys()
-            for key in stock_info:
-                torch.testing.assert_close(
-                    info[key][env].float(), stock_info[key][0].float(), atol=TOLERANCE, rtol=0, msg=here
-                )
-        stock.close()
-    batch.close()
 
 
 @pytest.fixture(scope="module")
@@ -114,41 +73,6 @@ def test_a_reset_env_goes_on_as_if_its_neighbours_had_not_been_reset(pick_cubes:
         return pick_cubes.get_state()[2]
 
     assert torch.equal(run(reset_others=False), run(reset_others=True))
-
-
-def test_the_same_seeds_and_actions_give_the_same_bits(pick_cubes: BaseEnv) -> None:
-    def run() -> torch.Tensor:
-        rng = np.random.default_rng(3)
-        pick_cubes.reset(seed=[5, 6, 7, 8])
-        states = []
-        for _ in range(20):
-            pick_cubes.step(rng.uniform(-1, 1, (4, 8)).astype(np.float32))
-            states.append(pick_cubes.get_state())
-        return torch.stack(states)
-
-    assert torch.equal(run(), run())
-
-
-def test_env_zero_does_not_depend_on_the_number_of_envs() -> None:
-    def run(num_envs: int) -> Any:
-        env = batched("StackCube-v1", num_envs)
-        env.reset(seed=list(range(num_envs)))
-        alone = batched("StackCube-v1", 1)
-        alone.reset(seed=0)
-        state = pytree.tree_map(lambda v: v.expand(num_envs, *v.shape[1:]).clone(), alone.get_state_dict())
-        env.set_state_dict(state)
-        env.agent.controller.reset()
-        rng = np.random.default_rng(0)
-        for _ in range(20):
-            action = rng.uniform(-1, 1, (1, 8)).astype(np.float32)
-            env.step(np.repeat(action, num_envs, axis=0))
-        result = env.get_state()
-        env.close()
-        alone.close()
-        return result
-
-    one, five = run(1), run(5)
-    assert torch.equal(one.expand(5, -1), five)
 
 
 def test_contact_impulses_of_a_grasp_equal_the_stock_values(pick_cubes: BaseEnv) -> None:

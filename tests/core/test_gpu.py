@@ -1,5 +1,7 @@
 """What the same API gives on a GPU: simulation there, or only pictures. Skipped where there is none."""
 
+# pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
+
 from __future__ import annotations
 
 from collections.abc import Iterator

@@ -1,0 +1,136 @@
+"""An env of a batch is ManiSkill's own single CPU env, whatever the batch: to the bit, on task after task.
+
+Here are the tasks that differ in kind. All ids that ship in mani_skill's wheel are compared by the slow sweep
+(`test_every_task`), and each has its result on the docs page ``task_ids.md``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+
+from tests.sweeps import follow_stock
+from tests.sweeps.follow_stock import MOVED_BY_THE_TASK, batch_of, compare, packed, take_over, touching
+from workbench.core import actions
+
+CASES = (
+    ("PickCube-v1", 1, 0),
+    ("PickCube-v1", 16, 7),
+    ("PushCube-v1", 4, 3),
+    ("StackCube-v1", 16, 15),
+    ("PegInsertionSide-v1", 4, 2),  # another peg for every seed
+    ("LiftPegUpright-v1", 4, 3),
+    ("TwoRobotPickCube-v1", 4, 3),  # an action for each robot
+    ("TriFingerRotateCubeLevel4-v1", 4, 3),  # three fingers push a cube all the time
+    ("RotateSingleObjectInHandLevel1-v1", 4, 3),  # a hand, and another object in each env
+    ("RotateValveLevel1-v1", 4, 3),  # another articulation in each env
+    ("SO100GraspCube-v1", 4, 3),  # controllers that remember their target
+    ("MS-CartpoleBalance-v1", 4, 3),  # from MJCF, no contacts
+    ("MS-HumanoidRun-v1", 4, 3),  # falls over itself
+    ("UnitreeG1Stand-v1", 4, 3),
+)
+
+
+@pytest.mark.parametrize(("env_id", "num_envs", "place"), CASES)
+def test_an_env_follows_the_stock_single_env(env_id: str, num_envs: int, place: int) -> None:
+    comparison = compare(env_id, num_envs, place)
+    assert comparison.first_difference is None, comparison
+    assert comparison.value_difference == 0, comparison
+
+
+def test_a_difference_would_be_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    def take_over_nearly(stock: Any, *others: Any) -> None:
+        take_over(stock, *others)
+        stock.agent.robot.set_qpos(stock.agent.robot.get_qpos() + 1e-6)
+
+    monkeypatch.setattr(follow_stock, "take_over", take_over_nearly)
+    comparison = compare("MS-CartpoleBalance-v1")
+    assert comparison.first_difference == 1 and comparison.value_difference > 0
+
+
+# --- alone, and among others ---------------------------------------------------------------------------
+
+CROWDED = (
+    "PickCube-v1",
+    "TriFingerRotateCubeLevel4-v1",
+    "RotateSingleObjectInHandLevel0-v1",
+    "SO100GraspCube-v1",
+    "MS-HumanoidRun-v1",
+)
+SEED = 5
+
+
+@pytest.mark.parametrize("env_id", CROWDED)
+def test_an_env_does_not_depend_on_how_many_there_are_nor_on_its_place_nor_on_its_neighbours(
+    env_id: str,
+) -> None:
+    model = batch_of(env_id, 1)
+    model.reset(seed=[SEED], options={"reconfigure": True})
+    state = model.scene.px.systems[0].pack()  # pyright: ignore[reportAttributeAccessIssue]
+    touched: set[bool] = set()
+    ways = [_way_of(env_id, model, state, *where, touched) for where in ((1, 0), (2, 0), (5, 3), (5, 4))]
+    model.close()
+    assert touched == {True}, "nothing touched: the test proved little"
+    for way in ways[1:]:
+        assert way == ways[0]
+
+
+def _way_of(
+    env_id: str, model: BaseEnv, state: bytes, num_envs: int, place: int, touched: set[bool]
+) -> list[bytes]:
+    """The states of an env that starts as `model` is, while its neighbours do and reset as they like."""
+    env = batch_of(env_id, num_envs)
+    # Where every seed builds another object, this env has the model's.
+    seeds = [SEED if i == place else 20 + i for i in range(num_envs)]
+    env.reset(seed=seeds, options={"reconfigure": True})
+    take_over(env, place, model, 0, state)
+    parts = actions.action_parts(env)
+    mine, theirs = np.random.default_rng(1), np.random.default_rng([num_envs, place])
+    without, _ = MOVED_BY_THE_TASK.get(env_id, (None, None))
+    states = []
+    for step in range(20):
+        if step == 10 and num_envs > 1:
+            neighbours = [i for i in range(num_envs) if i != place]
+            env.reset(options={"env_idx": torch.tensor(neighbours)})
+        flat = actions.random_action(parts, num_envs, theirs)
+        flat[place] = actions.random_action(parts, 1, mine)[0]
+        env.step(actions.to_env_action(env, parts, flat))
+        states.append(packed(env, place, without))
+        touched |= {True} if touching(env, place) else set()
+    env.close()
+    return states
+
+
+# --- the same again --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(params=["PickCube-v1", "TriFingerRotateCubeLevel4-v1", "PegInsertionSide-v1"])
+def two_batches(request: pytest.FixtureRequest) -> Iterator[tuple[BaseEnv, BaseEnv]]:
+    batches = batch_of(request.param, 3), batch_of(request.param, 3)
+    yield batches
+    for batch in batches:
+        batch.close()
+
+
+def test_the_same_seeds_and_actions_give_the_same_bits(two_batches: tuple[BaseEnv, BaseEnv]) -> None:
+    first, second = (_episode(batch) for batch in two_batches)
+    assert first == second, "in another env"
+    assert _episode(two_batches[0]) == first, "in the same env, a second time"
+
+
+def _episode(batch: BaseEnv) -> list[bytes]:
+    rng = np.random.default_rng(3)
+    parts = actions.action_parts(batch)
+    batch.reset(seed=[5, 6, 7])
+    seen = []
+    for _ in range(20):
+        _, reward, _, _, _ = batch.step(
+            actions.to_env_action(batch, parts, actions.random_action(parts, 3, rng))
+        )
+        seen += [packed(batch, i) for i in range(3)] + [torch.as_tensor(reward).numpy().tobytes()]
+    return seen

@@ -1,0 +1,155 @@
+"""Every task in ManiSkill's registry: it works batched, or an error says what it needs or whose fault it is.
+
+The sweep over all ids takes minutes and is slow-marked; `tests/sweeps/task_ids.py` makes the docs page of it. Here is what
+can be had in seconds: some ids with their cameras, every fault of ManiSkill's own, and every missing download.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import pytest
+import torch
+from mani_skill.utils.registration import REGISTERED_ENVS
+
+from tests.sweeps.exercise_task import exercise
+from tests.sweeps.task_ids import PAGE, page, registered_ids, sweep
+from tests.sweeps.upstream_faults import FAULTS, Fault, where_it_fails
+from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+
+WITH_CAMERAS = (
+    "PushCube-v1",
+    "TriFingerRotateCubeLevel4-v1",
+    "RotateSingleObjectInHandLevel0-v1",
+    "SO100GraspCube-v1",
+    "MS-CartpoleBalance-v1",
+)
+
+
+def rows_of_the_page() -> dict[str, list[str]]:
+    """The cells of each row by id."""
+    rows = [
+        line[2:-2].split(" | ")
+        for line in PAGE.read_text().splitlines()
+        if re.match(r"\| [\w-]+-v\d+ ", line)
+    ]
+    return {cells[0]: cells for cells in rows}
+
+
+@pytest.mark.parametrize("env_id", WITH_CAMERAS)
+def test_a_task_does_all_that_is_promised_with_cameras_on(env_id: str) -> None:
+    row = exercise(env_id)
+    assert row.outcome == "passed" and row.cameras, row
+
+
+@pytest.mark.parametrize("env_id", ["MS-HopperStand-v1", "RotateSingleObjectInHandLevel1-v1"])
+def test_a_task_with_a_fault_of_its_own_does_the_rest(env_id: str) -> None:
+    row = exercise(env_id)
+    assert row.outcome == "upstream", row
+
+
+# --- faults of ManiSkill's own --------------------------------------------------------------------------
+
+_EACH = [
+    pytest.param(
+        fault, env_id, id=f"{env_id} {fault.stage}", marks=[pytest.mark.slow] * (env_id == "DrawSVG-v1")
+    )
+    for fault in FAULTS
+    for env_id in fault.ids
+]
+
+
+@pytest.mark.parametrize(("fault", "env_id"), _EACH)
+def test_a_fault_of_the_task_is_at_the_line_that_is_named_and_the_error_says_so(
+    fault: Fault, env_id: str
+) -> None:
+    spec = REGISTERED_ENVS[env_id]
+    made = make_env(spec.cls, EnvOptions(4, "cpu", render=False), default_kwargs=spec.default_kwargs)
+    env = TaskEnv(made)
+    env.reset(seed=1)
+    act = {"partial reset": lambda: env.reset(seed=5, env_idx=[1, 3]), "get_state": made.get_state}[
+        fault.stage
+    ]
+    with pytest.raises(Exception) as caught:
+        act()
+    where = where_it_fails(fault, caught.value)
+    assert where is not None, f"not at {fault.file}: {fault.line}\n{caught.getrepr()}"
+    if fault.stage == "partial reset":
+        (note,) = caught.value.__notes__
+        assert f"own, not the batched core's: {where}" in note and "Envs [1, 3] of 4" in note
+    env.reset(seed=1)
+    made.close()
+
+
+def test_the_buffers_that_a_partial_reset_replaced_are_named() -> None:
+    spec = REGISTERED_ENVS["RotateValveLevel0-v1"]
+    env: Any = make_env(spec.cls, EnvOptions(4, "cpu", render=False), default_kwargs=spec.default_kwargs)
+    with pytest.raises(RuntimeError) as caught:
+        env.reset(options={"env_idx": torch.tensor([0, 2, 3])})
+    assert "self.rest_qpos: 4 rows before, 3 now" in caught.value.__notes__[0]
+    env.close()
+
+
+def test_a_fault_that_upstream_mended_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    faulty = FAULTS[0]
+    mended = Fault(("PushCube-v1",), faulty.stage, faulty.file, faulty.line, faulty.why, faulty.upstream)
+    monkeypatch.setattr("tests.sweeps.upstream_faults.FAULTS", (mended,))
+    row = exercise("PushCube-v1")
+    assert row.outcome == "failed" and "upstream mended" in row.notes[0], row
+
+
+# --- downloads ------------------------------------------------------------------------------------------
+
+
+def test_what_must_be_downloaded_is_named_without_a_question_and_without_the_network(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # ManiSkill takes this for a yes to every download.
+    monkeypatch.setenv("MS_SKIP_ASSET_DOWNLOAD_PROMPT", "1")
+    wanted = [env_id for env_id, cells in rows_of_the_page().items() if cells[2] == "download"]
+    assert len(wanted) > 20
+    rows = list(sweep([*wanted, "No-Such-Task-v1", "PickSingleYCB-v1"]))
+    assert {row["env_id"]: row["outcome"] for row in rows[: len(wanted)]} == dict.fromkeys(wanted, "download")
+    assert [row["outcome"] for row in rows[len(wanted) :]] == ["crashed", "download"], "a crash is one row"
+    named = {row["env_id"]: row["notes"] for row in rows}
+    assert named["PickSingleYCB-v1"] == ["ycb"]
+    assert named["UnitreeH1Stand-v1"] == ["unitree_h1"], "a robot"
+    assert named["OpenCabinetDrawer-v1"] == ["partnet_mobility_cabinet"], "a group of many"
+    assert named["ArchitecTHOR_SceneManipulation-v1"] == ["AI2THOR"], "by the file that is not there"
+    assert named["ReplicaCADSetTableVal_SceneManipulation-v1"] == ["ReplicaCAD", "ReplicaCADRearrange"]
+
+
+def test_a_task_that_does_not_come_back_is_one_row() -> None:
+    (row,) = sweep(["PickCube-v1"], limit=0.2)
+    assert row["outcome"] == "hung"
+
+
+# --- the page -------------------------------------------------------------------------------------------
+
+
+def test_the_page_has_a_row_for_every_registered_id_and_no_failure() -> None:
+    rows = rows_of_the_page()
+    assert sorted(rows) == registered_ids()
+    assert {cells[2] for cells in rows.values()} == {"passed", "its own fault", "download"}
+    assert {env_id for env_id, cells in rows.items() if cells[2] == "its own fault"} == {
+        env_id for fault in FAULTS for env_id in fault.ids
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_every_registered_id_works_as_the_page_says() -> None:
+    rows = list(sweep(registered_ids()))
+    outcomes = {row["env_id"]: row["outcome"] for row in rows}
+    assert not {
+        env_id: outcome for env_id, outcome in outcomes.items() if outcome in ("failed", "crashed", "hung")
+    }
+    ships = [row for row in rows if row["outcome"] != "download"]
+    assert all(row["follows"] for row in ships), [row for row in ships if not row["follows"]]
+    assert sum(row["like_stock"] == "bit for bit" for row in ships) >= 25
+    told = {
+        cells[0]: cells[2:4]
+        for cells in (line[2:-2].split(" | ") for line in page(rows).splitlines()[-len(rows) :])
+    }
+    assert {env_id: cells[2:4] for env_id, cells in rows_of_the_page().items()} == told

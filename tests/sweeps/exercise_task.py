@@ -1,0 +1,264 @@
+"""One built-in task through everything that the core promises of every task, with cameras on.
+
+Made with four envs, reset with seeds, 20 random actions, a partial reset of two envs that may not change a bit of
+the other two, a snapshot that gives the same bits when it is restored, and pictures that show something. What the
+task itself does wrong (`upstream_faults`) is recorded, and the rest is still done.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import mani_skill.envs  # noqa: F401  registers the ids
+import numpy as np
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.registration import REGISTERED_ENVS
+from torch.utils import _pytree as pytree
+
+from tests.sweeps.upstream_faults import Fault, faults_of, where_it_fails
+from workbench.core import actions
+from workbench.core.assets import MissingAssets, robots_of
+from workbench.core.cpu_layout import BODY
+from workbench.core.returns import wrong_evaluate
+from workbench.core.snapshot import restore_snapshot, take_snapshot
+from workbench.core.take_pictures import Request, list_cameras, take_pictures
+from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+
+NUM_ENVS = 4
+SEEDS = [11, 12, 13, 14]
+ACTIONS = 20
+RESET, KEPT = [1, 3], [0, 2]
+STEPS_AGAIN = 5
+HIDDEN = 90_000
+"""Metres; ManiSkill puts what it hides 99999 m away."""
+ROUNDING = 1e-6
+"""PhysX keeps a root by its centre of mass: the last bit of a pose may change when it is put back."""
+OBS_MODES = ("rgb+depth+segmentation", "rgb+segmentation", "sensor_data")
+
+
+@dataclass
+class Row:
+    """What came of one id; plain values, since it crosses a pipe as JSON."""
+
+    env_id: str
+    robot: str = ""
+    outcome: str = ""
+    """``passed``, ``upstream`` (passed but for the task's own faults), ``download``, ``failed``."""
+    seconds: float = 0.0
+    cameras: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    after_restore: list[float] = field(default_factory=list)
+    """The largest difference of a number of the state, `STEPS_AGAIN` steps after a restore: from the run that was
+    not interrupted, and from the run after a second restore."""
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def exercise(env_id: str) -> Row:
+    """Raises nothing but what ends the process: a failure is a row that says where it came from."""
+    row = Row(env_id, _default_robots(env_id))
+    begun = time.perf_counter()
+    stage = ["make"]
+    env = None
+    try:
+        env = _made(env_id)
+        row.robot = _robots_in(env.env) or "none"
+        _all_stages(env, row, stage)
+        row.outcome = row.outcome or "passed"
+    except MissingAssets as missing:
+        row.outcome, row.notes = "download", list(missing.names) or [str(missing)]
+    except Exception as error:
+        row.outcome = "failed"
+        row.notes.append(f"{stage[0]}: {type(error).__name__}: {error}")
+    finally:
+        if env is not None:
+            env.close()
+    row.seconds = round(time.perf_counter() - begun, 1)
+    return row
+
+
+def _made(env_id: str) -> TaskEnv:
+    spec = REGISTERED_ENVS[env_id]
+    kwargs = {"obs_mode": obs_mode_of(spec.cls), "render_mode": "rgb_array"}
+    options = EnvOptions(NUM_ENVS, "cpu", render=True, kwargs=kwargs)
+    env = make_env(
+        spec.cls, options, asset_ids=spec.asset_download_ids or (), default_kwargs=spec.default_kwargs
+    )
+    return TaskEnv(env, spec.max_episode_steps)
+
+
+def obs_mode_of(task: type[BaseEnv]) -> str:
+    """The richest pictures that the task can give as an observation."""
+    supported = task.SUPPORTED_OBS_MODES
+    return next(m for m in OBS_MODES if m in supported or (m == OBS_MODES[0] and "any_textures" in supported))
+
+
+def _all_stages(env: TaskEnv, row: Row, stage: list[str]) -> None:
+    faults = faults_of(row.env_id)
+    rng = np.random.default_rng(0)
+
+    stage[0] = "reset"
+    _check_start(env.reset(seed=SEEDS).elapsed_steps, env)
+    first = _states(env)
+    env.reset(seed=SEEDS)
+    assert _states(env) == first, "the same seeds gave another start"
+    _check_observed(env.obs, row)
+
+    stage[0] = "step"
+    for _ in range(ACTIONS):
+        step = env.step(_action(env, rng))
+        assert np.isfinite(step.reward).all() and np.isfinite(step.poses[:, :, 0]).any(), "NaN"
+    assert env.env.elapsed_steps.tolist() == [ACTIONS] * NUM_ENVS
+    _check_observed(env.obs, row)
+    said = wrong_evaluate(env.env.evaluate(), NUM_ENVS)
+    if said is not None:
+        row.notes.append(f"evaluate() {said}")
+
+    stage[0] = "get_state"
+    _or_its_fault(faults.get(stage[0]), env.env.get_state, row)
+
+    stage[0] = "partial reset"
+    before, kept_controllers = _states(env), _controllers(env)
+
+    def partial_reset() -> None:
+        result = env.reset(seed=77, env_idx=RESET)
+        assert result.elapsed_steps.tolist() == [ACTIONS, 0, ACTIONS, 0]
+        after = _states(env)
+        assert all(after[i] == before[i] for i in KEPT), "an env that was not reset changed"
+        assert any(after[i] != before[i] for i in RESET), "nothing was reset"
+        assert torch.equal(_controllers(env), kept_controllers), "a controller was reset with its neighbour"
+
+    if not _or_its_fault(faults.get(stage[0]), partial_reset, row):
+        env.reset(seed=SEEDS)
+        env.step(_action(env, rng))
+
+    stage[0] = "snapshot"
+    again = [_action(env, rng) for _ in range(STEPS_AGAIN)]
+    snapshot = take_snapshot(env.env)
+    at = _states(env)
+    went_on = _run(env, again)
+    restore_snapshot(env.env, snapshot)
+    assert _apart(env, _states(env), at) <= ROUNDING, "the restored state is another"
+    once = _run(env, again)
+    restore_snapshot(env.env, snapshot)
+    twice = _run(env, again)
+    row.after_restore = [_apart(env, a, b) for a, b in ((went_on[-1], once[-1]), (once[-1], twice[-1]))]
+
+    stage[0] = "pictures"
+    _check_pictures(env, row)
+
+
+def _or_its_fault(fault: Fault | None, attempt: Callable[[], Any], row: Row) -> bool:
+    """True if `attempt` worked; False if it failed as `fault` says. Anything else is raised."""
+    try:
+        attempt()
+    except AssertionError:
+        raise
+    except Exception as error:
+        where = None if fault is None else where_it_fails(fault, error)
+        if fault is None or where is None:
+            raise
+        owned = " ".join(getattr(error, "__notes__", []))
+        if fault.stage == "partial reset":
+            assert "own, not the batched core's" in owned and where in owned, (
+                f"the error does not own up: {owned}"
+            )
+        row.outcome = "upstream"
+        row.notes.append(f"{fault.stage}: {where}: {fault.why} (upstream: {fault.upstream})")
+        return False
+    if fault is not None:
+        raise RuntimeError(
+            f"{fault.stage} works: upstream mended {fault.file}; take it out of upstream_faults"
+        )
+    return True
+
+
+def _states(env: TaskEnv) -> list[bytes]:
+    px: Any = env.env.scene.px
+    return [system.pack() for system in px.systems]
+
+
+def _apart(env: TaskEnv, some: list[bytes], others: list[bytes]) -> float:
+    """The largest difference between two states of all envs, but for hidden objects.
+
+    One is kept 99999 m away, as it was when it was hidden; a snapshot keeps where it really is.
+    """
+    px: Any = env.env.scene.px
+    largest = 0.0
+    for system, state, other in zip(px.systems, some, others, strict=True):
+        a, b = (np.frombuffer(packed, np.float32).astype(np.float64) for packed in (state, other))
+        difference = np.abs(a - b)
+        bodies = BODY * len(system.rigid_dynamic_components)
+        hidden = (np.abs([a[:bodies], b[:bodies]]).reshape(2, -1, BODY) > HIDDEN).any(axis=(0, 2))
+        difference[:bodies].reshape(-1, BODY)[hidden] = 0.0
+        largest = max(largest, float(difference.max(initial=0.0)))
+    return largest
+
+
+def _controllers(env: TaskEnv) -> torch.Tensor:
+    """(kept envs, K) what the controllers of the envs that are not reset remember."""
+    agent: Any = env.env.agent
+    state = {} if agent is None else agent.get_controller_state()
+    leaves = [leaf[KEPT].reshape(len(KEPT), -1) for leaf in pytree.tree_leaves(state)]
+    return torch.cat(leaves, dim=1) if leaves else torch.zeros(len(KEPT), 0)
+
+
+def _action(env: TaskEnv, rng: np.random.Generator) -> Any:
+    return actions.random_action(env.parts, NUM_ENVS, rng) if env.parts else None
+
+
+def _run(env: TaskEnv, chosen: list[Any]) -> list[list[bytes]]:
+    seen = []
+    for action in chosen:
+        env.step(action)
+        seen.append(_states(env))
+    return seen
+
+
+def _check_start(elapsed: np.ndarray, env: TaskEnv) -> None:
+    assert elapsed.tolist() == [0] * NUM_ENVS
+    assert env.episode_seeds.tolist() == SEEDS
+
+
+def _check_observed(obs: Any, row: Row) -> None:
+    """ManiSkill's own observation: pictures of every env, each with something on it."""
+    for camera, textures in obs.get("sensor_data", {}).items():
+        for name, values in textures.items():
+            assert values.shape[0] == NUM_ENVS and values.ndim == 4, f"{camera} {name}: {tuple(values.shape)}"
+            blank = [i for i in range(NUM_ENVS) if bool((values[i] == values[i, :1, :1]).all())]
+            assert not blank, f"{camera} {name}: one value all over in envs {blank}"
+    row.cameras = sorted(obs.get("sensor_data", {}))
+
+
+def _check_pictures(env: TaskEnv, row: Row) -> None:
+    frames = env.env.render()
+    assert isinstance(frames, torch.Tensor) and frames.shape[0] == NUM_ENVS and frames.shape[-1] == 3, (
+        "render()"
+    )
+    assert frames.dtype == torch.uint8 and all(len(frame.unique()) > 1 for frame in frames), (
+        "render() is blank"
+    )
+    wanted: list[Request] = [
+        (camera.name, camera.kind, ["rgb"]) for camera in list_cameras(env.env, env.table)
+    ]
+    for picture in take_pictures(env.env, RESET[0], wanted):
+        assert picture.rgb is not None and len(np.unique(picture.rgb)) > 1, f"{picture.camera} is blank"
+    row.cameras = [name for name, _, _ in wanted]
+
+
+def _default_robots(env_id: str) -> str:
+    """What the class says that it takes, for a task that could not be made."""
+    spec = REGISTERED_ENVS[env_id]
+    robots = robots_of(spec.cls, spec.default_kwargs)
+    several = robots if isinstance(robots, (tuple, list)) else [robots]
+    return ", ".join(robot if isinstance(robot, str) else getattr(robot, "uid", "") for robot in several)
+
+
+def _robots_in(env: BaseEnv) -> str:
+    agent: Any = env.agent
+    return "" if agent is None else ", ".join(robot.uid for robot in getattr(agent, "agents", [agent]))

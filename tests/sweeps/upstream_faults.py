@@ -1,0 +1,109 @@
+"""What is wrong in ManiSkill's own tasks (3.0.1), each with the line that fails and the thread that knows of it.
+
+Nothing here is excused by its exception alone: the traceback must go through the file, the function and the
+very source line that are named, so an entry whose fault upstream has mended, or moved, is found out.
+"""
+
+from __future__ import annotations
+
+import traceback
+from dataclasses import dataclass
+
+_ROTATE = "tasks/dexterity/rotate_single_object_in_hand.py"
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One thing that a built-in task does wrong when N envs are run at once, on the GPU as on the CPU."""
+
+    ids: tuple[str, ...]
+    stage: str
+    """``partial reset`` or ``get_state``."""
+    file: str
+    """The end of the path of the file whose line fails."""
+    line: str
+    """That line, as it stands in the source."""
+    why: str
+    upstream: str
+    """Issues and pull requests of mani-skill/ManiSkill, as far as any was found."""
+
+
+FAULTS = (
+    Fault(
+        tuple(f"RotateValveLevel{level}-v1" for level in range(5)),
+        "partial reset",
+        "tasks/dexterity/rotate_valve.py",
+        "valve_rotation = (self.valve.qpos - self.rest_qpos)[:, 0]",
+        "_initialize_actors replaces self.rest_qpos and self.rotate_direction by the subset's rows",
+        "the fault of #1067 and #1373 (another task); not reported for this one",
+    ),
+    Fault(
+        tuple(f"RotateValveLevel{level}-v1" for level in range(5)),
+        "get_state",
+        "utils/common.py",
+        "return torch.hstack(states)",
+        "the valves, one an env, stay in the state registry beside the merged valve",
+        "#444, #517 (PR #676 gave tasks the means to mend it)",
+    ),
+    Fault(
+        ("RotateSingleObjectInHandLevel1-v1",),
+        "partial reset",
+        _ROTATE,
+        "torch.abs(new_pos[:, 2]) + self.hand_init_height + self.obj_heights",
+        "self.obj_heights has a row for each env and is used without [env_idx]",
+        "#1067, #1373; PR #1377 mended the lines beside it",
+    ),
+    Fault(
+        ("RotateSingleObjectInHandLevel1-v1",),
+        "get_state",
+        "utils/common.py",
+        "return torch.hstack(states)",
+        "the objects, one an env, stay in the state registry beside the merged object",
+        "#444, #517 (PR #676 gave tasks the means to mend it)",
+    ),
+    Fault(
+        ("MS-HopperStand-v1", "MS-HopperHop-v1"),
+        "partial reset",
+        "tasks/control/hopper.py",
+        "random_qpos *= q_ranges",
+        "q_ranges has a row for each env",
+        "no report found",
+    ),
+    Fault(
+        ("MS-AntWalk-v1", "MS-AntRun-v1"),
+        "partial reset",
+        "tasks/control/ant.py",
+        "self.camera_mount.set_pose(",
+        "the camera mount gets the torso's pose of every env",
+        "no report found",
+    ),
+    Fault(
+        ("FMBAssembly1Easy-v1",),
+        "partial reset",
+        "tasks/fmb/fmb.py",
+        "self.bridge_grasp.set_pose(self.bridge.pose * self.bridge_grasp_offset)",
+        "the grasp marker gets the bridge's pose of every env",
+        "no report found",
+    ),
+    Fault(
+        ("DrawSVG-v1",),
+        "partial reset",
+        "tasks/drawing/draw_svg.py",
+        "rot_mat.double() @ self.points[env_idx].transpose(-1, -2).double()",
+        "self.points is replaced by the subset's rows, since hasattr asks for another name",
+        "no report found",
+    ),
+)
+
+
+def faults_of(env_id: str) -> dict[str, Fault]:
+    """By stage."""
+    return {fault.stage: fault for fault in FAULTS if env_id in fault.ids}
+
+
+def where_it_fails(fault: Fault, error: BaseException) -> str | None:
+    """``file.py:line`` if the traceback goes through the line that `fault` names, else None."""
+    for frame in traceback.extract_tb(error.__traceback__):
+        if frame.filename.endswith(fault.file) and frame.line == fault.line:
+            return f"{fault.file.rsplit('/', 1)[1]}:{frame.lineno}"
+    return None
