@@ -1,6 +1,6 @@
 """What the same API gives on a GPU: simulation there, or only pictures. Skipped where there is none."""
 
-# pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false, reportOptionalSubscript=false
 
 from __future__ import annotations
 

@@ -14,6 +14,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs import Pose
 
+from tests.core.single_env_judge import Bare, batch_of
 from workbench.core.partial_reset import active_controllers
 from workbench.core.task_env import EnvOptions, make_env
 
@@ -71,11 +72,7 @@ def test_several_robots_and_none_have_their_controllers_found() -> None:
     assert len(active_controllers(two)) == 4, "an arm and a gripper each"
     two.close()
 
-    class Robotless(BaseEnv):
-        def __init__(self, *args: Any, **kwargs: Any) -> None:
-            super().__init__(*args, robot_uids="none", **kwargs)
-
-    bare = made(Robotless, 2, obs_mode="none", reward_mode="none")
+    bare = batch_of(Bare, 2)
     assert active_controllers(bare) == []
     bare.reset(options={"env_idx": torch.tensor([1])})
     bare.close()
@@ -99,14 +96,17 @@ class ForgetsRows(PICK_CUBE):
 @pytest.mark.parametrize(
     ("task", "words"),
     [
-        (WrongBatch, ["test_partial_reset.py:", "in _initialize_episode", "Envs [2] of 4", "len(env_idx)"]),
-        (ForgetsRows, ["in evaluate", "It replaced self.start: 4 rows before, 1 now"]),
+        (
+            WrongBatch,
+            ["test_partial_reset.py:", "in _initialize_episode", "Envs [1, 2] of 4", "len(env_idx)"],
+        ),
+        (ForgetsRows, ["in evaluate", "It replaced self.start: 4 rows before, 2 now"]),
     ],
 )
 def test_an_error_of_the_task_is_called_its_own(task: type[BaseEnv], words: list[str]) -> None:
     env = made(task)
     with pytest.raises(Exception) as caught:
-        env.reset(options={"env_idx": torch.tensor([2])})
+        env.reset(options={"env_idx": torch.tensor([1, 2])})
     (note,) = caught.value.__notes__
     for word in [f"{task.__name__}'s own", *words]:
         assert word in note

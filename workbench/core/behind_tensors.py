@@ -54,16 +54,15 @@ GUARDED_METHODS: dict[type, dict[str, str]] = {
     },
 }
 
-_strict_scenes: weakref.WeakValueDictionary[int, StrictCpuSystem] = weakref.WeakValueDictionary()
-"""By the id of a sub-scene, which is unique while the system, and with it the sub-scene, lives."""
+_strict_systems: weakref.WeakSet[StrictCpuSystem] = weakref.WeakSet()
+"""Asked for their scenes each time, since a restored snapshot gives an env another scene."""
 _installed = False
 
 
 def guard_scenes(system: StrictCpuSystem) -> None:
     """Let the setters of what is in the scenes of `system` raise, once it is laid out."""
     _install()
-    for scene in system.scenes:
-        _strict_scenes[id(scene)] = system
+    _strict_systems.add(system)
 
 
 def _install() -> None:
@@ -90,7 +89,7 @@ def _guarded(stock: Any, called: str, instead: str) -> Callable[..., Any]:
     stock = getattr(stock, "__func__", stock)  # pybind11's methods are wrapped in an instancemethod
 
     def call(self: Any, *args: Any, **kwargs: Any) -> Any:
-        if _strict_scenes and not sys._getframe(1).f_globals.get("__name__", "").startswith(
+        if _strict_systems and not sys._getframe(1).f_globals.get("__name__", "").startswith(
             "workbench.core."
         ):
             _refuse(self, called, instead)
@@ -104,9 +103,10 @@ def _refuse(owner: Any, called: str, instead: str) -> None:
     entity = _entity(owner)
     if entity is None or entity.scene is None:
         return
-    system = _strict_scenes.get(id(entity.scene))
-    if system is not None and system.laid_out:
-        env = [id(scene) for scene in system.scenes].index(id(entity.scene))
+    for system in _strict_systems:
+        env = next((i for i, scene in enumerate(system.scenes) if scene is entity.scene), None)
+        if env is None or not system.laid_out:
+            continue
         name = owner.name if isinstance(owner, physx.PhysxArticulation) else entity.name
         system.break_rule(
             f"{called} on '{name}' (env {env}) goes behind the tensors: on the GPU it does nothing. Use {instead} of "

@@ -218,7 +218,8 @@ class BatchedCpuMixin:
         # What a hook that raised had written (a NaN, say) would else be applied by every reset that follows,
         # and what it had applied and not fetched would make the next one raise.
         if self.scene is not None and self.scene._gpu_sim_initialized:
-            self.scene.px.drop_writes()
+            px: BatchedCpuSystem = self.scene.px  # type: ignore[assignment]
+            px.drop_writes()
             self.scene._gpu_fetch_all()
 
     def _setup_scene(self) -> None:
