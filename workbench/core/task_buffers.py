@@ -141,11 +141,10 @@ class _Scene:
 
     def add(self, leaves: list[_Found]) -> None:
         for leaf in leaves:
-            if leaf.path not in self.marks:
-                self.marks[leaf.path] = _mark(leaf.value)
-                owner, _, name = leaf.path.rpartition(".")
-                if isinstance(leaf.value, PLAIN) and name.isidentifier():
-                    self.plain.setdefault(owner, {})[name] = leaf.value
+            self.marks[leaf.path] = _mark(leaf.value)
+            owner, _, name = leaf.path.rpartition(".")
+            if isinstance(leaf.value, PLAIN) and name.isidentifier():
+                self.plain.setdefault(owner, {})[name] = leaf.value
         self.paths = frozenset(self.marks)
 
 
