@@ -11,8 +11,8 @@ for what PhysX keeps to itself: contact caches, the order in which it solves con
 articulation's root, which it holds by its centre of mass and rounds when it is set. Measured over all 46
 tasks that ship with ManiSkill, five control steps after a restore, as the largest difference of any number of the
 state (velocities included): nothing for a cart-pole, about 1e-7 in free motion (PushT 6e-6, PickCube 1e-5), 1e-4 to
-5e-3 where bodies press on each other, up to 9e-2 for hands and legged robots in full contact; eight steps after a struck cube of StackCube, 0.45 in its
-velocity. In the three humanoid
+5e-3 where bodies press on each other, up to 9e-2 for hands and legged robots in full contact; StackCube under an end-effector
+target differed by 0.95 after one step, which is not explained yet. In the three humanoid
 tasks two restores also differ, by up to 5e-2. ``web_assets/docs/task_ids.md`` has every task's two figures.
 """
 
