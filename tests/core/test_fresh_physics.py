@@ -136,7 +136,7 @@ def test_a_drive_between_two_bodies_still_holds() -> None:
 
 
 def test_pictures_and_segmentation_are_the_same_after_it() -> None:
-    env = made(PICK_CUBE, 2, render=True, obs_mode="rgb+segmentation")
+    env: Any = made(PICK_CUBE, 2, render=True, obs_mode="rgb+segmentation")
     env.reset(seed=[0, 1])
     env.step(env.action_space.sample())
     restore_snapshot(env, take_snapshot(env))
