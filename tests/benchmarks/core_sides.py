@@ -119,19 +119,22 @@ def stock_rate(env_id: str, seconds: float) -> float:
 
 
 def async_rate(env_id: str, num_envs: int, seconds: float) -> float:
-    """Env-steps per second of gymnasium's AsyncVectorEnv over ManiSkill's CPUGymWrapper."""
+    """Env-steps per second of gymnasium's AsyncVectorEnv over ManiSkill's CPUGymWrapper.
+
+    Its processes are forked, gymnasium's default on Linux: to spawn 64 takes minutes of imports on two cores.
+    """
     import gymnasium as gym
+    import mani_skill.envs  # noqa: F401  once, before the fork
+    import torch
+    from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
+
+    torch.set_num_threads(1)
 
     def make() -> gym.Env:
-        import mani_skill.envs  # noqa: F401
-        import torch
-        from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
-
-        torch.set_num_threads(1)
         env = gym.make(env_id, obs_mode="state", sim_backend="physx_cpu", render_backend="none")
         return CPUGymWrapper(env)
 
-    envs = gym.vector.AsyncVectorEnv([make] * num_envs, context="spawn")
+    envs = gym.vector.AsyncVectorEnv([make] * num_envs, context="fork")
     envs.reset(seed=0)
     envs.action_space.seed(0)
     rate = num_envs * steps_per_second(lambda: envs.step(envs.action_space.sample()), seconds)
@@ -183,14 +186,14 @@ def picture_seconds(env_id: str, num_envs: int, seconds: float) -> dict[str, flo
 
 
 def snapshot_seconds(env_id: str, num_envs: int, rounds: int = 60) -> dict[str, float]:
-    """Median seconds of a control step, of a snapshot of all envs after it, and of its restore."""
+    """Median seconds of a control step, of a snapshot of all envs after it, and of its two restores."""
     from workbench.core.snapshot import restore_snapshot, take_snapshot
 
     env = make_batched(env_id, num_envs)
     step = random_stepper(env)
     for _ in range(10):
         step()
-    times: dict[str, list[float]] = {"step": [], "snapshot": [], "restore": []}
+    times: dict[str, list[float]] = {"step": [], "snapshot": [], "exact": [], "quick": []}
 
     def timed(name: str, call: Callable[[], Any]) -> Any:
         start = time.perf_counter()
@@ -202,7 +205,10 @@ def snapshot_seconds(env_id: str, num_envs: int, rounds: int = 60) -> dict[str, 
         timed("step", step)
         kept = timed("snapshot", lambda: take_snapshot(env))
         step()
-        timed("restore", lambda kept=kept: restore_snapshot(env, kept))
+        timed("exact", lambda kept=kept: restore_snapshot(env, kept))
+        step()
+        timed("quick", lambda kept=kept: restore_snapshot(env, kept, fresh_physics=False))
+        step()
     return {name: float(np.median(values)) for name, values in times.items()}
 
 

@@ -101,6 +101,8 @@ class CpuStatePlan:
     """Objects whose ids are used: pybind11 gives an id anew once its object is gone."""
     offsets: dict[int, tuple[int, int]]
     """Env and offset in its packed floats of an actor, by the ``id`` of its entity."""
+    settled: list[dict[int, tuple[bytes, bytes]]]
+    """Of each env, by offset in its packed bytes: a root pose that was wanted, and which was asked for to get it."""
 
 
 def plan_cpu_state(env: Any) -> CpuStatePlan:
@@ -114,7 +116,7 @@ def plan_cpu_state(env: Any) -> CpuStatePlan:
         return component.entity.name if slot is None else table.names[slot % len(table.names)]
 
     alike: dict[Contents, Contents] = {}
-    plan = CpuStatePlan([], [], [], {}, [], [], {})
+    plan = CpuStatePlan([], [], [], {}, [], [], {}, [{} for _ in px.systems])
     first_articulation = 0
     for index, system in enumerate(px.systems):
         bodies, links = system.rigid_dynamic_components, system.articulation_link_components
@@ -185,8 +187,7 @@ def write_cpu_state(
     carried: dict[str, None] = {}
     missed: dict[str, str] = {}
     px: BatchedCpuSystem = env.scene.px
-    packs = px.packs()
-    alike: dict[int, Contents] = {}
+    own = px.packs()
     for i in env_idx:
         for _, _, component in plan.sleepers[i]:
             # Or the time until it falls asleep would depend on what it touched before: a cube that was in
@@ -196,38 +197,25 @@ def write_cpu_state(
         for i in renew_physics(env.scene, env_idx):
             missed[f"fresh physics of env {i}"] = "entities were removed from its scene since it was built"
     hidden = _hidden_rows(env, plan)
-    qf = px.cuda_articulation_qf.torch().numpy()
+    packed: dict[int, bytes] = {}
+    matches: dict[int, list[int | None]] = {}
+    alike: dict[int, Contents] = {}
     for i, state in zip(env_idx, states, strict=True):
-        contents, rows = plan.contents[i], plan.articulations[i]
-        if state.contents == contents:
-            packed, matches = state.packed, list(range(len(contents)))
-            alike[id(contents)] = contents
+        packed[i] = state.packed
+        if state.contents == plan.contents[i]:
+            alike[id(plan.contents[i])] = plan.contents[i]
         else:
-            packed, matches = _joined(contents, packs[i], state, carried, missed)
+            packed[i], matches[i] = _joined(plan.contents[i], own[i], state, carried, missed)
         if i in hidden:
-            packed = _hide(packed, hidden[i])
-        px.systems[i].unpack(packed)
-        _settle_roots(px, plan, i, packed)
-        bodies = sum(part.joints is None for part in contents)
-        for part in range(bodies, len(contents)):
-            source = matches[part]
-            if source is not None:
-                theirs = source - sum(p.joints is None for p in state.contents)
-                row, dof = rows.start + part - bodies, len(contents[part].joints or ())
-                qf[row, :dof] = state.qf[theirs, :dof]
-                for flags, was in zip(px.drive_flags, state.driven, strict=True):
-                    flags[row] = was[theirs]
-    px.gpu_apply_articulation_qf()
-    for i in env_idx if fresh_physics else []:
-        for row in range(plan.articulations[i].start, plan.articulations[i].stop):
-            if qf[row].any():  # a new scene has none, though the tensor may not have changed
-                px.articulation(row).set_qf(qf[row, : px.articulation(row).dof])
+            packed[i] = _hide(packed[i], hidden[i])
+    _unpack(px, plan, packed)
+    _write_joint_forces(px, plan, dict(zip(env_idx, states, strict=True)), matches, fresh_physics)
     for i, state in zip(env_idx, states, strict=True):
-        slept = {part.name for part, asleep in zip(state.contents, state.asleep, strict=True) if asleep}
-        for part, _, component in plan.sleepers[i]:
-            if plan.contents[i][part].name in slept:
-                component.put_to_sleep()
-    px.note_change()
+        if any(state.asleep):
+            slept = {part.name for part, asleep in zip(state.contents, state.asleep, strict=True) if asleep}
+            for part, _, component in plan.sleepers[i]:
+                if plan.contents[i][part].name in slept:
+                    component.put_to_sleep()
     env.scene._gpu_fetch_all()
     for i, state in zip(env_idx, states, strict=True):
         known = plan.bodies[i]
@@ -243,11 +231,70 @@ def write_cpu_state(
     return carried, missed
 
 
+def _unpack(px: BatchedCpuSystem, plan: CpuStatePlan, packed: dict[int, bytes]) -> None:
+    """Put packed states into envs, so that each reads back as it was packed."""
+    for i, wanted in packed.items():
+        px.systems[i].unpack(_asked_for(plan, i, wanted))
+    px.note_change()
+    got = px.packs()
+    unsettled = [i for i, wanted in packed.items() if got[i] != wanted]
+    for i in unsettled:
+        _settle_roots(px, plan, i, packed[i])
+    if unsettled:
+        px.note_change()
+
+
+def _write_joint_forces(
+    px: BatchedCpuSystem,
+    plan: CpuStatePlan,
+    states: dict[int, CpuEnvState],
+    matches: dict[int, list[int | None]],
+    fresh_physics: bool,
+) -> None:
+    """Put ``set_qf``'s forces and the drives' flags back, by env; `matches` as of `_joined`, where envs differ."""
+    qf = px.cuda_articulation_qf.torch().numpy()
+    for i, state in states.items():
+        rows = plan.articulations[i]
+        if i not in matches and state.qf.shape[1] == qf.shape[1]:
+            qf[rows] = state.qf
+            for flags, was in zip(px.drive_flags, state.driven, strict=True):
+                flags[rows] = was
+            continue
+        contents = plan.contents[i]
+        bodies, their_bodies = (sum(p.joints is None for p in c) for c in (contents, state.contents))
+        for part in range(bodies, len(contents)):
+            source = matches[i][part] if i in matches else part
+            if source is not None:
+                row, theirs, dof = (
+                    rows.start + part - bodies,
+                    source - their_bodies,
+                    len(contents[part].joints or ()),
+                )
+                qf[row, :dof] = state.qf[theirs, :dof]
+                for flags, was in zip(px.drive_flags, state.driven, strict=True):
+                    flags[row] = was[theirs]
+    px.gpu_apply_articulation_qf()
+    if fresh_physics and qf.any():
+        for i in states:
+            for row in range(plan.articulations[i].start, plan.articulations[i].stop):
+                if qf[row].any():  # a new scene has none, though the tensor may not have changed
+                    px.articulation(row).set_qf(qf[row, : px.articulation(row).dof])
+
+
+def _asked_for(plan: CpuStatePlan, env: int, packed: bytes) -> bytes:
+    """The bytes to unpack for `packed` to be read: with the roots that `_settle_roots` found, where it did."""
+    for at, (wanted, asked) in plan.settled[env].items():
+        if packed[at : at + len(wanted)] == wanted:
+            packed = packed[:at] + asked + packed[at + len(wanted) :]
+    return packed
+
+
 def _settle_roots(px: BatchedCpuSystem, plan: CpuStatePlan, env: int, packed: bytes) -> None:
     """Make articulations' root poses read back as they were packed.
 
     PhysX keeps a root by its centre of mass, and what it gives back differs in the last bit from what it was
-    given; over many snapshots of snapshots that adds up. What differs is asked for that much further off.
+    given; over many snapshots of snapshots that adds up. What differs is asked for that much further off. The
+    last answer is kept: most roots stand still.
     """
     numbers = np.frombuffer(packed, dtype=np.float32)
     at = sum(part.size for part in plan.contents[env] if part.joints is None)
@@ -262,6 +309,10 @@ def _settle_roots(px: BatchedCpuSystem, plan: CpuStatePlan, env: int, packed: by
                 break
             asked = asked + (wanted - got)
             articulation.root_pose = sapien.Pose(asked[4:], asked[:4])  # type: ignore[arg-type]
+        else:
+            asked = wanted
+        if asked is not wanted:
+            plan.settled[env][at * wanted.itemsize] = wanted.tobytes(), asked.tobytes()
         at += part.size
 
 
