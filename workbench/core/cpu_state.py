@@ -21,7 +21,7 @@ is described in `snapshot` and `fresh_physics`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import sapien
@@ -64,9 +64,8 @@ Touch = tuple[str, str, NDArray[np.float32]]
 """A contact that a query counts: the names of two bodies, and the impulse (3,) in N s on the first."""
 
 
-@dataclass(frozen=True)
-class CpuEnvState:
-    """The simulation state of one env."""
+class CpuEnvState(NamedTuple):
+    """The simulation state of one env. A tuple, since hundreds are made at once."""
 
     contents: Contents
     packed: bytes
@@ -158,21 +157,15 @@ def read_cpu_state(env: Any, plan: CpuStatePlan, env_idx: list[int]) -> list[Cpu
     touching = _touching(px, plan)
     states = []
     for i in env_idx:
-        packed = packs[i]
+        packed, contents, rows = packs[i], plan.contents[i], plan.articulations[i]
         if i in true_poses:
             numbers = np.frombuffer(packed, dtype=np.float32).copy()
             for offset, pose in true_poses[i]:
                 numbers[offset : offset + 7] = pose
             packed = numbers.tobytes()
-        asleep = [False] * len(plan.contents[i])
-        for part, flag, component in plan.sleepers[i]:
-            asleep[part] = getattr(component, flag)
-        rows = plan.articulations[i]
-        states.append(
-            CpuEnvState(
-                plan.contents[i], packed, tuple(asleep), qf[rows], driven[:, rows], touching.get(i, ())
-            )
-        )
+        sleeping = {part for part, flag, component in plan.sleepers[i] if getattr(component, flag)}
+        asleep = tuple([part in sleeping for part in range(len(contents))])
+        states.append(CpuEnvState(contents, packed, asleep, qf[rows], driven[:, rows], touching.get(i, ())))
     return states
 
 
