@@ -44,7 +44,7 @@ class Past:
 
     @property
     def count(self) -> int:
-        """Control steps so far: the tick of the next row."""
+        """Control steps so far, which is one past the tick of the newest row."""
         return self._count
 
     def curves(self) -> Curves:

@@ -488,7 +488,7 @@ class Session:
             s.step = event.step
             if s.past is not None and s.timeline is not None:
                 s.past.add(event)
-                s.timeline.add(event, s.past.count)
+                s.timeline.add(event, max(0, s.past.count - 1))
                 s.step_serial = s.timeline.history.last
             if s.state == "error" and s.problem_at_run:
                 # What failed while running runs again: the task was reset, or the policy changed.

@@ -42,6 +42,8 @@ class TimelineView:
     """Whether the shown moment can be gone back to."""
     undo: str | None = None
     """What `Session.undo` would take back, in words."""
+    not_carried: tuple[str, ...] = ()
+    """What the last going back could not put back, each with its reason."""
     wants_pictures: bool = False
     """The shown moment has no pictures of the cameras that are looked through."""
 
@@ -70,12 +72,16 @@ class Timeline:
         self.history = History(num_envs, limit, first_serial)
         self._num_envs = num_envs
         self._shown: int | None = None
+        self._not_carried: tuple[str, ...] = ()
         self._asked: tuple[int, int, tuple[CameraRequest, ...]] | None = None
 
     # --- what comes ----------------------------------------------------------------------------------
 
     def add(self, stepped: Stepped, tick: int) -> None:
         self.history.add(stepped, tick)
+        if stepped.reset_mask.any():
+            missed = {} if stepped.restored is None else stepped.restored.not_carried
+            self._not_carried = tuple(f"{what}: {why}" for what, why in missed.items())
         if self._shown is not None and self._shown < self.history.first:
             self._shown = self.history.first  # what was looked at had to go
 
@@ -131,6 +137,7 @@ class Timeline:
             moments=len(history),
             can_go_on=moment is not None and bool(moment.snapshot),
             undo=None if jump is None else _in_words(jump, self._num_envs),
+            not_carried=self._not_carried,
             wants_pictures=moment is not None and bool(self._lacking(moment, env, cameras)),
         )
 
@@ -144,7 +151,11 @@ class Timeline:
             tuple(history.events(env, low, high)[-_MOST_EVENTS:]),
             history.rewards(env, low, high),
             tuple(pair for pair in history.jumps_back(env) if low <= pair[0] <= high),
-            tuple((max(s.first, low), min(s.last, high)) for s in history.stretches(env) if s.last >= low),
+            tuple(
+                (max(s.first, low), min(s.last, high))
+                for s in history.stretches(env)
+                if s.last >= low and s.first <= high
+            ),
         )
 
     # --- what is asked of the worker -------------------------------------------------------------------
@@ -202,4 +213,4 @@ def _in_words(jump: Moment, num_envs: int) -> str:
         who = f"{len(envs)} envs"
     else:
         who = ("env " if len(envs) == 1 else "envs ") + ", ".join(str(i) for i in envs)
-    return f"the reset of {who}" if jump.happened[envs[0]] & RESET else f"going back ({who})"
+    return f"reset of {who}" if jump.happened[envs[0]] & RESET else f"going back ({who})"

@@ -33,6 +33,7 @@ from workbench.ui.run_panel import RunPanel
 from workbench.ui.scene_view import SceneView
 from workbench.ui.selection_mark import SelectionMark
 from workbench.ui.status_line import StatusLine
+from workbench.ui.timeline_panel import TimelinePanel
 from workbench.ui.view_panel import ViewPanel
 from workbench.ui.viewpoint import FOV, USUAL_ASPECT, Viewpoint, frame_all, frame_one
 
@@ -91,6 +92,7 @@ class Page:
             self._curves = CurvesPanel(server)
         with tabs.add_tab("Episodes", viser.Icon.MOVIE):
             self._record = RecordPanel(server, session.start_recording, session.stop_recording)
+        self._timeline = TimelinePanel(server, session)
         self._banner = Banner(server, session.reload, session.restart_worker)
 
         self._scene = SceneView(server)
@@ -155,6 +157,7 @@ class Page:
         self._numbers.draw(view)
         self._curves.draw(view)
         self._record.draw(view)
+        self._timeline.draw(view)
 
     def _count_clients(self) -> int:
         clients = self._server.get_clients()
@@ -268,12 +271,19 @@ class Page:
     # --- keys ------------------------------------------------------------------------------------
 
     def _commands(self) -> list[Command]:
-        session, run = self._session, self._run
+        session, run, timeline = self._session, self._run, self._timeline
         return [
             Command("Play or pause", run.toggle_play, "space"),
             Command("Single step", session.step, "S"),
             Command("Reset all envs", session.reset, "R"),
             Command("Reset the selected env", run.reset_this, "R", "shift"),
+            Command("Take back the last reset or going back", session.undo, "U"),
+            Command("A step back in time", lambda: timeline.step_by(-1), "arrowleft"),
+            Command("A step on in time", lambda: timeline.step_by(1), "arrowright"),
+            Command("To the event before", lambda: timeline.to_event(-1), "arrowleft", "shift"),
+            Command("To the next event", lambda: timeline.to_event(1), "arrowright", "shift"),
+            Command("What is live", timeline.go_live, "end"),
+            Command("Go on from here, in the selected env", timeline.go_on, "G"),
             Command("Next env", lambda: run.select_neighbour(1), "N"),
             Command("Previous env", lambda: run.select_neighbour(-1), "P"),
             Command("Show all envs or the selected one", self._view_panel.toggle_only_selected, "O"),
