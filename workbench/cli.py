@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import sys
 import threading
@@ -46,6 +47,7 @@ def open_page(
     port: int = 8080,
     token: bool = True,
     recordings: Path = Path("recordings"),
+    history: str = "256MB",
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
 ) -> int:
     """Open a task in a browser page that follows its file.
@@ -59,6 +61,7 @@ def open_page(
         port: port of the page; 0 takes any free one.
         token: ask for the token of the printed address (--no-token: this machine only).
         recordings: folder for recorded episodes.
+        history: memory that the steps of the past may take, such as 64MB or 2GB; the oldest go first.
         env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
     """
     from workbench.authoring.reference import named_file
@@ -70,6 +73,7 @@ def open_page(
         return _refuse(f"there is no file {file}")
     try:
         options = _task_options(num_envs, backend, seed, env)
+        history_bytes = _bytes(history)
         door = open_door(DoorOptions(host=host, port=port, token=token), label="Workbench")
     except (ValueError, DoorError) as error:
         return _refuse(str(error))
@@ -91,7 +95,14 @@ def open_page(
             code = 1
             stop.set()
 
-    session = Session(task, options, recordings=recordings, on_event=on_event, on_line=_echo)
+    session = Session(
+        task,
+        options,
+        recordings=recordings,
+        history_bytes=history_bytes,
+        on_event=on_event,
+        on_line=_echo,
+    )
     page = Page(door.server, session)
 
     def on_signal(number: int, frame: FrameType | None) -> None:
@@ -255,6 +266,15 @@ def _env_argument(pair: str) -> tuple[str, Any]:
         return name, json.loads(value)
     except json.JSONDecodeError:
         return name, value
+
+
+def _bytes(text: str) -> int:
+    """``256MB``, ``1.5 GB`` or a plain number, as bytes."""
+    found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kmg]?)b?\s*", text, re.IGNORECASE)
+    size = 0 if found is None else int(float(found[1]) * 1024 ** " kmg".index(found[2].lower() or " "))
+    if not 1024**2 <= size <= 1024**4:
+        raise ValueError(f"--history takes a size from 1MB on, such as 256MB or 2GB; got {text!r}")
+    return size
 
 
 def _say(event: Event) -> None:

@@ -13,7 +13,7 @@ give for the state: its own shaders and texture transforms make them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -89,8 +89,15 @@ def segmentation_names(
     return {number: " | ".join(known) for number, known in names.items()}
 
 
-def take_pictures(env: Any, env_index: int, requests: Sequence[Request]) -> tuple[Picture, ...]:
-    """Render the cameras that are asked for, in env `env_index`, as it is now; in the order asked.
+def take_pictures(
+    env: Any, env_index: int, requests: Sequence[Request], poses: NDArray[np.float32] | None = None
+) -> tuple[Picture, ...]:
+    """Render the cameras that are asked for, in env `env_index`; in the order asked.
+
+    Args:
+        poses: (B, 7) where to draw the env's bodies, as `body_table.read_poses` gives them; None for where they
+            are. Only what is drawn moves, so a moment of the past can be looked at while the simulation is
+            elsewhere. A camera rides along with the body that it is mounted on; colours and lights are today's.
 
     Raises:
         IndexError: there is no such env.
@@ -100,7 +107,7 @@ def take_pictures(env: Any, env_index: int, requests: Sequence[Request]) -> tupl
     pictures: dict[int, Picture] = {}
     for kind in KINDS:
         chosen = [i for i, request in enumerate(requests) if request[1] == kind]
-        begun = begin_pictures(env, env_index, [requests[i] for i in chosen])
+        begun = begin_pictures(env, env_index, [requests[i] for i in chosen], poses)
         pictures.update(zip(chosen, begun.finish(), strict=True))
     return tuple(pictures[i] for i in range(len(requests)))
 
@@ -116,7 +123,9 @@ class BegunPictures:
         return tuple(_read(*taken) for taken in self._taken)
 
 
-def begin_pictures(env: Any, env_index: int, requests: Sequence[Request]) -> BegunPictures:
+def begin_pictures(
+    env: Any, env_index: int, requests: Sequence[Request], poses: NDArray[np.float32] | None = None
+) -> BegunPictures:
     """Set the renderer to work on the cameras asked for, and return at once.
 
     SAPIEN hands a picture to the driver in 0.05 ms and waits for it only when it is read: a GPU, or the
@@ -126,6 +135,7 @@ def begin_pictures(env: Any, env_index: int, requests: Sequence[Request]) -> Beg
 
     Args:
         requests: all of one kind, since sensors and human cameras see different objects.
+        poses: as in `take_pictures`.
 
     Raises:
         As `take_pictures`.
@@ -145,16 +155,56 @@ def begin_pictures(env: Any, env_index: int, requests: Sequence[Request]) -> Beg
         scene.px.sync_poses_gpu_to_cpu()
     sub_scene = scene.sub_scenes[env_index]
     taken = []
-    with _hidden_objects(env, env_index, shown=kinds == {"human"}):
+    components = [_components(cameras[kind, name])[env_index] for name, kind, _ in requests]
+    with (
+        _hidden_objects(env, env_index, shown=kinds == {"human"}),
+        _drawn_at(env, env_index, components, poses) as move_bodies,
+    ):
         sub_scene.update_render()
-        for name, kind, modalities in requests:
-            camera = cameras[kind, name]
-            component = _components(camera)[env_index]
+        move_bodies()
+        for (name, kind, modalities), component in zip(requests, components, strict=True):
             component.take_picture()
             pose = component.get_global_pose()
             where = np.array([*pose.p, *pose.q], dtype=np.float32)
-            taken.append((camera, name, kind, env_index, tuple(modalities), where))
+            taken.append((cameras[kind, name], name, kind, env_index, tuple(modalities), where))
     return BegunPictures(tuple(taken))
+
+
+@contextmanager
+def _drawn_at(
+    env: Any, env_index: int, components: Sequence[Any], poses: NDArray[np.float32] | None
+) -> Iterator[Callable[[], None]]:
+    """Draw the bodies of an env at `poses`, with the cameras on them, and leave the bodies where they are.
+
+    Gives the function that moves what is drawn, to be called after ``update_render``, which draws every body
+    where it is. Cameras are drawn by ``update_render``, so those on a body are moved before it.
+    """
+    if poses is None:
+        yield lambda: None
+        return
+    row = build_body_table(env).entities[env_index]
+    then = {id(entity): pose for entity, pose in zip(row, poses, strict=True) if np.isfinite(pose).all()}
+    was: list[tuple[Any, sapien.Pose]] = []
+    for component in components:
+        pose = then.get(id(component.entity))
+        if pose is not None:
+            was.append((component, component.local_pose))
+            there = sapien.Pose(pose[:3], pose[3:])
+            component.local_pose = component.entity.pose.inv() * there * component.local_pose
+
+    def move_bodies() -> None:
+        for entity in row:
+            pose = then.get(id(entity))
+            for drawn in [] if pose is None else entity.components:
+                if pose is not None and isinstance(drawn, sapien.render.RenderBodyComponent):
+                    drawn._internal_node.set_position(pose[:3])
+                    drawn._internal_node.set_rotation(pose[3:])
+
+    try:
+        yield move_bodies
+    finally:
+        for component, local_pose in was:
+            component.local_pose = local_pose
 
 
 def _cameras(env: Any) -> dict[tuple[CameraKind, str], Any]:

@@ -48,6 +48,8 @@ class EpisodeGatherer:
         for env in self._builders:
             if stepped.reset_mask[env]:
                 self.end(env)
+                if stepped.step.elapsed_steps[env] != 0:
+                    continue  # somebody went back into an episode: no seed starts one there
                 seed = int(stepped.seeds[env]) if stepped.seeds is not None else -1
                 self._begin(env, stepped.step, seed, stepped.captured)
             elif stepped.step.action is not None:

@@ -160,6 +160,34 @@ class SetCapture:
 
 
 @dataclass(frozen=True)
+class Restore:
+    """Put envs back to a moment of the past; the answer is a `Stepped` with `Stepped.restored`."""
+
+    snapshot: bytes
+    """A pickled `core.snapshot.Snapshot` of the whole batch."""
+    env_idx: tuple[int, ...]
+    """The envs to be set."""
+    source: tuple[int, ...]
+    """Whose state each of them gets."""
+    origin: int
+    """The server's number of that moment; comes back as it is."""
+    undoes: int | None = None
+    """The server's number of the jump that this takes back, if it takes one back; comes back as it is."""
+
+
+@dataclass(frozen=True)
+class DrawPast:
+    """Draw one env as it was, without touching its simulation; the answer is `PastPictures`."""
+
+    poses: NDArray[np.float32]
+    """(B, 7) of that env's bodies, as in `StepResult.poses`."""
+    env: int
+    cameras: tuple[CameraRequest, ...]
+    origin: int
+    """The server's number of that moment; comes back as it is."""
+
+
+@dataclass(frozen=True)
 class Quit:
     pass
 
@@ -175,6 +203,8 @@ Request = (
     | SetSliders
     | WatchCameras
     | SetCapture
+    | Restore
+    | DrawPast
     | Quit
 )
 
@@ -206,16 +236,39 @@ class Failed:
 
 
 @dataclass(frozen=True)
+class Restored:
+    """What a `Restore` did."""
+
+    env_idx: tuple[int, ...]
+    source: tuple[int, ...]
+    origin: int
+    undoes: int | None
+    not_carried: dict[str, str]
+    """What could not be put back, and why; empty within one version of a task."""
+
+
+@dataclass(frozen=True)
 class Stepped:
-    """One reset or control step of the batch, always sent, in order."""
+    """One reset, control step or restore of the batch, always sent, in order."""
 
     step: StepResult
     reset_mask: NDArray[np.bool_]
-    """(N,) True where this result is the first of a new episode."""
+    """(N,) True where this result does not follow from the one before: the first of a new episode, or a moment
+    of the past that was returned to (`restored`)."""
     captured: tuple[Picture, ...] = ()
     """Pictures that belong to exactly this step (only while capturing)."""
     seeds: NDArray[np.int64] | None = None
     """(N,) episode seed of each env, where a reset was part of this."""
+    snapshot: bytes = b""
+    """The body of the snapshot of the whole batch at this moment (see `core.snapshot_parts`): opaque to the
+    server, whose `History.snapshot_at` makes a pickled `Snapshot` of it."""
+    part_keys: tuple[int, ...] | None = None
+    """The parts of the snapshot; None where they are those of the event before."""
+    new_parts: dict[int, bytes] = field(default_factory=dict)
+    """Parts that were not sent before."""
+    number: int = 0
+    """Counts these events since the worker began; `Pictures.numbers` refers to it."""
+    restored: Restored | None = None
 
 
 @dataclass(frozen=True)
@@ -224,6 +277,16 @@ class Pictures:
 
     pictures: tuple[Picture, ...]
     milliseconds: float
+    numbers: tuple[int, ...] = ()
+    """`Stepped.number` of the moment that each of them shows."""
+
+
+@dataclass(frozen=True)
+class PastPictures:
+    """The answer to `DrawPast`."""
+
+    origin: int
+    pictures: tuple[Picture, ...]
 
 
 @dataclass(frozen=True)
@@ -237,4 +300,4 @@ class Status:
     """What keeps the worker from its requests for a while, if anything does."""
 
 
-Event = Loading | Loaded | Failed | Stepped | Pictures | Status
+Event = Loading | Loaded | Failed | Stepped | Pictures | PastPictures | Status

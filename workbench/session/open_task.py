@@ -24,6 +24,7 @@ from workbench.authoring.returns import check_step_returns, problem_from_return
 from workbench.core import actions
 from workbench.core.backends import find_renderer
 from workbench.core.scene_geometry import read_geometry
+from workbench.core.snapshot import RestoreReport, Snapshot
 from workbench.core.step import StepResult
 from workbench.core.strict import BrokenRule, WrongReturn
 from workbench.core.take_pictures import list_cameras, segmentation_names
@@ -127,6 +128,14 @@ def reset_checked(
     """`TaskEnv.reset`; what goes wrong is raised as a TaskError with the author's line."""
     with _blamed("reset", loaded, task):
         return task.reset(seed=seed, env_idx=env_idx)
+
+
+def restore_checked(
+    task: TaskEnv, loaded: LoadedTask, snapshot: Snapshot, env_idx: Sequence[int], source: Sequence[int]
+) -> tuple[StepResult, RestoreReport]:
+    """`TaskEnv.restore`; what goes wrong is raised as a TaskError with the author's line."""
+    with _blamed("restore", loaded, task):
+        return task.restore(snapshot, env_idx, source)
 
 
 def describe(loaded: LoadedTask, task: TaskEnv) -> TaskDescription:

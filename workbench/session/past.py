@@ -42,6 +42,11 @@ class Past:
         self._new_episode = np.zeros_like(self._new_episode)
         self._count += 1
 
+    @property
+    def count(self) -> int:
+        """Control steps so far, which is one past the tick of the newest row."""
+        return self._count
+
     def curves(self) -> Curves:
         rows = np.arange(max(0, self._count - self._length), self._count) % self._length
         return Curves(

@@ -37,15 +37,19 @@ class PictureMaker:
         self._made: list[Picture] = []
         self._round_began = 0.0
         self._expected: dict[CameraKind, float] = {"sensor": 0.0, "human": 0.0}
+        self._moment = 0
+        self._begun_of = 0
+        self.moments: list[int] = []
+        """Which moment (as `scene_changed` was told) each picture of the last round shows."""
 
     def watch(self, env_index: int, requests: Sequence[Request]) -> None:
         """From now on these cameras of this env."""
         self._env_index, self._requests = env_index, tuple(requests)
         self._wanted = bool(requests)
 
-    def scene_changed(self) -> None:
-        """What was drawn is old."""
-        self._wanted = bool(self._requests)
+    def scene_changed(self, moment: int) -> None:
+        """What was drawn is old; the scene is now that of `moment`, a number of the caller's."""
+        self._wanted, self._moment = bool(self._requests), moment
 
     @property
     def idle(self) -> bool:
@@ -63,7 +67,7 @@ class PictureMaker:
         if self._begun is None:
             if not self._wanted or now < self._next_round:
                 return None
-            self._wanted, self._round_began, self._made = False, now, []
+            self._wanted, self._round_began, self._made, self.moments = False, now, [], []
             self._kinds_left = [kind for kind in KINDS if any(r[1] == kind for r in self._requests)]
             self._begin_next(env)
             return None
@@ -89,6 +93,7 @@ class PictureMaker:
         chosen = [request for request in self._requests if request[1] == kind]
         self._begun = begin_pictures(env.env, self._env_index, chosen)
         self._kind: CameraKind = kind
+        self._begun_of = self._moment
         self._begun_at = time.monotonic()
         self._ready_at = self._begun_at + self._expected[kind]
 
@@ -96,7 +101,9 @@ class PictureMaker:
         begun, self._begun = self._begun, None
         assert begun is not None
         asked = time.monotonic()
-        self._made += begun.finish()
+        made = begun.finish()
+        self._made += made
+        self.moments += [self._begun_of] * len(made)
         done = time.monotonic()
         waited = done - asked > 0.004
         # Fetched too early, the wait tells how long it takes; otherwise it may take less than expected.

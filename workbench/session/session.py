@@ -29,10 +29,12 @@ from workbench.session.messages import (
     Load,
     Loaded,
     Loading,
+    PastPictures,
     Pictures,
     Play,
     Request,
     Reset,
+    Restore,
     SetActionSource,
     SetCapture,
     SetEpisodeEnd,
@@ -47,9 +49,12 @@ from workbench.session.messages import (
 )
 from workbench.session.past import Past
 from workbench.session.record_live import LiveRecorder
+from workbench.session.timeline import Scope, Strip, Timeline, TimelineView
 from workbench.session.view import Curves, SessionView, State
 
 _PRINTED_LINES = 200
+HISTORY_BYTES = 256 * 1024**2
+"""What the past may take unless somebody says otherwise."""
 
 
 @dataclass
@@ -71,6 +76,7 @@ class _State:
     problem_serial: int = 0
     problem_at_run: bool = False
     past: Past | None = None
+    timeline: Timeline | None = None
     selected_env: int = 0
     playing: bool = False
     wants_play: bool = False
@@ -95,6 +101,7 @@ class Session:
         options: TaskOptions,
         *,
         recordings: Path,
+        history_bytes: int = HISTORY_BYTES,
         on_event: Callable[[Event], None] = lambda event: None,
         on_line: Callable[[str], None] = lambda line: None,
     ) -> None:
@@ -102,12 +109,14 @@ class Session:
         Args:
             task: a file, ``file.py:ClassName``, or a registered env id.
             recordings: folder that recorded episodes go to; made when the first is written.
+            history_bytes: memory that the past may take.
             on_event: called with every event of the worker on the session's thread (the terminal).
             on_line: called with every line that the worker printed, from its own threads.
         """
         self._task = task
         self._options = options
         self._seed = options.seed
+        self._history_bytes = history_bytes
         self._on_event = on_event
         self._print = on_line
         self._lock = threading.Lock()
@@ -134,6 +143,8 @@ class Session:
             s = self._state
             if s.past is not None and (self._curves is None or self._curves.serial != s.step_serial):
                 self._curves = s.past.curves()
+            shown = None if s.timeline is None else s.timeline.shown
+            live = s.timeline is None or shown is None
             return SessionView(
                 state=s.state,
                 activity=s.activity,
@@ -141,9 +152,9 @@ class Session:
                 task=s.task,
                 task_serial=s.task_serial,
                 load_milliseconds=s.load_milliseconds,
-                step=s.step,
-                step_serial=s.step_serial,
-                pictures=s.pictures,
+                step=s.step if shown is None else shown.step,
+                step_serial=s.step_serial if shown is None else shown.serial,
+                pictures=s.pictures if live or s.timeline is None else s.timeline.pictures(s.selected_env),
                 pictures_serial=s.pictures_serial,
                 picture_milliseconds=s.picture_milliseconds,
                 problem=s.problem,
@@ -161,6 +172,7 @@ class Session:
                 real_time_factor=s.real_time_factor,
                 recording=recording,
                 printed=tuple(s.printed),
+                timeline=TimelineView() if s.timeline is None else s.timeline.view(s.selected_env, s.cameras),
             )
 
     def wait(self, seen: int, timeout: float) -> int:
@@ -186,6 +198,7 @@ class Session:
         self._worker.replace()
 
     def play(self) -> None:
+        self.seek(None)
         self._set(playing=True, wants_play=True)
         self._send(Play(True))
 
@@ -195,11 +208,13 @@ class Session:
 
     def step(self) -> None:
         """One control step; pauses first."""
+        self.seek(None)
         self.pause()
         self._send(SingleStep())
 
     def reset(self, env_idx: tuple[int, ...] | None = None) -> None:
         """All envs with the session's seed, or some with fresh seeds."""
+        self.seek(None)
         self._send(Reset(env_idx, self._seed if env_idx is None else None))
 
     def set_seed(self, seed: int) -> None:
@@ -273,6 +288,81 @@ class Session:
         self._recorder.stop()
         self._note()
 
+    # --- the past ------------------------------------------------------------------------------------
+
+    def seek(self, serial: int | None) -> None:
+        """Show a moment of the past, by its number (see `TimelineView`); None shows what is live."""
+        self._seek(lambda timeline: timeline.seek(serial))
+
+    def seek_by(self, steps: int) -> None:
+        """Show a moment before (negative) or after the one that is shown."""
+        self._seek(lambda timeline: timeline.seek_by(steps))
+
+    def seek_event(self, direction: int) -> None:
+        """Show the next (1) or last (-1) event of the selected env: reset, success, fail, truncation, branch."""
+        env = self._state.selected_env
+        self._seek(lambda timeline: timeline.seek_event(env, direction))
+
+    def go_on(self, scope: Scope) -> None:
+        """Put envs back to the shown moment; the simulation goes on from there (see `timeline.Scope`)."""
+        self._travel(lambda timeline, env: timeline.go_on(env, scope))
+
+    def undo(self) -> None:
+        """Take back the selected env's last reset or going back, and pause there."""
+        self.pause()
+        self._travel(lambda timeline, env: timeline.undo(env))
+
+    def draw_past(self) -> None:
+        """Ask for pictures of the moment that is shown, if it has none of the cameras looked through."""
+        with self._lock:
+            s = self._state
+            request = None if s.timeline is None else s.timeline.draw(s.selected_env, s.cameras)
+        if request is not None:
+            self._send(request)
+
+    def strip(self, low: int, high: int) -> Strip | None:
+        """The selected env's past between two moments; None before a task is loaded."""
+        with self._lock:
+            s = self._state
+            return None if s.timeline is None else s.timeline.strip(s.selected_env, low, high)
+
+    def stretch(self) -> tuple[int, int] | None:
+        """First and last moment of what the selected env lived through round the shown moment, without a jump."""
+        with self._lock:
+            s = self._state
+            if s.timeline is None or not len(s.timeline.history):
+                return None
+            shown = s.timeline.shown
+            at = s.timeline.history.last if shown is None else shown.serial
+            return s.timeline.history.stretch_at(s.selected_env, at)
+
+    def snapshot(self) -> bytes | None:
+        """The newest moment, pickled for `Load.snapshot`; None before a task is loaded."""
+        with self._lock:
+            timeline = self._state.timeline
+            return None if timeline is None else timeline.history.snapshot_at(timeline.history.last)
+
+    def _seek(self, seek: Callable[[Timeline], None]) -> None:
+        with self._lock:
+            s = self._state
+            if s.timeline is None:
+                return
+            before = s.timeline.shown
+            seek(s.timeline)
+            if s.timeline.shown is before:
+                return
+            s.pictures_serial += 1
+        self._note()
+
+    def _travel(self, ask: Callable[[Timeline, int], Restore | None]) -> None:
+        with self._lock:
+            s = self._state
+            request = None if s.timeline is None else ask(s.timeline, s.selected_env)
+            s.pictures_serial += 1
+        if request is not None:
+            self._send(request)
+        self._note()
+
     def close(self) -> None:
         """End the worker and the watcher, and wait for episodes that are being written."""
         with self._changed:
@@ -344,7 +434,13 @@ class Session:
             s.problem_at_run = s.state != "loading"
             s.state = "error"
             s.stale = s.stale or not s.problem_at_run
+        elif isinstance(event, PastPictures):
+            if s.timeline is not None:
+                s.timeline.add_pictures(event)
+                s.pictures_serial += 1
         elif isinstance(event, Pictures):
+            if s.timeline is not None:
+                s.timeline.add_pictures(event)
             if event.pictures and event.pictures[0].env == s.selected_env:
                 s.pictures = {(picture.kind, picture.camera): picture for picture in event.pictures}
                 s.pictures_serial += 1
@@ -368,8 +464,9 @@ class Session:
             self._last_good = dict(task.source) or None
             s.task, s.step, s.load_milliseconds = task, event.first, event.milliseconds
             s.task_serial += 1
-            s.step_serial += 1
             s.past, self._curves = Past(task.num_envs), None
+            next_serial = 0 if s.timeline is None else s.timeline.history.next_serial
+            s.timeline = Timeline(task.num_envs, self._history_bytes, next_serial)
             s.pictures, s.sliders = {}, ()
             s.pictures_serial += 1
             s.selected_env = min(s.selected_env, task.num_envs - 1)
@@ -389,9 +486,10 @@ class Session:
         with self._lock:
             s = self._state
             s.step = event.step
-            s.step_serial += 1
-            if s.past is not None:
+            if s.past is not None and s.timeline is not None:
                 s.past.add(event)
+                s.timeline.add(event, max(0, s.past.count - 1))
+                s.step_serial = s.timeline.history.last
             if s.state == "error" and s.problem_at_run:
                 # What failed while running runs again: the task was reset, or the policy changed.
                 self._set_problem(None)

@@ -16,6 +16,7 @@ from workbench.authoring.problem import Problem
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.step import StepResult
 from workbench.session.messages import ActionSource, EpisodeEnd, TaskDescription
+from workbench.session.timeline import TimelineView
 
 State = Literal["starting", "loading", "running", "paused", "error", "stopped"]
 """``starting``: the worker process is coming up. ``loading``: a task is being imported or built.
@@ -62,7 +63,9 @@ class SessionView:
     """Grows with every load that succeeded."""
     load_milliseconds: dict[str, float]
     step: StepResult | None
+    """What is shown: the newest step, or a moment of the past (`timeline`)."""
     step_serial: int
+    """Number of the moment that is shown."""
     pictures: dict[tuple[CameraKind, str], Picture]
     pictures_serial: int
     picture_milliseconds: float
@@ -82,3 +85,5 @@ class SessionView:
     recording: RecordingStatus
     printed: tuple[str, ...]
     """The last lines that the author's code printed."""
+    timeline: TimelineView = TimelineView()
+    """The past. While a moment of it is shown, `step` and `pictures` are of that moment."""

@@ -11,6 +11,7 @@ The server starts it as ``python -m workbench.session.worker FD`` with one end o
 from __future__ import annotations
 
 import gc
+import pickle
 import sys
 import time
 from collections.abc import Callable
@@ -23,23 +24,28 @@ import torch
 from workbench.authoring.problem import Problem, TaskError, problem_from_exception
 from workbench.core import actions
 from workbench.core.pictures import Picture
+from workbench.core.snapshot_parts import PackedSnapshot, SnapshotPacker
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import Request as PictureRequest
 from workbench.core.take_pictures import take_pictures
 from workbench.session.episodes import recorded_pictures
 from workbench.session.messages import (
     ActionSource,
+    DrawPast,
     EpisodeEnd,
     Event,
     Failed,
     Load,
     Loaded,
     Loading,
+    PastPictures,
     Pictures,
     Play,
     Quit,
     Request,
     Reset,
+    Restore,
+    Restored,
     SetActionSource,
     SetCapture,
     SetEpisodeEnd,
@@ -50,7 +56,14 @@ from workbench.session.messages import (
     Stepped,
     WatchCameras,
 )
-from workbench.session.open_task import OpenedTask, open_task, reset_checked, step_checked, zero_action
+from workbench.session.open_task import (
+    OpenedTask,
+    open_task,
+    reset_checked,
+    restore_checked,
+    step_checked,
+    zero_action,
+)
 from workbench.session.pacing import Pacer, Rate
 from workbench.session.picture_maker import PictureMaker
 from workbench.session.policy import Policy, load_policy
@@ -78,6 +91,8 @@ class Worker:
         self._pictures = PictureMaker()
         self._renderer_ready = False
         self._capture = SetCapture(())
+        self._packer: SnapshotPacker | None = SnapshotPacker()
+        self._number = 0
         self._status_sent = 0.0
         self._quit = False
         self._handlers: dict[type, Callable[[Any], None]] = {
@@ -91,6 +106,8 @@ class Worker:
             SetSliders: self._set_sliders,
             WatchCameras: self._watch_cameras,
             SetCapture: self._set_capture,
+            Restore: self._restore,
+            DrawPast: self._draw_past,
             Quit: self._stop,
         }
 
@@ -153,7 +170,10 @@ class Worker:
         self._sliders = ()
         self._watch_cameras(self._watch)
         self._capture = SetCapture(())
+        self._packer = SnapshotPacker()
         self._send(Loaded(opened.description, opened.first, opened.milliseconds))
+        # The past begins with the reset, and what a first step is taken back to is this.
+        self._send_step(opened.first, np.ones(opened.env.num_envs, bool), opened.env.episode_seeds)
         if before is not None:
             before.env.close()
 
@@ -207,6 +227,21 @@ class Worker:
     def _set_capture(self, request: SetCapture) -> None:
         self._capture = request
 
+    def _restore(self, request: Restore) -> None:
+        self._guarded(lambda opened: self._restore_envs(opened, request))
+
+    def _draw_past(self, request: DrawPast) -> None:
+        if self._opened is None:
+            return
+        self._pictures.settle()  # its cameras and bodies are about to be drawn elsewhere
+        wanted: list[PictureRequest] = [(c.name, c.kind, c.modalities) for c in request.cameras]
+        try:
+            pictures = take_pictures(self._opened.env.env, request.env, wanted, request.poses)
+        except (RuntimeError, ValueError, IndexError) as error:
+            self._fail(problem_from_exception(error, "pictures", self._opened.loaded.source_files))
+            return
+        self._send(PastPictures(request.origin, pictures))
+
     def _stop(self, request: Quit) -> None:
         self._quit = True
 
@@ -259,6 +294,15 @@ class Worker:
             mask[list(env_idx)] = True
         self._send_step(step, mask, seeds=opened.env.episode_seeds)
 
+    def _restore_envs(self, opened: OpenedTask, request: Restore) -> None:
+        self._pictures.settle()  # the envs get new scenes, with the same entities
+        snapshot = pickle.loads(request.snapshot)
+        step, report = restore_checked(opened.env, opened.loaded, snapshot, request.env_idx, request.source)
+        mask = np.zeros(opened.env.num_envs, bool)
+        mask[list(request.env_idx)] = True
+        did = Restored(request.env_idx, request.source, request.origin, request.undoes, report.not_carried)
+        self._send_step(step, mask, opened.env.episode_seeds, did)
+
     def _next_action(self, opened: OpenedTask) -> np.ndarray:
         env = opened.env
         if self._source == "random":
@@ -276,15 +320,53 @@ class Worker:
             return np.broadcast_to(action, (env.num_envs, len(low))).copy()
         return actions.hold_action(env.parts, env.num_envs)
 
-    def _send_step(self, step: StepResult, reset_mask: np.ndarray, seeds: np.ndarray | None = None) -> None:
-        self._pictures.scene_changed()
+    def _send_step(
+        self,
+        step: StepResult,
+        reset_mask: np.ndarray,
+        seeds: np.ndarray | None = None,
+        restored: Restored | None = None,
+    ) -> None:
+        assert self._opened is not None
+        self._number += 1
+        self._pictures.scene_changed(self._number)
         captured: tuple[Picture, ...] = ()
-        if self._capture.env_idx and self._opened is not None:
+        if self._capture.env_idx:
             self._pictures.settle()
             wanted = recorded_pictures(self._opened.description.cameras)
             for env in self._capture.env_idx:
                 captured += take_pictures(self._opened.env.env, env, wanted)
-        self._send(Stepped(step, reset_mask, captured, seeds))
+        packed = self._packed_snapshot(self._opened)
+        self._send(
+            Stepped(
+                step,
+                reset_mask,
+                captured,
+                seeds,
+                packed.body,
+                packed.keys,
+                packed.new_parts,
+                self._number,
+                restored,
+            )
+        )
+
+    def _packed_snapshot(self, opened: OpenedTask) -> PackedSnapshot:
+        """The batch as it is; empty for a task whose state cannot be kept, which is said once."""
+        nothing = PackedSnapshot(b"", None, {})
+        if self._packer is None:
+            return nothing
+        try:
+            return self._packer.pack(opened.env.snapshot())
+        except Exception as error:
+            # What a task keeps on itself is open: an array of objects that cannot be pickled must not end
+            # the run of a task that works.
+            self._packer = None
+            print(
+                f"The past of this task can be looked at, but not gone back to: {type(error).__name__}: {error}",
+                file=sys.stderr,
+            )
+            return nothing
 
     # --- pictures and status -----------------------------------------------------------------------
 
@@ -303,7 +385,7 @@ class Worker:
         if made is None:
             return
         pictures, seconds = made
-        self._send(Pictures(pictures, 1000 * seconds))
+        self._send(Pictures(pictures, 1000 * seconds, tuple(self._pictures.moments)))
         if not self._renderer_ready:
             self._renderer_ready = True
             self._pacer.start(time.monotonic())

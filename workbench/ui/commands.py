@@ -1,7 +1,7 @@
 """Every action that matters, with a key and a name in the command palette (Ctrl+K).
 
-Keys work while no text field has the focus. Arrows are left alone: a slider that has the focus takes them too,
-and one press would count twice. The list is one table, so that the page, the palette and
+Keys work while no text field has the focus. A slider that has the focus takes the arrows too, and one press would
+count twice, so the commands on arrows ask first whether one did (`Control.touched_within`). The list is one table, so that the page, the palette and
 the help that is made from it cannot disagree.
 """
 
@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import viser
 from viser._messages import HotkeyKey, KeyModifier  # the types of add_command's arguments (viser 1.1.1)
+
+_NAMES = {"space": "Space", "arrowleft": "←", "arrowright": "→", "end": "End"}
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,7 @@ class Command:
         """For a person: ``Space``, ``Shift R``."""
         if self.key is None:
             return ""
-        name = "Space" if self.key == "space" else self.key
+        name = _NAMES.get(self.key, self.key)
         return f"{self.modifier.capitalize()} {name}" if self.modifier else name
 
 

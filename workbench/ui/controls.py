@@ -13,7 +13,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from typing import Any, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import viser
 
@@ -36,6 +36,8 @@ class Control(Generic[Handle, T]):
         settle: Seconds without a change before a value is sent.
     """
 
+    _last_touch: ClassVar[float] = -1e9
+
     def __init__(
         self,
         handle: Handle,
@@ -53,6 +55,11 @@ class Control(Generic[Handle, T]):
         self._waiting: viser.ClientHandle | None = None
         self._lock = threading.Lock()
         handle.on_update(self._on_update)
+
+    @staticmethod
+    def touched_within(seconds: float) -> bool:
+        """Whether a person touched any input so lately: then it has the focus, and takes the arrow keys."""
+        return time.monotonic() - Control._last_touch < seconds
 
     def show(self, value: T) -> None:
         """Show what the session says, unless someone has their hand on the input; send what settled."""
@@ -75,7 +82,7 @@ class Control(Generic[Handle, T]):
     def _on_update(self, event: viser.GuiEvent) -> None:
         if event.client is None:
             return  # `show` wrote it; sending it back would make an endless exchange.
-        self._touched = time.monotonic()
+        self._touched = Control._last_touch = time.monotonic()
         if self._settle:
             with self._lock:
                 self._waiting = event.client

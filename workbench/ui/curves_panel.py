@@ -20,6 +20,9 @@ LONGEST = 600
 """Points of a curve. More do not fit in the panel's 300 pixels."""
 SELECTED_COLOUR = "#228be6"
 BATCH_COLOUR = "#868e96"
+CURSOR = uplot.Series(
+    label="shown", stroke="#f08c00", width=0, points={"show": True, "size": 10, "fill": "#f08c00"}
+)
 
 
 class CurvesPanel:
@@ -28,7 +31,7 @@ class CurvesPanel:
         self._charts: dict[str, viser.GuiUplotHandle] = {}
         self._folder = server.gui.add_folder(None)
         self._empty = server.gui.add_html('<div class="wb-note">Curves appear with the first step.</div>')
-        self._drawn: tuple[int, int, int] | None = None
+        self._drawn: tuple[int, int, int, int | None] | None = None
         self._drawn_at = 0.0
 
     def draw(self, view: SessionView) -> None:
@@ -40,12 +43,13 @@ class CurvesPanel:
                 chart.visible = False
         if curves is None or not drawable:
             return
-        wanted = (curves.serial, view.selected_env, curves.reward.shape[1])
+        shown = None if view.timeline.shown is None else view.timeline.tick
+        wanted = (curves.serial, view.selected_env, curves.reward.shape[1], shown)
         if wanted == self._drawn or time.monotonic() - self._drawn_at < REDRAW_EVERY:
             return
         self._drawn, self._drawn_at = wanted, time.monotonic()
-        self._draw_chart("reward", curves, curves.reward, view.selected_env, None)
-        self._draw_chart("success", curves, curves.success, view.selected_env, (-0.05, 1.05))
+        self._draw_chart("reward", curves, curves.reward, view.selected_env, None, shown)
+        self._draw_chart("success", curves, curves.success, view.selected_env, (-0.05, 1.05), shown)
 
     def _draw_chart(
         self,
@@ -54,6 +58,7 @@ class CurvesPanel:
         values: NDArray[np.float32],
         env: int,
         span: tuple[float, float] | None,
+        shown: int | None,
     ) -> None:
         chart = self._charts.get(title)
         if np.isnan(values).all():
@@ -62,24 +67,28 @@ class CurvesPanel:
             return
         data, labels = curve_data(curves.tick, values, env)
         series = chart_series(labels)
+        if shown is not None:
+            # uPlot finds no range for data with NaN in it.
+            span = span or value_span(data[1:])
+            data, series = (*data, cursor_data(data, shown)), (*series, CURSOR)
+        scales = {"x": uplot.Scale(time=False)} | ({} if span is None else {"y": uplot.Scale(range=span)})
         if chart is None:
             with self._folder:
                 self._charts[title] = self._server.gui.add_uplot(
                     data,
                     series,
                     title=title,
-                    scales={"x": uplot.Scale(time=False)}
-                    | ({} if span is None else {"y": uplot.Scale(range=span)}),
+                    scales=scales,
                     axes=(uplot.Axis(size=30), uplot.Axis(size=46)),
                     legend=uplot.Legend(show=True),
                     height=150,
                     padding=(6, 12, 0, 0),
                 )
             return
-        if chart.series != series:
+        if chart.series != series or chart.scales != scales:
             # The data must fit the series in every state that the browser may see.
             with self._server.atomic():
-                chart.series = series
+                chart.series, chart.scales = series, scales
                 chart.data = data
         else:
             chart.data = data
@@ -96,6 +105,20 @@ def curve_data(
     if values.shape[1] == 1:
         return (x, one), ("env 0",)
     return (x, values[recent].mean(axis=1, dtype=np.float64), one), ("mean of the batch", f"env {env}")
+
+
+def cursor_data(data: tuple[NDArray[np.float64], ...], shown: int) -> NDArray[np.float64]:
+    """One point on the selected env's line at the moment of the past that is shown, nothing elsewhere."""
+    return np.where(data[0] == shown, data[-1], np.nan)
+
+
+def value_span(lines: tuple[NDArray[np.float64], ...]) -> tuple[float, float]:
+    """A range that holds every finite value, with some room above and below."""
+    values = np.concatenate(lines)
+    values = values[np.isfinite(values)]
+    low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
+    room = 0.08 * (high - low) or 0.5
+    return low - room, high + room
 
 
 def chart_series(labels: tuple[str, ...]) -> tuple[uplot.Series, ...]:

@@ -33,8 +33,10 @@ from workbench.ui.run_panel import RunPanel
 from workbench.ui.scene_view import SceneView
 from workbench.ui.selection_mark import SelectionMark
 from workbench.ui.status_line import StatusLine
+from workbench.ui.timeline_panel import HEIGHT as TIMELINE_HEIGHT
+from workbench.ui.timeline_panel import TimelinePanel
 from workbench.ui.view_panel import ViewPanel
-from workbench.ui.viewpoint import FOV, USUAL_ASPECT, Viewpoint, frame_all, frame_one
+from workbench.ui.viewpoint import FOV, USUAL_ASPECT, USUAL_HEIGHT, Viewpoint, frame_all, frame_one
 
 log = logging.getLogger(__name__)
 
@@ -91,6 +93,7 @@ class Page:
             self._curves = CurvesPanel(server)
         with tabs.add_tab("Episodes", viser.Icon.MOVIE):
             self._record = RecordPanel(server, session.start_recording, session.stop_recording)
+        self._timeline = TimelinePanel(server, session)
         self._banner = Banner(server, session.reload, session.restart_worker)
 
         self._scene = SceneView(server)
@@ -155,6 +158,7 @@ class Page:
         self._numbers.draw(view)
         self._curves.draw(view)
         self._record.draw(view)
+        self._timeline.draw(view)
 
     def _count_clients(self) -> int:
         clients = self._server.get_clients()
@@ -214,7 +218,7 @@ class Page:
 
     def frame(self, view: SessionView, untouched_only: bool = False) -> None:
         """Point every open page (or those whose view nobody has moved), and those to come, at the scene."""
-        viewpoint = self._viewpoint(view, USUAL_ASPECT)
+        viewpoint = self._viewpoint(view, USUAL_ASPECT, USUAL_HEIGHT)
         if viewpoint is None:
             return
         self._server.initial_camera.position = viewpoint.position
@@ -243,19 +247,19 @@ class Page:
                 self._point(client, view)
 
     def _point(self, client: viser.ClientHandle, view: SessionView) -> None:
-        viewpoint = self._viewpoint(view, aspect_of(client))
+        viewpoint = self._viewpoint(view, aspect_of(client), client.camera.image_height or USUAL_HEIGHT)
         if viewpoint is not None:
             self._pointed[client.client_id] = (viewpoint.position, aspect_of(client))
             client.camera.position = viewpoint.position
             client.camera.look_at = viewpoint.look_at
 
-    def _viewpoint(self, view: SessionView, aspect: float) -> Viewpoint | None:
+    def _viewpoint(self, view: SessionView, aspect: float, height: float) -> Viewpoint | None:
         if self._layout is None or view.task is None:
             return None
         if self._view_panel.only_selected or view.task.num_envs == 1:
             human = next((p for (kind, _), p in view.pictures.items() if kind == "human"), None)
-            return frame_one(self._layout, human, aspect)
-        return frame_all(self._layout, aspect)
+            return frame_one(self._layout, human, aspect, TIMELINE_HEIGHT / height)
+        return frame_all(self._layout, aspect, TIMELINE_HEIGHT / height)
 
     def _on_scene_click(self, event: viser.SceneClickEvent) -> None:
         layout, view = self._layout, self._session.view()
@@ -268,12 +272,19 @@ class Page:
     # --- keys ------------------------------------------------------------------------------------
 
     def _commands(self) -> list[Command]:
-        session, run = self._session, self._run
+        session, run, timeline = self._session, self._run, self._timeline
         return [
             Command("Play or pause", run.toggle_play, "space"),
             Command("Single step", session.step, "S"),
             Command("Reset all envs", session.reset, "R"),
             Command("Reset the selected env", run.reset_this, "R", "shift"),
+            Command("Take back the last reset or going back", session.undo, "U"),
+            Command("A step back in time", lambda: timeline.step_by(-1), "arrowleft"),
+            Command("A step on in time", lambda: timeline.step_by(1), "arrowright"),
+            Command("To the event before", lambda: timeline.to_event(-1), "arrowleft", "shift"),
+            Command("To the next event", lambda: timeline.to_event(1), "arrowright", "shift"),
+            Command("What is live", timeline.go_live, "end"),
+            Command("Go on from here, in the selected env", timeline.go_on, "G"),
             Command("Next env", lambda: run.select_neighbour(1), "N"),
             Command("Previous env", lambda: run.select_neighbour(-1), "P"),
             Command("Show all envs or the selected one", self._view_panel.toggle_only_selected, "O"),

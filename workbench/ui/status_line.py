@@ -41,6 +41,7 @@ class StatusLine:
             self._task_serial = view.task_serial
         fresh = now - self._loaded_at < NEWS
         state = f"{view.state} {view.stale} {view.activity} {view.task_serial} {fresh} {view.problem_serial}"
+        state += f" {view.timeline.shown is None}"
         if state == self._state and now - self._drawn_at < REDRAW_EVERY:
             return
         self._drawn_at, self._state = now, state
@@ -56,6 +57,7 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
         "word": WORDS[view.state],
         "problem": view.problem is not None,
         "stale": view.stale and task is not None and view.state not in ("starting", "loading"),
+        "ago": None if view.timeline.shown is None else view.timeline.last - view.timeline.shown,
         "activity": view.activity,
         "news": f"new version in {sum(view.load_milliseconds.values()) / 1000:.1f} s" if fresh else "",
         "task": None if task is None else task.env_id,

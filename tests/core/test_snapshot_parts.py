@@ -1,0 +1,149 @@
+"""A snapshot cut in parts is the snapshot, and what did not change is said once."""
+
+# A task's own attributes are not known to the checker.
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import pickle
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
+
+from workbench.core import actions
+from workbench.core.snapshot import Snapshot
+from workbench.core.snapshot_bytes import WholeSnapshot
+from workbench.core.snapshot_parts import PackedSnapshot, SnapshotPacker, unpack_snapshot
+from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+
+N = 4
+
+
+@pytest.fixture(scope="module")
+def task() -> Iterator[TaskEnv]:
+    task = TaskEnv(make_env(PickCubeEnv, EnvOptions(num_envs=N, backend="cpu", render=False)), 50)
+    yield task
+    task.close()
+
+
+class Receiver:
+    """What a server does with the parts."""
+
+    def __init__(self) -> None:
+        self.parts: dict[int, bytes] = {}
+        self.keys: tuple[int, ...] = ()
+
+    def take(self, packed: PackedSnapshot) -> list[bytes]:
+        self.parts.update(packed.new_parts)
+        self.keys = self.keys if packed.keys is None else packed.keys
+        return [self.parts[key] for key in self.keys]
+
+
+def same(a: object, b: object) -> bool:
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+    if type(a) is not type(b):
+        return False
+    if hasattr(a, "__dataclass_fields__"):
+        return all(same(getattr(a, name), getattr(b, name)) for name in a.__dataclass_fields__)
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)  # type: ignore[union-attr]
+    if isinstance(a, (list, tuple)):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))  # type: ignore[arg-type]
+    return a == b
+
+
+def step(task: TaskEnv, rng: np.random.Generator) -> None:
+    task.step(actions.random_action(task.parts, N, rng))
+
+
+def test_every_snapshot_comes_back_as_it_was_whatever_happened_between(task: TaskEnv) -> None:
+    rng, packer, receiver = np.random.default_rng(0), SnapshotPacker(), Receiver()
+    task.reset(seed=0)
+    for number in range(30):
+        step(task, rng)
+        if number == 7:
+            task.reset(seed=[3], env_idx=[2])
+        if number == 12:
+            task.env.best = torch.arange(N, dtype=torch.float32)
+        if number == 15:
+            task.env.best += 1
+        if number == 18:
+            del task.env.best
+        if number == 21:
+            task.env.best = torch.zeros(N)
+        if number == 24:
+            torch.rand(1)
+            np.random.rand()
+        snapshot = task.snapshot()
+        packed = packer.pack(snapshot)
+        assert same(unpack_snapshot(packed.body, receiver.take(packed)), snapshot), f"after step {number}"
+        # A receiver that keeps only what the newest snapshot needs must always have enough.
+        receiver.parts = {key: receiver.parts[key] for key in receiver.keys}
+    del task.env.best
+
+
+def test_a_grasp_and_what_it_touches_come_back(task: TaskEnv) -> None:
+    task.reset(seed=0)
+    hold = actions.hold_action(task.parts, N)
+    for _ in range(3):
+        task.step(hold)
+    task.env.agent.is_grasping(task.env.cube)
+    task.step(hold)
+    snapshot = task.snapshot()
+    packed = SnapshotPacker().pack(snapshot)
+    assert same(unpack_snapshot(packed.body, Receiver().take(packed)), snapshot)
+
+
+def test_of_a_step_only_what_moved_is_sent(task: TaskEnv) -> None:
+    rng, packer = np.random.default_rng(0), SnapshotPacker()
+    task.reset(seed=0)
+    step(task, rng)
+    packer.pack(task.snapshot())
+    step(task, rng)
+    packer.pack(task.snapshot())
+    step(task, rng)
+    snapshot = task.snapshot()
+    packed = packer.pack(snapshot)
+    assert packed.keys is None and packed.new_parts == {}
+    assert len(packed.body) < 0.2 * len(pickle.dumps(snapshot))
+
+
+def test_a_reset_of_one_env_sends_that_envs_generators(task: TaskEnv) -> None:
+    packer = SnapshotPacker()
+    task.reset(seed=0)
+    packer.pack(task.snapshot())
+    task.reset(seed=[9], env_idx=[1])
+    packed = packer.pack(task.snapshot())
+    states = [pickle.loads(part) for part in packed.new_parts.values() if len(part) > 2000]
+    assert 0 < len(states) <= 2 and all(state[0] == "MT19937" for state in states)
+
+
+def test_some_envs_can_be_packed_alone(task: TaskEnv) -> None:
+    snapshot = task.snapshot([3, 1])
+    packed = SnapshotPacker().pack(snapshot)
+    assert same(unpack_snapshot(packed.body, Receiver().take(packed)), snapshot)
+
+
+def test_whole_bytes_unpickle_as_a_snapshot(task: TaskEnv) -> None:
+    snapshot = task.snapshot()
+    packed = SnapshotPacker().pack(snapshot)
+    whole = pickle.dumps(WholeSnapshot(packed.body, tuple(Receiver().take(packed))))
+    back = pickle.loads(whole)
+    assert isinstance(back, Snapshot) and same(back, snapshot)
+
+
+def test_whole_bytes_are_made_without_torch_or_a_simulator() -> None:
+    code = (
+        "import pickle, sys\n"
+        "from workbench.core.snapshot_bytes import WholeSnapshot\n"
+        "assert pickle.dumps(WholeSnapshot(b'body', (b'part',)))\n"
+        "print(sorted({'torch', 'sapien', 'mani_skill'} & sys.modules.keys()))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,164 @@
+"""The log of moments: what it keeps, what it lets go, and what it says happened."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from workbench.core.pictures import Picture
+from workbench.core.step import StepResult
+from workbench.session.history import FAIL, RESET, SUCCESS, TRUNCATED, WENT_BACK, History
+from workbench.session.messages import PastPictures, Pictures, Restored, Stepped
+
+N, BODIES = 3, 4
+
+
+def stepped(
+    number: int,
+    jumped: tuple[int, ...] = (),
+    success: tuple[int, ...] = (),
+    truncated: tuple[int, ...] = (),
+    restored: Restored | None = None,
+    keys: tuple[int, ...] | None = None,
+    new: dict[int, bytes] | None = None,
+) -> Stepped:
+    step = StepResult(
+        elapsed_steps=np.full(N, number, np.int32),
+        reward=np.full(N, number, np.float32),
+        terminated=_mask(success),
+        truncated=_mask(truncated),
+        evaluate={"success": _mask(success), "fail": _mask(())},
+        poses=np.zeros((N, BODIES, 7), np.float32),
+    )
+    mask = _mask(jumped)
+    return Stepped(step, mask, (), None, b"body %d" % number, keys, new or {}, number, restored)
+
+
+def _mask(envs: tuple[int, ...]) -> np.ndarray:
+    mask = np.zeros(N, bool)
+    mask[list(envs)] = True
+    return mask
+
+
+def picture(env: int, size: int = 64) -> Picture:
+    return Picture("eye", "sensor", env, np.zeros(7, np.float32), np.zeros((size, size, 3), np.uint8))
+
+
+def filled(count: int, limit: int = 10**9, part: int = 0) -> History:
+    history = History(N, limit)
+    history.add(stepped(0, jumped=(0, 1, 2), keys=(1,), new={1: bytes(part)}), 0)
+    for number in range(1, count):
+        history.add(stepped(number), number)
+    return history
+
+
+def test_memory_is_bounded_and_the_oldest_goes_first() -> None:
+    limit = 60_000
+    history = filled(500, limit)
+    assert history.used <= limit
+    assert 5 < len(history) < 500
+    assert history.last == 499 and history.first == 500 - len(history)
+    assert history.at(history.first - 1) is None
+    kept = [moment.serial for moment in history.between(0, 10**6)]
+    assert kept == list(range(history.first, 500))
+    assert history.rewards(0, history.first, history.last).tolist() == kept
+
+
+def test_a_part_is_kept_and_counted_as_long_as_a_moment_needs_it() -> None:
+    history = History(N, 40_000)
+    history.add(stepped(0, keys=(1, 2), new={1: bytes(3000), 2: bytes(500)}), 0)
+    with_both = history.used
+    history.add(stepped(1, keys=(2, 3), new={3: bytes(100)}), 1)
+    assert history.used - with_both < 3000
+    assert history.snapshot_at(0) is not None and b"body 1" in (history.snapshot_at(1) or b"")
+    for number in range(2, 100):
+        history.add(stepped(number), number)
+    assert set(history._parts) == {2, 3}
+    size = sum(m.size for m in history.between(history.first, history.last))
+    assert history.used == size + 600
+
+
+def test_a_snapshot_whose_parts_never_came_is_none() -> None:
+    history = filled(2)
+    history.add(stepped(2, keys=(1, 99)), 2)
+    assert history.snapshot_at(1) is not None
+    assert history.snapshot_at(2) is None
+    assert history.at(2) is not None
+
+
+def test_pictures_belong_to_the_moment_that_they_show_and_fill_half_at_most() -> None:
+    limit = 400_000
+    history = filled(30, limit)
+    history.add_pictures(Pictures((picture(1),), 5.0, (12,)))
+    moment = history.at(12)
+    assert moment is not None and list(moment.pictures) == [(1, "sensor", "eye")]
+    for serial in range(29):
+        history.add_pictures(PastPictures(serial, (picture(0),)))
+    pictured = [m.serial for m in history.between(0, 29) if m.pictures]
+    assert 0 < len(pictured) < 29 and pictured[-1] == 28
+    assert len(history) == 30, "steps are not dropped for pictures"
+    assert sum(64 * 64 * 3 for _ in pictured) <= limit / 2
+
+
+def test_events_are_the_first_success_of_an_episode_truncations_and_jumps() -> None:
+    history = filled(1)
+    history.add(stepped(1, success=(1,)), 1)
+    history.add(stepped(2, success=(1,)), 2)
+    history.add(stepped(3, truncated=(1,)), 3)
+    history.add(stepped(0, jumped=(1,)), 3)
+    history.add(stepped(1, success=(1,)), 4)
+    back = Restored((1,), (1,), 2, None, {})
+    history.add(stepped(2, jumped=(1,), success=(1,), restored=back), 4)
+    history.add(stepped(3, success=(1,)), 5)
+    assert history.events(1, 0, 99) == [
+        (0, RESET),
+        (1, SUCCESS),
+        (3, TRUNCATED),
+        (4, RESET),
+        (5, SUCCESS),
+        (6, WENT_BACK),
+    ]
+    assert history.events(0, 1, 99) == []
+    assert FAIL not in {flag for _, flag in history.events(1, 0, 99)}
+    assert history.jumps_back(1) == [(6, 2)]
+
+
+def test_a_stretch_is_what_an_env_lived_through_without_a_jump() -> None:
+    history = filled(4)
+    history.add(stepped(0, jumped=(1,)), 4)
+    history.add(stepped(1), 5)
+    assert [(s.first, s.last, s.whole) for s in history.stretches(1)] == [(0, 3, True), (4, 5, True)]
+    assert [(s.first, s.last) for s in history.stretches(0)] == [(0, 5)]
+    assert history.stretch_at(1, 2) == (0, 3)
+    assert history.stretch_at(1, 5) == (4, 5)
+
+
+def test_a_stretch_whose_start_was_dropped_says_so() -> None:
+    history = filled(100, 60_000)
+    (only,) = history.stretches(0)
+    assert only.first == history.first and not only.whole
+
+
+def test_undo_goes_back_through_the_jumps_one_by_one() -> None:
+    history = filled(3)
+    history.add(stepped(0, jumped=(0, 1, 2)), 3)
+    history.add(stepped(0, jumped=(1,)), 3)
+    last = history.last_jump(1)
+    assert last is not None and last.serial == 4
+    history.add(stepped(0, jumped=(1,), restored=Restored((1,), (1,), 3, 4, {})), 3)
+    before = history.last_jump(1)
+    assert before is not None and before.serial == 3
+    other = history.last_jump(0)
+    assert other is not None and other.serial == 3
+
+
+def test_what_was_before_the_oldest_moment_cannot_be_returned_to() -> None:
+    history = filled(1)
+    assert history.last_jump(0) is None
+
+
+@pytest.mark.parametrize("count", [1, 1023, 1024, 1025, 5000])
+def test_rows_stay_with_their_moments_however_many_there_are(count: int) -> None:
+    history = filled(count, 3_000_000)
+    expected = [float(m.step.reward[0]) for m in history.between(0, count)]
+    assert history.rewards(0, 0, count).tolist() == expected

@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.ui.scenes import running
+from workbench.session.history import FAIL, RESET, SUCCESS, TRUNCATED, WENT_BACK
+from workbench.session.timeline import Strip, TimelineView
+from workbench.ui.fragments import render
+from workbench.ui.timeline_strip import HEIGHT, POINTS, line_points, strip_values
+
+
+def strip(**changes: object) -> Strip:
+    values: dict[str, object] = {
+        "low": 100,
+        "high": 200,
+        "events": ((100, RESET), (150, SUCCESS | TRUNCATED), (160, RESET), (180, WENT_BACK)),
+        "reward": np.linspace(0, 1, 101, dtype=np.float32),
+        "branches": ((180, 120),),
+        "stretches": ((100, 159), (160, 179), (180, 200)),
+    }
+    return Strip(**{**values, **changes})  # type: ignore[arg-type]
+
+
+def past(shown: int | None = None) -> TimelineView:
+    return TimelineView(100, 200, shown, 60, 3 * 1024**2, 256 * 1024**2, 101, True, None)
+
+
+def test_marks_stand_where_they_happened_and_say_what_matters_most() -> None:
+    values = strip_values(strip(), running(4, timeline=past()))
+    marks = values["marks"]
+    assert isinstance(marks, list)
+    assert [(m["x"], m["style"], m["ago"]) for m in marks] == [
+        (0.0, "reset", 100),
+        (50.0, "success", 50),
+        (60.0, "reset", 40),
+        (80.0, "back", 20),
+    ]
+    assert marks[-1]["name"] == "went back 60 steps"
+    assert values["arcs"] == [{"a": 20.0, "b": 80.0, "middle": 50.0}]
+    assert values["live"] and values["cursor"] == 100.0
+
+
+def test_a_shown_moment_is_told_in_steps_ago() -> None:
+    values = strip_values(strip(), running(4, selected_env=2, timeline=past(163)))
+    assert (values["cursor"], values["ago"], values["live"]) == (63.0, 37, False)
+    html = render("timeline", **values)
+    assert "37 steps ago" in html and "env 2: step 7 / 50, 0.35 s" in html
+    assert "history 3.0 of 256 MB, 101 steps" in html
+
+
+def test_a_moment_outside_the_strip_stays_at_its_edge() -> None:
+    values = strip_values(strip(low=160), running(4, timeline=past(120)))
+    assert values["cursor"] == 0.0
+
+
+def test_one_moment_alone_can_be_drawn() -> None:
+    one = strip(
+        low=100, high=100, events=((100, RESET),), reward=np.zeros(1), branches=(), stretches=((100, 100),)
+    )
+    html = render("timeline", **strip_values(one, running(1, timeline=past())))
+    assert "nan" not in html and 'width="-' not in html
+
+
+@pytest.mark.parametrize("count", [2, POINTS, POINTS + 1, 15_000])
+def test_a_spike_of_one_step_stays_in_the_line(count: int) -> None:
+    reward = np.zeros(count, np.float32)
+    reward[count // 3] = 5.0
+    points = [tuple(map(float, point.split(","))) for point in line_points(reward).split()]
+    assert len(points) <= POINTS
+    assert min(y for _, y in points) == 0.0 and max(y for _, y in points) == HEIGHT
+    assert all(0 <= x <= 100 for x, _ in points)
+
+
+def test_a_reward_without_a_number_or_without_a_change_has_no_line() -> None:
+    assert line_points(np.full(10, np.nan, np.float32)) == ""
+    assert line_points(np.ones(10, np.float32)) == ""
+    points = line_points(np.array([0, np.nan, 1], np.float32))
+    assert "nan" not in points and len(points.split()) == 3
+
+
+def test_what_could_not_be_put_back_is_said_and_escaped() -> None:
+    view = running(2, timeline=TimelineView(100, 200, not_carried=("actor <b>peg</b>: gone",)))
+    html = render("timeline", **strip_values(strip(), view))
+    assert "not put back: actor &lt;b&gt;peg&lt;/b&gt;: gone" in html
+
+
+def test_fail_is_drawn_before_success() -> None:
+    values = strip_values(strip(events=((150, FAIL | SUCCESS),)), running(4, timeline=past()))
+    assert isinstance(values["marks"], list) and values["marks"][0]["style"] == "fail"

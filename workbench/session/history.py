@@ -1,0 +1,352 @@
+"""Every control step of every env since the task was built, to look at and to go back to.
+
+The history is a log, not a tape: what arrives is put at its end and nothing in it is changed. A reset is a
+moment of its own. Going back to step 43 is one too: the envs *jump*, and what follows are new moments behind the
+jump. So the future that was left stays where it was, can be scrubbed through and returned to, and "undo" is
+nothing but going back to the moment before a jump. What one env lived through without a jump is a `Stretch`: it
+starts from a snapshot, and its actions, rewards and entries of ``evaluate`` are all here, so it can be run again.
+
+Memory is bounded, and what is oldest goes first. Pictures are by far the largest (a human camera's is 0.8 MB, a
+step of 16 PickCube envs without pictures 21 KB, of 64 envs 72 KB) and can be drawn again, so they may fill no more
+than half of it. Snapshots are kept as the bytes that came, cut into parts that many steps share (see
+`core.snapshot_parts`): a part is kept as long as a step needs it.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.core.pictures import CameraKind, Picture
+from workbench.core.snapshot_bytes import WholeSnapshot
+from workbench.core.step import StepResult
+from workbench.session.messages import PastPictures, Pictures, Restored, Stepped
+
+RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED = 1, 2, 4, 8, 16
+"""What may happen to an env at a moment. Success and failure: the first moment of it in an episode."""
+_OVERHEAD = 2500
+"""Bytes of the objects around a moment's arrays; with it the count is within 2 % of what tracemalloc measures."""
+_PICTURES_SHARE = 0.5
+_FIRST_ROWS = 1024
+_RECENT = 200
+"""Moments among which one is looked for that pictures belong to: they come some steps late."""
+
+
+@dataclass
+class Moment:
+    """The batch after one reset, control step or jump."""
+
+    serial: int
+    """Counts up over the session."""
+    step: StepResult
+    jumped: NDArray[np.bool_]
+    """(N,) as `Stepped.reset_mask`."""
+    seeds: NDArray[np.int64] | None
+    tick: int
+    """Control steps of the session so far: where this is on the curves."""
+    happened: NDArray[np.uint8]
+    """(N,) of `RESET` ... `TRUNCATED`, added up."""
+    restored: Restored | None
+    number: int
+    """`Stepped.number`."""
+    snapshot: bytes
+    parts: _PartSet
+    size: int
+    """Bytes, without parts and pictures."""
+    pictures: dict[tuple[int, CameraKind, str], Picture] = field(default_factory=dict)
+    """By env, kind and name of the camera."""
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """What one env lived through without a jump: its first moment is a snapshot, each other one a step."""
+
+    env: int
+    first: int
+    last: int
+    """Serials of its first and last moment, both kept; not all between are its steps where others jumped."""
+    whole: bool
+    """Whether its first moment is the one that it began with; else that was dropped for want of memory."""
+
+
+@dataclass
+class _PartSet:
+    """The parts of a snapshot, shared by all moments that have the same."""
+
+    keys: tuple[int, ...]
+    moments: int = 0
+    complete: bool = True
+
+
+class History:
+    """The moments of one built task, oldest first. Not thread-safe: its owner locks."""
+
+    def __init__(self, num_envs: int, limit: int, first_serial: int = 0) -> None:
+        """
+        Args:
+            limit: bytes that it may take; the newest moment is kept whatever it takes.
+            first_serial: the number of the first moment.
+        """
+        self._num_envs = num_envs
+        self.limit = limit
+        self._moments: deque[Moment] = deque()
+        self._next_serial = first_serial
+        self._parts: dict[int, bytes] = {}
+        self._references: dict[int, int] = {}
+        self._last_set = _PartSet(())
+        self._used = 0
+        self._pictures_used = 0
+        self._pictured: deque[int] = deque()
+        self._ever = {flag: np.zeros(num_envs, bool) for flag in (SUCCESS, FAIL)}
+        self._undone: set[int] = set()
+        self._jumps: deque[Moment] = deque()
+        self._base = first_serial
+        self._happened = np.zeros((_FIRST_ROWS, num_envs), np.uint8)
+        self._reward = np.zeros((_FIRST_ROWS, num_envs), np.float32)
+
+    # --- what comes --------------------------------------------------------------------------------
+
+    def add(self, stepped: Stepped, tick: int) -> Moment:
+        """The next moment."""
+        parts = self._take_parts(stepped)
+        size = _OVERHEAD + len(stepped.snapshot) + _step_bytes(stepped.step)
+        moment = Moment(
+            serial=self._next_serial,
+            step=stepped.step,
+            jumped=stepped.reset_mask,
+            seeds=stepped.seeds,
+            tick=tick,
+            happened=self._events(stepped),
+            restored=stepped.restored,
+            number=stepped.number,
+            snapshot=stepped.snapshot if parts.complete else b"",
+            parts=parts,
+            size=size,
+        )
+        if stepped.restored is not None and stepped.restored.undoes is not None:
+            self._undone.add(stepped.restored.undoes)
+        self._write_row(moment)
+        self._next_serial += 1
+        self._moments.append(moment)
+        if moment.jumped.any():
+            self._jumps.append(moment)
+        self._used += size
+        self._shrink()
+        return moment
+
+    def add_pictures(self, event: Pictures | PastPictures) -> None:
+        """Pictures are kept with the moment that they show, if it still is."""
+        if isinstance(event, PastPictures):
+            moment = self.at(event.origin)
+            pairs = [] if moment is None else [(moment, picture) for picture in event.pictures]
+        else:
+            recent = {
+                self._moments[-k].number: self._moments[-k]
+                for k in range(min(_RECENT, len(self._moments)), 0, -1)
+            }
+            pairs = [
+                (recent[number], picture)
+                for number, picture in zip(event.numbers, event.pictures, strict=False)
+                if number in recent
+            ]
+        for moment, picture in pairs:
+            key = (picture.env, picture.kind, picture.camera)
+            before = moment.pictures.get(key)
+            if before is None:
+                self._pictured.append(moment.serial)
+            moment.pictures[key] = picture
+            change = _picture_bytes(picture) - (0 if before is None else _picture_bytes(before))
+            self._pictures_used += change
+            self._used += change
+        self._shrink()
+
+    # --- what is there -----------------------------------------------------------------------------
+
+    def __len__(self) -> int:
+        return len(self._moments)
+
+    @property
+    def used(self) -> int:
+        """Bytes."""
+        return self._used
+
+    @property
+    def first(self) -> int:
+        """Serial of the oldest moment; one past `last` if there is none."""
+        return self._next_serial - len(self._moments)
+
+    @property
+    def last(self) -> int:
+        """Serial of the newest moment."""
+        return self._next_serial - 1
+
+    @property
+    def next_serial(self) -> int:
+        return self._next_serial
+
+    def at(self, serial: int) -> Moment | None:
+        """The moment of this number, if it is kept."""
+        return self._moments[serial - self.first] if self.first <= serial <= self.last else None
+
+    def snapshot_at(self, serial: int) -> bytes | None:
+        """A pickled `core.snapshot.Snapshot` of the whole batch at that moment; None where there is none."""
+        moment = self.at(serial)
+        if moment is None or not moment.snapshot:
+            return None
+        parts = tuple(self._parts[key] for key in moment.parts.keys)
+        return pickle.dumps(WholeSnapshot(moment.snapshot, parts))
+
+    def between(self, low: int, high: int) -> Iterable[Moment]:
+        """The kept moments of these serials, both included."""
+        start = self.first
+        return (self._moments[k - start] for k in range(max(low, start), min(high, self.last) + 1))
+
+    def events(self, env: int, low: int, high: int) -> list[tuple[int, int]]:
+        """What happened to this env between two moments, both included: serials and `RESET` ... added up."""
+        low, rows = self._rows(low, high)
+        happened = self._happened[rows, env]
+        return [(low + int(k), int(happened[k])) for k in np.flatnonzero(happened)]
+
+    def rewards(self, env: int, low: int, high: int) -> NDArray[np.float32]:
+        """(K,) of this env at the moments between two, both included; zero at a jump."""
+        return self._reward[self._rows(low, high)[1], env].copy()
+
+    def jumps_back(self, env: int) -> list[tuple[int, int]]:
+        """Serials of the kept moments at which this env went back, and of those that it went back to."""
+        return [
+            (moment.serial, moment.restored.origin)
+            for moment in self._jumps
+            if moment.restored is not None and moment.jumped[env]
+        ]
+
+    def stretch_at(self, env: int, serial: int) -> tuple[int, int]:
+        """First and last serial of what this env lived through without a jump round this moment."""
+        low, high = self.first, self.last
+        for moment in self._jumps:
+            if moment.jumped[env]:
+                if moment.serial > serial:
+                    high = moment.serial - 1
+                    break
+                low = moment.serial
+        return low, high
+
+    def stretches(self, env: int) -> list[Stretch]:
+        """What this env lived through, cut at its jumps; oldest first."""
+        if not self._moments:
+            return []
+        begins = [moment.serial for moment in self._jumps if moment.jumped[env]]
+        if not begins or begins[0] > self.first:
+            begins.insert(0, self.first)
+        ends = [*(begin - 1 for begin in begins[1:]), self.last]
+        known = {moment.serial for moment in self._jumps if moment.jumped[env]}
+        return [Stretch(env, a, b, a in known) for a, b in zip(begins, ends, strict=True)]
+
+    def last_jump(self, env: int) -> Moment | None:
+        """The newest jump of this env that can be taken back: one that was not, and takes none back itself."""
+        for moment in reversed(self._jumps):
+            takes_back = moment.restored is not None and moment.restored.undoes is not None
+            if moment.jumped[env] and not takes_back and moment.serial not in self._undone:
+                before = self.at(moment.serial - 1)
+                return moment if before is not None and before.snapshot else None
+        return None
+
+    # --- the inside --------------------------------------------------------------------------------
+
+    def _take_parts(self, stepped: Stepped) -> _PartSet:
+        self._parts.update(stepped.new_parts)
+        keys = stepped.part_keys
+        if keys is None or keys == self._last_set.keys:
+            parts = self._last_set
+        else:
+            # A snapshot whose parts went to another history cannot be put back: it is none.
+            parts = self._last_set = _PartSet(keys, complete=all(key in self._parts for key in keys))
+        if not parts.complete:
+            return parts
+        if parts.moments == 0:
+            for key in parts.keys:
+                self._references[key] = self._references.get(key, 0) + 1
+                if self._references[key] == 1:
+                    self._used += len(self._parts[key])
+        parts.moments += 1
+        return parts
+
+    def _release(self, parts: _PartSet) -> None:
+        parts.moments -= 1
+        if parts.moments == 0 and parts.complete:
+            for key in parts.keys:
+                self._references[key] -= 1
+                if self._references[key] == 0:
+                    self._used -= len(self._parts[key])
+                    del self._references[key]
+                    # The worker will not send it again while the newest moment has it; that one is kept.
+                    del self._parts[key]
+
+    def _rows(self, low: int, high: int) -> tuple[int, slice]:
+        low, high = max(low, self.first), min(high, self.last)
+        return low, slice(low - self._base, max(low, high + 1) - self._base)
+
+    def _write_row(self, moment: Moment) -> None:
+        row = moment.serial - self._base
+        if row == len(self._reward):
+            kept = self._rows(self.first, self.last)[1]
+            rows = max(_FIRST_ROWS, 2 * len(self._moments))
+            for name in ("_happened", "_reward"):
+                old = getattr(self, name)
+                new = np.zeros((rows, self._num_envs), old.dtype)
+                new[: len(self._moments)] = old[kept]
+                setattr(self, name, new)
+            self._base = self.first
+            row = moment.serial - self._base
+        self._happened[row] = moment.happened
+        self._reward[row] = moment.step.reward
+
+    def _shrink(self) -> None:
+        while self._pictures_used > self.limit * _PICTURES_SHARE and self._pictured:
+            moment = self.at(self._pictured.popleft())
+            if moment is not None and moment.pictures:
+                self._drop_pictures(moment)
+        while self._used > self.limit and len(self._moments) > 1:
+            oldest = self._moments.popleft()
+            self._used -= oldest.size
+            self._drop_pictures(oldest)
+            self._release(oldest.parts)
+            self._undone.discard(oldest.serial)
+            if self._jumps and self._jumps[0] is oldest:
+                self._jumps.popleft()
+
+    def _drop_pictures(self, moment: Moment) -> None:
+        size = sum(_picture_bytes(picture) for picture in moment.pictures.values())
+        moment.pictures = {}
+        self._pictures_used -= size
+        self._used -= size
+
+    def _events(self, stepped: Stepped) -> NDArray[np.uint8]:
+        step, jumped = stepped.step, stepped.reset_mask
+        happened = np.zeros(self._num_envs, np.uint8)
+        happened[jumped] |= RESET if stepped.restored is None else WENT_BACK
+        for flag, name in ((SUCCESS, "success"), (FAIL, "fail")):
+            now = step.evaluate.get(name)
+            if now is None:
+                continue
+            is_so = np.asarray(now).reshape(self._num_envs, -1)[:, 0].astype(bool)
+            # A moment that was gone back to is no event: its success was reached where it came from.
+            happened[is_so & ~self._ever[flag] & ~jumped] |= flag
+            self._ever[flag] = np.where(jumped, is_so, self._ever[flag] | is_so)
+        happened[step.truncated & ~jumped] |= TRUNCATED
+        return happened
+
+
+def _step_bytes(step: StepResult) -> int:
+    arrays = [step.elapsed_steps, step.reward, step.terminated, step.truncated, step.poses]
+    arrays += [*step.evaluate.values()] + ([] if step.action is None else [step.action])
+    return sum(array.nbytes for array in arrays)
+
+
+def _picture_bytes(picture: Picture) -> int:
+    arrays = (picture.rgb, picture.depth, picture.segmentation)
+    return 300 + sum(array.nbytes for array in arrays if array is not None)

@@ -1,0 +1,216 @@
+"""What of the past is shown, and where one may go from there.
+
+Live is the newest moment. Whoever moves the slider pins another one, and all that the page draws of the batch
+(poses, numbers, pictures) comes from it, out of the server's own memory: the worker hears nothing of it and goes
+on. Only three things are asked of the worker: to go on from a moment, to take back a jump, and, when somebody
+stands still at a moment that has no pictures, to draw it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.core.pictures import CameraKind, Picture
+from workbench.session.history import RESET, History, Moment
+from workbench.session.messages import CameraRequest, DrawPast, PastPictures, Pictures, Restore, Stepped
+
+Scope = Literal["this", "all", "into all"]
+"""Who goes back: the selected env; every env, each to its own; or every env to the selected env's moment."""
+_MOST_EVENTS = 400
+
+
+@dataclass(frozen=True)
+class TimelineView:
+    """The past in numbers, for the page. Moments are named by serials, which count up and never come again."""
+
+    first: int = 0
+    last: int = -1
+    """The kept moments; `last` is the live one."""
+    shown: int | None = None
+    """The moment that is shown; None while live."""
+    tick: int = 0
+    """Where the shown moment is on the curves."""
+    used: int = 0
+    limit: int = 0
+    """Bytes."""
+    moments: int = 0
+    can_go_on: bool = False
+    """Whether the shown moment can be gone back to."""
+    undo: str | None = None
+    """What `Session.undo` would take back, in words."""
+    not_carried: tuple[str, ...] = ()
+    """What the last going back could not put back, each with its reason."""
+    wants_pictures: bool = False
+    """The shown moment has no pictures of the cameras that are looked through."""
+
+
+@dataclass(frozen=True)
+class Strip:
+    """A part of the past of one env, to be drawn under the slider."""
+
+    low: int
+    high: int
+    """Serials, both included."""
+    events: tuple[tuple[int, int], ...]
+    """Serial, and what happened (`history.RESET` ... added up)."""
+    reward: NDArray[np.float32]
+    """(high - low + 1,)"""
+    branches: tuple[tuple[int, int], ...]
+    """Serials at which the env went back, and of the moments that it went back to."""
+    stretches: tuple[tuple[int, int], ...]
+    """First and last serial of what it lived through without a jump."""
+
+
+class Timeline:
+    """The history of the present task and the moment that is shown. Not thread-safe: the session locks."""
+
+    def __init__(self, num_envs: int, limit: int, first_serial: int = 0) -> None:
+        self.history = History(num_envs, limit, first_serial)
+        self._num_envs = num_envs
+        self._shown: int | None = None
+        self._not_carried: tuple[str, ...] = ()
+        self._asked: tuple[int, int, tuple[CameraRequest, ...]] | None = None
+
+    # --- what comes ----------------------------------------------------------------------------------
+
+    def add(self, stepped: Stepped, tick: int) -> None:
+        self.history.add(stepped, tick)
+        if stepped.reset_mask.any():
+            missed = {} if stepped.restored is None else stepped.restored.not_carried
+            self._not_carried = tuple(f"{what}: {why}" for what, why in missed.items())
+        if self._shown is not None and self._shown < self.history.first:
+            self._shown = self.history.first  # what was looked at had to go
+
+    def add_pictures(self, event: Pictures | PastPictures) -> None:
+        self.history.add_pictures(event)
+
+    # --- what is shown -------------------------------------------------------------------------------
+
+    @property
+    def shown(self) -> Moment | None:
+        """The pinned moment; None while live."""
+        return None if self._shown is None else self.history.at(self._shown)
+
+    def seek(self, serial: int | None) -> None:
+        """Pin a moment, the nearest that is kept; the newest, or None, is live."""
+        if serial is None or serial >= self.history.last:
+            self._shown = None
+        else:
+            self._shown = max(serial, self.history.first)
+
+    def seek_by(self, steps: int) -> None:
+        """Some moments on (or back, if negative) from what is shown."""
+        self.seek((self.history.last if self._shown is None else self._shown) + steps)
+
+    def seek_event(self, env: int, direction: int) -> None:
+        """To the next (1) or last (-1) event of this env; forward from the last one is live."""
+        here = self.history.last if self._shown is None else self._shown
+        if direction > 0:
+            after = self.history.events(env, here + 1, self.history.last)
+            self.seek(after[0][0] if after else None)
+        else:
+            before = self.history.events(env, self.history.first, here - 1)
+            self.seek(before[-1][0] if before else self.history.first)
+
+    def pictures(self, env: int) -> dict[tuple[CameraKind, str], Picture]:
+        """Those of the shown moment that were kept."""
+        moment = self.shown
+        if moment is None:
+            return {}
+        return {(kind, name): p for (of, kind, name), p in moment.pictures.items() if of == env}
+
+    def view(self, env: int, cameras: tuple[CameraRequest, ...]) -> TimelineView:
+        history, moment = self.history, self.shown
+        at = moment if moment is not None else history.at(history.last)
+        jump = history.last_jump(env)
+        return TimelineView(
+            first=history.first,
+            last=history.last,
+            shown=self._shown,
+            tick=0 if at is None else at.tick,
+            used=history.used,
+            limit=history.limit,
+            moments=len(history),
+            can_go_on=moment is not None and bool(moment.snapshot),
+            undo=None if jump is None else _in_words(jump, self._num_envs),
+            not_carried=self._not_carried,
+            wants_pictures=moment is not None and bool(self._lacking(moment, env, cameras)),
+        )
+
+    def strip(self, env: int, low: int, high: int) -> Strip:
+        """The past of one env between two moments."""
+        history = self.history
+        low, high = max(low, history.first), min(high, history.last)
+        return Strip(
+            low,
+            high,
+            tuple(history.events(env, low, high)[-_MOST_EVENTS:]),
+            history.rewards(env, low, high),
+            tuple(pair for pair in history.jumps_back(env) if low <= pair[0] <= high),
+            tuple(
+                (max(s.first, low), min(s.last, high))
+                for s in history.stretches(env)
+                if s.last >= low and s.first <= high
+            ),
+        )
+
+    # --- what is asked of the worker -------------------------------------------------------------------
+
+    def go_on(self, env: int, scope: Scope) -> Restore | None:
+        """Ask to go on from the shown moment, which is left for live; None where that cannot be."""
+        moment = self.shown
+        snapshot = None if moment is None else self.history.snapshot_at(moment.serial)
+        if moment is None or snapshot is None:
+            return None
+        envs = (env,) if scope == "this" else tuple(range(self._num_envs))
+        source = (env,) * len(envs) if scope == "into all" else envs
+        self._shown = None
+        return Restore(snapshot, envs, source, moment.serial)
+
+    def undo(self, env: int) -> Restore | None:
+        """Ask to take back this env's last jump, in all envs that jumped; None where there is none."""
+        jump = self.history.last_jump(env)
+        if jump is None:
+            return None
+        snapshot = self.history.snapshot_at(jump.serial - 1)
+        if snapshot is None:
+            return None
+        envs = tuple(int(i) for i in np.flatnonzero(jump.jumped))
+        self._shown = None
+        return Restore(snapshot, envs, envs, jump.serial - 1, undoes=jump.serial)
+
+    def draw(self, env: int, cameras: tuple[CameraRequest, ...]) -> DrawPast | None:
+        """Ask for the pictures that the shown moment lacks; once for each moment, env and choice of cameras."""
+        moment = self.shown
+        if moment is None:
+            return None
+        lacking = self._lacking(moment, env, cameras)
+        asked = (moment.serial, env, lacking)
+        if not lacking or asked == self._asked:
+            return None
+        self._asked = asked
+        return DrawPast(moment.step.poses[env].copy(), env, lacking, moment.serial)
+
+    def _lacking(
+        self, moment: Moment, env: int, cameras: tuple[CameraRequest, ...]
+    ) -> tuple[CameraRequest, ...]:
+        def lacks(camera: CameraRequest) -> bool:
+            picture = moment.pictures.get((env, camera.kind, camera.name))
+            return picture is None or any(getattr(picture, m) is None for m in camera.modalities)
+
+        return tuple(camera for camera in cameras if lacks(camera))
+
+
+def _in_words(jump: Moment, num_envs: int) -> str:
+    envs = np.flatnonzero(jump.jumped)
+    if len(envs) == num_envs:
+        who = "the env" if num_envs == 1 else "all envs"
+    elif len(envs) > 3:
+        who = f"{len(envs)} envs"
+    else:
+        who = ("env " if len(envs) == 1 else "envs ") + ", ".join(str(i) for i in envs)
+    return f"reset of {who}" if jump.happened[envs[0]] & RESET else f"going back ({who})"
