@@ -61,19 +61,12 @@ def exchange_cameras(env: BaseEnv) -> None:
         return
     for camera in [*seams.sensors(env).values(), *seams.human_render_cameras(env).values()]:
         for component in seams.camera_components(camera) or ():
-            _take_out(component)
+            # The entity stays, empty: with one fewer, SAPIEN would number the others anew in a scene that a
+            # restored snapshot makes (see `fresh_physics`), and segmentation pictures name bodies by number.
+            component.entity.remove_component(component)
     seams.forget_cameras(env)
     with torch.random.fork_rng(devices=[]):
         seams.set_up_sensors(env)
-
-
-def _take_out(component: Any) -> None:
-    entity = component.entity
-    if len(entity.components) == 1:
-        entity.remove_from_scene()
-    else:
-        # On a body: that stays.
-        entity.remove_component(component)
 
 
 def rehearse_hooks(env: BaseEnv, hooks: Collection[str]) -> dict[str, str]:

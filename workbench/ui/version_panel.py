@@ -8,6 +8,8 @@ otherwise. Where a file has several tasks, this is where one of them is chosen.
 
 from __future__ import annotations
 
+from typing import Any
+
 import viser
 
 from workbench.session.messages import LoadLevel, ReloadReport
@@ -33,9 +35,11 @@ class VersionPanel:
         self._session = session
         self._drawn: object = None
         self._names: tuple[str, ...] = ("",)
+        # viser's annotations take the first options for all that there will ever be.
+        add_dropdown: Any = server.gui.add_dropdown
         with server.gui.add_folder("Version of the file"):
             self._task = Control(
-                server.gui.add_dropdown("Task", self._names, visible=False, hint="The file has several."),
+                add_dropdown("Task", self._names, visible=False, hint="The file has several tasks."),
                 read=lambda value: checked_choice(value, self._names, "task"),
                 send=session.choose_class,
             )
