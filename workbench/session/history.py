@@ -139,6 +139,12 @@ class History:
         self._shrink()
         return moment
 
+    def renew_last(self, step: StepResult) -> None:
+        """The newest moment was judged anew, by a version that was put on the env that is there."""
+        if self._moments:
+            self._moments[-1].step = step
+            self._write_row(self._moments[-1])
+
     def add_pictures(self, event: Pictures | PastPictures) -> None:
         """Pictures are kept with the moment that they show, if it still is."""
         if isinstance(event, PastPictures):
