@@ -91,6 +91,8 @@ class Load:
     options: TaskOptions
     source: dict[str, str] | None = None
     """Text to use in place of what is on disk: how the last good version comes back."""
+    snapshot: bytes | None = None
+    """A pickled `core.snapshot.Snapshot`, to be restored by name after the build."""
 
 
 @dataclass(frozen=True)
@@ -160,6 +162,13 @@ class SetCapture:
 
 
 @dataclass(frozen=True)
+class WarmUp:
+    """Do what the first load and the first picture of a process take long over; see `warm_up`."""
+
+    options: TaskOptions
+
+
+@dataclass(frozen=True)
 class Quit:
     pass
 
@@ -175,6 +184,7 @@ Request = (
     | SetSliders
     | WatchCameras
     | SetCapture
+    | WarmUp
     | Quit
 )
 
@@ -195,6 +205,10 @@ class Loaded:
     first: StepResult
     milliseconds: dict[str, float]
     """Time of each part of the load: import, build, reset, probe, geometry."""
+    snapshot: bytes = b""
+    """The moment of `first`, as `Stepped.snapshot`."""
+    not_restored: str = ""
+    """Why the moment that the load named could not be had; empty when it was, or none was named."""
 
 
 @dataclass(frozen=True)
@@ -216,6 +230,8 @@ class Stepped:
     """Pictures that belong to exactly this step (only while capturing)."""
     seeds: NDArray[np.int64] | None = None
     """(N,) episode seed of each env, where a reset was part of this."""
+    snapshot: bytes = b""
+    """Pickled `core.snapshot.Snapshot` of the whole batch at this moment."""
 
 
 @dataclass(frozen=True)
@@ -237,4 +253,11 @@ class Status:
     """What keeps the worker from its requests for a while, if anything does."""
 
 
-Event = Loading | Loaded | Failed | Stepped | Pictures | Status
+@dataclass(frozen=True)
+class WarmedUp:
+    """The answer to `WarmUp`."""
+
+    seconds: float
+
+
+Event = Loading | Loaded | Failed | Stepped | Pictures | Status | WarmedUp
