@@ -46,6 +46,8 @@ def open_page(
     port: int = 8080,
     token: bool = True,
     recordings: Path = Path("recordings"),
+    memory_limit: str = "auto",
+    spare: bool = True,
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
 ) -> int:
     """Open a task in a browser page that follows its file.
@@ -59,6 +61,10 @@ def open_page(
         port: port of the page; 0 takes any free one.
         token: ask for the token of the printed address (--no-token: this machine only).
         recordings: folder for recorded episodes.
+        memory_limit: memory that the task's process may use, such as 8GB; auto is 80 % of this machine's, none
+            sets no limit. A process that uses more is ended and replaced.
+        spare: keep a second process ready to take over when the task's dies (--no-spare: it then takes some
+            seconds more, and about 0.8 GB of memory less).
         env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
     """
     from workbench.authoring.reference import named_file
@@ -68,8 +74,12 @@ def open_page(
     file = named_file(task)
     if file is not None and not file.is_file():
         return _refuse(f"there is no file {file}")
+    from workbench.session.kept_worker import WorkerOptions
+    from workbench.session.memory_limit import parse_memory
+
     try:
         options = _task_options(num_envs, backend, seed, env)
+        worker = WorkerOptions(parse_memory(memory_limit), spare)
         door = open_door(DoorOptions(host=host, port=port, token=token), label="Workbench")
     except (ValueError, DoorError) as error:
         return _refuse(str(error))
@@ -91,7 +101,7 @@ def open_page(
             code = 1
             stop.set()
 
-    session = Session(task, options, recordings=recordings, on_event=on_event, on_line=_echo)
+    session = Session(task, options, recordings=recordings, worker=worker, on_event=on_event, on_line=_echo)
     page = Page(door.server, session)
 
     def on_signal(number: int, frame: FrameType | None) -> None:
@@ -271,7 +281,8 @@ def _say(event: Event) -> None:
     elif isinstance(event, Failed):
         _print_problem(event.problem)
         if event.kept:
-            err.print("[dim]the last good version keeps running[/]")
+            back = "comes back where it was" if event.problem.stage == "worker" else "keeps running"
+            err.print(f"[dim]the last good version {back}[/]")
 
 
 def _echo(line: str) -> None:

@@ -105,7 +105,8 @@ class Session:
             task: a file, ``file.py:ClassName``, or a registered env id.
             recordings: folder that recorded episodes go to; made when the first is written.
             worker: limits of the worker process, and whether there is a spare one.
-            on_event: called with every event of the worker on the session's thread (the terminal).
+            on_event: called with every event of the worker, and its death as a failure, on the session's thread
+                (the terminal).
             on_line: called with the lines that the worker printed, from its own threads; not with all of a flood.
         """
         self._task = task
@@ -341,6 +342,7 @@ class Session:
             while_loading = self._recovery.loading
             self._recovery.died(death.file_waits)
             s.playing, s.steps_per_second, s.real_time_factor = False, 0.0, 0.0
+            told = None
             if not death.asked or death.stack:
                 known = () if s.task is None else s.task.source_files
                 self._set_problem(
@@ -354,11 +356,15 @@ class Session:
                     )
                 )
                 s.problem_at_run = not while_loading
+                told = s.problem
             if not death.file_waits:
                 s.wants_play = False
             s.state = "stopped" if death.gives_up else "starting"
             s.activity = "" if death.gives_up else "starting another worker"
+            kept = s.task is not None
         self._note()
+        if told is not None:
+            self._on_event(Failed(told, kept))
 
     def _on_busy(self, busy: Busy | None) -> None:
         with self._lock:
