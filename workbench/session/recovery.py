@@ -98,7 +98,7 @@ class Recovery:
             self._rung = "file"
         elif self._loading:
             self._step_down()
-        else:
+        elif self._rung != "nothing":
             self._rung = "moment" if self._good is not None else "nothing"
         self._loading = self._has_env = False
 
