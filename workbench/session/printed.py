@@ -74,11 +74,11 @@ class PrintedLog:
             earned = (now - self._refilled) * _LINES_PER_SECOND
             self._budget, self._refilled = min(self._budget + earned, float(_LINES_PER_SECOND)), now
             found, dropped = self._split(stream, piece)
-            over = len(found) - int(self._budget)
+            # The last lines of a flood say more than its first ones, and the very last the most.
+            over = len(found) - max(1, int(self._budget))
             if over > 0:
-                # The last lines of a flood say more than its first ones.
                 found, dropped = found[over:], dropped + over
-            self._budget -= len(found)
+            self._budget = max(0.0, self._budget - len(found))
             lines = [PrintedLine(stream, _text(line)) for line in found]
             self._dropped += dropped
             self._lines.extend(lines)
