@@ -19,6 +19,7 @@ def hazard(place):
     wanted, what = file.read_text().split()
     if wanted != place:
         return
+    file.with_name("provoked").touch()
     if what == "loop":
         while True:
             pass
@@ -100,6 +101,11 @@ def provoke(file: Path, place: str, what: str) -> None:
 def calm(file: Path) -> None:
     """All is well again."""
     file.with_name("hazard").unlink(missing_ok=True)
+
+
+def provoked(file: Path) -> bool:
+    """Whether it has happened, or goes on."""
+    return file.with_name("provoked").exists()
 
 
 def edit(file: Path) -> None:

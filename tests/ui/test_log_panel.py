@@ -4,7 +4,7 @@ import viser
 
 from tests.ui.scenes import running
 from workbench.session.kept_worker import Vitals
-from workbench.session.printed import Printed, PrintedLine
+from workbench.session.printed import NOTHING_PRINTED, Printed, PrintedLine
 from workbench.ui.log_panel import LINES_SHOWN, LogPanel, log_html, vitals_html
 
 LINES = (
@@ -53,10 +53,13 @@ def test_what_was_printed_is_text() -> None:
 def test_held_still_it_waits_and_cleared_it_does_not(server: viser.ViserServer) -> None:
     cleared: list[bool] = []
     panel = LogPanel(server, lambda: cleared.append(True))
+    draw(panel, NOTHING_PRINTED)
+    assert not panel._filter.visible and not panel._clear.visible
     assert "reward" in draw(panel, Printed(1, LINES[:1], 0))
     panel._hold.value = True
     assert "Warning" not in draw(panel, Printed(2, LINES[:2], 0))
     panel._on_clear(lambda: cleared.append(True))
+    assert panel._filter.visible
     assert cleared and "Nothing printed" in draw(panel, Printed(3, (), 0))
 
 

@@ -196,7 +196,8 @@ class KeptWorker:
             self._take_the_last_events(worker)
         self._on_busy(None)
         if self._closing:
-            worker.stop()
+            # One that is at work may be in a loop, and would not hear.
+            worker.stop(grace=1.0 if worker.beat().doing == "idle" else 0.3)
             return False
         code = worker.exit_code()
         words = worker.last_words()

@@ -52,6 +52,9 @@ class LogPanel:
         if key != self._drawn and not (self._hold.value and self._drawn is not None):
             self._drawn, self._drawn_at = key, now
             self._html.content = log_html(view.printed, self._wanted)
+            # With nothing there, there is nothing to filter, to hold or to clear.
+            for control in (self._filter, self._hold, self._clear):
+                control.visible = bool(view.printed.lines or view.printed.dropped)
         vitals = vitals_html(view.vitals)
         if vitals != self._vitals_drawn:
             self._vitals_drawn, self._drawn_at = vitals, now
