@@ -124,7 +124,11 @@ def open_page(
         page.stop()
         session.close()
         door.close()
-    return code
+    # All is closed and written. The interpreter would now take its modules apart, one object after the other: a
+    # second of waiting after Ctrl-C, and several on a machine that is at work.
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 @app.command

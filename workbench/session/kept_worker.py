@@ -196,8 +196,7 @@ class KeptWorker:
             self._take_the_last_events(worker)
         self._on_busy(None)
         if self._closing:
-            # One that is at work may be in a loop, and would not hear.
-            worker.stop(grace=1.0 if worker.beat().doing == "idle" else 0.3)
+            worker.stop(grace=0.3)  # it has nothing to lose: what is kept is kept by the server
             return False
         code = worker.exit_code()
         words = worker.last_words()
