@@ -48,6 +48,8 @@ def open_page(
     token: bool = True,
     recordings: Path = Path("recordings"),
     history: str = "256MB",
+    memory_limit: str = "auto",
+    spare: bool = True,
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
 ) -> int:
     """Open a task in a browser page that follows its file.
@@ -62,6 +64,10 @@ def open_page(
         token: ask for the token of the printed address (--no-token: this machine only).
         recordings: folder for recorded episodes.
         history: memory that the steps of the past may take, such as 64MB or 2GB; the oldest go first.
+        memory_limit: memory that the task's process may use, such as 8GB; auto is 80 % of this machine's, none
+            sets no limit. A process that uses more is ended and replaced.
+        spare: keep a second process ready to take over when the task's dies (--no-spare: it then takes some
+            seconds more, and about 0.8 GB of memory less).
         env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
     """
     from workbench.authoring.reference import named_file
@@ -71,9 +77,13 @@ def open_page(
     file = named_file(task)
     if file is not None and not file.is_file():
         return _refuse(f"there is no file {file}")
+    from workbench.session.kept_worker import WorkerOptions
+    from workbench.session.memory_limit import parse_memory
+
     try:
         options = _task_options(num_envs, backend, seed, env)
         history_bytes = _bytes(history)
+        worker = WorkerOptions(parse_memory(memory_limit), spare)
         door = open_door(DoorOptions(host=host, port=port, token=token), label="Workbench")
     except (ValueError, DoorError) as error:
         return _refuse(str(error))
@@ -100,6 +110,7 @@ def open_page(
         options,
         recordings=recordings,
         history_bytes=history_bytes,
+        worker=worker,
         on_event=on_event,
         on_line=_echo,
     )
@@ -125,7 +136,11 @@ def open_page(
         page.stop()
         session.close()
         door.close()
-    return code
+    # All is closed and written. The interpreter would now take its modules apart, one object after the other: a
+    # second of waiting after Ctrl-C, and several on a machine that is at work.
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 @app.command
@@ -291,7 +306,8 @@ def _say(event: Event) -> None:
     elif isinstance(event, Failed):
         _print_problem(event.problem)
         if event.kept:
-            err.print("[dim]the last good version keeps running[/]")
+            back = "comes back where it was" if event.problem.stage == "worker" else "keeps running"
+            err.print(f"[dim]the last good version {back}[/]")
 
 
 def _echo(line: str) -> None:

@@ -55,6 +55,19 @@ def shoot_branch(page: Page) -> None:
     page.get_by_role("button", name="now", exact=True).click()
 
 
+def shoot_busy(page: Page, file: Path) -> None:
+    """A loop that does not end, in the reward of a new version."""
+    lines = TASK.read_text().splitlines()
+    place = next(i for i, line in enumerate(lines) if line.strip().startswith("def compute_dense_reward"))
+    while not lines[place].rstrip().endswith(":"):
+        place += 1
+    lines[place + 1 : place + 1] = ["        while self.elapsed_steps.max() >= 0:", "            continue"]
+    file.write_text("\n".join(lines) + "\n")
+    expect(page.get_by_role("button", name="Interrupt", exact=True)).to_be_visible(timeout=60_000)
+    tab(page, "Log")
+    shoot(page, "busy")
+
+
 def main() -> None:
     chromium = find_chromium()
     if chromium is None:
@@ -95,6 +108,7 @@ def main() -> None:
             expect(page.get_by_text("NameError").first).to_be_visible(timeout=60_000)
             tab(page, "Reward")
             shoot(page, "banner")
+            shoot_busy(page, file)
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ def wait_until(session: Session, reached: Callable[[SessionView], bool], what: s
         seen = session.wait(seen, timeout=0.5)
     view = session.view()
     raise AssertionError(
-        f"{what} did not come; state {view.state}, problem {view.problem}, {view.printed[-10:]}"
+        f"{what} did not come; state {view.state}, problem {view.problem}, {view.printed.texts[-10:]}"
     )
 
 

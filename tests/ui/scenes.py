@@ -12,6 +12,7 @@ from workbench.core.geometry import BodyKind, Material, Mesh, SceneGeometry, Vis
 from workbench.core.pictures import CameraInfo, CameraKind
 from workbench.core.step import StepResult
 from workbench.session.messages import ActionDimension, TaskDescription
+from workbench.session.printed import NOTHING_PRINTED
 from workbench.session.view import RecordingStatus, SessionView
 
 
@@ -132,7 +133,7 @@ EMPTY = SessionView(
     steps_per_second=0.0,
     real_time_factor=0.0,
     recording=RecordingStatus(False, (), 0, 0, "recordings", None, None),
-    printed=(),
+    printed=NOTHING_PRINTED,
 )
 """A session that has just begun."""
 

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import operator
 import pickle
+import secrets
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -60,7 +61,8 @@ class SnapshotPacker:
     """The parts of the last snapshot, by name."""
     _buffers: dict[str, Buffer] = field(default_factory=dict)
     """The buffers of the last snapshot, by path."""
-    _next_key: int = 0
+    _next_key: int = field(default_factory=lambda: secrets.randbits(30) << 30)
+    """Not from 0: the server may still keep parts of a worker before this one."""
     _last_keys: tuple[int, ...] | None = None
 
     def pack(self, snapshot: Snapshot) -> PackedSnapshot:

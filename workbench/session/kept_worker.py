@@ -1,9 +1,12 @@
 """A worker that is always there: one process after the other, with a reason for each end.
 
-The author's code may crash its process, exit it, or loop for ever, and the page must not care. One
-thread starts a worker, greets it, hands on its events, and when it ends says why and starts the next.
-Two things it will not do: start workers without end, when each dies before a task ever loads; and leave
-a mended file waiting behind a worker that hangs, so a load that is not taken up in time ends the worker.
+The author's code may crash its process, exit it, loop for ever or fill the memory, and the page must not care.
+One thread starts a worker, greets it, hands on its events, looks at it ten times a second, and when it ends says
+why and takes the next, from the warm spare if there is one.
+
+It ends a worker by itself for two reasons only: more memory than allowed; and a load that waits behind
+something that cannot be interrupted, since a mended file must not wait behind a worker that hangs. One that is
+merely busy is never ended unasked, as it may only be slow: that it is busy, with what and where, is told.
 """
 
 from __future__ import annotations
@@ -13,25 +16,69 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from workbench.session.messages import Event, Load, Loading, Request
-from workbench.session.process import WorkerProcess, describe_exit
+from workbench.session.last_words import Busy, busy_at, fatal_error
+from workbench.session.memory_limit import in_words
+from workbench.session.messages import Event, Load, Loaded, Loading, Request, WarmedUp, WarmUp
+from workbench.session.process import Output, WorkerProcess, describe_exit
+from workbench.session.pulse import Beat, Doing
+from workbench.session.spare import SpareWorker
 
+_LOOK = 0.1
+"""Seconds between two looks at the worker."""
+_LOOK_AT_CHILDREN = 2.0
+_BUSY = 2.0
+_LONG: dict[Doing, float] = {"starting": 20.0, "warming up": 20.0, "drawing": 20.0}
+"""Seconds of one piece of work after which it is told: importing and compiling shaders takes long anyway."""
+_STACK_EVERY = 1.0
+"""Seconds between two looks at where it is."""
+_DEAF = 1.5
+"""Seconds after an interrupt in which the author's code must have been left."""
+_LOAD_WAITS = 2.0
+"""Seconds that a load may wait behind something else, which is then interrupted ..."""
 _LONGEST_SILENCE = 5.0
-"""Seconds in which a worker must begin a load that it was sent."""
+"""... and after so many the worker is ended."""
 _MOST_DEATHS = 3
 """Workers that may die one after the other without a load in between."""
+
+
+@dataclass(frozen=True)
+class WorkerOptions:
+    """How the processes of a session are kept."""
+
+    memory_limit: int | None = None
+    """Bytes that the worker and what it started may have in memory; None sets no limit."""
+    spare: bool = False
+    """Keep a second worker, warmed up, to take the place of one that dies."""
 
 
 @dataclass(frozen=True)
 class Death:
     """The end of a worker."""
 
-    why: str | None
-    """For example ``was killed by SIGSEGV``; None when it was replaced because somebody asked."""
-    hung: bool
+    why: str
+    """For example ``was killed by SIGSEGV``."""
+    asked: bool
+    """Somebody had it replaced."""
+    file_waits: bool
     """It was ended because it did not take up a load."""
+    doing: str | None
+    """What it was at; None for nothing."""
+    stack: str
+    """Where it was, as faulthandler writes it; may be empty."""
     gives_up: bool
     """Too many died: the next is started only when `KeptWorker.replace` is called."""
+
+
+@dataclass(frozen=True)
+class Vitals:
+    """What the processes hold."""
+
+    memory: int = 0
+    """Bytes of the worker, with the processes that it started."""
+    memory_limit: int | None = None
+    spare_memory: int | None = None
+    """Bytes of the spare; None while there is none."""
+    spare_ready: bool = False
 
 
 class KeptWorker:
@@ -39,19 +86,36 @@ class KeptWorker:
 
     def __init__(
         self,
+        options: WorkerOptions,
+        warm_up: WarmUp,
+        *,
         greet: Callable[[], list[Request]],
         on_event: Callable[[Event], None],
         on_death: Callable[[Death], None],
-        on_line: Callable[[str, str], None],
+        on_busy: Callable[[Busy | None], None],
+        own_files: Callable[[], list[str]],
+        output: Output,
     ) -> None:
-        """The callbacks are called on this object's threads, and may call `send` and `replace`."""
-        self._greet, self._on_event, self._on_death, self._on_line = greet, on_event, on_death, on_line
+        """The callbacks are called on this object's threads, and may call `send`, `replace` and `interrupt`.
+
+        Args:
+            on_busy: called about once a second while the worker is at one piece of work for long, and with
+                None when it is done.
+            own_files: the author's files, to find their line on a stack.
+            output: as for `WorkerProcess`.
+        """
+        self._options, self._warm_up = options, warm_up
+        self._greet, self._on_event, self._on_death, self._on_busy = greet, on_event, on_death, on_busy
+        self._own_files, self._output = own_files, output
         self._condition = threading.Condition()
         self._worker: WorkerProcess | None = None
+        self._spare: SpareWorker | None = SpareWorker(warm_up) if options.spare else None
+        self._vitals = Vitals(memory_limit=options.memory_limit)
         self._load_sent: float | None = None
         self._replace_asked = False
         self._closing = False
         self._deaths = 0
+        self._interrupted: tuple[int, float] | None = None
         self._thread = threading.Thread(target=self._run, name="session", daemon=True)
 
     def start(self) -> None:
@@ -64,6 +128,11 @@ class KeptWorker:
         with self._condition:
             return None if self._worker is None else self._worker.pid
 
+    @property
+    def vitals(self) -> Vitals:
+        """What the processes hold, as of the last look."""
+        return self._vitals
+
     def send(self, request: Request) -> None:
         """To the present worker; between two it is lost, and `greet` must make up for it."""
         with self._condition:
@@ -73,14 +142,21 @@ class KeptWorker:
         if worker is not None:
             worker.send(request)
 
+    def interrupt(self) -> None:
+        """Have the author's code left where it is, if it is at work and Python runs it."""
+        with self._condition:
+            worker = self._worker
+        if worker is not None:
+            beat = worker.beat()
+            if beat.seconds > 0:
+                self._interrupted = beat.number, time.monotonic()
+                worker.interrupt()
+
     def replace(self) -> None:
         """End the worker, whatever it is doing, and start another."""
         with self._condition:
             self._replace_asked, self._deaths = True, 0
-            worker = self._worker
             self._condition.notify_all()
-        if worker is not None:
-            worker.kill()
 
     def ran(self) -> None:
         """A task was loaded: earlier deaths are forgiven."""
@@ -90,53 +166,144 @@ class KeptWorker:
         """End the worker for good; returns when the thread has ended."""
         with self._condition:
             self._closing = True
-            worker = self._worker
             self._condition.notify_all()
-        if worker is not None:
-            worker.stop()
         self._thread.join()
 
     def _run(self) -> None:
-        while True:
-            worker = WorkerProcess(self._on_line)
-            with self._condition:
-                self._worker, self._load_sent, self._replace_asked = worker, None, False
-                closing = self._closing
-            if closing:
-                worker.stop()
-                return
-            for request in self._greet():
-                worker.send(request)
-            hung = self._hand_on_events(worker)
-            code = worker.exit_code()
-            worker.stop(grace=0.0)
-            with self._condition:
-                self._worker = None
-                if self._closing:
-                    return
-                asked = self._replace_asked
-                self._deaths += 0 if asked or hung else 1
-                gives_up = self._deaths >= _MOST_DEATHS
-            why = f"did not answer for {_LONGEST_SILENCE:.0f} s" if hung else describe_exit(code)
-            self._on_death(Death(None if asked else why, hung, gives_up))
-            with self._condition:
-                if gives_up:
-                    self._condition.wait_for(lambda: self._replace_asked or self._closing)
-                if self._closing:
-                    return
-
-    def _hand_on_events(self, worker: WorkerProcess) -> bool:
-        """Until the worker is gone; True if it hung."""
-        hung = False
         try:
-            while True:
-                event = worker.receive(timeout=1.0)
-                if isinstance(event, Loading):
-                    self._load_sent = None
-                if event is not None:
-                    self._on_event(event)
-                elif self._load_sent is not None and time.monotonic() - self._load_sent > _LONGEST_SILENCE:
-                    hung = True
-                    worker.kill()
+            while self._one_life():
+                pass
+        finally:
+            if self._spare is not None:
+                self._spare.stop()
+
+    def _one_life(self) -> bool:
+        """From the start of a worker to its end; False when there is to be no other."""
+        worker = self._spare.take() if self._spare is not None else None
+        if worker is None:
+            worker = WorkerProcess(self._output)
+        else:
+            worker.hear(self._output)
+        with self._condition:
+            self._worker, self._load_sent, self._replace_asked = worker, None, False
+            self._interrupted = None
+        for request in self._greet():
+            worker.send(request)
+        life = _Life()
+        try:
+            self._attend(worker, life)
         except EOFError:
-            return hung
+            self._take_the_last_events(worker)
+        self._on_busy(None)
+        if self._closing:
+            worker.stop(grace=0.3)  # it has nothing to lose: what is kept is kept by the server
+            return False
+        code = worker.exit_code()
+        words = worker.last_words()
+        worker.stop(grace=0.0)
+        with self._condition:
+            self._worker = None
+            asked = self._replace_asked
+            self._deaths += 0 if asked or life.file_waits else 1
+            gives_up = self._deaths >= _MOST_DEATHS
+        stack = words if fatal_error(words) is not None else life.stack
+        self._on_death(
+            Death(life.why or describe_exit(code), asked, life.file_waits, _doing(life.beat), stack, gives_up)
+        )
+        with self._condition:
+            if gives_up:
+                self._condition.wait_for(lambda: self._replace_asked or self._closing)
+            return not self._closing
+
+    def _attend(self, worker: WorkerProcess, life: _Life) -> None:
+        """Hand on events and look after the worker until it is gone (EOFError) or all is to end."""
+        looked = 0.0
+        while not self._closing:
+            event = worker.receive(timeout=_LOOK)
+            if isinstance(event, Loading):
+                self._load_sent = None
+            if isinstance(event, Loaded) and self._spare is not None:
+                self._spare.begin_soon()
+            if event is not None and not isinstance(event, WarmedUp):
+                self._on_event(event)
+            if time.monotonic() - looked >= _LOOK:
+                looked = time.monotonic()
+                self._look(worker, life)
+                if self._spare is not None:
+                    self._spare.attend()
+
+    def _take_the_last_events(self, worker: WorkerProcess) -> None:
+        """What it had sent before it was gone: a recording loses nothing but the step under way."""
+        try:
+            while (event := worker.receive(timeout=_LOOK)) is not None:
+                self._on_event(event)
+        except EOFError:
+            return
+
+    def _look(self, worker: WorkerProcess, life: _Life) -> None:
+        now = time.monotonic()
+        life.beat = beat = worker.beat()
+        if self._replace_asked:
+            life.why = "was ended by hand"
+            self._end(worker, life)
+        self._look_at_memory(worker, life, now)
+        if self._load_sent is not None and beat.doing not in _LONG and beat.since < self._load_sent:
+            waited = now - self._load_sent
+            if waited > _LONGEST_SILENCE and beat.seconds > 0:
+                life.why = f"did not answer for {_LONGEST_SILENCE:.0f} s"
+                life.file_waits = True
+                self._end(worker, life)
+            elif waited > _LOAD_WAITS and not self._was_interrupted(beat):
+                self.interrupt()
+        if beat.seconds < _LONG.get(beat.doing, _BUSY):
+            if life.told is not None:
+                life.told = None
+                self._on_busy(None)
+        elif life.told is None or now - life.told >= _STACK_EVERY:
+            life.told = now
+            life.stack = worker.stack() or life.stack
+            deaf = self._was_interrupted(beat) and now - self._interrupted[1] > _DEAF  # type: ignore[index]
+            self._on_busy(busy_at(beat.seconds, beat.doing, life.stack, self._own_files(), deaf))
+
+    def _look_at_memory(self, worker: WorkerProcess, life: _Life, now: float) -> None:
+        if now - life.looked_at_children > _LOOK_AT_CHILDREN:
+            life.looked_at_children = now
+            life.children = max(0, worker.memory(with_children=True) - worker.memory())
+        used, limit = worker.memory() + life.children, self._options.memory_limit
+        spare = self._spare.memory if self._spare is not None else 0
+        ready = self._spare is not None and self._spare.ready
+        self._vitals = Vitals(used, limit, spare or None, ready)
+        if limit is not None and used > limit:
+            life.why = (
+                f"was ended because it had {in_words(used)} in memory, more than the {in_words(limit)} that "
+                "--memory-limit allows,"
+            )
+            self._end(worker, life)
+
+    def _was_interrupted(self, beat: Beat) -> bool:
+        return self._interrupted is not None and self._interrupted[0] == beat.number
+
+    def _end(self, worker: WorkerProcess, life: _Life) -> None:
+        if life.beat is not None and life.beat.seconds > 0:
+            life.stack = worker.stack() or life.stack
+        worker.kill()
+        raise EOFError
+
+
+@dataclass
+class _Life:
+    """What is known of one worker."""
+
+    why: str | None = None
+    """Why it was ended, if we ended it."""
+    file_waits: bool = False
+    beat: Beat | None = None
+    stack: str = ""
+    told: float | None = None
+    """When it was last told that the worker is busy."""
+    looked_at_children: float = 0.0
+    children: int = 0
+
+
+def _doing(beat: Beat | None) -> str | None:
+    return None if beat is None or beat.doing in ("idle", "starting") else beat.doing

@@ -199,6 +199,13 @@ class DrawPast:
 
 
 @dataclass(frozen=True)
+class WarmUp:
+    """Do what the first load and the first picture of a process take long over; see `warm_up`."""
+
+    options: TaskOptions
+
+
+@dataclass(frozen=True)
 class Quit:
     pass
 
@@ -216,6 +223,7 @@ Request = (
     | SetCapture
     | Restore
     | DrawPast
+    | WarmUp
     | Quit
 )
 
@@ -328,4 +336,11 @@ class Status:
     """What keeps the worker from its requests for a while, if anything does."""
 
 
-Event = Loading | Loaded | Failed | Stepped | Pictures | PastPictures | Status
+@dataclass(frozen=True)
+class WarmedUp:
+    """The answer to `WarmUp`."""
+
+    seconds: float
+
+
+Event = Loading | Loaded | Failed | Stepped | Pictures | PastPictures | Status | WarmedUp

@@ -29,6 +29,7 @@ from workbench.core.step import StepResult
 from workbench.core.strict import BrokenRule, WrongReturn
 from workbench.core.take_pictures import list_cameras, segmentation_names
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+from workbench.session.interrupts import Interrupted
 from workbench.session.messages import ActionDimension, TaskDescription, TaskOptions
 
 
@@ -205,6 +206,10 @@ class blamed:
         pass
 
     def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        if isinstance(error, Interrupted):
+            # Nothing more of the author's is called to find out what is wrong: it may be what does not end.
+            files, cls = self._loaded.source_files, self._loaded.cls
+            raise TaskError(problem_from_exception(error, self._stage, files, cls)) from error
         # SystemExit as well: an author's exit() must not take the worker along.
         if isinstance(error, (Exception, SystemExit)) and not isinstance(error, TaskError):
             raise TaskError(self._problem(error)) from error

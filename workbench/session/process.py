@@ -1,83 +1,185 @@
-"""The worker as a child process: start it, talk to it, hear what it prints, know when it dies.
+"""The worker as a child process: start it, talk to it, hear what it prints, look at it, know when it dies.
 
 A plain subprocess with one end of a socket pair: no standard input (a task that reads it gets end of
 file, not a hang), its own process group (Ctrl-C in the terminal is for the server, which then ends the
-worker in good order), and its output read line by line so that an author's prints reach the page.
+worker in good order), and its output read as it comes so that an author's prints reach the page.
+
+The author's code may keep it from reading, from writing, and from ending. So nothing here waits for it: what
+is sent goes through a queue and a thread of its own (a socket that nobody reads is full after some hundred
+messages, and a page's control would wait there); what it is doing stands in shared memory (`pulse`); and where
+it is, it says from a signal handler into a file in memory, whatever its interpreter is doing (`last_words`).
 """
 
 from __future__ import annotations
 
+import fcntl
 import os
 import signal
 import socket
 import subprocess
 import sys
 import threading
+import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from multiprocessing.connection import Connection
 
-from workbench.session.messages import Event, Quit, Request
+from workbench.session.interrupts import INTERRUPT_SIGNAL, STACK_SIGNAL
+from workbench.session.memory_limit import memory_with_children, resident_memory
+from workbench.session.messages import (
+    Event,
+    Load,
+    Quit,
+    Request,
+    SetActionSource,
+    SetEpisodeEnd,
+    SetSliders,
+    SetSpeed,
+    WatchCameras,
+)
+from workbench.session.pulse import Beat, PulseReader, make_pulse
 
-_LONGEST_LINE = 2000
+_SETTINGS = (Load, SetActionSource, SetEpisodeEnd, SetSliders, SetSpeed, WatchCameras)
+"""Of two of one kind that wait one behind the other only the second matters."""
+_MOST_WAITING = 1000
+"""Requests for a worker that reads none; more are dropped (a key held down on Step)."""
+_PIECE = 1 << 20
+_FLOOD_PAUSE = 0.005
+"""Seconds between two reads of a flood: with pieces of a megabyte that drains 200 MB a second."""
+_F_SETPIPE_SZ = 1031
+
+Output = Callable[[str, bytes], bool]
+"""Gets ``stdout`` or ``stderr`` and the bytes that came (none at its end); True asks for a little rest."""
 
 
 class WorkerProcess:
-    """One worker. Events are taken by `receive`; requests go out by `send` from any thread."""
+    """One worker. Events are taken by `receive`, on one thread; all else may be called from any.
 
-    def __init__(self, on_line: Callable[[str, str], None], env: Mapping[str, str] | None = None) -> None:
+    It must be started on a thread that lives as long as the worker may: the kernel ends a worker with the
+    thread that started it, so that none is left behind when the server is killed.
+    """
+
+    def __init__(self, output: Output, env: Mapping[str, str] | None = None) -> None:
         """
         Args:
-            on_line: called with ``stdout`` or ``stderr`` and a line, on threads of this object.
+            output: called with what it prints, on threads of this object; see `hear`.
             env: environment variables to set on top of this process's own.
         """
         ours, theirs = socket.socketpair()
+        pulse = make_pulse()
+        self._stacks = os.memfd_create("workbench-stacks")
+        # Appended to by the worker, read and emptied by us: the position is shared with it.
+        fcntl.fcntl(self._stacks, fcntl.F_SETFL, os.O_APPEND)
+        fds = [theirs.fileno(), pulse, self._stacks]
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "workbench.session.worker", str(theirs.fileno())],
+                [sys.executable, "-m", "workbench.session.worker_start", *map(str, fds), str(os.getpid())],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
-                pass_fds=[theirs.fileno()],
+                bufsize=0,
+                pass_fds=fds,
                 start_new_session=True,
                 env={**os.environ, "PYTHONUNBUFFERED": "1", **(env or {})},
             )
+            self._pulse = PulseReader(pulse)
+        except BaseException:
+            ours.close()
+            os.close(self._stacks)
+            raise
         finally:
             theirs.close()
-        self._connection = Connection(ours.detach())
-        self._send_lock = threading.Lock()
-        self._on_line = on_line
+            os.close(pulse)
+        self._socket, self._connection = ours, Connection(os.dup(ours.fileno()))
+        self._output = output
+        self._waiting: deque[Request] = deque()
+        self._wake = threading.Condition()
+        self._ending = False
+        self._look_lock = threading.Lock()
+        self._writer = threading.Thread(target=self._write_all, name="worker-requests", daemon=True)
         self._readers = [
-            threading.Thread(target=self._read_lines, args=(name, stream), name=f"worker-{name}", daemon=True)
+            threading.Thread(
+                target=self._read_output, args=(name, stream), name=f"worker-{name}", daemon=True
+            )
             for name, stream in (("stdout", self._process.stdout), ("stderr", self._process.stderr))
         ]
-        for reader in self._readers:
-            reader.start()
+        for thread in (self._writer, *self._readers):
+            thread.start()
 
     @property
     def pid(self) -> int:
         return self._process.pid
 
-    def send(self, request: Request) -> bool:
-        """False when the worker is gone; `receive` then says so too."""
-        try:
-            with self._send_lock:
-                self._connection.send(request)
-        except (BrokenPipeError, OSError):
-            return False
-        return True
+    # --- messages ----------------------------------------------------------------------------------
 
-    def receive(self, timeout: float | None = None) -> Event | None:
+    def send(self, request: Request) -> None:
+        """Never waits. What is sent to a worker that is gone is lost; `receive` says so."""
+        with self._wake:
+            if self._waiting and isinstance(request, _SETTINGS) and type(self._waiting[-1]) is type(request):
+                self._waiting.pop()
+            if len(self._waiting) < _MOST_WAITING:
+                self._waiting.append(request)
+            self._wake.notify()
+
+    def receive(self, timeout: float) -> Event | None:
         """The next event; None after `timeout` seconds without one.
 
         Raises:
-            EOFError: the worker hung up (see `exit_code`).
+            EOFError: the worker is gone (see `exit_code`), and all that it sent was received.
         """
         try:
             if not self._connection.poll(timeout):
+                # A process that the author's code forked may hold the socket open after its parent's death.
+                if self._process.poll() is not None and not self._connection.poll(0):
+                    raise EOFError
                 return None
             return self._connection.recv()
         except (ConnectionResetError, OSError) as error:
             raise EOFError from error
+
+    def hear(self, output: Output) -> None:
+        """From now on what it prints goes there."""
+        self._output = output
+
+    # --- looking at it -------------------------------------------------------------------------------
+
+    def beat(self) -> Beat:
+        """What it is doing, and since when."""
+        return self._pulse.read()
+
+    def memory(self, with_children: bool = False) -> int:
+        """Bytes that are in memory; counting the children as well takes milliseconds."""
+        return memory_with_children(self.pid) if with_children else resident_memory(self.pid)
+
+    def stack(self, patience: float = 0.3) -> str:
+        """Where it is now, as faulthandler writes it; empty when it does not say so within `patience` seconds."""
+        if self.beat().number == 0 or self._process.poll() is not None:
+            return ""  # before its handlers are there the signal would end it
+        with self._look_lock:
+            start = size = os.fstat(self._stacks).st_size
+            os.kill(self.pid, STACK_SIGNAL)
+            deadline = time.monotonic() + patience
+            while time.monotonic() < deadline:
+                time.sleep(0.005)
+                now = os.fstat(self._stacks).st_size
+                if now == size > start:
+                    break
+                size = now
+            dump = os.pread(self._stacks, max(0, size - start), start).decode(errors="replace")
+            if self._process.poll() is None:
+                os.ftruncate(self._stacks, 0)
+        return dump
+
+    def last_words(self) -> str:
+        """What it wrote on its way out: the stack of a crash, or of ``os._exit``. Empty after a plain kill."""
+        return os.pread(self._stacks, 100_000, 0).decode(errors="replace")
+
+    def interrupt(self) -> None:
+        """Leave the author's code if Python runs it; see `interrupts`."""
+        if self.beat().number > 0 and self._process.poll() is None:
+            os.kill(self.pid, INTERRUPT_SIGNAL)
+
+    # --- its end -----------------------------------------------------------------------------------
 
     def exit_code(self) -> int | None:
         """As ``subprocess`` gives it: negative is the signal that ended it. Waits a little for it."""
@@ -88,32 +190,59 @@ class WorkerProcess:
 
     def kill(self) -> None:
         """End it now with all that it started; `receive` then raises EOFError."""
-        self._kill_group()
-
-    def stop(self, grace: float = 1.0) -> None:
-        """Ask it to end, and after `grace` seconds end it with all that it started."""
-        self.send(Quit())
-        try:
-            self._process.wait(timeout=grace)
-        except subprocess.TimeoutExpired:
-            pass
-        self._kill_group()
-        self._process.wait()
-        for reader in self._readers:
-            reader.join(timeout=1.0)
-        self._connection.close()
-
-    def _kill_group(self) -> None:
         try:
             os.killpg(self._process.pid, signal.SIGKILL)
         except ProcessLookupError:
             pass  # it and all its children are gone already
 
-    def _read_lines(self, name: str, stream: object) -> None:
-        # readline with a limit: an author who prints a gigabyte without a newline must not fill us up.
-        with stream as lines:  # type: ignore[attr-defined]
-            while chunk := lines.readline(_LONGEST_LINE):
-                self._on_line(name, chunk.decode(errors="replace").rstrip("\n"))
+    def stop(self, grace: float = 1.0) -> None:
+        """Ask it to end, and after `grace` seconds end it with all that it started."""
+        if grace > 0 and self._process.poll() is None:
+            self.send(Quit())
+            try:
+                self._process.wait(timeout=grace)
+            except subprocess.TimeoutExpired:
+                pass
+        self.kill()
+        self._process.wait()
+        with self._wake:
+            self._ending = True
+            self._wake.notify()
+        # Else the writer may wait for ever where a process that left the group still holds the other end.
+        self._socket.shutdown(socket.SHUT_RDWR)
+        self._writer.join()
+        for reader in self._readers:
+            # A process that left the group may hold the pipe; its thread then stays with it.
+            reader.join(timeout=1.0)
+        self._connection.close()
+        self._socket.close()
+        os.close(self._stacks)
+
+    # --- its threads -------------------------------------------------------------------------------
+
+    def _write_all(self) -> None:
+        while True:
+            with self._wake:
+                self._wake.wait_for(lambda: self._waiting or self._ending)
+                if not self._waiting:
+                    return
+                request = self._waiting.popleft()
+            try:
+                self._connection.send(request)
+            except (BrokenPipeError, OSError):
+                return  # it is gone, and `receive` says so
+
+    def _read_output(self, name: str, stream: object) -> None:
+        with stream as pipe:  # type: ignore[attr-defined]
+            fd = pipe.fileno()
+            try:
+                fcntl.fcntl(fd, _F_SETPIPE_SZ, _PIECE)
+            except OSError:
+                pass  # the system's limit for pipes is reached: smaller pieces then
+            while piece := os.read(fd, _PIECE):
+                if self._output(name, piece):
+                    time.sleep(_FLOOD_PAUSE)
+            self._output(name, b"")
 
 
 def describe_exit(code: int | None) -> str:

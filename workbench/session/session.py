@@ -9,7 +9,6 @@ the last version that ran, and the page never goes away.
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,7 +18,8 @@ from workbench.authoring.reference import named_file
 from workbench.authoring.watch import SourceWatcher
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.step import StepResult
-from workbench.session.kept_worker import Death, KeptWorker
+from workbench.session.kept_worker import Death, KeptWorker, WorkerOptions
+from workbench.session.last_words import Busy, death_problem, own_files_of
 from workbench.session.messages import (
     SCENE_KEPT,
     ActionSource,
@@ -48,14 +48,16 @@ from workbench.session.messages import (
     Stepped,
     TaskDescription,
     TaskOptions,
+    WarmUp,
     WatchCameras,
 )
 from workbench.session.past import Past
+from workbench.session.printed import PrintedLine, PrintedLog
 from workbench.session.record_live import LiveRecorder
+from workbench.session.recovery import Recovery, Wanted, is_on_disk
 from workbench.session.timeline import Scope, Strip, Timeline, TimelineView
 from workbench.session.view import Curves, SessionView, State
 
-_PRINTED_LINES = 200
 HISTORY_BYTES = 256 * 1024**2
 """What the past may take unless somebody says otherwise."""
 
@@ -95,7 +97,7 @@ class _State:
     real_time_factor: float = 0.0
     cameras: tuple[CameraRequest, ...] = ()
     clients: int = 0
-    printed: deque[str] = field(default_factory=lambda: deque(maxlen=_PRINTED_LINES))
+    busy: Busy | None = None
 
 
 class Session:
@@ -108,6 +110,7 @@ class Session:
         *,
         recordings: Path,
         history_bytes: int = HISTORY_BYTES,
+        worker: WorkerOptions | None = None,
         on_event: Callable[[Event], None] = lambda event: None,
         on_line: Callable[[str], None] = lambda line: None,
     ) -> None:
@@ -116,8 +119,10 @@ class Session:
             task: a file, ``file.py:ClassName``, or a registered env id.
             recordings: folder that recorded episodes go to; made when the first is written.
             history_bytes: memory that the past may take.
-            on_event: called with every event of the worker on the session's thread (the terminal).
-            on_line: called with every line that the worker printed, from its own threads.
+            worker: limits of the worker process, and whether there is a spare one.
+            on_event: called with every event of the worker, and its death as a failure, on the session's thread
+                (the terminal).
+            on_line: called with the lines that the worker printed, from its own threads; not with all of a flood.
         """
         self._task = task
         self._options = options
@@ -131,9 +136,19 @@ class Session:
         self._state = _State()
         self._curves: Curves | None = None
         self._closing = False
-        self._last_good: dict[str, str] | None = None
-        self._restoring = False
-        self._worker = KeptWorker(self._greeting, self._handle, self._on_death, self._on_line)
+        self._first_due = False
+        self._recovery = Recovery(self._newest_moment)
+        self._printed = PrintedLog(self._on_lines)
+        self._worker = KeptWorker(
+            worker or WorkerOptions(),
+            WarmUp(options),
+            greet=self._greeting,
+            on_event=self._handle,
+            on_death=self._on_death,
+            on_busy=self._on_busy,
+            own_files=self._own_files,
+            output=self._printed.feed,
+        )
         self._recorder = LiveRecorder(recordings, self._note)
         self._watcher = SourceWatcher(self._on_files_changed)
         self._own_file = named_file(task)
@@ -145,6 +160,7 @@ class Session:
     def view(self) -> SessionView:
         """A snapshot; cheap enough for every frame."""
         recording = self._recorder.status()
+        printed, vitals = self._printed.view(), self._worker.vitals
         with self._lock:
             s = self._state
             if s.past is not None and (self._curves is None or self._curves.serial != s.step_serial):
@@ -180,8 +196,10 @@ class Session:
                 steps_per_second=s.steps_per_second,
                 real_time_factor=s.real_time_factor,
                 recording=recording,
-                printed=tuple(s.printed),
                 timeline=TimelineView() if s.timeline is None else s.timeline.view(s.selected_env, s.cameras),
+                printed=printed,
+                busy=s.busy,
+                vitals=vitals,
             )
 
     def wait(self, seen: int, timeout: float) -> int:
@@ -200,9 +218,15 @@ class Session:
     def reload(self, level: LoadLevel = "auto") -> None:
         """Load the file again, by a level that is named whatever it may leave of the old version.
 
-        A worker that does not take it up (an endless loop) is replaced.
+        A worker that does not take it up (an endless loop) is interrupted or replaced.
         """
-        self._send(replace(self._load_request(None), level=level))
+        with self._lock:
+            request = replace(self._load_request(self._recovery.file_asked()), level=level)
+            stopped = self._state.state == "stopped"
+        if stopped:
+            self._worker.replace()  # it will be greeted with the file
+        else:
+            self._send(request)
 
     def choose_class(self, name: str) -> None:
         """Another task class of the same file, one that `TaskDescription.others` names."""
@@ -213,10 +237,20 @@ class Session:
             self._task = f"{self._own_file}:{name}"
         self.reload()
 
+    def interrupt(self) -> None:
+        """Have the author's code left where it is, if it is at work; its traceback becomes the problem."""
+        self._worker.interrupt()
+
     def restart_worker(self) -> None:
-        """End the worker, whatever it is doing, and start another with the file as it is now."""
-        self._last_good = None
+        """End the worker, whatever it is doing, and start another with the last good version where it was."""
+        with self._lock:
+            self._recovery.restart_asked()
         self._worker.replace()
+
+    def clear_printed(self) -> None:
+        """Forget what the author's code printed."""
+        self._printed.clear()
+        self._note()
 
     def play(self) -> None:
         self.seek(None)
@@ -360,8 +394,11 @@ class Session:
     def snapshot(self) -> bytes | None:
         """The newest moment, pickled for `Load.snapshot`; None before a task is loaded."""
         with self._lock:
-            timeline = self._state.timeline
-            return None if timeline is None else timeline.history.snapshot_at(timeline.history.last)
+            return self._newest_moment()
+
+    def _newest_moment(self) -> bytes | None:
+        timeline = self._state.timeline
+        return None if timeline is None else timeline.history.snapshot_at(timeline.history.last)
 
     def _seek(self, seek: Callable[[Timeline], None]) -> None:
         with self._lock:
@@ -397,38 +434,65 @@ class Session:
 
     def _greeting(self) -> list[Request]:
         """Everything that a worker before this one knew."""
-        s = self._state
-        self._restoring = self._last_good is not None
-        requests: list[Request] = [
-            SetSpeed(s.speed),
-            SetEpisodeEnd(s.episode_end),
-            SetActionSource(s.action_source, s.policy),
-            self._load_request(self._last_good),
-        ]
-        if s.wants_play:
-            requests.append(Play(True))
-        return [*requests, self._watch_request()]
+        with self._lock:
+            s = self._state
+            requests: list[Request] = [
+                SetSpeed(s.speed),
+                SetEpisodeEnd(s.episode_end),
+                SetActionSource(s.action_source, s.policy),
+            ]
+            wanted = self._recovery.wanted()
+            if wanted is not None:
+                requests.append(self._load_request(wanted))
+            elif s.state == "starting":
+                # Nothing that could be loaded: the problem stands, and the file is waited for.
+                s.state, s.activity = "error", ""
+            if s.wants_play:
+                requests.append(Play(True))
+            return [*requests, self._watch_request()]
 
     def _on_death(self, death: Death) -> None:
         self._recorder.stop()
         with self._lock:
             s = self._state
+            while_loading = self._recovery.loading
+            self._recovery.died(death.file_waits)
             s.playing, s.steps_per_second, s.real_time_factor = False, 0.0, 0.0
-            if death.why is not None:
-                doing = f" while {s.activity}" if s.activity else ""
-                file = None if s.task is None else s.task.file
-                tail = "\n".join(list(s.printed)[-20:])
+            told = None
+            if not death.asked or death.stack:
+                known = () if s.task is None else s.task.source_files
                 self._set_problem(
-                    Problem("worker", f"the worker process {death.why}{doing}", file, None, None, tail)
+                    death_problem(
+                        death.why,
+                        death.doing,
+                        death.stack,
+                        own_files_of(known, self._own_file),
+                        self._printed.tail(20),
+                        {} if s.task is None or while_loading else s.task.source,
+                    )
                 )
-            if death.hung:
-                # A load was waiting behind it: that file is what the next worker is to load.
-                self._last_good = None
-            elif death.why is not None:
+                s.problem_at_run = not while_loading
+                told = s.problem
+            if not death.file_waits:
                 s.wants_play = False
             s.state = "stopped" if death.gives_up else "starting"
             s.activity = "" if death.gives_up else "starting another worker"
+            kept = s.task is not None
         self._note()
+        if told is not None:
+            self._on_event(Failed(told, kept))
+
+    def _on_busy(self, busy: Busy | None) -> None:
+        with self._lock:
+            if busy is None and self._state.busy is None:
+                return
+            self._state.busy = busy
+        self._note()
+
+    def _own_files(self) -> list[str]:
+        with self._lock:
+            task = self._state.task
+        return own_files_of(() if task is None else task.source_files, self._own_file)
 
     def _handle(self, event: Event) -> None:
         if isinstance(event, Loaded):
@@ -438,6 +502,8 @@ class Session:
         else:
             with self._lock:
                 self._apply(event)
+            if isinstance(event, Failed):
+                self._bring_back(event)
             if isinstance(event, Failed) and event.problem.file is not None:
                 # A module beside the task that broke before the task had ever imported it whole.
                 known = self._state.task.source_files if self._state.task is not None else ()
@@ -484,7 +550,10 @@ class Session:
             self._recorder.stop()
         with self._lock:
             s = self._state
-            self._last_good = dict(task.source) or None
+            restored = self._recovery.restoring
+            self._recovery.loaded(task)
+            self._first_due = not kept
+            same = restored and s.task is not None and s.task.source_hash == task.source_hash
             if kept and s.task is not None:
                 # The same scene: who has drawn it can see that by its being the same object.
                 task = replace(task, geometry=s.task.geometry)
@@ -492,11 +561,12 @@ class Session:
             s.task_serial += 1
             if not kept:
                 s.scene_serial += 1
-                s.past, self._curves = Past(task.num_envs), None
-                next_serial = 0 if s.timeline is None else s.timeline.history.next_serial
-                s.timeline = Timeline(task.num_envs, self._history_bytes, next_serial)
                 s.sliders = ()
                 s.selected_env = min(s.selected_env, task.num_envs - 1)
+                if s.past is None or s.timeline is None or not same:
+                    s.past, self._curves = Past(task.num_envs), None
+                    next_serial = 0 if s.timeline is None else s.timeline.history.next_serial
+                    s.timeline = Timeline(task.num_envs, self._history_bytes, next_serial)
             elif s.timeline is not None:
                 s.timeline.history.renew_last(event.first)
             if report is None or report.level not in ("same", "patched"):
@@ -505,10 +575,9 @@ class Session:
                 s.pictures_serial += 1
             s.activity = ""
             # The last good version came back after a worker's death: what killed it still stands.
-            s.stale = self._restoring
-            if not self._restoring:
+            s.stale = restored and not is_on_disk(task.source)
+            if not restored:
                 self._set_problem(None)
-            self._restoring = False
             s.state = "running" if s.playing else "paused"
         self._follow(task.source_files, {} if s.stale else task.source)
         self._watch()
@@ -529,7 +598,8 @@ class Session:
                 s.past.add(event)
                 s.timeline.add(event, max(0, s.past.count - 1))
                 s.step_serial = s.timeline.history.last
-            if s.state == "error" and s.problem_at_run:
+            first, self._first_due = self._first_due, False
+            if s.problem is not None and s.problem_at_run and not first:
                 # What failed while running runs again: the task was reset, or the policy changed.
                 self._set_problem(None)
                 s.state = "running" if s.playing else "paused"
@@ -541,11 +611,10 @@ class Session:
         self._note()
         self.reload()
 
-    def _on_line(self, stream: str, line: str) -> None:
-        with self._lock:
-            self._state.printed.append(line)
+    def _on_lines(self, lines: list[PrintedLine], dropped: int) -> None:
         self._note()
-        self._print(line)
+        for line in lines:
+            self._print(line.text)
 
     def _follow(self, paths: Iterable[str], texts: Mapping[str, str]) -> None:
         """Watch the task's own file, whether or not it ever loaded, and `paths` beside it."""
@@ -560,11 +629,18 @@ class Session:
         self._state.problem = problem
         self._state.problem_serial += 1
 
-    def _load_request(self, source: dict[str, str] | None) -> Load:
+    def _load_request(self, wanted: Wanted) -> Load:
         options = TaskOptions(
             self._options.num_envs, self._options.backend, self._seed, self._options.env_kwargs
         )
-        return Load(self._task, options, source)
+        return Load(self._task, options, wanted.source, snapshot=wanted.snapshot)
+
+    def _bring_back(self, failed: Failed) -> None:
+        """A fresh worker could not load the file: it is to have the last good version."""
+        with self._lock:
+            wanted = self._recovery.wanted() if self._recovery.failed(failed.kept) else None
+        if wanted is not None:
+            self._send(self._load_request(wanted))
 
     def _watch_request(self) -> WatchCameras:
         s = self._state

@@ -6,7 +6,7 @@ The page is redrawn by one loop that compares this snapshot with the last one it
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -15,7 +15,10 @@ from numpy.typing import NDArray
 from workbench.authoring.problem import Problem
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.step import StepResult
+from workbench.session.kept_worker import Vitals
+from workbench.session.last_words import Busy
 from workbench.session.messages import ActionSource, EpisodeEnd, ReloadReport, TaskDescription
+from workbench.session.printed import Printed
 from workbench.session.timeline import TimelineView
 
 State = Literal["starting", "loading", "running", "paused", "error", "stopped"]
@@ -89,7 +92,11 @@ class SessionView:
     steps_per_second: float
     real_time_factor: float
     recording: RecordingStatus
-    printed: tuple[str, ...]
+    printed: Printed
     """The last lines that the author's code printed."""
     timeline: TimelineView = TimelineView()
     """The past. While a moment of it is shown, `step` and `pictures` are of that moment."""
+    busy: Busy | None = None
+    """What the worker has been at for long."""
+    vitals: Vitals = field(default_factory=Vitals)
+    """What the processes hold."""

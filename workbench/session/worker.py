@@ -5,7 +5,8 @@ because the author's code may loop for ever or crash: the page must go on. One l
 nothing ever touches the env while it steps: take the requests that have come, take a step if one is
 due, make pictures if somebody looks, sleep until the next of these.
 
-The server starts it as ``python -m workbench.session.worker FD`` with one end of a socket pair.
+The server starts it through `worker_start`, with one end of a socket pair. Whatever the loop does is noted in
+shared memory (`pulse`), and while it is the author's code it can be left by hand (`interrupts`).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -25,11 +27,13 @@ import torch
 from workbench.authoring.problem import Problem, TaskError, problem_from_exception
 from workbench.core import actions
 from workbench.core.pictures import Picture
+from workbench.core.snapshot import Snapshot, restore_snapshot
 from workbench.core.snapshot_parts import PackedSnapshot, SnapshotPacker
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import Request as PictureRequest
 from workbench.core.take_pictures import take_pictures
 from workbench.session.episodes import recorded_pictures
+from workbench.session.interrupts import Interrupted, Interrupts
 from workbench.session.messages import (
     SCENE_KEPT,
     ActionSource,
@@ -44,6 +48,7 @@ from workbench.session.messages import (
     Pictures,
     Play,
     Quit,
+    ReloadReport,
     Request,
     Reset,
     Restore,
@@ -56,13 +61,17 @@ from workbench.session.messages import (
     SingleStep,
     Status,
     Stepped,
+    WarmedUp,
+    WarmUp,
     WatchCameras,
 )
 from workbench.session.open_task import OpenedTask, reset_checked, restore_checked, step_checked, zero_action
 from workbench.session.pacing import Pacer, Rate
 from workbench.session.picture_maker import PictureMaker
 from workbench.session.policy import Policy, load_policy
+from workbench.session.pulse import Doing, PulseWriter
 from workbench.session.reload import Running, load_version
+from workbench.session.warm_up import warm_up
 
 _STATUS_PERIOD = 0.25
 _IDLE = 0.5
@@ -72,8 +81,11 @@ _IDLE = 0.5
 class Worker:
     """The state of the loop; see the module's text."""
 
-    def __init__(self, connection: Connection) -> None:
+    def __init__(self, connection: Connection, pulse: PulseWriter) -> None:
         self._connection = connection
+        self._pulse = pulse
+        self._interrupts = Interrupts()
+        self._moment: Snapshot | None = None
         self._opened: OpenedTask | None = None
         self._loaded_by: Load | None = None
         self._last: StepResult | None = None
@@ -106,20 +118,49 @@ class Worker:
             SetCapture: self._set_capture,
             Restore: self._restore,
             DrawPast: self._draw_past,
+            WarmUp: self._warm_up,
             Quit: self._stop,
         }
 
     def run(self) -> None:
         """Until the server says so or hangs up."""
+        self._interrupts.install()
         while not self._quit:
+            self._pulse.begin("idle")
             for request in self._requests(self._sleep()):
-                self._handlers[type(request)](request)
+                self._at_work(_DOING.get(type(request)), partial(self._handlers[type(request)], request))
             now = time.monotonic()
             if self._playing and self._pacer.due(now):
                 self._pacer.spend()
-                self._control_step()
+                self._at_work("stepping", self._control_step)
             self._make_pictures()
             self._send_status(time.monotonic())
+
+    def _at_work(self, doing: Doing | None, work: Callable[[], None]) -> None:
+        """Do `work`; if the author's code is at work in it, it can be left."""
+        if doing is None:
+            work()
+            return
+        self._pulse.begin(doing)
+        try:
+            self._interrupts.run(work)
+        except Interrupted as error:
+            # Outside of what knows its task: between two hooks, or in the workbench's own code.
+            known = () if self._opened is None else self._opened.loaded.source_files
+            self._fail(problem_from_exception(error, _STAGE.get(doing, "step"), known))
+            self._back_to_the_moment()
+        finally:
+            self._pulse.begin("idle")
+
+    def _back_to_the_moment(self) -> None:
+        """After a step was left half done: the batch stands again where the last one ended."""
+        if self._opened is None or self._moment is None:
+            return
+        try:
+            # Not `TaskEnv.restore`: that calls `evaluate`, which may be what would not end.
+            restore_snapshot(self._opened.env.env, self._moment)
+        except (RuntimeError, ValueError, TypeError) as error:
+            self._fail(problem_from_exception(error, "reset", self._opened.loaded.source_files))
 
     # --- requests ----------------------------------------------------------------------------------
 
@@ -145,7 +186,8 @@ class Worker:
 
     def _send(self, event: Event) -> None:
         try:
-            self._connection.send(event)
+            with self._interrupts.shielded():
+                self._connection.send(event)
         except (BrokenPipeError, OSError):
             self._quit = True
 
@@ -161,6 +203,11 @@ class Worker:
         except TaskError as error:
             self._send(Failed(error.problem, kept=self._opened is not None))
             return
+        # From here on it is one thing: an interrupt in the middle would leave the page with another task than ours.
+        with self._interrupts.shielded():
+            self._take_over(opened, report, request)
+
+    def _take_over(self, opened: OpenedTask, report: ReloadReport | None, request: Load) -> None:
         before, self._opened = self._opened, opened
         self._loaded_by, self._last = request, opened.first
         if report is not None and report.level in SCENE_KEPT:
@@ -184,6 +231,11 @@ class Worker:
         self._send_step(opened.first, np.ones(opened.env.num_envs, bool), opened.env.episode_seeds)
         if before is not None:
             before.env.close()
+
+    def _warm_up(self, request: WarmUp) -> None:
+        began = time.monotonic()
+        warm_up(request.options, lambda: not self._connection.poll(0))
+        self._send(WarmedUp(time.monotonic() - began))
 
     def _play(self, request: Play) -> None:
         self._playing = request.playing and self._opened is not None
@@ -214,7 +266,7 @@ class Worker:
             return
         try:
             self._policy = load_policy(request.policy)
-        except (Exception, SystemExit) as error:
+        except (Exception, SystemExit, Interrupted) as error:
             self._policy = None
             self._fail(problem_from_exception(error, "policy", ()))
 
@@ -265,6 +317,8 @@ class Worker:
             do(self._opened)
         except TaskError as error:
             self._fail(error.problem)
+            if isinstance(error.__cause__, Interrupted):
+                self._back_to_the_moment()
 
     def _fail(self, problem: Problem) -> None:
         self._playing = False
@@ -320,7 +374,7 @@ class Worker:
         if self._source == "policy" and self._policy is not None:
             try:
                 return actions.to_flat_action(env.env, env.parts, self._policy(env.obs))
-            except (Exception, SystemExit) as error:
+            except (Exception, SystemExit, Interrupted) as error:
                 raise TaskError(problem_from_exception(error, "policy", ())) from error
         low, high = actions.bounds(env.parts)
         if self._source == "sliders" and len(self._sliders) == len(low):
@@ -366,11 +420,12 @@ class Worker:
         if self._packer is None:
             return nothing
         try:
-            return self._packer.pack(opened.env.snapshot())
+            self._moment = opened.env.snapshot()
+            return self._packer.pack(self._moment)
         except Exception as error:
             # What a task keeps on itself is open: an array of objects that cannot be pickled must not end
             # the run of a task that works.
-            self._packer = None
+            self._packer = self._moment = None
             print(
                 f"The past of this task can be looked at, but not gone back to: {type(error).__name__}: {error}",
                 file=sys.stderr,
@@ -385,6 +440,7 @@ class Worker:
         if not self._renderer_ready and self._pictures.idle:
             # The first picture of a process compiles the shaders: 5 to 19 s on a software renderer.
             self._send_status(None, "compiling the renderer's shaders, once")
+        self._pulse.begin("drawing")
         try:
             made = self._pictures.poll(self._opened.env, time.monotonic())
         except RuntimeError as error:
@@ -410,8 +466,20 @@ class Worker:
         self._send(Status(self._playing, steps, steps * self._pacer.control_dt, activity))
 
 
-def main() -> None:
-    """Entry of the process; the argument is the file descriptor of the connection."""
+_DOING: dict[type, Doing] = {
+    Load: "loading",
+    SingleStep: "stepping",
+    Reset: "resetting",
+    Restore: "resetting",
+    SetActionSource: "importing the policy",
+    WarmUp: "warming up",
+}
+"""The requests that may run the author's code, or take long for other reasons."""
+_STAGE: dict[Doing, str] = {"loading": "build", "stepping": "step", "resetting": "reset"}
+
+
+def work(connection: int, pulse: PulseWriter) -> None:
+    """The life of the process; `connection` is the file descriptor of its end of the socket pair."""
     # The tensors hold a few thousand numbers: threads over them only wait for each other (measured:
     # 16 PickCube envs ran 2.8 times faster with one thread than with two).
     torch.set_num_threads(1)
@@ -419,8 +487,4 @@ def main() -> None:
     # each time: 0.25 s, most of a reload of 16 envs.
     gc.collect()
     gc.freeze()
-    Worker(Connection(int(sys.argv[1]))).run()
-
-
-if __name__ == "__main__":
-    main()
+    Worker(Connection(connection), pulse).run()

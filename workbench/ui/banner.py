@@ -13,6 +13,7 @@ import viser
 
 from workbench.authoring.problem import Problem
 from workbench.session.view import SessionView
+from workbench.ui.busy_banner import is_shown as busy_is_shown
 from workbench.ui.fragments import render
 
 WIDEST, NARROWEST = 520, 240
@@ -32,6 +33,11 @@ DOING = {
     "returns": "returned something of the wrong shape",
     "policy": "was stopped by its policy",
     "worker": "lost its worker process",
+}
+INTERRUPTED = {
+    "import": "was interrupted while it was imported",
+    "build": "was interrupted while it built its scene",
+    "policy": "had its policy interrupted",
 }
 
 
@@ -58,22 +64,23 @@ class Banner:
         self._width = WIDEST
         self._reload.on_click(lambda _: reload())
         self._restart.on_click(lambda _: restart())
-        self._serial: int | None = None
+        self._drawn: tuple[int, str] | None = None
 
     def draw(self, view: SessionView) -> None:
         problem = view.problem
-        if problem is None:
+        if problem is None or busy_is_shown(view):
             if self._panel.visible:
                 self._panel.visible = False
-            self._serial = None
+            self._drawn = None
             return
         self._fit_views()
         stopped = view.state == "stopped"
         if self._restart.visible != stopped:
             self._restart.visible = stopped
         # Written once a problem: a new text would close the traceback that someone has open.
-        if view.problem_serial != self._serial:
-            self._serial = view.problem_serial
+        drawn = view.problem_serial, _kept(view) if problem.stage == "worker" else ""
+        if drawn != self._drawn:
+            self._drawn = drawn
             self._html.content = banner_html(problem, view)
             self._panel.visible = True
             self._panel.expand()
@@ -96,22 +103,32 @@ def banner_html(problem: Problem, view: SessionView) -> str:
     where = None
     if problem.file is not None:
         where = Path(problem.file).name + (f":{problem.line}" if problem.line is not None else "")
-    if view.state == "stopped":
-        kept = "The worker process is gone, so nothing moves until there is a new one."
-    elif view.task is None:
-        kept = "There is no version to show yet. Mend the file and save it; the page follows."
-    elif view.playing:
-        kept = "The last good version keeps running."
-    else:
-        kept = "The last good version stays on the page."
+    doing = DOING.get(problem.stage, f"failed in {problem.stage}")
+    if problem.message.startswith("Interrupted:"):
+        doing = INTERRUPTED.get(problem.stage, f"was interrupted in {problem.stage}")
     return render(
         "banner",
         subject=subject,
-        doing=DOING.get(problem.stage, f"failed in {problem.stage}"),
+        doing=doing,
         where=where,
         path=problem.file,
         code=problem.code,
         message=problem.message,
-        kept=kept,
+        kept=_kept(view),
         traceback=problem.traceback.rstrip(),
     )
+
+
+def _kept(view: SessionView) -> str:
+    """What there still is."""
+    if view.state == "stopped":
+        return "The worker process is gone, so nothing moves until there is a new one."
+    if view.task is None:
+        return "There is no version to show yet. Mend the file and save it; the page follows."
+    if view.problem is not None and view.problem.stage == "worker":
+        if view.state in ("starting", "loading"):
+            return "Another worker takes over; the last good version comes back where it was."
+        return "The last good version is back where it was, and paused."
+    if view.playing:
+        return "The last good version keeps running."
+    return "The last good version stays on the page."

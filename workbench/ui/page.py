@@ -20,6 +20,7 @@ import viser
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.banner import Banner
+from workbench.ui.busy_banner import BusyBanner
 from workbench.ui.camera_frustums import LARGE, SMALL, CameraFrustums, without_the_viewpoint
 from workbench.ui.cameras_panel import CamerasPanel
 from workbench.ui.commands import Command, register
@@ -27,6 +28,7 @@ from workbench.ui.curves_panel import CurvesPanel
 from workbench.ui.env_layout import EnvLayout, env_under_ray, lay_out
 from workbench.ui.fragments import render, style_sheet
 from workbench.ui.lights import light
+from workbench.ui.log_panel import LogPanel
 from workbench.ui.numbers_panel import NumbersPanel
 from workbench.ui.record_panel import RecordPanel
 from workbench.ui.run_panel import RunPanel
@@ -95,8 +97,11 @@ class Page:
             self._curves = CurvesPanel(server)
         with tabs.add_tab("Episodes", viser.Icon.MOVIE):
             self._record = RecordPanel(server, session.start_recording, session.stop_recording)
+        with tabs.add_tab("Log", viser.Icon.TERMINAL_2):
+            self._log = LogPanel(server, session.clear_printed)
         self._timeline = TimelinePanel(server, session)
         self._banner = Banner(server, session.reload, session.restart_worker)
+        self._busy_banner = BusyBanner(server, session.interrupt, session.restart_worker)
 
         self._scene = SceneView(server)
         self._mark = SelectionMark(server)
@@ -154,6 +159,7 @@ class Page:
         self._server.flush()
         self._status.draw(view)
         self._banner.draw(view)
+        self._busy_banner.draw(view)
         self._run.draw(view)
         self._view_panel.draw(view)
         self._version.draw(view)
@@ -162,6 +168,7 @@ class Page:
         self._curves.draw(view)
         self._record.draw(view)
         self._timeline.draw(view)
+        self._log.draw(view)
 
     def _count_clients(self) -> int:
         clients = self._server.get_clients()
@@ -294,6 +301,7 @@ class Page:
             Command("Frame what is shown", lambda: self.frame(session.view()), "F"),
             Command("Start or stop recording", self._record.toggle, "C"),
             Command("Load the file again", session.reload, "L"),
+            Command("Interrupt what the task is doing", session.interrupt, "I"),
             Command("Restart the worker", session.restart_worker, "L", "shift"),
             Command("Dark or light", self._view_panel.toggle_dark, "D"),
         ]

@@ -23,6 +23,7 @@ WORDS = {
     "paused": "paused",
     "error": "error",
     "stopped": "worker stopped",
+    "busy": "busy",
 }
 
 
@@ -41,7 +42,8 @@ class StatusLine:
             self._loaded_at = now if self._task_serial else 0.0
             self._task_serial = view.task_serial
         fresh = now - self._loaded_at < NEWS
-        state = f"{view.state} {view.stale} {view.activity} {view.task_serial} {fresh} {view.problem_serial}"
+        busy = "" if view.busy is None else f"{view.busy.doing} {view.busy.seconds:.0f}"
+        state = f"{busy} {view.state} {view.stale} {view.activity} {view.task_serial} {fresh} {view.problem_serial}"
         state += f" {view.timeline.shown is None}"
         if state == self._state and now - self._drawn_at < REDRAW_EVERY:
             return
@@ -52,14 +54,16 @@ class StatusLine:
 def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
     """What the template is given; `fresh` when a new version of the file has just come in."""
     task = view.task
-    moving = view.playing and view.state in ("running", "error") and task is not None
+    # While the renderer is at work, what the session says of it is more than that it is busy.
+    busy = None if view.busy is not None and view.busy.drawing and view.activity else view.busy
+    moving = view.playing and view.state in ("running", "error") and task is not None and busy is None
     return {
-        "state": view.state,
-        "word": WORDS[view.state],
+        "state": view.state if busy is None else "loading",
+        "word": WORDS[view.state if busy is None else "busy"],
         "problem": view.problem is not None,
         "stale": view.stale and task is not None and view.state not in ("starting", "loading"),
         "ago": None if view.timeline.shown is None else view.timeline.last - view.timeline.shown,
-        "activity": view.activity,
+        "activity": view.activity if busy is None else f"{busy.doing} for {busy.seconds:.0f} s",
         "news": _news(view) if fresh else "",
         "task": None if task is None else task.env_id,
         "backend": "" if task is None else task.backend,

@@ -1,0 +1,79 @@
+"""The author's code hangs and dies under an open page, in a real Chromium."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import pytest
+from playwright.sync_api import expect, sync_playwright
+
+from tests.browser.opened import launch, new_page, open_workbench
+from tests.browser.test_page import Desk, until
+from tests.session.hazards import calm, provoke, write_task
+
+pytestmark = pytest.mark.browser
+expect.set_options(timeout=60_000)
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Iterator[Desk]:
+    folder = tmp_path_factory.mktemp("author")
+    file = write_task(folder)
+    arguments = (str(file), "--num-envs", "2", "--no-spare")
+    with open_workbench(*arguments, cwd=folder) as opened, sync_playwright() as playwright:
+        browser = launch(playwright, chromium_path)
+        page, errors = new_page(browser)
+        page.goto(opened.url)
+        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=90_000)
+        yield Desk(page, errors, file, opened, folder)
+        browser.close()
+
+
+def test_a_loop_shows_a_banner_that_ends_it_with_its_traceback(desk: Desk) -> None:
+    provoke(desk.file, "evaluate", "loop")
+    desk.button("Step").click()
+    expect(desk.page.get_by_text("busy", exact=True)).to_be_visible()
+    expect(
+        desk.page.get_by_text(re.compile(r"has been in evaluate for \d+ s — risky\.py:\d+"))
+    ).to_be_visible()
+    # The page's own controls answer all the while.
+    desk.button("next ›").click()
+    until(lambda: "env 1: step" in desk.page.inner_text("body"), "the next env")
+    desk.button("Interrupt").click()
+    expect(desk.page.get_by_text(re.compile("was interrupted in evaluate"))).to_be_visible()
+    expect(desk.button("Interrupt")).to_be_hidden()
+    desk.page.get_by_text("The whole traceback").click()
+    expect(desk.page.get_by_text(re.compile(r'hazard\("evaluate"\)')).first).to_be_visible()
+    calm(desk.file)
+    desk.button("Step").click()
+    expect(desk.page.get_by_text(re.compile("was interrupted in evaluate"))).to_have_count(0)
+
+
+def test_restart_ends_what_cannot_be_interrupted(desk: Desk) -> None:
+    provoke(desk.file, "evaluate", "native")
+    desk.button("Step").click()
+    desk.button("Interrupt").click()
+    expect(desk.page.get_by_text(re.compile("was interrupted and goes on"))).to_be_visible()
+    expect(desk.button("Interrupt")).to_be_hidden()
+    calm(desk.file)
+    desk.button("Restart").click()
+    expect(desk.page.get_by_text(re.compile("is back where it was"))).to_be_visible()
+    assert desk.opened.wait_for_line("worker failed.*ended by hand in evaluate")
+
+
+def test_the_log_shows_what_was_printed_and_forgets_it(desk: Desk) -> None:
+    provoke(desk.file, "reset", "flood")
+    desk.button("Reset all").click()
+    desk.tab("Log")
+    expect(desk.page.get_by_text(re.compile("more came too fast to be kept"))).to_be_visible()
+    expect(desk.page.get_by_text(re.compile("all work and no play")).first).to_be_visible()
+    expect(desk.page.get_by_text(re.compile(r"Memory: .* GB allowed"))).to_be_visible()
+    until(lambda: not (desk.file.parent / "hazard").exists(), "the end of the flood")
+    expect(desk.page.get_by_text("paused", exact=True)).to_be_visible()
+    desk.button("Clear").click()
+    expect(desk.page.get_by_text("Nothing printed so far.")).to_be_visible()
+
+
+def test_nothing_went_wrong_in_the_console(desk: Desk) -> None:
+    assert desk.errors == []

@@ -1,0 +1,113 @@
+"""A task that does, in the hook that one names, whatever can be done to a process."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from tests.session.conftest import TASKS
+
+_MISCHIEF = """
+import ctypes as _ctypes, os as _os, signal as _signal, sys as _sys, time as _time
+from pathlib import Path as _Path
+
+
+def hazard(place):
+    file = _Path(__file__).with_name("hazard")
+    if not file.exists():
+        return
+    wanted, what = file.read_text().split()
+    if wanted != place:
+        return
+    file.with_name("provoked").touch()
+    if what == "loop":
+        while True:
+            pass
+    if what == "catch":
+        while True:
+            try:
+                _time.sleep(0.05)
+            except BaseException:
+                pass
+    if what == "native":
+        sum(range(10**15))  # one loop in C, days long
+    if what == "slow":
+        for _ in range(100):
+            _time.sleep(0.1)
+            if not file.exists():
+                return
+    if what == "exit":
+        _os._exit(3)
+    if what == "leave":
+        _sys.exit("enough")
+    if what == "segfault":
+        _ctypes.string_at(0)
+    if what == "abort":
+        _os.abort()
+    if what == "kill":
+        _os.kill(_os.getpid(), _signal.SIGKILL)
+    if what == "memory":
+        eaten = []
+        while True:
+            eaten.append(b"x" * 2**24)
+    if what == "children":
+        if _os.fork() == 0:
+            _time.sleep(3600)
+        _os.kill(_os.getpid(), _signal.SIGKILL)
+    if what == "flood":
+        block = "all work and no play " * 50 + "\\n"
+        for _ in range(20_000):
+            print(block * 10, end="")
+        file.unlink()
+    if what == "read":
+        input("your name? ")
+
+
+"""
+_HOOKS = {
+    "build": "        build_ground(self.scene)\n",
+    "reset": '        self.agent.reset(self.agent.keyframes["rest"].qpos)\n',
+    "evaluate": '        return {"success"',
+}
+
+
+def line_of(file: Path, code: str) -> int:
+    """1-based number of the only line of `file` that is `code`."""
+    (number,) = [n for n, line in enumerate(file.read_text().splitlines(), 1) if line.strip() == code]
+    return number
+
+
+def write_task(folder: Path) -> Path:
+    """``tasks/minimal.py`` with a hazard in each hook; all is well until `provoke`."""
+    file = Path(shutil.copy(TASKS / "minimal.py", folder / "risky.py"))
+    text = file.read_text()
+    for place, line in _HOOKS.items():
+        assert text.count(line) == 1
+        text = text.replace(line, f'        hazard("{place}")\n{line}')
+    reward = "\n    def compute_sparse_reward(self, obs, action, info):\n"
+    reward += '        hazard("reward")\n        return super().compute_sparse_reward(obs, action, info)\n'
+    text = text.replace("\n\n# ManiSkill takes", reward + "\n\n# ManiSkill takes")
+    before = '@register_env("WorkbenchMinimal'
+    text = text.replace(before, f'{_MISCHIEF}hazard("import")\n\n\n{before}')
+    file.write_text(text)
+    return file
+
+
+def provoke(file: Path, place: str, what: str) -> None:
+    """From now on `what` happens in the hook `place`."""
+    file.with_name("hazard").write_text(f"{place} {what}")
+
+
+def calm(file: Path) -> None:
+    """All is well again."""
+    file.with_name("hazard").unlink(missing_ok=True)
+
+
+def provoked(file: Path) -> bool:
+    """Whether it has happened, or goes on."""
+    return file.with_name("provoked").exists()
+
+
+def edit(file: Path) -> None:
+    """Save a new version that differs in nothing that matters."""
+    file.write_text(file.read_text() + "\n# edited\n")

@@ -1,0 +1,37 @@
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from workbench.session.memory_limit import in_words, parse_memory, resident_memory, total_memory
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [("8GB", 8 * 2**30), ("1.5 GiB", 3 * 2**29), ("2048m", 2**31), ("none", None), (" 8g ", 8 * 2**30)],
+)
+def test_sizes_as_people_write_them(text: str, size: int | None) -> None:
+    assert parse_memory(text) == size
+
+
+@pytest.mark.parametrize("text", ["", "8 XB", "-1GB", "many", "100MB", "1e9", "8GB8"])
+def test_what_is_no_size_or_too_little_is_refused_with_a_reason(text: str) -> None:
+    with pytest.raises(ValueError, match="--memory-limit"):
+        parse_memory(text)
+
+
+def test_auto_leaves_something_to_the_others() -> None:
+    limit = parse_memory("auto")
+    assert limit is not None and 0.5 * total_memory() < limit < 0.9 * total_memory()
+
+
+def test_memory_of_a_process_is_seen_and_of_none_is_nothing() -> None:
+    before = resident_memory(os.getpid())
+    held = b"x" * (64 * 2**20)
+    assert resident_memory(os.getpid()) - before > 0.9 * len(held)
+    assert resident_memory(2**22 + 1) == 0
+
+
+def test_in_words() -> None:
+    assert (in_words(8 * 2**30), in_words(310 * 2**20)) == ("8.0 GB", "310 MB")

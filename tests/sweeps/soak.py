@@ -1,0 +1,144 @@
+"""Hundreds of reloads and dozens of worker deaths in one session: does anything grow, is anything left?
+
+    python tests/sweeps/soak.py [--reloads 500] [--deaths 50] [--num-envs 4] [--no-spare]
+
+Versions of `tests/session/hazards.py`'s task are saved one after the other: two that are good, one with a wrong
+syntax, one that raises in ``evaluate``. In between the worker dies, in one of several ways. After each tenth of
+it all a row says what the server and the worker hold: memory, threads, open files, child processes. The last
+lines say how much the server's figures grew from the first row to the last, and what was left at the end.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+import tyro
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from tests.session.hazards import calm, provoke, write_task
+from workbench.session.kept_worker import WorkerOptions
+from workbench.session.messages import TaskOptions
+from workbench.session.session import Session
+from workbench.session.view import SessionView
+
+DEATHS = ("segfault", "exit", "kill", "abort", "children")
+PATIENCE = 120.0
+
+
+@dataclass(frozen=True)
+class Options:
+    reloads: int = 500
+    deaths: int = 50
+    num_envs: int = 4
+    spare: bool = True
+
+
+@dataclass(frozen=True)
+class Holds:
+    """What a process has."""
+
+    megabytes: float
+    threads: int
+    files: int
+    children: int
+
+    @classmethod
+    def of(cls, pid: int) -> Holds:
+        process = psutil.Process(pid)
+        memory = process.memory_info().rss / 2**20
+        return cls(memory, process.num_threads(), process.num_fds(), len(process.children(recursive=True)))
+
+    def __str__(self) -> str:
+        return (
+            f"{self.megabytes:.0f} MB, {self.threads} threads, {self.files} files, {self.children} children"
+        )
+
+
+def reach(session: Session, reached: Callable[[SessionView], bool], what: str) -> SessionView:
+    deadline, seen = time.monotonic() + PATIENCE, -1
+    while time.monotonic() < deadline:
+        view = session.view()
+        if reached(view):
+            return view
+        seen = session.wait(seen, timeout=0.2)
+    raise TimeoutError(f"{what} did not come: {session.view().state}, {session.view().problem}")
+
+
+def save(session: Session, file: Path, good: str, number: int) -> None:
+    """Save version `number` and see it loaded, or refused."""
+    before = session.view()
+    if number % 4 == 1:
+        file.write_text(good + f"\ndef broken(:  # {number}\n")
+    elif number % 4 == 3:
+        file.write_text(good.replace('hazard("evaluate")', f"raise KeyError({number})"))
+    else:
+        file.write_text(
+            good.replace('{"success"', f'{{"version": self.cube.pose.p[:, 0] * 0 + {number}, "success"')
+        )
+        reach(session, lambda v: v.task_serial > before.task_serial, f"version {number}")
+        return
+    reach(
+        session, lambda v: v.problem is not None and v.problem_serial > before.problem_serial, "the problem"
+    )
+
+
+def die(session: Session, file: Path, number: int) -> float:
+    """Have the worker die, and the seconds until its version is back."""
+    before = session.view()
+    provoke(file, "evaluate", DEATHS[number % len(DEATHS)])
+    session.step()
+    reach(session, lambda v: v.problem_serial > before.problem_serial, "the death")
+    began = time.monotonic()
+    calm(file)
+    reach(session, lambda v: v.task_serial > before.task_serial, "the version again")
+    return time.monotonic() - began
+
+
+def main(options: Options) -> None:
+    ourselves = psutil.Process().pid
+    with tempfile.TemporaryDirectory() as name:
+        file = write_task(Path(name))
+        good = file.read_text()
+        session = Session(
+            str(file),
+            TaskOptions(num_envs=options.num_envs),
+            recordings=Path(name) / "recordings",
+            worker=WorkerOptions(spare=options.spare),
+        )
+        reach(session, lambda v: v.task is not None, "the first load")
+        every = max(1, options.reloads // 10)
+        per_death = max(1, options.reloads // max(1, options.deaths))
+        rows: list[Holds] = []
+        back: list[float] = []
+        for number in range(options.reloads):
+            save(session, file, good, number)
+            if number % per_death == per_death - 1 and len(back) < options.deaths:
+                file.write_text(good)
+                reach(session, lambda v: v.problem is None and not v.stale, "the good version")
+                back.append(die(session, file, len(back)))
+            if number % every == every - 1:
+                rows.append(Holds.of(ourselves))
+                worker = "none" if session.worker_pid is None else Holds.of(session.worker_pid)
+                print(
+                    f"{number + 1} reloads, {len(back)} deaths | server {rows[-1]} | worker {worker}",
+                    flush=True,
+                )
+        session.close()
+    first, last, end = rows[0], rows[-1], Holds.of(ourselves)
+    print(
+        f"server from the first row to the last: {last.megabytes - first.megabytes:+.0f} MB, "
+        f"{last.threads - first.threads:+d} threads, {last.files - first.files:+d} files"
+    )
+    print(f"after the end: {end}")
+    if back:
+        print(f"back after a death: median {sorted(back)[len(back) // 2]:.2f} s, worst {max(back):.2f} s")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

@@ -1,0 +1,86 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import viser
+
+from tests.ui.scenes import EMPTY, problem, running
+from workbench.session.last_words import Busy
+from workbench.ui.banner import Banner, banner_html
+from workbench.ui.busy_banner import SHOWN_AFTER, BusyBanner, busy_html
+from workbench.ui.fragments import render
+from workbench.ui.status_line import status_values
+
+EVIL = "<img src=x onerror=alert(1)><script>alert(2)</script>"
+LOOP = Busy(6.4, "in evaluate", "/home/me/push.py", 88, "while True:", "Traceback ...")
+
+
+def a_banner(server: viser.ViserServer) -> tuple[BusyBanner, list[str]]:
+    asked: list[str] = []
+    return BusyBanner(server, lambda: asked.append("interrupt"), lambda: asked.append("restart")), asked
+
+
+def test_says_what_takes_long_where_and_for_how_long() -> None:
+    html = busy_html(LOOP, running(2))
+    assert all(word in html for word in ("PushEnv", "in evaluate", "6 s", "push.py:88", "while True:"))
+
+
+def test_everything_of_the_author_s_is_escaped() -> None:
+    evil = Busy(6.0, EVIL, f"/{EVIL}.py", 1, EVIL, EVIL)
+    html = busy_html(evil, EMPTY) + render("traceback", traceback=EVIL)
+    assert "<script" not in html and "<img" not in html
+
+
+def test_comes_after_a_while_and_goes_when_it_is_over(server: viser.ViserServer) -> None:
+    banner, _ = a_banner(server)
+    banner.draw(running(2, busy=replace(LOOP, seconds=SHOWN_AFTER - 1)))
+    assert not banner._panel.visible
+    banner.draw(running(2, busy=LOOP))
+    assert banner._panel.visible and banner._interrupt.visible and not banner._traceback.visible
+    banner.draw(running(2))
+    assert not banner._panel.visible
+
+
+def test_what_cannot_be_interrupted_offers_no_interrupt_and_shows_where_it_is(
+    server: viser.ViserServer,
+) -> None:
+    banner, _ = a_banner(server)
+    banner.draw(running(2, busy=replace(LOOP, deaf=True)))
+    assert not banner._interrupt.visible and banner._restart.visible
+    assert banner._traceback.visible and "Traceback ..." in banner._traceback.content
+
+
+def test_stands_instead_of_the_banner_of_a_problem(server: viser.ViserServer) -> None:
+    banner = Banner(server, lambda: None, lambda: None)
+    view = running(2, problem=problem(), problem_serial=1, state="error")
+    banner.draw(replace(view, busy=LOOP))
+    assert not banner._panel.visible
+    banner.draw(view)
+    assert banner._panel.visible and "KeyError" in banner._html.content
+
+
+def test_an_interrupt_is_not_called_a_failure() -> None:
+    html = banner_html(problem("Interrupted: stopped by hand after 6.1 s"), running(2))
+    assert "was interrupted in evaluate" in html and "failed" not in html
+
+
+def test_a_worker_s_death_says_when_all_is_back(server: viser.ViserServer) -> None:
+    banner = Banner(server, lambda: None, lambda: None)
+    died = replace(problem("the worker process was killed by SIGSEGV"), stage="worker")
+    view = running(2, problem=died, problem_serial=1, state="starting", playing=False)
+    banner.draw(view)
+    assert "Another worker takes over" in banner._html.content
+    banner.draw(replace(view, state="paused"))
+    assert "is back where it was" in banner._html.content
+
+
+def test_the_status_line_says_busy_with_what_and_claims_no_rate() -> None:
+    text = render("status_line", **status_values(running(4, busy=LOOP)))
+    assert "busy" in text and "in evaluate for 6 s" in text and "steps/s" not in text
+
+
+def test_the_status_line_lets_the_renderer_s_own_words_stand() -> None:
+    drawing = Busy(25.0, "drawing", drawing=True)
+    view = running(4, busy=drawing, state="loading", activity="compiling the renderer's shaders, once")
+    text = render("status_line", **status_values(view))
+    assert "compiling" in text and "busy" not in text

@@ -1,0 +1,166 @@
+"""Where a worker hangs, or died, in the author's words: read from faulthandler's dumps.
+
+A process that loops in native code, or that a segmentation fault ends, cannot be asked anything any more. But
+Python's ``faulthandler`` writes the stack from within a signal handler, without the interpreter's help, into
+a file that both processes hold. The server reads it here: the frames, which of them is the author's, and in
+which hook of the task it all happened. (Format: ``_Py_DumpTraceback`` in CPython's ``Python/traceback.c``;
+innermost frame first, no source lines, characters beyond ASCII as backslash escapes.)
+"""
+
+from __future__ import annotations
+
+import linecache
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from workbench.authoring.problem import HOOK_STAGES, Problem
+
+_FRAME = re.compile(r'^  File "(?P<file>.*)", line (?P<line>\d+|\?\?\?) in (?P<function>.*)$', re.MULTILINE)
+_FATAL = re.compile(r"^Fatal Python error: (?P<what>.+)$", re.MULTILINE)
+_EXIT = re.compile(r"^os\._exit\((?P<code>[^)]*)\)$", re.MULTILINE)
+_MOST_FRAMES = 60
+_OURS = ("/workbench/session/", "/workbench/core/", "/workbench/authoring/", "<frozen runpy>")
+
+
+@dataclass(frozen=True)
+class Frame:
+    file: str
+    line: int
+    function: str
+
+
+@dataclass(frozen=True)
+class Busy:
+    """A piece of work that has lasted long, and where it was when the worker was last looked at."""
+
+    seconds: float
+    doing: str
+    """For people: ``in evaluate``, ``loading``."""
+    file: str | None = None
+    """The author's file, if one of their lines is being executed."""
+    line: int | None = None
+    code: str | None = None
+    traceback: str = ""
+    drawing: bool = False
+    """The renderer is at work, which may take long the first time."""
+    deaf: bool = False
+    """It was interrupted and went on all the same."""
+
+
+def parse_stack(dump: str) -> list[Frame]:
+    """The frames of the dump's last stack, innermost first; empty when there is none."""
+    last = dump.rfind("(most recent call first):")
+    return [
+        Frame(found["file"], int(found["line"]) if found["line"].isdigit() else 0, found["function"])
+        for found in _FRAME.finditer(dump, max(last, 0))
+    ][:_MOST_FRAMES]
+
+
+def fatal_error(dump: str) -> str | None:
+    """What the dump says of the end: ``Segmentation fault``, ``called os._exit(3)``; None if nothing."""
+    fatal, left = _FATAL.search(dump), _EXIT.search(dump)
+    if fatal is not None:
+        return fatal["what"]
+    return None if left is None else f"called os._exit({left['code']})"
+
+
+def author_frame(frames: Sequence[Frame], own_files: Iterable[str]) -> Frame | None:
+    """The innermost frame in one of `own_files` (the author's paths)."""
+    named = {path.encode("ascii", "backslashreplace").decode(): path for path in own_files}
+    for frame in frames:
+        if frame.file in named:
+            return replace(frame, file=named[frame.file])
+    return None
+
+
+def hook_of(frames: Sequence[Frame]) -> str | None:
+    """The stage of the innermost hook of a task on the stack: ``evaluate``, ``reward``, ``build`` ..."""
+    return next((HOOK_STAGES[f.function] for f in frames if f.function in HOOK_STAGES), None)
+
+
+def as_traceback(frames: Sequence[Frame], texts: Mapping[str, str] | None = None) -> str:
+    """As Python prints a traceback: outermost first, with the lines; less the workbench's own at its start.
+
+    Args:
+        texts: source by path, of files whose running version is not what is on disk.
+    """
+    outermost_first = list(reversed(frames))
+    while outermost_first and any(part in outermost_first[0].file for part in _OURS):
+        outermost_first.pop(0)
+    if not outermost_first:
+        return ""
+    lines = ["Traceback (most recent call last):"]
+    for frame in outermost_first:
+        lines.append(f'  File "{frame.file}", line {frame.line}, in {frame.function}')
+        code = code_of(frame.file, frame.line, texts)
+        if code:
+            lines.append(f"    {code}")
+    return "\n".join(lines)
+
+
+def code_of(file: str, line: int, texts: Mapping[str, str] | None = None) -> str | None:
+    """Text of a line, stripped; None where it cannot be had."""
+    text = None if texts is None else texts.get(file)
+    if text is not None:
+        lines = text.splitlines()
+        return lines[line - 1].strip() or None if 0 < line <= len(lines) else None
+    linecache.checkcache(file)
+    return linecache.getline(file, line).strip() or None
+
+
+def busy_at(seconds: float, doing: str, dump: str, own_files: Iterable[str], deaf: bool) -> Busy:
+    """What a look at a worker at work showed; `dump` may be empty."""
+    frames = parse_stack(dump)
+    hook, place = hook_of(frames), author_frame(frames, own_files)
+    return Busy(
+        seconds=seconds,
+        doing=f"in {hook}" if hook is not None else doing,
+        file=None if place is None else place.file,
+        line=None if place is None else place.line,
+        code=None if place is None else code_of(place.file, place.line),
+        traceback=as_traceback(frames),
+        drawing=doing == "drawing" and hook is None,
+        deaf=deaf,
+    )
+
+
+def death_problem(
+    why: str, doing: str | None, dump: str, own_files: Sequence[str], printed: str, texts: Mapping[str, str]
+) -> Problem:
+    """Why there is no worker any more, at the author's line if its last words name one.
+
+    Args:
+        why: for example ``was killed by SIGSEGV``.
+        doing: what it was at: ``stepping``; None when it was at nothing.
+        dump: its last stack, or empty.
+        printed: the last lines that it printed.
+        texts: source by path of the version that ran.
+    """
+    frames = parse_stack(dump)
+    place, hook, fatal = author_frame(frames, own_files), hook_of(frames), fatal_error(dump)
+    message = f"the worker process {why}"
+    if fatal is not None and fatal.startswith("called"):
+        message = f"the worker process {fatal}"
+    elif fatal is not None:
+        message += f" ({fatal})"
+    if hook is not None:
+        message += f" in {hook}"
+    elif doing is not None:
+        message += f" while {doing}"
+    parts = [as_traceback(frames, texts), f"The last lines that it printed:\n{printed}" if printed else ""]
+    return Problem(
+        stage="worker",
+        message=message,
+        file=None if place is None else place.file,
+        line=None if place is None else place.line,
+        code=None if place is None else code_of(place.file, place.line, texts),
+        traceback="\n\n".join(part for part in parts if part),
+    )
+
+
+def own_files_of(source_files: Iterable[str], own_file: Path | None) -> list[str]:
+    """The author's files, the task's own first, also before it was ever loaded."""
+    own = [] if own_file is None else [str(own_file)]
+    return own + [path for path in source_files if path not in own]

@@ -1,0 +1,79 @@
+"""How much memory a worker may have, and how much it has.
+
+A limit on address space (``RLIMIT_AS``) is of no use here: torch and the renderer reserve far more than they use,
+and fail in ways that name nothing. What counts is resident memory, so the server looks at it ten times a
+second and ends a worker that has more than it may, with a message, before the kernel must choose a
+victim. Should the kernel be quicker all the same, the worker has told it to be chosen first (``oom_score_adj``).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import psutil
+
+_UNITS = {"": 1, "k": 2**10, "m": 2**20, "g": 2**30, "t": 2**40}
+_SIZE = re.compile(r"(?P<number>\d+(\.\d+)?)\s*(?P<unit>[kmgt]?)i?b?", re.IGNORECASE)
+_SHARE = 0.8
+"""Of the memory that this machine, or the container, has."""
+_LEAST = 2**30
+"""Bytes; a worker that has only imported uses about half of this."""
+_CONTAINER_LIMITS = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
+_PAGE = os.sysconf("SC_PAGE_SIZE")
+
+
+def parse_memory(text: str) -> int | None:
+    """Bytes of ``8GB``, ``800 MiB`` (both count by 1024), ``auto``; None for ``none``.
+
+    Raises:
+        ValueError: it is none of these, or too little for any worker.
+    """
+    word = text.strip().lower()
+    if word == "none":
+        return None
+    if word == "auto":
+        return max(_LEAST, int(_SHARE * total_memory()))
+    found = _SIZE.fullmatch(word)
+    if found is None:
+        raise ValueError(f"--memory-limit takes a size such as 8GB, auto, or none; got {text!r}")
+    size = int(float(found["number"]) * _UNITS[found["unit"].lower()])
+    if size < _LEAST:
+        raise ValueError(
+            f"--memory-limit must be at least 1GB: a worker that has built nothing uses half of it, not {text}"
+        )
+    return size
+
+
+def total_memory() -> int:
+    """Bytes that there are for all: of the machine, or of the container if that has less."""
+    total = psutil.virtual_memory().total
+    for path in _CONTAINER_LIMITS:
+        try:
+            total = min(total, int(Path(path).read_text()))
+        except (OSError, ValueError):
+            continue  # no such container, or "max"
+    return total
+
+
+def resident_memory(pid: int) -> int:
+    """Bytes of the process that are in memory; 0 when it is gone."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_bytes().split()[1]) * _PAGE
+    except (OSError, IndexError):
+        return 0
+
+
+def memory_with_children(pid: int) -> int:
+    """As `resident_memory`, with the processes that the author's code started. Takes milliseconds."""
+    try:
+        children = psutil.Process(pid).children(recursive=True)
+    except psutil.NoSuchProcess:
+        return 0
+    return resident_memory(pid) + sum(resident_memory(child.pid) for child in children)
+
+
+def in_words(size: int) -> str:
+    """``8.0 GB``, ``310 MB``; by 1024."""
+    return f"{size / 2**30:.1f} GB" if size >= 2**30 else f"{size / 2**20:.0f} MB"

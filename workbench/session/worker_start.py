@@ -1,0 +1,75 @@
+"""How a worker process begins: ready to say where it died before anything that may die is imported.
+
+The heavy modules are imported last. By then a crash writes its stack, the server can look at the process by
+a signal, the kernel knows whom to end when memory is short, and the process goes when its server does.
+
+The server starts it as ``python -m workbench.session.worker_start SOCKET PULSE STACKS SERVER``: three file
+descriptors (see `process`) and the server's process id.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import faulthandler
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import NoReturn
+
+_PR_SET_PDEATHSIG = 1
+
+
+def main() -> None:
+    """Entry of the process."""
+    connection, pulse_fd, stacks, server = map(int, sys.argv[1:5])
+    _end_with(server)
+    _be_the_first_to_go()
+    _tell_where(stacks)
+    from workbench.session.pulse import PulseWriter
+
+    pulse = PulseWriter(pulse_fd)
+    pulse.begin("starting")
+
+    from workbench.session.worker import work
+
+    work(connection, pulse)
+
+
+def _end_with(server: int) -> None:
+    """Ask the kernel to end this process with its server, also when that is killed while we hang."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != server:
+        sys.exit("the server is gone")
+
+
+def _be_the_first_to_go() -> None:
+    """When memory runs out the kernel ends the process with the highest score: not the page's, ours."""
+    try:
+        Path("/proc/self/oom_score_adj").write_text("1000")
+    except OSError:
+        pass  # a sandbox may forbid it; the server watches over the memory as well
+
+
+def _tell_where(stacks: int) -> None:
+    """Write the stack into the file `stacks`: at a crash, when the server asks, and when the code leaves."""
+    from workbench.session.interrupts import INTERRUPT_SIGNAL, STACK_SIGNAL
+
+    faulthandler.enable(file=stacks, all_threads=False)
+    faulthandler.register(STACK_SIGNAL, file=stacks, all_threads=False)
+    # Until the worker takes it up there is nothing to interrupt, and its default would end us.
+    signal.signal(INTERRUPT_SIGNAL, signal.SIG_IGN)
+    leave, us = os._exit, os.getpid()
+
+    def leave_with_words(code: int) -> NoReturn:
+        # The one way out that tells nobody: no exception, no handler, only an exit code.
+        if os.getpid() == us:  # not in a process that the author's code forked
+            os.write(stacks, f"os._exit({code})\n".encode())
+            faulthandler.dump_traceback(file=stacks, all_threads=False)
+        leave(code)
+
+    os._exit = leave_with_words
+
+
+if __name__ == "__main__":
+    main()

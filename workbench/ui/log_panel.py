@@ -1,0 +1,116 @@
+"""The Log tab: what the author's code printed, with a filter, and what the worker's processes hold.
+
+Redrawn a few times a second and only the last lines of what fits the filter, so that a task that prints in every
+hook of every step costs the page no more than one that prints once.
+"""
+
+from __future__ import annotations
+
+import time
+
+import viser
+
+from workbench.session.kept_worker import Vitals
+from workbench.session.memory_limit import in_words
+from workbench.session.printed import Printed
+from workbench.session.view import SessionView
+from workbench.ui.checked import checked_text
+from workbench.ui.fragments import render
+
+REDRAW_EVERY = 0.3
+LINES_SHOWN = 200
+LONGEST_FILTER = 200
+
+
+class LogPanel:
+    """
+    Args:
+        server: The page.
+        clear: Asks the session to forget what was printed.
+    """
+
+    def __init__(self, server: viser.ViserServer, clear) -> None:
+        self._filter = server.gui.add_text(
+            "Filter", "", hint="Only lines with this in them; stderr: or stdout: before it takes one stream."
+        )
+        self._hold = server.gui.add_checkbox("Hold still", False, hint="Let new lines wait while you read.")
+        self._html = server.gui.add_html("")
+        self._clear = server.gui.add_button("Clear", icon=viser.Icon.ERASER, color="gray")
+        self._vitals = server.gui.add_html("")
+        self._clear.on_click(lambda _: self._on_clear(clear))
+        self._filter.on_update(self._on_filter)
+        self._wanted = ""
+        self._drawn: tuple[int, str] | None = None
+        self._vitals_drawn = ""
+        self._drawn_at = 0.0
+
+    def draw(self, view: SessionView) -> None:
+        now = time.monotonic()
+        if now - self._drawn_at < REDRAW_EVERY:
+            return
+        key = view.printed.serial, self._wanted
+        if key != self._drawn and not (self._hold.value and self._drawn is not None):
+            self._drawn, self._drawn_at = key, now
+            self._html.content = log_html(view.printed, self._wanted)
+            # With nothing there, there is nothing to filter, to hold or to clear.
+            for control in (self._filter, self._hold, self._clear):
+                control.visible = bool(view.printed.lines or view.printed.dropped)
+        vitals = vitals_html(view.vitals)
+        if vitals != self._vitals_drawn:
+            self._vitals_drawn, self._drawn_at = vitals, now
+            self._vitals.content = vitals
+
+    def _on_filter(self, event: viser.GuiEvent) -> None:
+        try:
+            self._wanted = checked_text(self._filter.value, LONGEST_FILTER, "filter").strip()
+        except ValueError as error:
+            if event.client is not None:
+                event.client.add_notification(
+                    "Not possible", str(error), color="orange", auto_close_seconds=6.0
+                )
+            return
+        self._drawn = None  # also while it is held: the filter is of what stands there
+
+    def _on_clear(self, clear) -> None:
+        self._drawn = None
+        clear()
+
+
+def log_html(printed: Printed, wanted: str) -> str:
+    """The last lines that fit; every value escaped.
+
+    Args:
+        wanted: text that a line must have in it, in any case of letters; ``stderr:`` or ``stdout:`` before it
+            takes the lines of one stream only.
+    """
+    stream, colon, rest = wanted.partition(":")
+    if not (colon and stream in ("stdout", "stderr")):
+        stream, rest = "", wanted
+    part = rest.strip().lower()
+    fits = [
+        line
+        for line in printed.lines
+        if (not stream or line.stream == stream) and (not part or part in line.text.lower())
+    ]
+    lines = fits[-LINES_SHOWN:]
+    return render(
+        "log",
+        lines=lines,
+        shown=len(lines),
+        kept=len(printed.lines),
+        wanted=wanted,
+        dropped=f"{printed.dropped:,}".replace(",", " ") if printed.dropped else "",
+    )
+
+
+def vitals_html(vitals: Vitals) -> str:
+    """What the processes hold, in words that change only when it matters."""
+    if not vitals.memory:
+        return ""
+    return render(
+        "vitals",
+        worker=in_words(vitals.memory),
+        limit=None if vitals.memory_limit is None else in_words(vitals.memory_limit),
+        spare=None if vitals.spare_memory is None else in_words(vitals.spare_memory),
+        ready=vitals.spare_ready,
+    )
