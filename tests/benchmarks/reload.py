@@ -6,7 +6,7 @@
 again with another edit, and the clock runs from the end of the write until the page shows what it changed:
 
     patched     another name of an entry of ``evaluate``       the entry is in the table
-    cameras     another place of the sensor camera             a new picture
+    cameras     another width of the sensor camera             a picture of that width
     rebuilt     another colour of the cube, another entry      the entry and a new picture, of all envs built anew
 
 The moment is the same before and after; the last column is what the worker says it took. The other side is what an
@@ -33,6 +33,7 @@ from tests.benchmarks.save_to_seen import TASK, cold_restart, version
 from tests.browser.opened import launch, new_page, open_workbench
 from workbench.machine.chromium import find_chromium, how_to_get_chromium
 
+WIDTH = 100
 BARS = {"patched": 0.3, "cameras": 0.6, "rebuilt": 2.0}
 
 
@@ -49,9 +50,9 @@ def edited(level: str, number: int) -> tuple[str, str | None, bool]:
     if level == "patched":
         return good.replace('"cube_to_goal"', f'"patch_{number}"'), f"patch_{number}", False
     if level == "cameras":
-        eye = "eye=[0.45, 0, 0.6]"
-        assert good.count(eye) == 1
-        return good.replace(eye, f"eye=[0.45, 0, {0.61 + 0.02 * number:.2f}]"), None, True
+        size = "width=128, height=128"
+        assert good.count(size) == 1
+        return good.replace(size, f"width={WIDTH + number}, height=128"), None, True
     return version(number), f"seen_{number}", True
 
 
@@ -62,12 +63,13 @@ def save_to_seen(page: Page, file: Path, level: str, number: int) -> tuple[float
     file.write_text(text)
     start = time.perf_counter()
     page.wait_for_function(
-        """([entry, picture, before]) => {
+        """([entry, picture, before, width]) => {
             const image = document.querySelector('img');
             return (!entry || document.body.textContent.includes(entry))
-                && (!picture || (image && image.src && image.src !== before));
+                && (!picture || (image && image.src && image.src !== before))
+                && (!width || (image && image.naturalWidth === width));
         }""",
-        arg=[entry, picture, before],
+        arg=[entry, picture, before, WIDTH + number if level == "cameras" else 0],
         polling=10,
     )
     seconds = time.perf_counter() - start

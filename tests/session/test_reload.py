@@ -328,7 +328,7 @@ def test_a_reload_as_random_as_can_be_equals_a_fresh_env_step_for_step(
     desks = [open_desk(Path(shutil.copy(path, folder / path.name)), obs_mode="state") for path in EDITED]
     tried: list[str] = []
 
-    @settings(max_examples=24, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=24, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
     @given(st.integers(0, len(EDITED) - 1), st.integers(0, 10**6), st.integers(1, 2))
     def edit(number: int, seed: int, edits: int) -> None:
         desk = desks[number]
@@ -378,8 +378,10 @@ def randomly_edited(text: str, rng: random.Random, edits: int) -> str:
 
 
 def _with_a_number(text: str, rng: random.Random, kind: str) -> str:
-    numbers = [n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.Constant) and type(n.value) is float]
+    constants = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Constant)]
+    numbers = [node for node in constants if isinstance(node.value, float)]
     node = rng.choice(numbers)
+    assert isinstance(node.value, float)
     value = f"{node.value * rng.choice((0.9, 1.1, 1.25)):.6g}"
     lines = text.splitlines(keepends=True)
     line = lines[node.lineno - 1]
