@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from workbench.authoring.problem import Problem
 from workbench.core.geometry import SceneGeometry
+from workbench.core.inspection import Inspection, Section
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.core.step import StepResult
 
@@ -160,6 +161,14 @@ class SetCapture:
 
 
 @dataclass(frozen=True)
+class Inspect:
+    """Read one env out, once; answered with an `Inspection`, between two control steps."""
+
+    env: int
+    sections: tuple[Section, ...]
+
+
+@dataclass(frozen=True)
 class Quit:
     pass
 
@@ -175,6 +184,7 @@ Request = (
     | SetSliders
     | WatchCameras
     | SetCapture
+    | Inspect
     | Quit
 )
 
@@ -237,4 +247,4 @@ class Status:
     """What keeps the worker from its requests for a while, if anything does."""
 
 
-Event = Loading | Loaded | Failed | Stepped | Pictures | Status
+Event = Loading | Loaded | Failed | Stepped | Pictures | Inspection | Status

@@ -17,8 +17,10 @@ from pathlib import Path
 from workbench.authoring.problem import Problem
 from workbench.authoring.reference import named_file
 from workbench.authoring.watch import SourceWatcher
+from workbench.core.inspection import Inspection, Section
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.step import StepResult
+from workbench.session.env_table import EnvRows, EnvTable
 from workbench.session.kept_worker import Death, KeptWorker
 from workbench.session.messages import (
     ActionSource,
@@ -26,6 +28,7 @@ from workbench.session.messages import (
     EpisodeEnd,
     Event,
     Failed,
+    Inspect,
     Load,
     Loaded,
     Loading,
@@ -47,6 +50,7 @@ from workbench.session.messages import (
 )
 from workbench.session.past import Past
 from workbench.session.record_live import LiveRecorder
+from workbench.session.reward_terms import TermCurves, TermHistory
 from workbench.session.view import Curves, SessionView, State
 
 _PRINTED_LINES = 200
@@ -71,6 +75,9 @@ class _State:
     problem_serial: int = 0
     problem_at_run: bool = False
     past: Past | None = None
+    table: EnvTable | None = None
+    terms: TermHistory | None = None
+    inspection: Inspection | None = None
     selected_env: int = 0
     playing: bool = False
     wants_play: bool = False
@@ -161,7 +168,18 @@ class Session:
                 real_time_factor=s.real_time_factor,
                 recording=recording,
                 printed=tuple(s.printed),
+                inspection=s.inspection,
             )
+
+    def env_rows(self) -> EnvRows | None:
+        """The row of every env; None before a task is loaded. Copies some 100 kB for 256 envs: not for every frame."""
+        with self._lock:
+            return None if self._state.table is None else self._state.table.rows()
+
+    def term_curves(self) -> TermCurves | None:
+        """The reward's terms over time; None before a task is loaded. Copies: not for every frame."""
+        with self._lock:
+            return None if self._state.terms is None else self._state.terms.curves()
 
     def wait(self, seen: int, timeout: float) -> int:
         """Block until something changed since the counter `seen`; returns the counter as it is now."""
@@ -247,6 +265,12 @@ class Session:
                 return
             self._state.cameras = cameras
         self._watch()
+
+    def inspect(self, sections: tuple[Section, ...]) -> None:
+        """Read the selected env out, once; the answer becomes `SessionView.inspection`."""
+        with self._lock:
+            env = self._state.selected_env
+        self._send(Inspect(env, sections))
 
     def set_clients(self, count: int) -> None:
         """How many pages are open; with none, no picture is rendered."""
@@ -349,6 +373,8 @@ class Session:
                 s.pictures = {(picture.kind, picture.camera): picture for picture in event.pictures}
                 s.pictures_serial += 1
                 s.picture_milliseconds = event.milliseconds
+        elif isinstance(event, Inspection):
+            s.inspection = event
         elif isinstance(event, Status):
             s.playing = event.playing
             s.steps_per_second, s.real_time_factor = event.steps_per_second, event.real_time_factor
@@ -370,6 +396,8 @@ class Session:
             s.task_serial += 1
             s.step_serial += 1
             s.past, self._curves = Past(task.num_envs), None
+            s.table, s.terms = EnvTable(task, event.first), TermHistory(task.num_envs)
+            s.inspection = None
             s.pictures, s.sliders = {}, ()
             s.pictures_serial += 1
             s.selected_env = min(s.selected_env, task.num_envs - 1)
@@ -392,6 +420,9 @@ class Session:
             s.step_serial += 1
             if s.past is not None:
                 s.past.add(event)
+            if s.table is not None and s.terms is not None:
+                s.table.add(event)
+                s.terms.add(event)
             if s.state == "error" and s.problem_at_run:
                 # What failed while running runs again: the task was reset, or the policy changed.
                 self._set_problem(None)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.authoring.problem import Problem
+from workbench.core.inspection import Inspection
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.step import StepResult
 from workbench.session.messages import ActionSource, EpisodeEnd, TaskDescription
@@ -82,3 +83,5 @@ class SessionView:
     recording: RecordingStatus
     printed: tuple[str, ...]
     """The last lines that the author's code printed."""
+    inspection: Inspection | None = None
+    """The newest answer to `Session.inspect`, of whichever env was selected then."""

@@ -22,6 +22,7 @@ import torch
 
 from workbench.authoring.problem import Problem, TaskError, problem_from_exception
 from workbench.core import actions
+from workbench.core.inspect_env import inspect_env
 from workbench.core.pictures import Picture
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import Request as PictureRequest
@@ -32,6 +33,7 @@ from workbench.session.messages import (
     EpisodeEnd,
     Event,
     Failed,
+    Inspect,
     Load,
     Loaded,
     Loading,
@@ -91,6 +93,7 @@ class Worker:
             SetSliders: self._set_sliders,
             WatchCameras: self._watch_cameras,
             SetCapture: self._set_capture,
+            Inspect: self._inspect,
             Quit: self._stop,
         }
 
@@ -206,6 +209,11 @@ class Worker:
 
     def _set_capture(self, request: SetCapture) -> None:
         self._capture = request
+
+    def _inspect(self, request: Inspect) -> None:
+        # The page asked while another version, with fewer envs, was on its way.
+        if self._opened is not None and request.env < self._opened.env.num_envs:
+            self._send(inspect_env(self._opened.env, request.env, request.sections))
 
     def _stop(self, request: Quit) -> None:
         self._quit = True

@@ -25,7 +25,10 @@ from workbench.ui.cameras_panel import CamerasPanel
 from workbench.ui.commands import Command, register
 from workbench.ui.curves_panel import CurvesPanel
 from workbench.ui.env_layout import EnvLayout, env_under_ray, lay_out
+from workbench.ui.env_panel import EnvPanel
+from workbench.ui.force_arrows import ForceArrows
 from workbench.ui.fragments import render, style_sheet
+from workbench.ui.inspect_panel import InspectPanel
 from workbench.ui.lights import light
 from workbench.ui.numbers_panel import NumbersPanel
 from workbench.ui.record_panel import RecordPanel
@@ -33,6 +36,7 @@ from workbench.ui.run_panel import RunPanel
 from workbench.ui.scene_view import SceneView
 from workbench.ui.selection_mark import SelectionMark
 from workbench.ui.status_line import StatusLine
+from workbench.ui.terms_panel import TermsPanel
 from workbench.ui.view_panel import ViewPanel
 from workbench.ui.viewpoint import FOV, USUAL_ASPECT, Viewpoint, frame_all, frame_one
 
@@ -89,13 +93,21 @@ class Page:
         with tabs.add_tab("Reward", viser.Icon.CHART_LINE):
             self._numbers = NumbersPanel(server)
             self._curves = CurvesPanel(server)
+            self._terms = TermsPanel(server, session)
+        with tabs.add_tab("Inspect", viser.Icon.ZOOM_IN):
+            self._inspect = InspectPanel(server, session)
         with tabs.add_tab("Episodes", viser.Icon.MOVIE):
             self._record = RecordPanel(server, session.start_recording, session.stop_recording)
+        self._env_window = server.gui.add_panel(order=5.0)
+        with self._env_window.add_tab("Envs", viser.Icon.LIST_DETAILS):
+            self._envs = EnvPanel(server, session)
+        self._env_window.float(x=15, y=-15, width=620, height=220)
         self._banner = Banner(server, session.reload, session.restart_worker)
 
         self._scene = SceneView(server)
         self._mark = SelectionMark(server)
         self._frustums = CameraFrustums(server)
+        self._forces = ForceArrows(server)
         commands = self._commands()
         register(server, commands)
         with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
@@ -154,6 +166,9 @@ class Page:
         self._cameras.draw(view)
         self._numbers.draw(view)
         self._curves.draw(view)
+        self._terms.draw(view)
+        self._inspect.draw(view)
+        self._envs.draw(view)
         self._record.draw(view)
 
     def _count_clients(self) -> int:
@@ -200,6 +215,7 @@ class Page:
             pictures = without_the_viewpoint(pictures, view.pictures)
         offset = np.zeros(3, np.float32) if one else self._layout.offsets[env]
         self._frustums.draw(task.cameras, pictures, offset, SMALL if alone else LARGE)
+        self._forces.draw(self._inspect.forces(view), offset)
         # A scene of another size is framed anew; a reload that keeps the size never moves the view.
         size = np.round(np.concatenate([self._layout.low, self._layout.high]), 0).tobytes()
         framing = (task.env_id, task.num_envs, one, size)
@@ -276,6 +292,8 @@ class Page:
             Command("Reset the selected env", run.reset_this, "R", "shift"),
             Command("Next env", lambda: run.select_neighbour(1), "N"),
             Command("Previous env", lambda: run.select_neighbour(-1), "P"),
+            Command("Next env that failed", lambda: self._envs.select_next("failed"), "E"),
+            Command("Next env with something odd", lambda: self._envs.select_next("flagged"), "E", "shift"),
             Command("Show all envs or the selected one", self._view_panel.toggle_only_selected, "O"),
             Command("Frame what is shown", lambda: self.frame(session.view()), "F"),
             Command("Start or stop recording", self._record.toggle, "C"),
