@@ -72,12 +72,8 @@ def inspect_env(task: TaskEnv, env: int, sections: Collection[Section]) -> Inspe
 
 def read_observation(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
     """The last observation; a flattened one (N, D) taken apart by the names of what it was made of."""
-    obs: Any = task.obs
-    tree: Mapping[str, Any] = {} if obs is None else {"": obs}
-    if isinstance(obs, Mapping):
-        tree = obs
     leaves: list[Leaf] = []
-    for name, value in _flat(tree):
+    for name, value in _flat(_tree(task.obs)):
         # "state" is what ManiSkill calls the flattened part beside the pictures.
         names = _names_of_flat(task, value) if name in ("", "state") else None
         if names is None:
@@ -100,7 +96,8 @@ def read_state(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
         for struct in structs.values():
             rows[f"{group}/{struct.name}"] = struct
     leaves: list[Leaf] = []
-    for name, value in _flat(task.env.get_state_dict()):
+    state: Any = task.env.get_state_dict()
+    for name, value in _flat(state):
         struct = rows.get(name)
         if struct is None:
             leaves.append(_leaf(name, _row(value, env, task.num_envs)))
@@ -228,6 +225,12 @@ def _find_names(task: TaskEnv, width: int) -> list[tuple[str, tuple[int, ...], s
             parts.append((name, shape or (made.shape[-1],), _dtype(value)))
     # A task may flatten in its own way: then no names are better than wrong ones.
     return parts if sum(int(np.prod(shape, dtype=int)) for _, shape, _ in parts) == width else None
+
+
+def _tree(obs: Any) -> Mapping[str, Any]:
+    if obs is None:
+        return {}
+    return obs if isinstance(obs, Mapping) else {"": obs}
 
 
 def _flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
