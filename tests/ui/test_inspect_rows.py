@@ -61,7 +61,7 @@ def test_joints_stand_between_their_limits() -> None:
 
 
 PRESSED = Touching(
-    ("cube", "<b>table</b>"),
+    ("cube", "<i>table</i>"),
     np.array([0, 3, 4], np.float32),
     np.array([0, 0.03, 0.04], np.float32),
     np.array([[0, 0, 0], [0.2, 0, 0]], np.float32),
@@ -116,7 +116,7 @@ def test_the_tab_never_shows_another_envs_reading_and_escapes_names(choice: str)
     other = inspect_html(choice, running(3, selected_env=0), now, None)
     own = inspect_html(choice, running(3, selected_env=1), now, None)
     assert "step 5" not in other
-    assert "<script>x" not in own and "<b>table</b>" not in own
+    assert "<script>x" not in own and "<i>table</i>" not in own
     expected = {
         "joints": "slide",
         "contacts": "5 N",
