@@ -2,7 +2,7 @@
 
     python tests/benchmarks/core.py                       # everything, about 15 minutes on two cores
     python tests/benchmarks/core.py --parts speed shares  # some of it
-    python tests/benchmarks/core.py --write               # also into web_assets/docs/benchmarks.md
+    python tests/benchmarks/core.py --write               # also into web_assets/docs/benchmarks.md, part by part
 
 Both sides of every comparison run in this one call, in turns, each turn in a process of its own. Take the
 ratios; the absolute numbers are those of the machine. Run it on a machine that does nothing else.
@@ -12,6 +12,8 @@ from __future__ import annotations
 
 import multiprocessing
 import platform
+import queue
+import re
 import statistics
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -35,8 +37,8 @@ class Options:
     seconds: float = 5.0
     """Of stepping, a turn."""
     turns: int = 3
-    most_envs: int = 1024
-    """The scaling table doubles from 1 to this."""
+    most_envs: int = 960
+    """The scaling table doubles from 1 to this; a process has room for a little more (`core/scene_limit.py`)."""
     resets: int = 1000
     rebuilds: int = 100
     write: bool = False
@@ -57,7 +59,13 @@ def in_own_process(function: Callable[..., Any], *args: Any) -> Any:
     results = context.Queue()
     process = context.Process(target=_answer, args=(function, args, results))
     process.start()
-    good, answer = results.get(timeout=1800)
+    while True:
+        try:
+            good, answer = results.get(timeout=1.0)
+            break
+        except queue.Empty:
+            if not process.is_alive() and results.empty():
+                raise RuntimeError(f"{function.__name__}{args} ended with {process.exitcode}") from None
     process.join()
     if not good:
         raise RuntimeError(f"{function.__name__}{args}: {answer}")
@@ -135,7 +143,7 @@ def scaling(options: Options) -> Iterator[str]:
 
     cores = usable_cores()
     threads = sorted({1, *(2**k for k in range(1, 12) if 2**k < cores), cores})
-    counts = [2**k for k in range(20) if 2**k <= options.most_envs]
+    counts = sorted({*(2**k for k in range(20) if 2**k <= options.most_envs), options.most_envs})
     rows = []
     for count in counts:
         rates = [
@@ -210,9 +218,25 @@ def memory(options: Options) -> Iterator[str]:
         yield ""
 
 
-def main(options: Options) -> None:
+def head_lines() -> list[str]:
     from workbench.core.threads import usable_cores
 
+    return [
+        "# The batched CPU core in figures",
+        "",
+        f"Made by `python tests/benchmarks/core.py --write` on {usable_cores()} cores ({platform.machine()}), without a GPU.",
+        "Both sides of each comparison ran in one call: take the ratios.",
+        "",
+    ]
+
+
+def sections_of(page: str) -> dict[str, str]:
+    """The text of each part of a page that was written before."""
+    found = re.split(r"<!-- (\w+) -->\n", page)
+    return dict(zip(found[1::2], found[2::2], strict=True))
+
+
+def main(options: Options) -> None:
     makers = {
         "speed": speed,
         "one": one,
@@ -222,19 +246,18 @@ def main(options: Options) -> None:
         "snapshots": snapshots,
         "memory": memory,
     }
-    lines = ["# The batched CPU core in figures", ""]
-    lines += [
-        f"Made by `python tests/benchmarks/core.py --write` on {usable_cores()} cores ({platform.machine()}), without a GPU."
-    ]
-    lines += ["Both sides of each comparison ran in that one call: take the ratios.", ""]
-    print("\n".join(lines), flush=True)
+    sections = sections_of(PAGE.read_text()) if PAGE.exists() else {}
     for part in options.parts:
+        lines = []
         for line in makers[part](options):
             lines.append(line)
             print(line, flush=True)
-    if options.write:
-        PAGE.parent.mkdir(exist_ok=True)
-        PAGE.write_text("\n".join(lines).rstrip() + "\n")
+        sections[part] = "\n".join(lines) + "\n"
+        if options.write:
+            # After each part: a call that is broken off keeps what it measured.
+            body = "".join(f"<!-- {p} -->\n{sections[p]}" for p in PARTS if p in sections)
+            PAGE.parent.mkdir(exist_ok=True)
+            PAGE.write_text("\n".join(head_lines()) + "\n" + body.rstrip() + "\n")
 
 
 if __name__ == "__main__":

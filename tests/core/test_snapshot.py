@@ -20,6 +20,7 @@ from mani_skill.utils.building import actors
 from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
+from workbench.core.fresh_physics import renew_physics
 from workbench.core.snapshot import restore_snapshot, take_snapshot
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env
 
@@ -102,18 +103,32 @@ def test_a_restored_episode_goes_the_same_way_every_time(
         assert [s[env] for s in first] == [s[env] for s in second]
 
 
-@pytest.mark.xfail(
-    reason="open: one step after a restore, StackCube with an end-effector target differed by 0.95"
-)
-def test_a_restored_episode_begins_as_the_uninterrupted_one(stack: BaseEnv) -> None:
-    stack.reset(seed=list(range(218, 218 + N)))
-    after(stack, random_actions(stack, 5, 218))
-    snapshot = take_snapshot(stack, [0, 1])
-    action = random_actions(stack, 1, 219)
-    live = after(stack, action)
-    restore_snapshot(stack, snapshot)
-    restored = after(stack, action)
-    assert max(difference(live[0][env], restored[0][env]) for env in (0, 1)) < 1e-2
+def uninterrupted_and_renewed(stack: BaseEnv, seed: int, renewed: bool) -> list[list[bytes]]:
+    stack.reset(seed=list(range(seed, seed + N)))
+    after(stack, random_actions(stack, 5, seed))
+    if renewed:
+        renew_physics(stack.scene, list(range(N)))
+        stack.scene._gpu_fetch_all()
+    return after(stack, random_actions(stack, 1, seed + 1))
+
+
+# 218: a finger that is pressed into the table has struck a cube, whose spin then differs by 0.95 rad/s.
+@pytest.mark.parametrize("seed", [0, 218])
+def test_a_restore_differs_from_the_uninterrupted_run_only_by_what_physx_forgets(
+    stack: BaseEnv, seed: int
+) -> None:
+    live = uninterrupted_and_renewed(stack, seed, renewed=False)
+    assert uninterrupted_and_renewed(stack, seed, renewed=False) == live, "the run itself is not repeatable"
+    forgotten = uninterrupted_and_renewed(stack, seed, renewed=True)
+    stack.reset(seed=list(range(seed, seed + N)))
+    after(stack, random_actions(stack, 5, seed))
+    restore_snapshot(stack, take_snapshot(stack))
+    restored = after(stack, random_actions(stack, 1, seed + 1))
+    # The same bodies in a PhysX scene without a past, nothing written: that alone makes the difference.
+    for env in range(N):
+        from_live, by_forgetting = (difference(live[0][env], run[0][env]) for run in (restored, forgotten))
+        assert difference(restored[0][env], forgotten[0][env]) < 1e-4, env
+        assert from_live <= by_forgetting + 1e-4, env
 
 
 @PROPERTY

@@ -17,8 +17,8 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
 from workbench.core.snapshot import restore_snapshot, take_snapshot
-from workbench.core.task_buffers import base_env_members
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+from workbench.core.task_members import base_env_members
 
 N = 4
 PUSH_CUBE: Any = REGISTERED_ENVS["PushCube-v1"].cls

@@ -27,6 +27,7 @@ from mani_skill.render.utils import can_render
 from workbench.core.contacts import CpuArray
 from workbench.core.cpu_system import BatchedCpuSystem
 from workbench.core.partial_reset import KeptControllers, others, told_whose_fault
+from workbench.core.scene_limit import require_scenes
 from workbench.core.seams import asks_for_a_gpu, install_index_seams, substeps_are_unwatched
 from workbench.core.strict import StrictMixin
 from workbench.core.struct_access import install_struct_access
@@ -223,6 +224,7 @@ class BatchedCpuMixin:
             self.scene._gpu_fetch_all()
 
     def _setup_scene(self) -> None:
+        require_scenes(self.num_envs)
         self._set_scene_config()
         sub_scenes = []
         for _ in range(self.num_envs):

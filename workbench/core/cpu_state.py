@@ -20,8 +20,10 @@ is described in `snapshot` and `fresh_physics`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import sapien
@@ -64,9 +66,8 @@ Touch = tuple[str, str, NDArray[np.float32]]
 """A contact that a query counts: the names of two bodies, and the impulse (3,) in N s on the first."""
 
 
-@dataclass(frozen=True)
-class CpuEnvState:
-    """The simulation state of one env."""
+class CpuEnvState(NamedTuple):
+    """The simulation state of one env. A tuple, since hundreds are made at once."""
 
     contents: Contents
     packed: bytes
@@ -89,8 +90,8 @@ class CpuStatePlan:
 
     contents: list[Contents]
     """Of each env; envs that are alike share one object."""
-    sleepers: list[list[tuple[int, str, Any]]]
-    """Of each env: index into its contents, what SAPIEN calls the flag, the component that can be put to sleep."""
+    sleepers: list[list[tuple[int, Callable[[], bool], Any]]]
+    """Of each env: index into its contents, whether it sleeps, the component that can be put to sleep."""
     articulations: list[slice]
     """Of each env: its rows in the (A, D) tensors."""
     names: dict[int, tuple[int, str]]
@@ -129,13 +130,13 @@ def plan_cpu_state(env: Any) -> CpuStatePlan:
         for body in bodies:
             plan.offsets[id(body.entity)] = index, sum(part.size for part in parts)
             if not body.kinematic:
-                sleepers.append((len(parts), "is_sleeping", body))
+                sleepers.append((len(parts), _getter(body, "is_sleeping"), body))
             parts.append(Part(name_of(body), None))
         roots = [link for link in links if link.is_root]
         for root in roots:
             articulation: Any = root.articulation
             name = name_of(root).rpartition("/")[0] or articulation.name
-            sleepers.append((len(parts), "sleeping", root))
+            sleepers.append((len(parts), _getter(root, "sleeping"), root))
             # SAPIEN's "scene-0_panda" has joints that are called "scene-0-panda_panda_joint1".
             prefix = articulation.name.replace("_", "-", 1) + "_"
             joints = tuple(joint.name.removeprefix(prefix) for joint in articulation.active_joints)
@@ -148,6 +149,11 @@ def plan_cpu_state(env: Any) -> CpuStatePlan:
     return plan
 
 
+def _getter(component: Any, name: str) -> Callable[[], bool]:
+    # Asked for every body at every snapshot: past the look-up of the property.
+    return partial(getattr(type(component), name).fget, component)
+
+
 def read_cpu_state(env: Any, plan: CpuStatePlan, env_idx: list[int]) -> list[CpuEnvState]:
     """The simulation state of the envs in `env_idx`, one each."""
     px: BatchedCpuSystem = env.scene.px
@@ -156,23 +162,20 @@ def read_cpu_state(env: Any, plan: CpuStatePlan, env_idx: list[int]) -> list[Cpu
     qf = px.cuda_articulation_qf.torch().numpy().copy()
     driven = np.stack(px.drive_flags)
     touching = _touching(px, plan)
+    awake = {len(contents): (False,) * len(contents) for contents in plan.contents}
     states = []
     for i in env_idx:
-        packed = packs[i]
+        packed, contents, rows = packs[i], plan.contents[i], plan.articulations[i]
         if i in true_poses:
             numbers = np.frombuffer(packed, dtype=np.float32).copy()
             for offset, pose in true_poses[i]:
                 numbers[offset : offset + 7] = pose
             packed = numbers.tobytes()
-        asleep = [False] * len(plan.contents[i])
-        for part, flag, component in plan.sleepers[i]:
-            asleep[part] = getattr(component, flag)
-        rows = plan.articulations[i]
-        states.append(
-            CpuEnvState(
-                plan.contents[i], packed, tuple(asleep), qf[rows], driven[:, rows], touching.get(i, ())
-            )
+        sleeping = [part for part, is_asleep, _ in plan.sleepers[i] if is_asleep()]
+        asleep = (
+            tuple([part in sleeping for part in range(len(contents))]) if sleeping else awake[len(contents)]
         )
+        states.append(CpuEnvState(contents, packed, asleep, qf[rows], driven[:, rows], touching.get(i, ())))
     return states
 
 

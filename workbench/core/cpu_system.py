@@ -142,6 +142,10 @@ class BatchedCpuSystem:
         self._joint_forces = np.zeros((len(layout.articulations), most_links, 6), dtype=np.float32)
         self._force = np.zeros((layout.row_count, 3), dtype=np.float32)
         self._torque = np.zeros((layout.row_count, 3), dtype=np.float32)
+        env_of = {id(scene): env for env, scene in enumerate(self.scenes)}
+        self._articulations_of: list[list[int]] = [[] for _ in self.scenes]
+        for i, articulation in enumerate(layout.articulations):
+            self._articulations_of[env_of[id(articulation.root.entity.scene)]].append(i)
         joints = [list(a.active_joints) for a in layout.articulations]
         self._set_target = [[j.set_drive_target for j in row] for row in joints]
         self._set_velocity_target = [[j.set_drive_velocity_target for j in row] for row in joints]
@@ -467,13 +471,19 @@ class BatchedCpuSystem:
         if not np.isfinite(now).all():
             for i in chosen:
                 _refuse_nan(now[i], self._laid_out.articulations[i].name)
-        values = now.tolist()
-        for i in chosen:
-            for set_target, value in zip(setters[i], values[i], strict=False):
-                set_target(value)
         if changed.any():
             self.note_change()
         seen[:] = now
+        values, written = now.tolist(), set(chosen)
+
+        def write(env: int) -> None:
+            for i in self._articulations_of[env]:
+                if i in written:
+                    for set_target, value in zip(setters[i], values[i], strict=False):
+                        set_target(value)
+
+        # 1200 calls a control step of 64 Pandas: in the envs' threads they cost nobody's waiting.
+        self.stepper.write_before_step(write)
 
     def _apply_forces(self, values: NDArray[np.float32], kind: str) -> None:
         layout, zero = self._laid_out, np.zeros(3, dtype=np.float32)

@@ -57,6 +57,7 @@ class Stepper:
         ]
         self._owed = 0
         self._in_a_row = 1
+        self._writes: list[Callable[[int], None]] = []
         self._packs: list[bytes] | None = None
         self._pose_packs: list[bytes] | None = None
 
@@ -90,17 +91,31 @@ class Stepper:
         finally:
             self._in_a_row = 1
 
+    def write_before_step(self, write: Callable[[int], None]) -> None:
+        """Call ``write(env)`` for each env before its next substep, in its thread, or before it is packed."""
+        self._writes.append(write)
+
+    def write_now(self) -> None:
+        """Make the writes that were put off."""
+        writes, self._writes = self._writes, []
+        for env in range(len(self._systems)) if writes else ():
+            for write in writes:
+                write(env)
+
     def catch_up(self) -> None:
         """Do the substeps that are owed."""
         count, self._owed = self._owed, 0
         if count == 0:
             return
+        writes, self._writes = self._writes, []
         packs: list[bytes] = [b""] * len(self._systems)
         pose_packs: list[bytes] = [b""] * len(self._systems)
         # Between single substeps of a control step nobody reads: packing then would be thrown away.
         packing = count > 1
 
         def advance(env: int) -> None:
+            for write in writes:
+                write(env)
             step = self.step_once[env]
             for _ in range(count):
                 step()
@@ -113,10 +128,12 @@ class Stepper:
 
     def forget(self) -> None:
         """What was packed is old: the simulation was written to."""
+        self.write_now()
         self._packs = self._pose_packs = None
 
     def packs(self) -> list[bytes]:
         """``pack()`` of every system, as it is now."""
+        self.write_now()
         if self._packs is None:
             self._packs = [system.pack() for system in self._systems]
         return self._packs

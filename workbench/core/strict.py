@@ -30,8 +30,9 @@ from typing import Any
 import torch
 
 from workbench.core.behind_tensors import guard_scenes
+from workbench.core.broken_rule import BrokenRule, RuleWarning
 from workbench.core.returns import wrong_evaluate, wrong_observation, wrong_reward
-from workbench.core.strict_system import BrokenRule, RuleWarning, StrictCpuSystem
+from workbench.core.strict_system import StrictCpuSystem
 
 __all__ = ["BrokenRule", "RuleWarning", "StrictMixin", "WrongReturn"]
 

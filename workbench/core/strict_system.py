@@ -9,8 +9,8 @@ second; this one raises `BrokenRule` on all three.
 
 It compares values and not calls, so that what changes nothing is no fault: a pose set to what it was, an
 apply of bodies that have not moved. Where the setters of ManiSkill's structs were called from
-is kept until the write is applied, and the error carries those frames as the innermost of its traceback:
-the fault is told at the line that wrote, though it shows only at the fetch.
+is kept until the write is applied (`broken_rule`): the fault is told at the line that wrote, though it shows
+only at the fetch.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from types import FrameType, TracebackType
 from typing import Any, Literal
 
 import numpy as np
@@ -30,6 +29,7 @@ import sapien
 import torch
 from numpy.typing import NDArray
 
+from workbench.core.broken_rule import Frame, RuleWarning, broken_at, frames_of_the_task, place_of
 from workbench.core.contacts import CpuArray
 from workbench.core.cpu_system import BatchedCpuSystem
 from workbench.core.returns import ENVS_NAMED
@@ -50,26 +50,9 @@ _TENSORS: dict[str, tuple[Group, ...]] = {
     "cuda_articulation_target_qvel": ("targets",),
 }
 _OWN_CODE = ("workbench.core.", "mani_skill.")
-_GENERAL_CODE = ("workbench.", "mani_skill.utils.", "mani_skill.envs.s")
-"""``mani_skill.envs.sapien_env`` and ``.scene``: they write what they are told to."""
 _MOVED = 1e-4
 """Metres, radians, per second. PhysX rounds the root pose of an articulation when it is set, by about 1e-7."""
-_FRAMES_KEPT = 12
-_BASE_ENV, _OUTERMOST = "mani_skill.envs.sapien_env", ("step", "reset")
-"""Where the frames end that are told with an error: above are those that the traceback has anyway."""
 _IN_ENV = re.compile(r"^scene-\d+[-_]")
-
-
-Frame = tuple[FrameType, int, int]
-"""A frame with its last instruction and its line at the time."""
-
-
-class BrokenRule(RuntimeError):
-    """The task did what goes wrong, or is lost, in GPU simulation."""
-
-
-class RuleWarning(UserWarning):
-    """What would be a `BrokenRule`, in a task that is only to be reported on."""
 
 
 @dataclass(frozen=True)
@@ -134,13 +117,10 @@ class StrictCpuSystem(BatchedCpuSystem):
                 None where no line is at fault.
         """
         if not self.only_warn:
-            trace = None
-            for frame, instruction, line in frames or ():
-                trace = TracebackType(trace, frame, instruction, line)
-            raise BrokenRule(message).with_traceback(trace)
+            raise broken_at(message, frames or ())
         if message not in self._told:
             self._told.add(message)
-            place = "" if frames is None else _place(frames or _frames())
+            place = "" if frames is None else place_of(frames or frames_of_the_task())
             warnings.warn(message + place, RuleWarning, stacklevel=2)
 
     @property
@@ -152,7 +132,7 @@ class StrictCpuSystem(BatchedCpuSystem):
 
     def about_to_write(self, struct: Any, group: Group, index: torch.Tensor) -> None:
         """A setter of `struct` will write rows `index` of `group`'s tensor."""
-        self._touches.append(_Touch(group, index.numpy().astype(np.int64), _frames()))
+        self._touches.append(_Touch(group, index.numpy().astype(np.int64), frames_of_the_task()))
         if self.being_reset is not None:
             envs = struct._scene_idxs.long()
             others = struct.scene._reset_mask[envs] & ~self.being_reset[envs]
@@ -392,7 +372,7 @@ class StrictCpuSystem(BatchedCpuSystem):
     def _handed_out(self, name: str) -> None:
         caller = sys._getframe(2)
         if not caller.f_globals.get("__name__", "").startswith(_OWN_CODE):
-            frames = _frames(caller)
+            frames = frames_of_the_task(caller)
             self._touches.extend(_Touch(group, None, frames) for group in _TENSORS[name])
 
     def _forget_touches(self, group: Group) -> None:
@@ -495,30 +475,9 @@ for _name in _TENSORS:
     setattr(StrictCpuSystem, _name, _tensor_property(_name))
 
 
-def _frames(innermost: FrameType | None = None) -> tuple[Frame, ...]:
-    """The frames that led here, from the first that is not the core's own."""
-    frame = sys._getframe(1) if innermost is None else innermost
-    kept: list[Frame] = []
-    while frame is not None and len(kept) < _FRAMES_KEPT:
-        if not frame.f_globals.get("__name__", "").startswith("workbench.core."):
-            kept.append((frame, frame.f_lasti, frame.f_lineno))
-        if frame.f_code.co_name in _OUTERMOST and frame.f_globals.get("__name__") == _BASE_ENV:
-            break
-        frame = frame.f_back
-    return tuple(kept)
-
-
 def _unguarded(owner: Any, method: str) -> Callable[[float], None]:
     function = getattr(type(owner), method)
     return partial(getattr(function, "__wrapped__", function), owner)
-
-
-def _place(frames: Sequence[Frame]) -> str:
-    """The file and line of the first frame that is not in ManiSkill's general code, in brackets."""
-    for frame, _, line in frames:
-        if not frame.f_globals.get("__name__", "").startswith(_GENERAL_CODE):
-            return f" ({frame.f_code.co_filename}:{line})"
-    return ""
 
 
 def _envs(envs: Any) -> str:
