@@ -45,6 +45,7 @@ log = logging.getLogger(__name__)
 FRAME = 1 / 30
 """Seconds. Faster pushes make a browser slower (measured: 350 a second leave it 13 to 30)."""
 PANEL_WIDTH = 340
+ENVS_WIDTH = 480
 SETTLES = 4.0
 """Seconds after a page has come in which its panels may still take their places."""
 
@@ -101,7 +102,10 @@ class Page:
         self._env_window = server.gui.add_panel(order=5.0)
         with self._env_window.add_tab("Envs", viser.Icon.LIST_DETAILS):
             self._envs = EnvPanel(server, session)
-        self._env_window.float(x=15, y=-15, width=620, height=220)
+        self._env_window.dock_left()
+        self._env_window.set_width(ENVS_WIDTH)
+        # A strip at the edge until somebody wants it: it takes half of a small screen's view.
+        self._env_window.minimize()
         self._banner = Banner(server, session.reload, session.restart_worker)
 
         self._scene = SceneView(server)
