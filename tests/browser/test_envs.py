@@ -80,6 +80,8 @@ def cell(page: Page, env: int, column: int) -> str:
 
 
 def test_a_row_is_pressed_and_its_env_selected_also_while_the_envs_play(page: Page) -> None:
+    assert envs(page) == []
+    page.keyboard.press("b")
     until(lambda: envs(page) == list(range(ENVS)), "the rows")
     page.get_by_role("button", name="Play", exact=True).click()
     until(lambda: int(cell(page, 0, 2)) > 2, "steps in the table")

@@ -42,7 +42,9 @@ class InspectPanel:
             hint="Read of the selected env, five times a second.",
         )
         self._forces = server.gui.add_checkbox(
-            "Force arrows", False, hint="Draw the contact forces of the selected env as arrows in the 3-D view."
+            "Force arrows",
+            False,
+            hint="Draw the contact forces of the selected env as arrows in the 3-D view.",
         )
         self._handle = server.gui.add_html("")
         self._asked: tuple[object, ...] | None = None

@@ -106,6 +106,7 @@ class Page:
         self._env_window.set_width(ENVS_WIDTH)
         # A strip at the edge until somebody wants it: it takes half of a small screen's view.
         self._env_window.minimize()
+        self._envs_open = False
         self._banner = Banner(server, session.reload, session.restart_worker)
 
         self._scene = SceneView(server)
@@ -174,6 +175,13 @@ class Page:
         self._inspect.draw(view)
         self._envs.draw(view)
         self._record.draw(view)
+
+    def _toggle_envs(self) -> None:
+        self._envs_open = not self._envs_open
+        if self._envs_open:
+            self._env_window.expand()
+        else:
+            self._env_window.minimize()
 
     def _count_clients(self) -> int:
         clients = self._server.get_clients()
@@ -296,6 +304,7 @@ class Page:
             Command("Reset the selected env", run.reset_this, "R", "shift"),
             Command("Next env", lambda: run.select_neighbour(1), "N"),
             Command("Previous env", lambda: run.select_neighbour(-1), "P"),
+            Command("Open or close the table of envs", self._toggle_envs, "B"),
             Command("Next env that failed", lambda: self._envs.select_next("failed"), "E"),
             Command("Next env with something odd", lambda: self._envs.select_next("flagged"), "E", "shift"),
             Command("Show all envs or the selected one", self._view_panel.toggle_only_selected, "O"),
