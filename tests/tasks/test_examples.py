@@ -47,7 +47,10 @@ def test_random_steps_give_batched_finite_numbers_in_every_reward_mode(
         assert reward.shape == terminated.shape == truncated.shape == (1,)
         assert torch.isfinite(obs).all() and torch.isfinite(reward).all()
         assert terminated.dtype == info["success"].dtype == torch.bool
-        assert all(value.shape[0] == 1 for value in info.values())
+        terms = info.pop("reward_terms", {})
+        assert all(value.shape[0] == 1 for value in (*info.values(), *terms.values()))
+        if terms and mode == "dense":
+            torch.testing.assert_close(sum(terms.values()), reward)
         assert int(info["elapsed_steps"]) == step
 
 

@@ -15,7 +15,7 @@ are those of `workbench.core.returns`, which the core's strict mode raises with.
 from __future__ import annotations
 
 import linecache
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,13 @@ def check_step_returns(
     on any device. A problem's stage is ``returns``; its place is in `source_files`, or None where
     the hook is inherited.
     """
+    # The reward's own entry in info, put there by another hook than evaluate.
+    terms = evaluate.get("reward_terms") if isinstance(evaluate, Mapping) else None
+    if terms is not None and reward is not None:
+        message = wrong_evaluate({"reward_terms": terms}, num_envs)
+        if message is not None:
+            message = message.replace("returned", "put into info", 1)
+            return problem_from_return(cls, _REWARD_HOOKS[0], message, source_files)
     message = wrong_evaluate(evaluate, num_envs)
     if message is not None:
         return problem_from_return(cls, "evaluate", message, source_files)

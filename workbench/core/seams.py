@@ -253,6 +253,11 @@ def pose_before_hiding(actor: Actor) -> torch.Tensor | None:
     return actor.before_hide_pose  # type: ignore[attr-defined]
 
 
+def unflattened_state(env: BaseEnv, info: dict[str, Any]) -> dict[str, Any]:
+    """What ``obs_mode="state"`` flattens, with its names: ``_get_obs_state_dict``. Runs the author's hooks."""
+    return env._get_obs_state_dict(info)
+
+
 def sensors(env: Any) -> dict[str, Any]:
     """``_sensors``; an env made without a render device has no such attribute."""
     return getattr(env, "_sensors", {})

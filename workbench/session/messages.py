@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from workbench.authoring.problem import Problem
 from workbench.core.geometry import SceneGeometry
+from workbench.core.inspection import Inspection, Section
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.core.step import StepResult
 
@@ -206,6 +207,14 @@ class WarmUp:
 
 
 @dataclass(frozen=True)
+class Inspect:
+    """Read one env out, once; answered with an `Inspection`, between two control steps."""
+
+    env: int
+    sections: tuple[Section, ...]
+
+
+@dataclass(frozen=True)
 class Quit:
     pass
 
@@ -224,6 +233,7 @@ Request = (
     | Restore
     | DrawPast
     | WarmUp
+    | Inspect
     | Quit
 )
 
@@ -343,4 +353,4 @@ class WarmedUp:
     seconds: float
 
 
-Event = Loading | Loaded | Failed | Stepped | Pictures | PastPictures | Status | WarmedUp
+Event = Loading | Loaded | Failed | Stepped | Pictures | PastPictures | Inspection | Status | WarmedUp

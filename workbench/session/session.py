@@ -16,8 +16,10 @@ from pathlib import Path
 from workbench.authoring.problem import Problem
 from workbench.authoring.reference import named_file
 from workbench.authoring.watch import SourceWatcher
+from workbench.core.inspection import Inspection, Section
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.step import StepResult
+from workbench.session.env_table import EnvRows, EnvTable
 from workbench.session.kept_worker import Death, KeptWorker, WorkerOptions
 from workbench.session.last_words import Busy, death_problem, own_files_of
 from workbench.session.messages import (
@@ -27,6 +29,7 @@ from workbench.session.messages import (
     EpisodeEnd,
     Event,
     Failed,
+    Inspect,
     Load,
     Loaded,
     Loading,
@@ -55,6 +58,7 @@ from workbench.session.past import Past
 from workbench.session.printed import PrintedLine, PrintedLog
 from workbench.session.record_live import LiveRecorder
 from workbench.session.recovery import Recovery, Wanted, is_on_disk
+from workbench.session.reward_terms import TermCurves, TermHistory
 from workbench.session.timeline import Scope, Strip, Timeline, TimelineView
 from workbench.session.view import Curves, SessionView, State
 
@@ -85,6 +89,9 @@ class _State:
     problem_at_run: bool = False
     past: Past | None = None
     timeline: Timeline | None = None
+    table: EnvTable | None = None
+    terms: TermHistory | None = None
+    inspection: Inspection | None = None
     selected_env: int = 0
     playing: bool = False
     wants_play: bool = False
@@ -200,7 +207,18 @@ class Session:
                 printed=printed,
                 busy=s.busy,
                 vitals=vitals,
+                inspection=s.inspection,
             )
+
+    def env_rows(self) -> EnvRows | None:
+        """The row of every env; None before a task is loaded. Copies some 100 kB for 256 envs: not for every frame."""
+        with self._lock:
+            return None if self._state.table is None else self._state.table.rows()
+
+    def term_curves(self) -> TermCurves | None:
+        """The reward's terms over time; None before a task is loaded. Copies: not for every frame."""
+        with self._lock:
+            return None if self._state.terms is None else self._state.terms.curves()
 
     def wait(self, seen: int, timeout: float) -> int:
         """Block until something changed since the counter `seen`; returns the counter as it is now."""
@@ -317,6 +335,12 @@ class Session:
                 return
             self._state.cameras = cameras
         self._watch()
+
+    def inspect(self, sections: tuple[Section, ...]) -> None:
+        """Read the selected env out, once; the answer becomes `SessionView.inspection`."""
+        with self._lock:
+            env = self._state.selected_env
+        self._send(Inspect(env, sections))
 
     def set_clients(self, count: int) -> None:
         """How many pages are open; with none, no picture is rendered."""
@@ -532,6 +556,8 @@ class Session:
                 s.pictures = {(picture.kind, picture.camera): picture for picture in event.pictures}
                 s.pictures_serial += 1
                 s.picture_milliseconds = event.milliseconds
+        elif isinstance(event, Inspection):
+            s.inspection = event
         elif isinstance(event, Status):
             s.playing = event.playing
             s.steps_per_second, s.real_time_factor = event.steps_per_second, event.real_time_factor
@@ -563,10 +589,12 @@ class Session:
                 s.scene_serial += 1
                 s.sliders = ()
                 s.selected_env = min(s.selected_env, task.num_envs - 1)
+                s.inspection = None
                 if s.past is None or s.timeline is None or not same:
                     s.past, self._curves = Past(task.num_envs), None
                     next_serial = 0 if s.timeline is None else s.timeline.history.next_serial
                     s.timeline = Timeline(task.num_envs, self._history_bytes, next_serial)
+                    s.table, s.terms = EnvTable(task, event.first), TermHistory(task.num_envs)
             elif s.timeline is not None:
                 s.timeline.history.renew_last(event.first)
             if report is None or report.level not in ("same", "patched"):
@@ -598,6 +626,9 @@ class Session:
                 s.past.add(event)
                 s.timeline.add(event, max(0, s.past.count - 1))
                 s.step_serial = s.timeline.history.last
+            if s.table is not None and s.terms is not None:
+                s.table.add(event)
+                s.terms.add(event)
             first, self._first_due = self._first_due, False
             if s.problem is not None and s.problem_at_run and not first:
                 # What failed while running runs again: the task was reset, or the policy changed.

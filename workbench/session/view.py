@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.authoring.problem import Problem
+from workbench.core.inspection import Inspection
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.step import StepResult
 from workbench.session.kept_worker import Vitals
@@ -100,3 +101,5 @@ class SessionView:
     """What the worker has been at for long."""
     vitals: Vitals = field(default_factory=Vitals)
     """What the processes hold."""
+    inspection: Inspection | None = None
+    """The newest answer to `Session.inspect`, of whichever env was selected then."""

@@ -26,6 +26,7 @@ import torch
 
 from workbench.authoring.problem import Problem, TaskError, problem_from_exception
 from workbench.core import actions
+from workbench.core.inspect_env import inspect_env
 from workbench.core.pictures import Picture
 from workbench.core.snapshot import Snapshot, restore_snapshot
 from workbench.core.snapshot_parts import PackedSnapshot, SnapshotPacker
@@ -41,6 +42,7 @@ from workbench.session.messages import (
     EpisodeEnd,
     Event,
     Failed,
+    Inspect,
     Load,
     Loaded,
     Loading,
@@ -119,6 +121,7 @@ class Worker:
             Restore: self._restore,
             DrawPast: self._draw_past,
             WarmUp: self._warm_up,
+            Inspect: self._inspect,
             Quit: self._stop,
         }
 
@@ -301,6 +304,11 @@ class Worker:
             self._fail(problem_from_exception(error, "pictures", self._opened.loaded.source_files))
             return
         self._send(PastPictures(request.origin, pictures))
+
+    def _inspect(self, request: Inspect) -> None:
+        # The page asked while another version, with fewer envs, was on its way.
+        if self._opened is not None and request.env < self._opened.env.num_envs:
+            self._send(inspect_env(self._opened.env, request.env, request.sections))
 
     def _stop(self, request: Quit) -> None:
         self._quit = True

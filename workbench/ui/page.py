@@ -26,7 +26,10 @@ from workbench.ui.cameras_panel import CamerasPanel
 from workbench.ui.commands import Command, register
 from workbench.ui.curves_panel import CurvesPanel
 from workbench.ui.env_layout import EnvLayout, env_under_ray, lay_out
+from workbench.ui.env_panel import EnvPanel
+from workbench.ui.force_arrows import ForceArrows
 from workbench.ui.fragments import render, style_sheet
+from workbench.ui.inspect_panel import InspectPanel
 from workbench.ui.lights import light
 from workbench.ui.log_panel import LogPanel
 from workbench.ui.numbers_panel import NumbersPanel
@@ -35,6 +38,7 @@ from workbench.ui.run_panel import RunPanel
 from workbench.ui.scene_view import SceneView
 from workbench.ui.selection_mark import SelectionMark
 from workbench.ui.status_line import StatusLine
+from workbench.ui.terms_panel import TermsPanel
 from workbench.ui.timeline_panel import HEIGHT as TIMELINE_HEIGHT
 from workbench.ui.timeline_panel import TimelinePanel
 from workbench.ui.version_panel import VersionPanel
@@ -46,6 +50,7 @@ log = logging.getLogger(__name__)
 FRAME = 1 / 30
 """Seconds. Faster pushes make a browser slower (measured: 350 a second leave it 13 to 30)."""
 PANEL_WIDTH = 340
+ENVS_WIDTH = 480
 SETTLES = 4.0
 """Seconds after a page has come in which its panels may still take their places."""
 
@@ -95,17 +100,29 @@ class Page:
         with tabs.add_tab("Reward", viser.Icon.CHART_LINE):
             self._numbers = NumbersPanel(server)
             self._curves = CurvesPanel(server)
+            self._terms = TermsPanel(server, session)
+        with tabs.add_tab("Inspect", viser.Icon.ZOOM_IN):
+            self._inspect = InspectPanel(server, session)
         with tabs.add_tab("Episodes", viser.Icon.MOVIE):
             self._record = RecordPanel(server, session.start_recording, session.stop_recording)
         with tabs.add_tab("Log", viser.Icon.TERMINAL_2):
             self._log = LogPanel(server, session.clear_printed)
         self._timeline = TimelinePanel(server, session)
+        self._env_window = server.gui.add_panel(order=5.0)
+        with self._env_window.add_tab("Envs", viser.Icon.LIST_DETAILS):
+            self._envs = EnvPanel(server, session)
+        self._env_window.dock_left()
+        self._env_window.set_width(ENVS_WIDTH)
+        # A strip at the edge until somebody wants it: it takes half of a small screen's view.
+        self._env_window.minimize()
+        self._envs_open = False
         self._banner = Banner(server, session.reload, session.restart_worker)
         self._busy_banner = BusyBanner(server, session.interrupt, session.restart_worker)
 
         self._scene = SceneView(server)
         self._mark = SelectionMark(server)
         self._frustums = CameraFrustums(server)
+        self._forces = ForceArrows(server)
         commands = self._commands()
         register(server, commands)
         with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
@@ -166,9 +183,19 @@ class Page:
         self._cameras.draw(view)
         self._numbers.draw(view)
         self._curves.draw(view)
+        self._terms.draw(view)
+        self._inspect.draw(view)
+        self._envs.draw(view)
         self._record.draw(view)
         self._timeline.draw(view)
         self._log.draw(view)
+
+    def _toggle_envs(self) -> None:
+        self._envs_open = not self._envs_open
+        if self._envs_open:
+            self._env_window.expand()
+        else:
+            self._env_window.minimize()
 
     def _count_clients(self) -> int:
         clients = self._server.get_clients()
@@ -214,6 +241,7 @@ class Page:
             pictures = without_the_viewpoint(pictures, view.pictures)
         offset = np.zeros(3, np.float32) if one else self._layout.offsets[env]
         self._frustums.draw(task.cameras, pictures, offset, SMALL if alone else LARGE)
+        self._forces.draw(self._inspect.forces(view), offset)
         # A scene of another size is framed anew; a reload that keeps the size never moves the view.
         size = np.round(np.concatenate([self._layout.low, self._layout.high]), 0).tobytes()
         framing = (task.env_id, task.num_envs, one, size)
@@ -297,6 +325,9 @@ class Page:
             Command("Go on from here, in the selected env", timeline.go_on, "G"),
             Command("Next env", lambda: run.select_neighbour(1), "N"),
             Command("Previous env", lambda: run.select_neighbour(-1), "P"),
+            Command("Open or close the table of envs", self._toggle_envs, "B"),
+            Command("Next env that failed", lambda: self._envs.select_next("failed"), "E"),
+            Command("Next env with something odd", lambda: self._envs.select_next("flagged"), "E", "shift"),
             Command("Show all envs or the selected one", self._view_panel.toggle_only_selected, "O"),
             Command("Frame what is shown", lambda: self.frame(session.view()), "F"),
             Command("Start or stop recording", self._record.toggle, "C"),

@@ -1,0 +1,149 @@
+"""The table of envs and the inspectors in a real Chromium, used as a person uses them."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page, expect, sync_playwright
+
+from tests.browser.opened import launch, new_page, open_workbench
+
+pytestmark = pytest.mark.browser
+TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
+ENVS = 6
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Iterator[Page]:
+    folder = tmp_path_factory.mktemp("author")
+    file = Path(shutil.copy(TASK, folder / "push_cube.py"))
+    # Env 4 says from its fifth step on that it knows no height; nothing else of the task asks for it.
+    good, lost = '"cube_height": height', "(self.elapsed_steps >= 5) & (torch.arange(len(height)) == 4)"
+    text = file.read_text()
+    assert text.count(good) == 1
+    file.write_text(text.replace(good, f"{good}.masked_fill({lost}, torch.nan)"))
+    with (
+        open_workbench(str(file), "--num-envs", str(ENVS), cwd=folder) as opened,
+        sync_playwright() as playwright,
+    ):
+        browser = launch(playwright, chromium_path)
+        page, errors = new_page(browser)
+        page.goto(opened.url)
+        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=90_000)
+        yield page
+        assert not errors
+        browser.close()
+
+
+def until(reached: Callable[[], bool], what: str, seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not reached():
+        assert time.monotonic() < deadline, f"{what} did not come within {seconds} s"
+        time.sleep(0.05)
+
+
+def press(page: Page, selector: str) -> None:
+    """With the mouse, where it is now: while envs play, the rows are replaced as one looks."""
+    at = page.evaluate(
+        """s => {
+            const element = document.querySelector(s);
+            element.scrollIntoView({block: 'nearest'});
+            const r = element.getBoundingClientRect();
+            return [r.x + 8, r.y + r.height / 2];
+        }""",
+        selector,
+    )
+    page.mouse.click(*at)
+
+
+def envs(page: Page) -> list[int]:
+    return page.evaluate(
+        "() => [...document.querySelectorAll('tr[data-env]')].map(r => Number(r.dataset.env))"
+    )
+
+
+def selected(page: Page) -> list[int]:
+    return page.evaluate(
+        "() => [...document.querySelectorAll('tr.wb-selected')].map(r => Number(r.dataset.env))"
+    )
+
+
+def cell(page: Page, env: int, column: int) -> str:
+    return page.evaluate(
+        "([e, c]) => document.querySelector(`tr[data-env='${e}']`).cells[c].innerText", [env, column]
+    )
+
+
+def test_a_row_is_pressed_and_its_env_selected_also_while_the_envs_play(page: Page) -> None:
+    assert envs(page) == []
+    page.keyboard.press("b")
+    until(lambda: envs(page) == list(range(ENVS)), "the rows")
+    page.get_by_role("button", name="Play", exact=True).click()
+    until(lambda: int(cell(page, 0, 2)) > 2, "steps in the table")
+    for env in (3, 1, 5):
+        press(page, f"tr[data-env='{env}']")
+        until(lambda env=env: selected(page) == [env], f"env {env} selected")
+    expect(page.get_by_text(re.compile(r"^env 5: step"))).to_be_visible()
+    page.get_by_role("button", name="Pause", exact=True).click()
+
+
+def test_an_odd_env_is_flagged_with_its_reason_and_found_by_the_filter(page: Page) -> None:
+    until(lambda: "flagged 1" in page.locator(".wb-pills").inner_text(), "the flag")
+    press(page, ".wb-pills span:nth-child(4)")
+    until(lambda: envs(page) == [4], "the filter")
+    assert "cube_height is not a number (" in cell(page, 4, 8)
+    press(page, ".wb-pills span:nth-child(1)")
+    until(lambda: len(envs(page)) == ENVS, "all rows again")
+    page.keyboard.press("Shift+E")
+    until(lambda: selected(page) == [4], "the flagged env selected by its key")
+
+
+def test_columns_sort_both_ways(page: Page) -> None:
+    press(page, ".wb-env-table th:nth-child(4)")
+    until(lambda: "↑" in page.locator(".wb-env-table th:nth-child(4)").inner_text(), "the order")
+    up = envs(page)
+    press(page, ".wb-env-table th:nth-child(4)")
+    until(lambda: envs(page) == up[::-1], "the other order")
+    assert [float(cell(page, env, 3)) for env in up] == sorted(float(cell(page, env, 3)) for env in up)
+    press(page, ".wb-env-table th:nth-child(1)")
+
+
+def test_the_buttons_behind_the_rows_are_not_seen(page: Page) -> None:
+    hidden = page.evaluate(
+        "() => [...document.querySelectorAll('[data-press]')].map(e => document.getElementById(e.dataset.press))"
+        ".map(b => [b !== null, b?.offsetParent === null])"
+    )
+    assert len(hidden) > ENVS and all(there and unseen for there, unseen in hidden)
+
+
+def show(page: Page, what: str) -> None:
+    page.locator("input[aria-haspopup=listbox]:visible").first.click()
+    page.get_by_role("option", name=what, exact=True).click()
+
+
+def test_the_selected_env_is_read_out_and_changes_are_marked(page: Page) -> None:
+    page.get_by_role("tab", name="Inspect").click()
+    assert page.locator(".wb-inspect").inner_text().startswith("Choose what to read")
+    show(page, "joints")
+    expect(page.get_by_text("panda_joint7", exact=True)).to_be_visible()
+    show(page, "observation")
+    expect(page.get_by_text("extra/tcp_to_cube")).to_be_visible()
+    page.keyboard.press("Escape")
+    page.locator(".wb-inspect").click()
+    page.keyboard.press("s")
+    until(lambda: page.locator(".wb-leaves .wb-changed").count() > 0, "changed numbers")
+    show(page, "contacts")
+    expect(page.get_by_text("by table-workspace")).to_be_visible()
+
+
+def test_a_pose_is_copied(page: Page) -> None:
+    show(page, "poses")
+    page.context.grant_permissions(["clipboard-read", "clipboard-write"])
+    expect(page.locator(".wb-leaves").get_by_text("cube", exact=True)).to_be_visible()
+    page.locator(".wb-leaves tr", has=page.get_by_text("cube", exact=True)).locator(".wb-pill").click()
+    until(lambda: page.evaluate("navigator.clipboard.readText()").startswith("sapien.Pose(p=["), "the copy")

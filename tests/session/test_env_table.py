@@ -1,0 +1,160 @@
+"""The table of envs against a plain reference that follows one env at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.ui.scenes import description, step_of, table_scene
+from workbench.core.step import StepResult
+from workbench.session.env_table import KEPT_REWARDS, EnvTable, Outcome
+from workbench.session.messages import Stepped
+
+N = 3
+
+
+@dataclass
+class Episode:
+    """One env's episode, as one would follow it by hand."""
+
+    steps: int = 0
+    rewards: list[float] = field(default_factory=list)
+    total: float = 0.0
+    outcome: Outcome = Outcome.RUNNING
+    end: int = -1
+    first: dict[str, int] = field(default_factory=dict)
+
+    def see(self, entries: dict[str, bool]) -> None:
+        for name, value in entries.items():
+            if value and name not in self.first:
+                self.first[name] = self.steps
+
+    def step(self, reward: float, entries: dict[str, bool], limit: bool) -> None:
+        self.steps += 1
+        self.rewards.append(reward)
+        if self.end < 0:
+            self.total += reward
+        self.see(entries)
+        if self.end < 0 and (entries["success"] or entries["fail"] or limit):
+            self.end = self.steps
+            self.outcome = (
+                Outcome.SUCCESS
+                if entries["success"]
+                else Outcome.FAIL
+                if entries["fail"]
+                else Outcome.TRUNCATED
+            )
+
+
+def result(
+    steps: list[int], rewards: list[float], entries: list[dict[str, bool]], limits: list[bool]
+) -> StepResult:
+    _, poses = table_scene(N)
+    values = {name: np.array([entry[name] for entry in entries]) for name in entries[0]}
+    return StepResult(
+        elapsed_steps=np.array(steps, np.int32),
+        reward=np.array(rewards, np.float32),
+        terminated=values["success"] | values["fail"],
+        truncated=np.array(limits),
+        evaluate={**values, "distance": np.zeros(N, np.float32)},
+        poses=poses,
+    )
+
+
+def table() -> EnvTable:
+    geometry, poses = table_scene(N)
+    first = step_of(poses, success=np.zeros(N, bool), fail=np.zeros(N, bool))
+    return EnvTable(
+        description(geometry), StepResult(**{**first.__dict__, "elapsed_steps": np.zeros(N, np.int32)})
+    )
+
+
+entry = st.fixed_dictionaries({"success": st.booleans(), "fail": st.booleans(), "near": st.booleans()})
+each = lambda strategy: st.lists(strategy, min_size=N, max_size=N)  # noqa: E731
+event = st.one_of(
+    st.tuples(st.just("step"), each(st.integers(-5, 5)), each(entry), each(st.booleans())),
+    st.tuples(st.just("reset"), each(st.booleans()).filter(any), each(entry), st.none()),
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(event, max_size=40))
+def test_rows_are_what_following_each_env_by_itself_gives(events: list[tuple]) -> None:
+    ours = table()
+    episodes, last = [Episode() for _ in range(N)], [None] * N
+    ended, succeeded, ticks = [0] * N, [0] * N, 0
+    for kind, first, entries, limits in events:
+        if kind == "reset":
+            for env in range(N):
+                if first[env]:
+                    if episodes[env].end >= 0:
+                        last[env] = episodes[env]
+                    episodes[env] = Episode()
+                    episodes[env].see(entries[env])
+            mask = np.array(first)
+            step = result([e.steps for e in episodes], [0] * N, entries, [False] * N)
+        else:
+            ticks += 1
+            for env, episode in enumerate(episodes):
+                running = episode.end < 0
+                episode.step(first[env], entries[env], limits[env])
+                if running and episode.end >= 0:
+                    ended[env] += 1
+                    succeeded[env] += episode.outcome == Outcome.SUCCESS
+            mask = np.zeros(N, bool)
+            step = result([e.steps for e in episodes], first, entries, limits)
+        ours.add(Stepped(step, mask))
+
+    rows = ours.rows()
+    assert rows.tick == ticks and rows.serial == len(events)
+    assert rows.steps.tolist() == [e.steps for e in episodes]
+    assert rows.outcome.tolist() == [e.outcome for e in episodes]
+    assert rows.end.tolist() == [e.end for e in episodes]
+    assert rows.total.tolist() == [e.total for e in episodes]
+    assert (rows.ended.tolist(), rows.succeeded.tolist()) == (ended, succeeded)
+    assert "distance" not in rows.first_true
+    for name, steps in rows.first_true.items():
+        assert steps.tolist() == [e.first.get(name, -1) for e in episodes]
+    for env, episode in enumerate(episodes):
+        kept = rows.rewards[env]
+        assert kept[np.isfinite(kept)].tolist() == episode.rewards[-KEPT_REWARDS:]
+        assert rows.tick_of(env, episode.steps) == ticks
+    assert rows.last.steps.tolist() == [-1 if e is None else e.end for e in last]
+    assert rows.last.outcome.tolist() == [0 if e is None else e.outcome for e in last]
+    assert rows.last.total.tolist() == [0 if e is None else e.total for e in last]
+
+
+NO = {"success": False, "fail": False, "near": False}
+
+
+def test_only_the_newest_rewards_of_a_long_episode_are_kept() -> None:
+    ours = table()
+    for step in range(1, KEPT_REWARDS + 31):
+        ours.add(Stepped(result([step] * N, [step, 0, 0], [NO] * N, [False] * N), np.zeros(N, bool)))
+    assert ours.rows().rewards[0].tolist() == list(range(31, KEPT_REWARDS + 31))
+
+
+@pytest.mark.parametrize("said", [True, False], ids=["said to be a reset", "only seen in the steps"])
+def test_an_env_that_was_put_back_does_not_claim_to_know_its_return(said: bool) -> None:
+    ours = table()
+    for step in (1, 2, 3):
+        ours.add(Stepped(result([step] * N, [1] * N, [NO] * N, [False] * N), np.zeros(N, bool)))
+    back = result([1, 3, 3], [0] * N, [NO] * N, [False] * N)
+    mask = np.array([True, False, False]) if said else np.array([False, False, False])
+    ours.add(Stepped(back if said else result([1, 4, 4], [1] * N, [NO] * N, [False] * N), mask))
+    rows = ours.rows()
+    assert np.isnan(rows.total[0]) and rows.steps[0] == 1
+    assert rows.total[1:].tolist() == ([3, 3] if said else [4, 4])
+
+
+def test_rows_that_were_taken_do_not_change_with_later_steps() -> None:
+    ours = table()
+    rows = ours.rows()
+    taken = [np.copy(values) for values in (rows.steps, rows.total, rows.rewards, rows.end)]
+    ours.add(Stepped(result([1] * N, [1] * N, [{**NO, "success": True}] * N, [False] * N), np.zeros(N, bool)))
+    for before, after in zip(taken, (rows.steps, rows.total, rows.rewards, rows.end), strict=True):
+        np.testing.assert_array_equal(before, after)

@@ -1,0 +1,262 @@
+"""Reads one env out: observation, state dict, joints, contacts.
+
+The numbers are taken from where the task itself takes them: the observation is the last one that the env
+returned, the state is ``get_state_dict()``, joints and drive targets come from ManiSkill's batched tensors. So
+what is shown is what the author's code sees, on the CPU as on a GPU, and not a second opinion of SAPIEN's.
+
+With ``obs_mode="state"`` the observation is one row of numbers, and which of forty is the cube's height is the
+first thing one asks. ManiSkill throws the names away when it flattens, so they are found by observing once
+more and not flattening: that runs the author's hooks, which may count or draw random numbers, hence it is done
+once a version of the task, and everything that the task remembers is put back afterwards.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from mani_skill.utils import common
+from numpy.typing import NDArray
+
+from workbench.core import seams
+from workbench.core.contact_list import Contact
+from workbench.core.inspection import Inspection, JointReadings, Leaf, Section, Touching
+from workbench.core.snapshot import restore_memory, take_memory
+from workbench.core.task_env import TaskEnv, to_numpy
+
+MOST_VALUES = 64
+"""Numbers of one array that are sent; a joint vector has fewer, a picture has more."""
+
+
+def inspect_env(task: TaskEnv, env: int, sections: Collection[Section]) -> Inspection:
+    """Read these sections of one env; what cannot be read is named in `Inspection.refused`.
+
+    Costs about 1 ms a section for a Panda on a table, and does not change how the episode goes on.
+
+    Raises:
+        IndexError: there is no such env.
+    """
+    if not 0 <= env < task.num_envs:
+        raise IndexError(f"env {env} is out of range for {task.num_envs} envs")
+    readers: dict[Section, Callable[[TaskEnv, int], Any]] = {
+        "observation": read_observation,
+        "state": read_state,
+        "joints": read_joints,
+        "contacts": read_contacts,
+    }
+    began = time.perf_counter()
+    read: dict[str, Any] = {}
+    refused: list[tuple[Section, str]] = []
+    for section, reader in readers.items():
+        if section not in sections:
+            continue
+        try:
+            read[section] = reader(task, env)
+        except NotImplementedError as error:
+            refused.append((section, str(error)))
+        except Exception as error:
+            # The author's own get_state_dict or observation hook: the others are still worth seeing.
+            refused.append((section, f"reading it raised {type(error).__name__}: {error}"))
+    return Inspection(
+        env=env,
+        elapsed_steps=int(task.env.elapsed_steps[env]),
+        refused=tuple(refused),
+        milliseconds=1000 * (time.perf_counter() - began),
+        **read,
+    )
+
+
+def read_observation(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
+    """The last observation; a flattened one (N, D) taken apart by the names of what it was made of."""
+    leaves: list[Leaf] = []
+    for name, value in _flat(_tree(task.obs)):
+        # "state" is what ManiSkill calls the flattened part beside the pictures.
+        names = _names_of_flat(task, value) if name in ("", "state") else None
+        if names is None:
+            leaves.append(_leaf(name or "observation", _row(value, env, task.num_envs)))
+            continue
+        row = to_numpy(value[env])
+        at = 0
+        for part, shape, dtype in names:
+            width = int(np.prod(shape, dtype=int))
+            leaves.append(_leaf(part, row[at : at + width].reshape(shape), dtype))
+            at += width
+    return tuple(leaves)
+
+
+def read_state(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
+    """``get_state_dict()``; 13 numbers of a body and 13 + 2 J of an articulation by what they are."""
+    registry = task.env.scene.state_dict_registry
+    rows: dict[str, Any] = {}
+    for group, structs in (("actors", registry.actors), ("articulations", registry.articulations)):
+        for struct in structs.values():
+            rows[f"{group}/{struct.name}"] = struct
+    leaves: list[Leaf] = []
+    state: Any = task.env.get_state_dict()
+    for name, value in _flat(state):
+        struct = rows.get(name)
+        if struct is None:
+            leaves.append(_leaf(name, _row(value, env, task.num_envs)))
+            continue
+        # An object that only some envs have has a row for each of those.
+        at = np.flatnonzero(np.asarray(seams.envs_of(struct)) == env)
+        if not len(at):
+            continue
+        row = to_numpy(value[int(at[0])])
+        leaves += [_leaf(f"{name}/{part}", numbers) for part, numbers in _state_parts(row)]
+    return tuple(leaves)
+
+
+def read_joints(task: TaskEnv, env: int) -> tuple[JointReadings, ...]:
+    """Every articulation that this env has, robots first as they were built."""
+    found = []
+    for name, articulation in task.env.scene.articulations.items():
+        at = np.flatnonzero(np.asarray(seams.envs_of(articulation)) == env)
+        if not len(at):
+            continue
+        row = int(at[0])
+        joints = seams.objects_of(articulation)[row].active_joints
+        count = len(joints)
+        if not count:
+            continue
+        # SAPIEN's own names carry the env's number.
+        names = tuple(joint.name for joint in articulation.active_joints)
+        limits = to_numpy(articulation.get_qlimits()[row])[:count]
+        stiff = np.array([joint.stiffness > 0 for joint in joints])
+        damped = np.array([joint.damping > 0 for joint in joints])
+        found.append(
+            JointReadings(
+                articulation=name,
+                names=names,
+                kinds=tuple(str(joint.type) for joint in joints),
+                position=_floats(articulation.get_qpos()[row])[:count],
+                velocity=_floats(articulation.get_qvel()[row])[:count],
+                target=np.where(stiff, _floats(articulation.get_drive_targets()[row])[:count], np.nan),
+                target_velocity=np.where(
+                    damped, _floats(articulation.get_drive_velocities()[row])[:count], np.nan
+                ),
+                low=limits[:, 0].astype(np.float32),
+                high=limits[:, 1].astype(np.float32),
+            )
+        )
+    return tuple(found)
+
+
+def read_contacts(task: TaskEnv, env: int) -> tuple[Touching, ...]:
+    """Pairs of bodies that touch in the last substep, strongest first.
+
+    Raises:
+        NotImplementedError: the env is simulated on the GPU.
+    """
+    pairs: dict[tuple[str, str], list[tuple[Contact, int]]] = {}
+    for contact in task.contacts(env):
+        first, second = contact.bodies
+        # Shapes that are near have a contact too; without a push and a gap apart they do not touch.
+        if not contact.impulses.any() and not (contact.separations <= 0).any():
+            continue
+        ordered = (first, second) if first <= second else (second, first)
+        pairs.setdefault(ordered, []).append((contact, 1 if ordered == (first, second) else -1))
+    touching = [_touching(bodies, contacts) for bodies, contacts in pairs.items()]
+    return tuple(sorted(touching, key=lambda pair: (-float(np.linalg.norm(pair.force)), pair.bodies)))
+
+
+def _touching(bodies: tuple[str, str], contacts: list[tuple[Contact, int]]) -> Touching:
+    timestep = np.float32(contacts[0][0].timestep)
+    impulses = np.concatenate([sign * contact.impulses for contact, sign in contacts])
+    impulse = impulses.sum(axis=0)
+    return Touching(
+        bodies=bodies,
+        force=impulse / timestep,
+        impulse=impulse,
+        points=np.concatenate([contact.points for contact, _ in contacts]),
+        forces=impulses / timestep,
+        separation=min(float(contact.separations.min()) for contact, _ in contacts),
+    )
+
+
+def _state_parts(row: NDArray) -> Iterator[tuple[str, NDArray]]:
+    """As `Actor.get_state` and `Articulation.get_state` lay them out."""
+    joints = (len(row) - 13) // 2
+    widths = [("p", 3), ("q", 4), ("v", 3), ("w", 3), ("qpos", joints), ("qvel", joints)]
+    if 13 + 2 * joints != len(row):
+        widths = [("", len(row))]
+    at = 0
+    for name, width in widths:
+        if width:
+            yield name, row[at : at + width]
+        at += width
+
+
+_layouts: WeakKeyDictionary[Any, tuple[type, int, list[tuple[str, tuple[int, ...], str]] | None]] = (
+    WeakKeyDictionary()
+)
+
+
+def _names_of_flat(task: TaskEnv, flat: Any) -> list[tuple[str, tuple[int, ...], str]] | None:
+    """Name, shape and dtype of each part of a flattened observation (N, D), or None if they cannot be told."""
+    env = task.env
+    if not isinstance(flat, torch.Tensor) or flat.ndim != 2 or not env.obs_mode_struct.state:
+        return None
+    known = _layouts.get(env)
+    # A reload may put another class on an env that stays.
+    if known is None or known[:2] != (type(env), flat.shape[1]):
+        known = (type(env), flat.shape[1], _find_names(task, flat.shape[1]))
+        _layouts[env] = known
+    return known[2]
+
+
+def _find_names(task: TaskEnv, width: int) -> list[tuple[str, tuple[int, ...], str]] | None:
+    env = task.env
+    every = list(range(task.num_envs))
+    memory = take_memory(env, every)
+    try:
+        obs = seams.unflattened_state(env, env.get_info())
+    finally:
+        restore_memory(env, memory, every, every, whole=True)
+    parts = []
+    for name, value in _flat(obs):
+        if isinstance(value, torch.Tensor) and value.nelement():
+            made: Any = common.flatten_state_dict({"value": value}, use_torch=True, device=env.device)
+            shape = tuple(value.shape[1:]) if np.prod(value.shape[1:], dtype=int) == made.shape[-1] else None
+            parts.append((name, shape or (made.shape[-1],), _dtype(value)))
+    # A task may flatten in its own way: then no names are better than wrong ones.
+    return parts if sum(int(np.prod(shape, dtype=int)) for _, shape, _ in parts) == width else None
+
+
+def _tree(obs: Any) -> Mapping[str, Any]:
+    if obs is None:
+        return {}
+    return obs if isinstance(obs, Mapping) else {"": obs}
+
+
+def _flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{key}/")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _row(value: Any, env: int, num_envs: int) -> NDArray:
+    shape: tuple[int, ...] = tuple(getattr(value, "shape", ()))
+    # Only the row leaves the device: a picture of every env would be megabytes.
+    return to_numpy(value[env] if shape[:1] == (num_envs,) else value)
+
+
+def _leaf(name: str, value: NDArray, dtype: str | None = None) -> Leaf:
+    numeric = value.dtype.kind in "fiub" and value.size > 0
+    low, high = (float(value.min()), float(value.max())) if numeric else (np.nan, np.nan)
+    values = value.reshape(-1)[:MOST_VALUES].copy()
+    return Leaf(name, tuple(value.shape), dtype or str(value.dtype), values, low, high)
+
+
+def _dtype(value: torch.Tensor) -> str:
+    return str(value.dtype).removeprefix("torch.")
+
+
+def _floats(value: torch.Tensor) -> NDArray[np.float32]:
+    return to_numpy(value).astype(np.float32)

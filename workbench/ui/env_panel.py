@@ -1,0 +1,170 @@
+"""The batch, one row an env: sort it, filter it, press a row to select that env and go to its moment.
+
+What the rows say is in `env_strip`; how a row of HTML can be pressed, in `presses`. The table is drawn a few times
+a second, and at most `MOST_ROWS` rows of it: which those are is what sorting and filtering are for. Sorting and
+filter belong to the page's server, like the selected env, so two open pages show the same.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Hashable
+
+import numpy as np
+import viser
+
+from workbench.session.env_table import EnvRows
+from workbench.session.session import Session
+from workbench.session.view import SessionView
+from workbench.ui.env_strip import FILTERS, Filter, columns, entry_names, make_rows, mask, moment_of, order
+from workbench.ui.fragments import render
+from workbench.ui.presses import Presses
+
+REDRAW_EVERY = 0.3
+"""Seconds. Faster, numbers of many rows cannot be read."""
+MOST_ROWS = 64
+"""On one page of the table."""
+HINTS = {
+    "env": "Press a column to sort by it, again to turn it round",
+    "state": "Of the episode under way: running until its first end",
+    "steps": "Control steps of the episode",
+    "return": "Sum of the rewards of the episode so far",
+    "last": "How the episode before ended, and at which step",
+    "flags": "What is odd: not a number, too fast, fallen, reward out of range",
+}
+
+
+class EnvPanel:
+    """The table of envs in the present container."""
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        session: Session,
+        on_jump: Callable[[int, int], None] = lambda env, tick: None,
+    ) -> None:
+        """
+        Args:
+            on_jump: called with an env and a control step of the batch (`EnvRows.tick_of`) when a row was
+                pressed whose env had an outlier or whose episode ended: the moment to look at.
+        """
+        self._session = session
+        self._on_jump = on_jump
+        self._handle = server.gui.add_html("")
+        self._presses = Presses(server)
+        self._column, self._descending = "env", False
+        self._filter: Filter = "all"
+        self._first = 0
+        self._changed = True
+        self._drawn: tuple[int, int, int] | None = None
+        self._drawn_at = 0.0
+
+    def draw(self, view: SessionView) -> None:
+        wanted = (view.task_serial, view.step_serial, view.selected_env)
+        late = time.monotonic() - self._drawn_at >= REDRAW_EVERY
+        selected = self._drawn is not None and wanted[2] != self._drawn[2]
+        if not (self._changed or selected or (late and wanted != self._drawn)):
+            return
+        self._changed, self._drawn, self._drawn_at = False, wanted, time.monotonic()
+        rows = self._session.env_rows()
+        content = render("envs", head=()) if rows is None else self._html(rows, view.selected_env)
+        if self._handle.content != content:
+            self._handle.content = content
+
+    def _html(self, rows: EnvRows, selected: int) -> str:
+        if self._column not in columns(rows):
+            self._column, self._descending = "env", False
+        envs = order(rows, self._column, self._descending, self._filter)
+        self._first = min(self._first, max(0, (len(envs) - 1) // MOST_ROWS * MOST_ROWS))
+        shown = envs[self._first : self._first + MOST_ROWS]
+        return render(
+            "envs",
+            filter=self._filter,
+            pills=[
+                {
+                    "name": name,
+                    "count": int(np.count_nonzero(mask(rows, name))),
+                    "on": name == self._filter,
+                    "press": self._press(("filter", name), lambda name=name: self._choose_filter(name)),
+                }
+                for name in FILTERS
+            ],
+            pages=self._pages(len(envs), len(shown)),
+            head=self._head(rows),
+            rows=[
+                {"cells": row, "selected": row.env == selected, "press": self._press_of_env(row.env)}
+                for row in make_rows(rows, shown)
+            ],
+        )
+
+    def _head(self, rows: EnvRows) -> list[dict[str, str]]:
+        def sortable(name: str, column: str, hint: str) -> dict[str, str]:
+            arrow = "" if column != self._column else " ↓" if self._descending else " ↑"
+            press = self._press(("sort", column), lambda: self._choose_column(column))
+            return {"name": name, "arrow": arrow, "press": press, "hint": hint}
+
+        entries = [
+            sortable(name, f"first {name}", f"The first step at which {name} was true")
+            for name in entry_names(rows)
+        ]
+        plain = {
+            "name": "reward",
+            "arrow": "",
+            "press": "",
+            "hint": "Over the episode; all rows on one scale",
+        }
+        start = [sortable(name, name, HINTS[name]) for name in ("env", "state", "steps", "return")]
+        return [*start, plain, *entries, *(sortable(name, name, HINTS[name]) for name in ("last", "flags"))]
+
+    def _pages(self, count: int, shown: int) -> dict[str, object] | None:
+        if count <= MOST_ROWS:
+            return None
+        return {
+            "first": self._first + 1,
+            "last": self._first + shown,
+            "of": count,
+            "back": self._press("back", lambda: self._turn(-MOST_ROWS)),
+            "on": self._press("on", lambda: self._turn(MOST_ROWS)),
+        }
+
+    # --- what is pressed ---------------------------------------------------------------------------
+
+    def _press(self, key: Hashable, do: Callable[[], None]) -> str:
+        def pressed(client: viser.ClientHandle | None) -> None:
+            do()
+            self._changed = True
+
+        return self._presses.id_of(key, pressed)
+
+    def _press_of_env(self, env: int) -> str:
+        return self._press(("env", env), lambda: self._choose_env(env))
+
+    def _choose_env(self, env: int) -> None:
+        rows = self._session.env_rows()
+        if rows is None or env >= rows.num_envs:
+            return  # a version with fewer envs was loaded since the table was drawn
+        self._session.select_env(env)
+        step = moment_of(rows, env)
+        if step is not None:
+            self._on_jump(env, rows.tick_of(env, step))
+
+    def _choose_column(self, column: str) -> None:
+        self._descending = not self._descending if column == self._column else False
+        self._column, self._first = column, 0
+
+    def _choose_filter(self, wanted: Filter) -> None:
+        self._filter, self._first = wanted, 0
+
+    def _turn(self, by: int) -> None:
+        self._first = max(0, self._first + by)
+
+    def select_next(self, wanted: Filter) -> None:
+        """The next env, by number and round the end, that a filter lets through; none if there is none."""
+        rows = self._session.env_rows()
+        if rows is None:
+            return
+        envs = np.flatnonzero(mask(rows, wanted))
+        if len(envs):
+            later = envs[envs > self._session.view().selected_env]
+            self._choose_env(int(later[0] if len(later) else envs[0]))
+            self._changed = True

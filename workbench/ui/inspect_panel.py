@@ -1,0 +1,148 @@
+"""The Inspect tab: one env from inside, read from the worker only while somebody wants it.
+
+viser does not say which tab is looked at, so what is read is what is chosen here, and with no page open nothing
+is. A reading takes a millisecond or two of the worker's time, five times a second at most, and the next is asked
+for only when the last has come: a worker that is busy is not sent a queue. Poses are on the page already.
+"""
+
+from __future__ import annotations
+
+import time
+
+import viser
+
+from workbench.core.inspection import SECTIONS, Inspection, Section
+from workbench.session.session import Session
+from workbench.session.view import SessionView
+from workbench.ui.fragments import render
+from workbench.ui.inspect_rows import contact_rows, joint_rows, leaf_rows, pose_rows
+
+READ_EVERY = 0.2
+"""Seconds."""
+PATIENCE = 2.0
+"""Seconds after which an answer that has not come is asked for again: the worker may be another by then."""
+NOTHING, POSES = "nothing", "poses"
+CHOICES: dict[str, Section | None] = {
+    NOTHING: None,
+    "joints": "joints",
+    "contacts": "contacts",
+    POSES: None,
+    "observation": "observation",
+    "state": "state",
+}
+
+
+class InspectPanel:
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._session = session
+        self._show = server.gui.add_dropdown(
+            "Show",
+            tuple(CHOICES),
+            initial_value=NOTHING,
+            hint="Read of the selected env, five times a second.",
+        )
+        self._forces = server.gui.add_checkbox(
+            "Force arrows",
+            False,
+            hint="Draw the contact forces of the selected env as arrows in the 3-D view.",
+        )
+        self._handle = server.gui.add_html("")
+        self._asked: tuple[object, ...] | None = None
+        self._asked_at = 0.0
+        self._had: Inspection | None = None
+        self._now: Inspection | None = None
+        self._before: Inspection | None = None
+        self._drawn: tuple[object, ...] | None = None
+        self._drawn_at = 0.0
+
+    def draw(self, view: SessionView) -> None:
+        choice = self._show.value if self._show.value in CHOICES else NOTHING
+        self._ask(view, choice)
+        self._take(view)
+        wanted = (choice, view.task_serial, view.selected_env, id(self._now))
+        if choice == POSES:
+            wanted = (*wanted, view.step_serial)
+        chosen = self._drawn is None or wanted[0] != self._drawn[0]
+        if wanted == self._drawn or not (chosen or time.monotonic() - self._drawn_at >= READ_EVERY):
+            return
+        self._drawn, self._drawn_at = wanted, time.monotonic()
+        self._handle.content = inspect_html(choice, view, self._now, self._before)
+
+    def forces(self, view: SessionView) -> Inspection | None:
+        """The reading whose contacts are to be drawn in the view; None draws none."""
+        shown = self._forces.value is True and self._now is not None and self._now.env == view.selected_env
+        return self._now if shown else None
+
+    def _ask(self, view: SessionView, choice: str) -> None:
+        chosen: tuple[Section | None, ...] = (
+            CHOICES[choice],
+            "contacts" if self._forces.value is True else None,
+        )
+        sections: tuple[Section, ...] = tuple(section for section in SECTIONS if section in chosen)
+        wanted = (view.task_serial, view.step_serial, view.selected_env, sections)
+        if not sections or view.task is None or wanted == self._asked:
+            return
+        waited = time.monotonic() - self._asked_at
+        answered = self._asked is None or view.inspection is not self._had
+        if waited >= (READ_EVERY if answered else PATIENCE):
+            self._asked, self._asked_at, self._had = wanted, time.monotonic(), view.inspection
+            self._session.inspect(sections)
+
+    def _take(self, view: SessionView) -> None:
+        new = view.inspection
+        if new is self._now:
+            return
+        old = self._now
+        if new is None or old is None or old.env != new.env:
+            self._before = None
+        elif old.elapsed_steps != new.elapsed_steps:
+            self._before = old
+        self._now = new
+
+
+def inspect_html(choice: str, view: SessionView, now: Inspection | None, before: Inspection | None) -> str:
+    """What the tab shows under its controls."""
+    leaves, articulations, contacts, poses = [], [], [], []
+    note = ""
+    env, section = view.selected_env, CHOICES[choice]
+    if view.task is None or view.step is None:
+        note = "There is something to inspect when the task is loaded."
+    elif choice == NOTHING:
+        note = (
+            "Choose what to read of the selected env: its joints, contacts, the poses of its bodies, the observation "
+            "or the simulation state. Nothing is read until then."
+        )
+    elif choice == POSES:
+        names = view.task.geometry.body_names
+        if view.step.poses.shape[:2] == (view.task.num_envs, len(names)):
+            poses = pose_rows(names, view.step.poses[env])
+        note = f"env {env}: metres, quaternions w x y z, in the env's own frame"
+    elif now is None or now.env != env or _reading(now, section) is None:
+        refused = dict(now.refused) if now is not None and now.env == env else {}
+        note = refused.get(section, f"Reading env {env} ...") if section else ""
+    else:
+        note = f"env {env} at step {now.elapsed_steps} of its episode"
+        if section == "joints":
+            articulations = [{"name": a.articulation, "joints": joint_rows(a)} for a in now.joints or ()]
+            note += "; bars show the position between the limits, and the target in orange"
+        elif section == "contacts":
+            contacts = contact_rows(now.contacts or ())
+            note += "" if contacts else ": nothing touches anything"
+        elif section == "observation":
+            leaves = leaf_rows(now.observation or (), before.observation if before else None)
+        elif section == "state":
+            leaves = leaf_rows(now.state or (), before.state if before else None)
+        if section in ("observation", "state"):
+            note += "; numbers that changed since the reading before are blue"
+    return render(
+        "inspect",
+        note=note,
+        leaves=leaves,
+        articulations=articulations,
+        contacts=contacts,
+        poses=poses,
+    )
+
+
+def _reading(now: Inspection, section: Section | None) -> object:
+    return None if section is None else getattr(now, section)
