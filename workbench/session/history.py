@@ -219,7 +219,7 @@ class History:
         return [(low + int(k), int(happened[k])) for k in np.flatnonzero(happened)]
 
     def rewards(self, env: int, low: int, high: int) -> NDArray[np.float32]:
-        """(K,) of this env at the moments between two, both included; zero at a jump."""
+        """(K,) of this env at the moments between two, both included; zero where it jumped."""
         return self._reward[self._rows(low, high)[1], env].copy()
 
     def jumps_back(self, env: int) -> list[tuple[int, int]]:
@@ -310,6 +310,10 @@ class History:
             row = moment.serial - self._base
         self._happened[row] = moment.happened
         self._reward[row] = moment.step.reward
+        if moment.step.action is None and self._moments:
+            # Others were reset: to those that were not, nothing happened, and their reward is no zero.
+            stays = ~moment.jumped
+            self._reward[row, stays] = self._reward[row - 1, stays]
 
     def _shrink(self) -> None:
         while self._pictures_used > self.limit * _PICTURES_SHARE and self._pictured:

@@ -106,6 +106,11 @@ class Timeline:
         """Some moments on (or back, if negative) from what is shown."""
         self.seek((self.history.last if self._shown is None else self._shown) + steps)
 
+    def seek_tick(self, tick: int) -> None:
+        """To the newest moment of this control step (`Moment.tick`), or the nearest that is kept."""
+        moments = self.history.between(self.history.first, self.history.last)
+        self.seek(max((m.serial for m in moments if m.tick <= tick), default=self.history.first))
+
     def seek_event(self, env: int, direction: int) -> None:
         """To the next (1) or last (-1) event of this env; forward from the last one is live."""
         here = self.history.last if self._shown is None else self._shown
