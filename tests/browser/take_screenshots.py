@@ -123,6 +123,8 @@ def shoot_envs(chromium: str) -> None:
             page.keyboard.press("Space")
             page.keyboard.press("b")
             page.keyboard.press("Shift+E")
+            time.sleep(3)
+            page.keyboard.press("f")
             shoot(page, "envs")
 
 

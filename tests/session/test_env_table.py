@@ -85,7 +85,8 @@ event = st.one_of(
 @given(st.lists(event, max_size=40))
 def test_rows_are_what_following_each_env_by_itself_gives(events: list[tuple]) -> None:
     ours = table()
-    episodes, last = [Episode() for _ in range(N)], [None] * N
+    episodes = [Episode() for _ in range(N)]
+    last: list[Episode | None] = [None] * N
     ended, succeeded, ticks = [0] * N, [0] * N, 0
     for kind, first, entries, limits in events:
         if kind == "reset":

@@ -49,5 +49,6 @@ def test_a_term_that_a_new_version_drops_goes_when_its_last_value_goes() -> None
 
 def test_the_number_of_terms_is_bounded() -> None:
     history = TermHistory(2)
-    history.add(stepped(**{f"term{i}": [0, 0] for i in range(MOST + 5)}))
+    terms: dict[str, Any] = {f"term{i}": [0, 0] for i in range(MOST + 5)}
+    history.add(stepped(**terms))
     assert len(history.curves().terms) == MOST

@@ -50,7 +50,7 @@ log = logging.getLogger(__name__)
 FRAME = 1 / 30
 """Seconds. Faster pushes make a browser slower (measured: 350 a second leave it 13 to 30)."""
 PANEL_WIDTH = 340
-ENVS_WIDTH = 480
+ENVS_WIDTH = 520
 SETTLES = 4.0
 """Seconds after a page has come in which its panels may still take their places."""
 
