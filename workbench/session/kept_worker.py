@@ -199,7 +199,7 @@ class KeptWorker:
             worker.stop(grace=0.3)  # it has nothing to lose: what is kept is kept by the server
             return False
         code = worker.exit_code()
-        words = worker.last_words()
+        words, beat = worker.last_words(), worker.beat()  # its memory outlives it
         worker.stop(grace=0.0)
         with self._condition:
             self._worker = None
@@ -208,7 +208,7 @@ class KeptWorker:
             gives_up = self._deaths >= _MOST_DEATHS
         stack = words if fatal_error(words) is not None else life.stack
         self._on_death(
-            Death(life.why or describe_exit(code), asked, life.file_waits, _doing(life.beat), stack, gives_up)
+            Death(life.why or describe_exit(code), asked, life.file_waits, _doing(beat), stack, gives_up)
         )
         with self._condition:
             if gives_up:
