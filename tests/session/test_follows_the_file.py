@@ -170,7 +170,8 @@ def test_a_file_that_is_mended_gets_past_a_worker_that_hangs(
     hanging = session.worker_pid
     task_file.write_text(good)
     view = wait_until(session, lambda v: v.task_serial > before, "the mended version")
-    assert view.problem is None and session.worker_pid != hanging
+    # Python ran the loop, so it could be left; only what cannot be costs the process.
+    assert view.problem is None and session.worker_pid == hanging
 
 
 def test_the_authors_prints_are_kept(session: Session, task_file: Path, good: str) -> None:

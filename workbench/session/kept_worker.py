@@ -35,8 +35,8 @@ _DEAF = 1.5
 """Seconds after an interrupt in which the author's code must have been left."""
 _LOAD_WAITS = 2.0
 """Seconds that a load may wait behind something else, which is then interrupted ..."""
-_LONGEST_SILENCE = 5.0
-"""... and after so many the worker is ended."""
+_LONGEST_SILENCE = 4.0
+"""... and so many later the worker is ended."""
 _MOST_DEATHS = 3
 """Workers that may die one after the other without a load in between."""
 
@@ -133,6 +133,11 @@ class KeptWorker:
         """What the processes hold, as of the last look."""
         return self._vitals
 
+    @property
+    def load_waits(self) -> bool:
+        """Whether a load was sent that the worker has not taken up."""
+        return self._load_sent is not None
+
     def send(self, request: Request) -> None:
         """To the present worker; between two it is lost, and `greet` must make up for it."""
         with self._condition:
@@ -199,16 +204,17 @@ class KeptWorker:
             worker.stop(grace=0.3)  # it has nothing to lose: what is kept is kept by the server
             return False
         code = worker.exit_code()
-        words = worker.last_words()
+        words, beat = worker.last_words(), worker.beat()  # its memory outlives it
         worker.stop(grace=0.0)
         with self._condition:
             self._worker = None
             asked = self._replace_asked
             self._deaths += 0 if asked or life.file_waits else 1
             gives_up = self._deaths >= _MOST_DEATHS
-        stack = words if fatal_error(words) is not None else life.stack
+        seen = life.stack if life.stack_of == beat.number else ""
+        stack = words if fatal_error(words) is not None else seen
         self._on_death(
-            Death(life.why or describe_exit(code), asked, life.file_waits, _doing(life.beat), stack, gives_up)
+            Death(life.why or describe_exit(code), asked, life.file_waits, _doing(beat), stack, gives_up)
         )
         with self._condition:
             if gives_up:
@@ -242,27 +248,29 @@ class KeptWorker:
 
     def _look(self, worker: WorkerProcess, life: _Life) -> None:
         now = time.monotonic()
-        life.beat = beat = worker.beat()
+        beat = worker.beat()
         if self._replace_asked:
             life.why = "was ended by hand"
             self._end(worker, life)
         self._look_at_memory(worker, life, now)
         if self._load_sent is not None and beat.doing not in _LONG and beat.since < self._load_sent:
             waited = now - self._load_sent
-            if waited > _LONGEST_SILENCE and beat.seconds > 0:
-                life.why = f"did not answer for {_LONGEST_SILENCE:.0f} s"
+            # Counted from the interrupt: leaving a load means to close what it had built.
+            ignored = self._since_interrupt(beat)
+            if waited > _LOAD_WAITS and ignored is None:
+                self.interrupt()
+            elif waited > _LOAD_WAITS and ignored is not None and ignored > _LONGEST_SILENCE:
+                life.why = f"did not answer for {waited:.0f} s"
                 life.file_waits = True
                 self._end(worker, life)
-            elif waited > _LOAD_WAITS and not self._was_interrupted(beat):
-                self.interrupt()
         if beat.seconds < _LONG.get(beat.doing, _BUSY):
             if life.told is not None:
                 life.told = None
                 self._on_busy(None)
         elif life.told is None or now - life.told >= _STACK_EVERY:
             life.told = now
-            life.stack = worker.stack() or life.stack
-            deaf = self._was_interrupted(beat) and now - self._interrupted[1] > _DEAF  # type: ignore[index]
+            self._look_where(worker, life, beat)
+            deaf = (self._since_interrupt(beat) or 0.0) > _DEAF
             self._on_busy(busy_at(beat.seconds, beat.doing, life.stack, self._own_files(), deaf))
 
     def _look_at_memory(self, worker: WorkerProcess, life: _Life, now: float) -> None:
@@ -280,12 +288,20 @@ class KeptWorker:
             )
             self._end(worker, life)
 
-    def _was_interrupted(self, beat: Beat) -> bool:
-        return self._interrupted is not None and self._interrupted[0] == beat.number
+    def _since_interrupt(self, beat: Beat) -> float | None:
+        """Seconds since this piece of work was interrupted; None if it was not."""
+        number, moment = self._interrupted or (0, 0.0)
+        return time.monotonic() - moment if number == beat.number else None
+
+    def _look_where(self, worker: WorkerProcess, life: _Life, beat: Beat) -> None:
+        if life.stack_of != beat.number:
+            life.stack, life.stack_of = "", beat.number
+        life.stack = worker.stack() or life.stack
 
     def _end(self, worker: WorkerProcess, life: _Life) -> None:
-        if life.beat is not None and life.beat.seconds > 0:
-            life.stack = worker.stack() or life.stack
+        beat = worker.beat()
+        if beat.seconds > 0:
+            self._look_where(worker, life, beat)
         worker.kill()
         raise EOFError
 
@@ -297,13 +313,14 @@ class _Life:
     why: str | None = None
     """Why it was ended, if we ended it."""
     file_waits: bool = False
-    beat: Beat | None = None
     stack: str = ""
+    stack_of: int = 0
+    """The piece of work that it was seen in."""
     told: float | None = None
     """When it was last told that the worker is busy."""
     looked_at_children: float = 0.0
     children: int = 0
 
 
-def _doing(beat: Beat | None) -> str | None:
-    return None if beat is None or beat.doing in ("idle", "starting") else beat.doing
+def _doing(beat: Beat) -> str | None:
+    return None if beat.doing in ("idle", "starting") else beat.doing

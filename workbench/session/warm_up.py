@@ -1,7 +1,7 @@
 """What a process does once and takes long over, done before somebody waits for it.
 
-Measured with N = 4 on two cores: the first env of a process takes SECONDS longer to make than the second, and the
-first picture of each kind of camera has its shaders compiled. Both go away by opening one of ManiSkill's own small
+Measured with N = 4 on two cores: to make the first env of a process and read its shapes takes 1.2 s, the second 0.12,
+and the first picture of each kind of camera has its shaders compiled. Both go away by opening one of ManiSkill's own small
 tasks and drawing it, whatever the author's task is: the robot's files, the render system and the shaders are
 the same.
 """
