@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import pickle
 import random
 import shutil
 from collections.abc import Iterator
@@ -277,6 +278,27 @@ def test_a_patch_that_was_not_found_safe_says_what_would_have_been_chosen(desk: 
     report = desk.edit("CUBE_HALF_SIZE = 0.02", "CUBE_HALF_SIZE = 0.03", "patched")
     assert report.level == "patched"
     assert "rebuilt would have been chosen" in report.reason and "CUBE_HALF_SIZE" in report.reason
+
+
+def test_a_worker_that_was_started_anew_goes_on_from_the_snapshot_that_it_is_given(desk: Desk) -> None:
+    before = desk.step(5)
+    kept = pickle.dumps(desk.task.snapshot())
+    request = Load(str(desk.file), desk.options, source={str(desk.file): desk.good}, snapshot=kept)
+    opened, report = load_version(request, None)
+    opened.env.close()
+    assert report is not None and report.level == "restarted"
+    assert "actor cube" in report.carried and not report.not_carried
+    np.testing.assert_allclose(opened.first.poses, before.poses, atol=1e-5)
+    np.testing.assert_array_equal(opened.first.elapsed_steps, before.elapsed_steps)
+
+
+def test_a_moment_in_which_the_new_scene_fails_is_left_and_a_fresh_episode_begins(desk: Desk) -> None:
+    desk.step(5)
+    text = desk.good.replace("base_color=[0.05,", "base_color=[0.5,")
+    late = "assert (self._elapsed_steps < 3).all(), 'too late'\n        distance = torch"
+    report = desk.save(text.replace("distance = torch", late, 1))
+    assert report.level == "rebuilt" and "too late" in report.not_carried["the moment"]
+    assert (desk.running.last.elapsed_steps == 0).all()
 
 
 def test_a_task_of_a_package_with_a_helper_beside_it_is_patched(tmp_path: Path) -> None:
