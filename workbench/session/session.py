@@ -19,6 +19,8 @@ from workbench.authoring.reference import named_file
 from workbench.authoring.watch import SourceWatcher
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.step import StepResult
+from workbench.session.judge import FILE_SAVED, Judge, what_a_load_means
+from workbench.session.judgement import JudgedCurve, Judgement
 from workbench.session.kept_worker import Death, KeptWorker
 from workbench.session.messages import (
     ActionSource,
@@ -129,6 +131,7 @@ class Session:
         self._restoring = False
         self._worker = KeptWorker(self._greeting, self._handle, self._on_death, self._on_line)
         self._recorder = LiveRecorder(recordings, self._note)
+        self._judge = Judge(self._note)
         self._watcher = SourceWatcher(self._on_files_changed)
         self._own_file = named_file(task)
         self._follow((), {})
@@ -173,6 +176,7 @@ class Session:
                 recording=recording,
                 printed=tuple(s.printed),
                 timeline=TimelineView() if s.timeline is None else s.timeline.view(s.selected_env, s.cameras),
+                judgement=self._judge.view,
             )
 
     def wait(self, seen: int, timeout: float) -> int:
@@ -342,6 +346,21 @@ class Session:
             timeline = self._state.timeline
             return None if timeline is None else timeline.history.snapshot_at(timeline.history.last)
 
+    # --- the past judged again -----------------------------------------------------------------------
+
+    def stop_judging(self) -> None:
+        """Judge the past no further; what is known by then stays."""
+        self._judge.stop("stopped by hand")
+
+    def judged_curve(self, name: str, env: int) -> JudgedCurve | None:
+        """One number of one env, as recorded and as the new code has it. Copies: not for every frame."""
+        return self._judge.curve(name, env)
+
+    def show(self, env: int, serial: int) -> None:
+        """Select an env and show a moment of its past."""
+        self.select_env(env)
+        self.seek(serial)
+
     def _seek(self, seek: Callable[[Timeline], None]) -> None:
         with self._lock:
             s = self._state
@@ -370,6 +389,7 @@ class Session:
             self._changed.notify_all()
         self._watcher.stop()
         self._worker.stop()
+        self._judge.close()
         self._recorder.close()
 
     # --- what the worker says, on the session's thread -------------------------------------------
@@ -461,6 +481,10 @@ class Session:
         task = event.task
         with self._lock:
             s = self._state
+            meaning = what_a_load_means(s.task, event, self._judge.view)
+            judgement = None
+            if meaning == "judge" and s.timeline is not None:
+                judgement = Judgement(s.timeline.history)
             self._last_good = dict(task.source) or None
             s.task, s.step, s.load_milliseconds = task, event.first, event.milliseconds
             s.task_serial += 1
@@ -477,6 +501,10 @@ class Session:
                 self._set_problem(None)
             self._restoring = False
             s.state = "running" if s.playing else "paused"
+        if judgement is not None:
+            self._judge.judge(self._load_request(dict(task.source)), judgement)
+        elif meaning == "forget":
+            self._judge.forget()
         self._follow(task.source_files, {} if s.stale else task.source)
         self._watch()
         if recording.active:
@@ -497,6 +525,7 @@ class Session:
         self._recorder.take(event)
 
     def _on_files_changed(self, paths: set[Path]) -> None:
+        self._judge.stop(FILE_SAVED)
         with self._lock:
             self._state.stale = True
         self._note()

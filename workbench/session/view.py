@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from workbench.authoring.problem import Problem
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.step import StepResult
+from workbench.session.judge import JudgementView
 from workbench.session.messages import ActionSource, EpisodeEnd, TaskDescription
 from workbench.session.timeline import TimelineView
 
@@ -87,3 +88,5 @@ class SessionView:
     """The last lines that the author's code printed."""
     timeline: TimelineView = TimelineView()
     """The past. While a moment of it is shown, `step` and `pictures` are of that moment."""
+    judgement: JudgementView = JudgementView()
+    """What the new code says of the episodes that were run with the old."""

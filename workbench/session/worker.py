@@ -29,12 +29,14 @@ from workbench.core.step import StepResult
 from workbench.core.take_pictures import Request as PictureRequest
 from workbench.core.take_pictures import take_pictures
 from workbench.session.episodes import recorded_pictures
+from workbench.session.judge_moments import judge_moments
 from workbench.session.messages import (
     ActionSource,
     DrawPast,
     EpisodeEnd,
     Event,
     Failed,
+    JudgeMoments,
     Load,
     Loaded,
     Loading,
@@ -108,6 +110,7 @@ class Worker:
             SetCapture: self._set_capture,
             Restore: self._restore,
             DrawPast: self._draw_past,
+            JudgeMoments: self._judge_moments,
             Quit: self._stop,
         }
 
@@ -241,6 +244,10 @@ class Worker:
             self._fail(problem_from_exception(error, "pictures", self._opened.loaded.source_files))
             return
         self._send(PastPictures(request.origin, pictures))
+
+    def _judge_moments(self, request: JudgeMoments) -> None:
+        if self._opened is not None:
+            self._send(judge_moments(self._opened, request))
 
     def _stop(self, request: Quit) -> None:
         self._quit = True
