@@ -26,6 +26,7 @@ from workbench.ui.commands import Command, register
 from workbench.ui.curves_panel import CurvesPanel
 from workbench.ui.env_layout import EnvLayout, env_under_ray, lay_out
 from workbench.ui.fragments import render, style_sheet
+from workbench.ui.judgement_panel import JudgementPanel
 from workbench.ui.lights import light
 from workbench.ui.numbers_panel import NumbersPanel
 from workbench.ui.record_panel import RecordPanel
@@ -90,6 +91,7 @@ class Page:
         with tabs.add_tab("Reward", viser.Icon.CHART_LINE):
             self._numbers = NumbersPanel(server)
             self._curves = CurvesPanel(server)
+            self._judgement = JudgementPanel(server, session)
         with tabs.add_tab("Episodes", viser.Icon.MOVIE):
             self._record = RecordPanel(server, session.start_recording, session.stop_recording)
         self._timeline = TimelinePanel(server, session)
@@ -156,6 +158,7 @@ class Page:
         self._cameras.draw(view)
         self._numbers.draw(view)
         self._curves.draw(view)
+        self._judgement.draw(view)
         self._record.draw(view)
         self._timeline.draw(view)
 
@@ -272,6 +275,7 @@ class Page:
 
     def _commands(self) -> list[Command]:
         session, run, timeline = self._session, self._run, self._timeline
+        judgement = self._judgement
         return [
             Command("Play or pause", run.toggle_play, "space"),
             Command("Single step", session.step, "S"),
@@ -284,6 +288,15 @@ class Page:
             Command("To the next event", lambda: timeline.to_event(1), "arrowright", "shift"),
             Command("What is live", timeline.go_live, "end"),
             Command("Go on from here, in the selected env", timeline.go_on, "G"),
+            Command(
+                "To the next episode that is judged otherwise now", lambda: judgement.go_to_difference(1), "J"
+            ),
+            Command(
+                "To the last episode that is judged otherwise now",
+                lambda: judgement.go_to_difference(-1),
+                "J",
+                "shift",
+            ),
             Command("Next env", lambda: run.select_neighbour(1), "N"),
             Command("Previous env", lambda: run.select_neighbour(-1), "P"),
             Command("Show all envs or the selected one", self._view_panel.toggle_only_selected, "O"),

@@ -105,6 +105,11 @@ class MalformedMessage(ValueError):
     """A client sent what no page of ours sends."""
 
 
+def element_id(handle: viser.GuiButtonHandle) -> str:
+    """The ``id`` of this button's element in the page (viser's ``Button.tsx``), for HTML that presses it."""
+    return handle._impl.uuid
+
+
 def _missing(root: object, dotted: tuple[str, ...]) -> list[str]:
     missing: list[str] = []
     for name in dotted:
