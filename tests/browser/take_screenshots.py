@@ -1,10 +1,11 @@
-"""Takes the README's screenshots anew, from the running page: python tests/browser/take_screenshots.py
+"""Takes the README's screenshots anew, from the running page: python tests/browser/take_screenshots.py [NAME ...]
 
 Not a test: pictures are looked at by people. It writes ``web_assets/screenshots/*.jpg``.
 """
 
 from __future__ import annotations
 
+import re
 import shutil
 import sys
 import tempfile
@@ -23,6 +24,8 @@ TASK = ROOT / "tasks" / "push_cube.py"
 
 
 def shoot(page: Page, name: str) -> None:
+    if sys.argv[1:] and name not in sys.argv[1:]:
+        return
     time.sleep(4.0)  # a browser that draws in software needs some seconds for a frame
     page.screenshot(path=OUT / f"{name}.jpg", type="jpeg", quality=82)
     print(OUT / f"{name}.jpg")
@@ -30,6 +33,26 @@ def shoot(page: Page, name: str) -> None:
 
 def tab(page: Page, name: str) -> None:
     page.get_by_role("tab", name=name).click()
+
+
+def shoot_branch(page: Page) -> None:
+    """The selected env goes back 30 steps and on from there; then a moment of that branch is looked at."""
+    tab(page, "Run")
+    page.get_by_role("button", name="Reset all", exact=True).click()
+    for play in ("Play", "Pause"):
+        page.get_by_role("button", name=play, exact=True).click()
+        time.sleep(2.0)
+    for _ in range(18):
+        page.get_by_role("button", name="‹ step", exact=True).click()
+    page.get_by_role("button", name=re.compile("Go on from here")).click()
+    for play in ("Play", "Pause"):
+        page.get_by_role("button", name=play, exact=True).click()
+        time.sleep(1.0)
+    tab(page, "Reward")
+    for _ in range(5):
+        page.get_by_role("button", name="‹ step", exact=True).click()
+    shoot(page, "branch")
+    page.get_by_role("button", name="now", exact=True).click()
 
 
 def main() -> None:
@@ -59,6 +82,7 @@ def main() -> None:
             tab(page, "Run")
             shoot(page, "run")
             page.get_by_role("button", name="Pause", exact=True).click()
+            shoot_branch(page)
             tab(page, "Cameras")
             for tick in page.locator("input[type=checkbox]:visible").all()[1:4]:
                 tick.check(force=True)

@@ -18,7 +18,9 @@ from mani_skill.utils.structs.pose import Pose
 
 from tests.core.single_env_judge import Bare, batch_of, put_in_same_state, single
 from tests.core.test_actors_and_articulations import by_hand
+from workbench.core.body_table import build_body_table, read_poses
 from workbench.core.render_device import keep_render_device
+from workbench.core.take_pictures import take_pictures
 
 N = 3
 RENDERED = {"obs_mode": "rgb+depth+segmentation", "render_backend": "cpu", "render_mode": "rgb_array"}
@@ -167,3 +169,33 @@ def test_a_partial_reset_moves_a_hidden_object_of_its_envs_only(env: Any) -> Non
     env.apply()
     env.reset(options={"env_idx": torch.tensor([2])})
     torch.testing.assert_close(env.marker.pose.p[:, 1], torch.tensor([0.5, 0.5, 0.2]))
+
+
+def test_a_moment_of_the_past_is_drawn_from_poses_and_nothing_moves(env: Any) -> None:
+    requests = [
+        (name, "sensor", ("rgb", "depth", "segmentation")) for name in ("on_link", "on_actor", "beside")
+    ]
+    env.reset(seed=[0, 1, 2])
+    table = build_body_table(env)
+    then_poses = read_poses(env, table)[1]
+    then = take_pictures(env, 1, requests)
+    for _ in range(6):
+        env.step(None)
+    pose = env.rider.pose.raw_pose.clone()
+    pose[:, 1] += 0.4
+    env.rider.set_pose(Pose.create(pose))
+    env.apply()
+    now_poses = read_poses(env, table)
+    now = take_pictures(env, 1, requests)
+    drawn = take_pictures(env, 1, requests, then_poses)
+    assert np.array_equal(read_poses(env, table), now_poses, equal_nan=True)
+    for was, again, other in zip(then, drawn, now, strict=True):
+        np.testing.assert_allclose(again.pose, was.pose, atol=1e-5)
+        # A pose that was taken apart and put together again may move an edge by a pixel.
+        assert np.mean(again.segmentation != was.segmentation) < 0.02
+        assert np.mean(np.abs(again.rgb.astype(int) - was.rgb) > 4) < 0.03
+        if was.camera != "beside":
+            assert np.mean(np.abs(other.rgb.astype(int) - was.rgb) > 4) > 0.03, "the camera saw no change"
+    for before, after in zip(now, take_pictures(env, 1, requests), strict=True):
+        np.testing.assert_array_equal(before.rgb, after.rgb)
+        np.testing.assert_array_equal(before.pose, after.pose)

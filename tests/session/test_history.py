@@ -29,6 +29,7 @@ def stepped(
         truncated=_mask(truncated),
         evaluate={"success": _mask(success), "fail": _mask(())},
         poses=np.zeros((N, BODIES, 7), np.float32),
+        action=None if jumped else np.zeros((N, 2), np.float32),
     )
     mask = _mask(jumped)
     return Stepped(step, mask, (), None, b"body %d" % number, keys, new or {}, number, restored)
@@ -68,8 +69,8 @@ def test_a_part_is_kept_and_counted_as_long_as_a_moment_needs_it() -> None:
     history = History(N, 40_000)
     history.add(stepped(0, keys=(1, 2), new={1: bytes(3000), 2: bytes(500)}), 0)
     with_both = history.used
-    history.add(stepped(1, keys=(2, 3), new={3: bytes(100)}), 1)
-    assert history.used - with_both < 3000
+    second = history.add(stepped(1, keys=(2, 3), new={3: bytes(100)}), 1)
+    assert history.used - with_both == second.size + 100
     assert history.snapshot_at(0) is not None and b"body 1" in (history.snapshot_at(1) or b"")
     for number in range(2, 100):
         history.add(stepped(number), number)
@@ -155,6 +156,13 @@ def test_undo_goes_back_through_the_jumps_one_by_one() -> None:
 def test_what_was_before_the_oldest_moment_cannot_be_returned_to() -> None:
     history = filled(1)
     assert history.last_jump(0) is None
+
+
+def test_a_reset_of_others_is_no_reward_of_zero() -> None:
+    history = filled(3)
+    history.add(stepped(0, jumped=(1,)), 3)
+    assert history.rewards(0, 0, 99).tolist() == [0, 1, 2, 2]
+    assert history.rewards(1, 0, 99).tolist() == [0, 1, 2, 0]
 
 
 @pytest.mark.parametrize("count", [1, 1023, 1024, 1025, 5000])

@@ -43,11 +43,12 @@ def step(page: Page, count: int) -> None:
         wait_until(page._session, lambda view, n=last: view.timeline.last > n, "a step")
 
 
-def test_it_appears_with_the_first_step_and_offers_only_what_can_be_done(page: Page) -> None:
-    assert not drawn(page)._panel.visible
+def test_it_is_there_from_the_first_moment_and_offers_only_what_can_be_done(page: Page) -> None:
+    panel = page._timeline
+    assert not panel._panel.visible, "the page was not drawn yet"
+    assert drawn(page)._panel.visible
     step(page, 4)
-    panel = drawn(page)
-    assert panel._panel.visible
+    drawn(page)
     assert (panel._slider.handle.min, panel._slider.handle.max, panel._slider.handle.value) == (-4, 0, 0)
     assert not panel._travel.visible, "nobody is in the past"
     assert panels.UNDO_RESET not in panel._walk.options, "nothing was before the first reset"

@@ -13,11 +13,14 @@ from workbench.ui.viewpoint import FOV, frame_all, frame_box, frame_one
 @given(
     size=st.tuples(st.floats(0.05, 60), st.floats(0.05, 60), st.floats(0.05, 10)),
     aspect=st.floats(0.35, 3.5),
+    covered=st.floats(0, 0.45),
 )
 @settings(deadline=None, max_examples=80)
-def test_whole_box_is_in_the_picture(size: tuple[float, float, float], aspect: float) -> None:
+def test_whole_box_is_in_the_picture_above_what_is_covered(
+    size: tuple[float, float, float], aspect: float, covered: float
+) -> None:
     low, high = -np.array(size) / 2, np.array(size) / 2
-    viewpoint = frame_box(low, high, aspect)
+    viewpoint = frame_box(low, high, aspect, covered)
     forward = viewpoint.look_at - viewpoint.position
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0, 0, 1])
@@ -27,7 +30,8 @@ def test_whole_box_is_in_the_picture(size: tuple[float, float, float], aspect: f
     corners = np.where(picks == 0, low, high) - viewpoint.position
     depth = corners @ forward
     assert (depth > 0).all()
-    assert (np.abs(corners @ up) <= np.tan(FOV / 2) * depth).all()
+    assert (corners @ up <= np.tan(FOV / 2) * depth).all()
+    assert (corners @ up >= -(1 - 2 * covered) * np.tan(FOV / 2) * depth).all()
     assert (np.abs(corners @ right) <= np.tan(FOV / 2) * aspect * depth).all()
 
 

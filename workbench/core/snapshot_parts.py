@@ -2,8 +2,7 @@
 
 A snapshot of every control step is what a scrubbed past is made of, and most of a snapshot is the same from
 step to step. Two random generators an env are 5 KB of state that changes at resets only, the generators
-of the process are 10 KB, a goal pose stays for an episode; a PickCube env itself is 300 bytes. Pickled as it
-is, a step of 64 envs takes 460 KB and 5 ms.
+of the process are 10 KB, a goal pose stays for an episode; the simulation of a PickCube env is 300 bytes.
 
 So a snapshot is cut in two. The *body* holds what moves: the packed state of the envs, as one array a field
 and not one an env, the steps elapsed, the buffers that were written. The *parts* are what mostly stays: each is
@@ -11,7 +10,10 @@ pickled when it differs from what it was, gets a number that no other part of th
 out once; a step then names its parts by number. Equality is asked of identity first (the reader of the
 generators gives the same tuple for the same state) and of the bytes next.
 
-Measured on PickCube-v1 while it plays (2 cores; what a step adds, beside the 0.3 and 1.0 ms of the snapshot): {MEASURED}
+Measured on PickCube-v1 with random actions (two cores, ``tests/benchmarks/history_cost.py``): for 16 envs the body
+of a step has 8.8 KB where the pickled snapshot has 107, for 64 envs 32 KB where it has 380. Cutting takes 0.34
+and 0.61 ms, after 0.75 and 1.4 ms for the snapshot itself; with poses, numbers and actions the message of a step
+has 19 and 70 KB and takes 0.08 ms to pickle. A reset of one env adds 5 KB.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ nothing but going back to the moment before a jump. What one env lived through w
 starts from a snapshot, and its actions, rewards and entries of ``evaluate`` are all here, so it can be run again.
 
 Memory is bounded, and what is oldest goes first. Pictures are by far the largest (a human camera's is 0.8 MB, a
-step of 16 PickCube envs without pictures {MEASURED_ROW}) and can be drawn again, so they may fill no more
+step of 16 PickCube envs without pictures 21 KB, of 64 envs 72 KB) and can be drawn again, so they may fill no more
 than half of it. Snapshots are kept as the bytes that came, cut into parts that many steps share (see
 `core.snapshot_parts`): a part is kept as long as a step needs it.
 """
@@ -30,7 +30,7 @@ from workbench.session.messages import PastPictures, Pictures, Restored, Stepped
 RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED = 1, 2, 4, 8, 16
 """What may happen to an env at a moment. Success and failure: the first moment of it in an episode."""
 _OVERHEAD = 2500
-"""Bytes of the objects around a moment's arrays (measured with tracemalloc)."""
+"""Bytes of the objects around a moment's arrays; with it the count is within 2 % of what tracemalloc measures."""
 _PICTURES_SHARE = 0.5
 _FIRST_ROWS = 1024
 _RECENT = 200
@@ -217,7 +217,7 @@ class History:
         return [(low + int(k), int(happened[k])) for k in np.flatnonzero(happened)]
 
     def rewards(self, env: int, low: int, high: int) -> NDArray[np.float32]:
-        """(K,) of this env at the moments between two, both included; zero at a jump."""
+        """(K,) of this env at the moments between two, both included; zero where it jumped."""
         return self._reward[self._rows(low, high)[1], env].copy()
 
     def jumps_back(self, env: int) -> list[tuple[int, int]]:
@@ -308,6 +308,10 @@ class History:
             row = moment.serial - self._base
         self._happened[row] = moment.happened
         self._reward[row] = moment.step.reward
+        if moment.step.action is None and self._moments:
+            # Others were reset: to those that were not, nothing happened, and their reward is no zero.
+            stays = ~moment.jumped
+            self._reward[row, stays] = self._reward[row - 1, stays]
 
     def _shrink(self) -> None:
         while self._pictures_used > self.limit * _PICTURES_SHARE and self._pictured:

@@ -34,9 +34,10 @@ from workbench.ui.run_panel import RunPanel
 from workbench.ui.scene_view import SceneView
 from workbench.ui.selection_mark import SelectionMark
 from workbench.ui.status_line import StatusLine
+from workbench.ui.timeline_panel import HEIGHT as TIMELINE_HEIGHT
 from workbench.ui.timeline_panel import TimelinePanel
 from workbench.ui.view_panel import ViewPanel
-from workbench.ui.viewpoint import FOV, USUAL_ASPECT, Viewpoint, frame_all, frame_one
+from workbench.ui.viewpoint import FOV, USUAL_ASPECT, USUAL_HEIGHT, Viewpoint, frame_all, frame_one
 
 log = logging.getLogger(__name__)
 
@@ -220,7 +221,7 @@ class Page:
 
     def frame(self, view: SessionView, untouched_only: bool = False) -> None:
         """Point every open page (or those whose view nobody has moved), and those to come, at the scene."""
-        viewpoint = self._viewpoint(view, USUAL_ASPECT)
+        viewpoint = self._viewpoint(view, USUAL_ASPECT, USUAL_HEIGHT)
         if viewpoint is None:
             return
         self._server.initial_camera.position = viewpoint.position
@@ -249,19 +250,19 @@ class Page:
                 self._point(client, view)
 
     def _point(self, client: viser.ClientHandle, view: SessionView) -> None:
-        viewpoint = self._viewpoint(view, aspect_of(client))
+        viewpoint = self._viewpoint(view, aspect_of(client), client.camera.image_height or USUAL_HEIGHT)
         if viewpoint is not None:
             self._pointed[client.client_id] = (viewpoint.position, aspect_of(client))
             client.camera.position = viewpoint.position
             client.camera.look_at = viewpoint.look_at
 
-    def _viewpoint(self, view: SessionView, aspect: float) -> Viewpoint | None:
+    def _viewpoint(self, view: SessionView, aspect: float, height: float) -> Viewpoint | None:
         if self._layout is None or view.task is None:
             return None
         if self._view_panel.only_selected or view.task.num_envs == 1:
             human = next((p for (kind, _), p in view.pictures.items() if kind == "human"), None)
-            return frame_one(self._layout, human, aspect)
-        return frame_all(self._layout, aspect)
+            return frame_one(self._layout, human, aspect, TIMELINE_HEIGHT / height)
+        return frame_all(self._layout, aspect, TIMELINE_HEIGHT / height)
 
     def _on_scene_click(self, event: viser.SceneClickEvent) -> None:
         layout, view = self._layout, self._session.view()

@@ -26,6 +26,8 @@ from workbench.ui.timeline_strip import strip_values
 WIDEST, NARROWEST = 760, 280
 GAP = 12
 """Pixels, as of the banner."""
+HEIGHT = 190
+"""Pixels of the view that it lies over, for whoever frames a scene."""
 REDRAW_EVERY = 0.2
 RANGE_EVERY = 0.5
 """Seconds. A slider whose ends move at every step cannot be held."""
@@ -121,7 +123,7 @@ class TimelinePanel:
 
     def draw(self, view: SessionView) -> None:
         past = view.timeline
-        there = view.task is not None and past.moments > 1
+        there = view.task is not None and past.moments > 0
         if self._panel.visible != there:
             self._panel.visible = there
         if not there or view.task is None:

@@ -19,6 +19,9 @@ FOV = 0.75
 """Vertical, radians. viser's own 75 degrees bends what stands at the edge of a grid."""
 USUAL_ASPECT = 1.25
 """Of the view beside the panel in a 1280 x 720 window, before a page has said its own."""
+USUAL_HEIGHT = 720.0
+"""Pixels."""
+MOST_COVERED = 0.45
 FROM_THE_FRONT = np.array([1.0, 0.12, 1.1])
 """ManiSkill's robots look along +x, so their front is seen from there; a little from the side."""
 
@@ -31,12 +34,16 @@ class Viewpoint:
     look_at: NDArray[np.float64]
 
 
-def frame_box(low: NDArray, high: NDArray, aspect: float = USUAL_ASPECT) -> Viewpoint:
-    """The nearest upright view from the front and above that has the whole box in it.
+def frame_box(low: NDArray, high: NDArray, aspect: float = USUAL_ASPECT, covered: float = 0.0) -> Viewpoint:
+    """The nearest upright view from the front and above that has the whole box in it, above what is covered.
 
-    For a camera at ``target - d * forward`` a corner c stays inside the picture when
-    ``|right . (c - target)| <= tan(fov_x / 2) * (d + forward . (c - target))``, and likewise for up;
-    so d is the largest of the bounds that the corners give.
+    Let the camera stand at ``target - d * forward - k * up``. A corner c, as seen from the target, is inside the
+    picture when ``|right . c| <= tan(fov_x / 2) * (d + forward . c)``, and when ``up . c + k`` lies between
+    ``-(1 - 2 * covered)`` and 1 times ``tan(fov_y / 2) * (d + forward . c)``. So d is the largest of the bounds that
+    the corners and the pairs of corners give, and k the middle of what is left to it.
+
+    Args:
+        covered: Part of the picture's height that something lies over, from below (the timeline).
     """
     target = (np.asarray(low, np.float64) + high) / 2
     forward = -FROM_THE_FRONT / np.linalg.norm(FROM_THE_FRONT)
@@ -47,23 +54,30 @@ def frame_box(low: NDArray, high: NDArray, aspect: float = USUAL_ASPECT) -> View
     corners = np.where(picks == 0, low, high) - target
     tall = np.tan(FOV / 2)
     wide = tall * float(np.clip(aspect, 0.3, 4.0))
-    ahead = corners @ forward
-    distance = max(
+    below = tall * (1 - 2 * float(np.clip(covered, 0.0, MOST_COVERED)))
+    ahead, height = corners @ forward, corners @ up
+    pairs = height[:, None] - height - tall * ahead[:, None] - below * ahead
+    distance = 1.04 * max(
         float((np.abs(corners @ right) / wide - ahead).max()),
-        float((np.abs(corners @ up) / tall - ahead).max()),
+        float(pairs.max()) / (tall + below),
         0.3,
     )
-    return Viewpoint(position=target - forward * distance * 1.04, look_at=target)
+    least = float((-below * (distance + ahead) - height).max())
+    most = float((tall * (distance + ahead) - height).min())
+    look_at = target - up * (least + most) / 2
+    return Viewpoint(position=look_at - forward * distance, look_at=look_at)
 
 
-def frame_all(layout: EnvLayout, aspect: float = USUAL_ASPECT) -> Viewpoint:
-    return frame_box(*layout.box_of_all(), aspect)
+def frame_all(layout: EnvLayout, aspect: float = USUAL_ASPECT, covered: float = 0.0) -> Viewpoint:
+    return frame_box(*layout.box_of_all(), aspect, covered)
 
 
-def frame_one(layout: EnvLayout, picture: Picture | None, aspect: float = USUAL_ASPECT) -> Viewpoint:
+def frame_one(
+    layout: EnvLayout, picture: Picture | None, aspect: float = USUAL_ASPECT, covered: float = 0.0
+) -> Viewpoint:
     """The view of one env at the origin: the task's own human camera where there is one."""
     if picture is None:
-        return frame_box(layout.low, layout.high, aspect)
+        return frame_box(layout.low, layout.high, aspect, covered)
     position = picture.pose[:3].astype(np.float64)
     forward = rotate(picture.pose[3:].astype(np.float64), np.array([1.0, 0.0, 0.0]))
     centre = (layout.low + layout.high) / 2

@@ -1,0 +1,91 @@
+"""What keeping every step costs: python tests/benchmarks/history_cost.py
+
+Plays PickCube-v1 in this process as the worker does, packs a snapshot of every step, sends it through a pickle as
+the pipe would, and keeps it in a `History` as the server does. Prints medians: milliseconds of the step, of the
+snapshot, of cutting it in parts, of the message; bytes of the message and bytes that the history holds a step.
+"""
+
+from __future__ import annotations
+
+import pickle
+import statistics
+import sys
+import time
+import tracemalloc
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
+
+from workbench.core import actions
+from workbench.core.snapshot_parts import SnapshotPacker
+from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+from workbench.session.history import History
+from workbench.session.messages import Stepped
+
+
+@dataclass
+class Options:
+    num_envs: tuple[int, ...] = (16, 64)
+    steps: int = 150
+    """Control steps that are played; every episode is 50."""
+
+
+def measure(num_envs: int, steps: int) -> str:
+    task = TaskEnv(make_env(PickCubeEnv, EnvOptions(num_envs=num_envs, backend="cpu", render=False)), 50)
+    rng = np.random.default_rng(0)
+    task.reset(seed=0)
+    packer, history = SnapshotPacker(), History(num_envs, 2**40)
+    laps: dict[str, list[float]] = {"step": [], "snapshot": [], "parts": [], "message": [], "keep": []}
+    sizes: list[int] = []
+    base, held = 0, 0
+    for number in range(steps):
+        times = [time.perf_counter()]
+        step = task.step(actions.random_action(task.parts, num_envs, rng))
+        times.append(time.perf_counter())
+        snapshot = task.snapshot()
+        times.append(time.perf_counter())
+        packed = packer.pack(snapshot)
+        times.append(time.perf_counter())
+        none = np.zeros(num_envs, bool)
+        event = Stepped(step, none, (), None, packed.body, packed.keys, packed.new_parts, number)
+        message = pickle.dumps(event)
+        times.append(time.perf_counter())
+        if number % 2:
+            tracemalloc.start()  # the odd steps tell the bytes, the even ones the time
+        history.add(pickle.loads(message), number)
+        times.append(time.perf_counter())
+        if number % 2:
+            held += tracemalloc.get_traced_memory()[0]
+            tracemalloc.stop()
+        sizes.append(len(message))
+        if number == 20:
+            base, held = history.used, 0
+        for lap, (a, b) in zip(laps, pairwise(times), strict=True):
+            if number % 2 == 0:
+                laps[lap].append(1000 * (b - a))
+        if number % 50 == 49:
+            task.reset()
+    task.close()
+    counted = (history.used - base) / (steps - 21)
+    shown = ", ".join(f"{lap} {statistics.median(values):.2f}" for lap, values in laps.items())
+    return (
+        f"{num_envs} envs: ms {shown}; message {statistics.median(sizes) / 1000:.1f} KB; "
+        f"history counts {counted / 1000:.1f} KB a step and takes {2 * held / (steps - 21) / 1000:.1f}"
+    )
+
+
+def main(options: Options) -> None:
+    torch.set_num_threads(1)
+    for count in options.num_envs:
+        print(measure(count, options.steps), flush=True)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

@@ -1,0 +1,157 @@
+"""The timeline in a real Chromium: slider, keys, going back, undo."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page, expect, sync_playwright
+
+from tests.browser.opened import launch, new_page, open_workbench
+
+pytestmark = pytest.mark.browser
+expect.set_options(timeout=60_000)
+TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
+STEPS = 8
+
+
+@dataclass
+class Desk:
+    page: Page
+    errors: list[str]
+
+    def elapsed(self) -> int:
+        """Steps of the selected env, as the Reward tab shows them."""
+        row = self.page.locator("tr", has=self.page.get_by_text("elapsed steps", exact=True))
+        return int(row.first.locator("td").nth(1).inner_text().split("/")[0])
+
+    def press(self, *keys: str) -> None:
+        for key in keys:
+            self.page.keyboard.press(key)
+            time.sleep(0.25)
+
+    def comes_to(self, steps: int) -> None:
+        until(lambda: self.elapsed() == steps, f"step {steps} (it is {self.elapsed()})")
+
+    def says(self, text: str) -> None:
+        expect(self.page.locator(".wb-timeline").get_by_text(re.compile(text)).first).to_be_visible()
+
+    def leave_inputs(self) -> None:
+        """Click on the empty view, so that no slider has the focus."""
+        self.page.mouse.click(60, 420)
+        time.sleep(0.5)
+
+
+def until(reached: Callable[[], bool], what: str, seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not reached():
+        assert time.monotonic() < deadline, f"{what} did not come within {seconds} s"
+        time.sleep(0.05)
+
+
+@pytest.fixture(scope="module")
+def opened(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Iterator[Desk]:
+    folder = tmp_path_factory.mktemp("author")
+    file = Path(shutil.copy(TASK, folder / "push_cube.py"))
+    with (
+        open_workbench(str(file), "--num-envs", "2", cwd=folder) as workbench,
+        sync_playwright() as playwright,
+    ):
+        browser = launch(playwright, chromium_path)
+        page, errors = new_page(browser)
+        page.goto(workbench.url)
+        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=90_000)
+        page.get_by_role("tab", name="Reward").click()
+        # The first picture compiles shaders, and no step is made meanwhile.
+        expect(page.get_by_text("elapsed steps")).to_be_visible(timeout=90_000)
+        yield Desk(page, errors)
+        browser.close()
+
+
+@pytest.fixture
+def desk(opened: Desk) -> Desk:
+    """Live, eight steps into an episode of seed 0, no input with the focus."""
+    opened.leave_inputs()
+    opened.press("End", "r")
+    opened.comes_to(0)
+    for step in range(1, STEPS + 1):
+        opened.page.keyboard.press("s")
+        opened.comes_to(step)
+    opened.says("live")
+    return opened
+
+
+def test_arrow_keys_walk_through_the_past_and_end_is_live(desk: Desk) -> None:
+    desk.press("ArrowLeft", "ArrowLeft", "ArrowLeft")
+    desk.comes_to(STEPS - 3)
+    desk.says("3 steps ago")
+    expect(desk.page.get_by_text("past, 3 steps ago")).to_be_visible()
+    desk.press("ArrowRight")
+    desk.comes_to(STEPS - 2)
+    desk.press("Shift+ArrowLeft")
+    desk.comes_to(0)
+    desk.press("End")
+    desk.comes_to(STEPS)
+    desk.says("live")
+
+
+def test_the_slider_goes_where_it_is_clicked_and_takes_an_arrow_once(desk: Desk) -> None:
+    desk.page.get_by_role("button", name="zoom to episode").click()
+    thumb = desk.page.get_by_role("slider").last
+    expect(thumb).to_have_attribute("aria-valuemin", str(-STEPS))
+    box = desk.page.locator(".wb-strip").bounding_box()
+    assert box is not None
+    place = desk.page.locator(".mantine-Slider-root").last.bounding_box()
+    assert place is not None and abs(place["width"] - box["width"]) < 8, "the strip is as wide as the slider"
+    desk.page.mouse.click(place["x"] + place["width"] / 2, place["y"] + place["height"] / 2)
+    desk.comes_to(STEPS // 2)
+    time.sleep(1.5)
+    desk.page.keyboard.press("ArrowLeft")
+    desk.comes_to(STEPS // 2 - 1)
+    time.sleep(1.5)
+    assert desk.elapsed() == STEPS // 2 - 1
+    desk.page.get_by_role("button", name="zoom out").click()
+
+
+def test_going_on_from_a_moment_leaves_the_old_future_in_reach(desk: Desk) -> None:
+    desk.press("ArrowLeft", "ArrowLeft", "ArrowLeft", "ArrowLeft")
+    desk.comes_to(STEPS - 4)
+    desk.page.get_by_role("button", name="Go on from here: env 0").click()
+    desk.says("live")
+    desk.comes_to(STEPS - 4)
+    desk.page.keyboard.press("s")
+    desk.comes_to(STEPS - 3)
+    desk.says("went back")
+    assert desk.page.locator(".wb-arc").count() == 1
+    desk.leave_inputs()
+    desk.press("u")
+    desk.comes_to(STEPS)
+
+
+def test_a_reset_is_undone_by_a_key(desk: Desk) -> None:
+    desk.page.keyboard.press("r")
+    desk.comes_to(0)
+    desk.press("u")
+    desk.comes_to(STEPS)
+
+
+def test_a_moment_that_one_stands_still_at_is_drawn(desk: Desk) -> None:
+    desk.page.get_by_role("tab", name="Cameras").click()
+    picture = desk.page.locator("img[src^='blob:']:visible").first
+    expect(picture).to_be_visible(timeout=90_000)
+    time.sleep(1.0)
+    live = picture.get_attribute("src")
+    desk.leave_inputs()
+    desk.press("Shift+ArrowLeft")
+    until(lambda: picture.get_attribute("src") != live, "another picture")
+    desk.press("End")
+    desk.page.get_by_role("tab", name="Reward").click()
+
+
+def test_nothing_went_wrong_in_the_console(opened: Desk) -> None:
+    assert opened.errors == []
