@@ -201,11 +201,15 @@ class History:
 
     def snapshot_at(self, serial: int) -> bytes | None:
         """A pickled `core.snapshot.Snapshot` of the whole batch at that moment; None where there is none."""
+        whole = self.whole_at(serial)
+        return None if whole is None else pickle.dumps(whole)
+
+    def whole_at(self, serial: int) -> WholeSnapshot | None:
+        """The same, not pickled yet: it shares its bytes with the history, and outlives the moment."""
         moment = self.at(serial)
         if moment is None or not moment.snapshot:
             return None
-        parts = tuple(self._parts[key] for key in moment.parts.keys)
-        return pickle.dumps(WholeSnapshot(moment.snapshot, parts))
+        return WholeSnapshot(moment.snapshot, tuple(self._parts[key] for key in moment.parts.keys))
 
     def between(self, low: int, high: int) -> Iterable[Moment]:
         """The kept moments of these serials, both included."""

@@ -215,6 +215,25 @@ class Inspect:
 
 
 @dataclass(frozen=True)
+class MomentToJudge:
+    """A moment of the past to be lived through again: a control step, or a jump if it has a snapshot."""
+
+    action: NDArray[np.float32] | None
+    """(N, A) that was made; None for a jump, or a task without robots."""
+    snapshot: bytes | None = None
+    """A pickled `core.snapshot.Snapshot` of the whole batch."""
+    env_idx: tuple[int, ...] = ()
+    """The envs that are put back to it."""
+
+
+@dataclass(frozen=True)
+class JudgeMoments:
+    """Live through these moments, in order; the answer is `Judged`. Only for a worker that does not play."""
+
+    moments: tuple[MomentToJudge, ...]
+
+
+@dataclass(frozen=True)
 class Quit:
     pass
 
@@ -234,6 +253,7 @@ Request = (
     | DrawPast
     | WarmUp
     | Inspect
+    | JudgeMoments
     | Quit
 )
 
@@ -336,6 +356,18 @@ class PastPictures:
 
 
 @dataclass(frozen=True)
+class Judged:
+    """The answer to `JudgeMoments`: what the task says of them now."""
+
+    steps: tuple[StepResult, ...]
+    """One for each moment; fewer if one raised."""
+    not_carried: dict[str, str]
+    """What the jumps among them could not put back, and why."""
+    problem: Problem | None = None
+    """What the moment after `steps` raised."""
+
+
+@dataclass(frozen=True)
 class Status:
     playing: bool
     steps_per_second: float
@@ -353,4 +385,6 @@ class WarmedUp:
     seconds: float
 
 
-Event = Loading | Loaded | Failed | Stepped | Pictures | PastPictures | Inspection | Status | WarmedUp
+Event = (
+    Loading | Loaded | Failed | Stepped | Pictures | PastPictures | Inspection | Judged | Status | WarmedUp
+)

@@ -20,6 +20,8 @@ from workbench.core.inspection import Inspection, Section
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.step import StepResult
 from workbench.session.env_table import EnvRows, EnvTable
+from workbench.session.judge import FILE_SAVED, Judge, what_a_load_means
+from workbench.session.judgement import JudgedCurve, Judgement
 from workbench.session.kept_worker import Death, KeptWorker, WorkerOptions
 from workbench.session.last_words import Busy, death_problem, own_files_of
 from workbench.session.messages import (
@@ -157,6 +159,7 @@ class Session:
             output=self._printed.feed,
         )
         self._recorder = LiveRecorder(recordings, self._note)
+        self._judge = Judge(self._note)
         self._watcher = SourceWatcher(self._on_files_changed)
         self._own_file = named_file(task)
         self._follow((), {})
@@ -208,6 +211,7 @@ class Session:
                 busy=s.busy,
                 vitals=vitals,
                 inspection=s.inspection,
+                judgement=self._judge.view,
             )
 
     def env_rows(self) -> EnvRows | None:
@@ -428,6 +432,21 @@ class Session:
         timeline = self._state.timeline
         return None if timeline is None else timeline.history.snapshot_at(timeline.history.last)
 
+    # --- the past judged again -----------------------------------------------------------------------
+
+    def stop_judging(self) -> None:
+        """Judge the past no further; what is known by then stays."""
+        self._judge.stop("stopped by hand")
+
+    def judged_curve(self, name: str, env: int) -> JudgedCurve | None:
+        """One number of one env, as recorded and as the new code has it. Copies: not for every frame."""
+        return self._judge.curve(name, env)
+
+    def show(self, env: int, serial: int) -> None:
+        """Select an env and show a moment of its past."""
+        self.select_env(env)
+        self.seek(serial)
+
     def _seek(self, seek: Callable[[Timeline], None]) -> None:
         with self._lock:
             s = self._state
@@ -456,6 +475,7 @@ class Session:
             self._changed.notify_all()
         self._watcher.stop()
         self._worker.stop()
+        self._judge.close()
         self._recorder.close()
 
     # --- what the worker says, on the session's thread -------------------------------------------
@@ -586,6 +606,10 @@ class Session:
             self._recovery.loaded(task)
             self._first_due = not kept
             same = restored and s.task is not None and s.task.source_hash == task.source_hash
+            meaning = what_a_load_means(s.task, event, self._judge.view)
+            judgement = None
+            if meaning == "judge" and s.timeline is not None:
+                judgement = Judgement(s.timeline.history)
             if kept and s.task is not None:
                 # The same scene: who has drawn it can see that by its being the same object.
                 task = replace(task, geometry=s.task.geometry)
@@ -613,6 +637,10 @@ class Session:
             if not restored:
                 self._set_problem(None)
             s.state = "running" if s.playing else "paused"
+        if judgement is not None:
+            self._judge.judge(self._load_request(Wanted(dict(task.source), None)), judgement)
+        elif meaning == "forget":
+            self._judge.forget()
         self._follow(task.source_files, {} if s.stale else task.source)
         self._watch()
         if not recording.active:
@@ -643,6 +671,7 @@ class Session:
         self._recorder.take(event)
 
     def _on_files_changed(self, paths: set[Path]) -> None:
+        self._judge.stop(FILE_SAVED)
         with self._lock:
             self._state.stale = True
         self._note()

@@ -16,6 +16,7 @@ from workbench.authoring.problem import Problem
 from workbench.core.inspection import Inspection
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.step import StepResult
+from workbench.session.judge import JudgementView
 from workbench.session.kept_worker import Vitals
 from workbench.session.last_words import Busy
 from workbench.session.messages import ActionSource, EpisodeEnd, ReloadReport, TaskDescription
@@ -103,3 +104,5 @@ class SessionView:
     """What the processes hold."""
     inspection: Inspection | None = None
     """The newest answer to `Session.inspect`, of whichever env was selected then."""
+    judgement: JudgementView = JudgementView()
+    """What the new code says of the episodes that were run with the old."""

@@ -35,6 +35,7 @@ from workbench.core.take_pictures import Request as PictureRequest
 from workbench.core.take_pictures import take_pictures
 from workbench.session.episodes import recorded_pictures
 from workbench.session.interrupts import Interrupted, Interrupts
+from workbench.session.judge_moments import judge_moments
 from workbench.session.messages import (
     SCENE_KEPT,
     ActionSource,
@@ -43,6 +44,7 @@ from workbench.session.messages import (
     Event,
     Failed,
     Inspect,
+    JudgeMoments,
     Load,
     Loaded,
     Loading,
@@ -122,6 +124,7 @@ class Worker:
             DrawPast: self._draw_past,
             WarmUp: self._warm_up,
             Inspect: self._inspect,
+            JudgeMoments: self._judge_moments,
             Quit: self._stop,
         }
 
@@ -309,6 +312,10 @@ class Worker:
         # The page asked while another version, with fewer envs, was on its way.
         if self._opened is not None and request.env < self._opened.env.num_envs:
             self._send(inspect_env(self._opened.env, request.env, request.sections))
+
+    def _judge_moments(self, request: JudgeMoments) -> None:
+        if self._opened is not None:
+            self._send(judge_moments(self._opened, request))
 
     def _stop(self, request: Quit) -> None:
         self._quit = True

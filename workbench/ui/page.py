@@ -30,6 +30,7 @@ from workbench.ui.env_panel import EnvPanel
 from workbench.ui.force_arrows import ForceArrows
 from workbench.ui.fragments import render, style_sheet
 from workbench.ui.inspect_panel import InspectPanel
+from workbench.ui.judgement_panel import JudgementPanel
 from workbench.ui.lights import light
 from workbench.ui.log_panel import LogPanel
 from workbench.ui.numbers_panel import NumbersPanel
@@ -101,6 +102,7 @@ class Page:
             self._numbers = NumbersPanel(server)
             self._curves = CurvesPanel(server)
             self._terms = TermsPanel(server, session)
+            self._judgement = JudgementPanel(server, session)
         with tabs.add_tab("Inspect", viser.Icon.ZOOM_IN):
             self._inspect = InspectPanel(server, session)
         with tabs.add_tab("Episodes", viser.Icon.MOVIE):
@@ -186,6 +188,7 @@ class Page:
         self._terms.draw(view)
         self._inspect.draw(view)
         self._envs.draw(view)
+        self._judgement.draw(view)
         self._record.draw(view)
         self._timeline.draw(view)
         self._log.draw(view)
@@ -311,6 +314,7 @@ class Page:
 
     def _commands(self) -> list[Command]:
         session, run, timeline = self._session, self._run, self._timeline
+        judgement = self._judgement
         return [
             Command("Play or pause", run.toggle_play, "space"),
             Command("Single step", session.step, "S"),
@@ -323,6 +327,15 @@ class Page:
             Command("To the next event", lambda: timeline.to_event(1), "arrowright", "shift"),
             Command("What is live", timeline.go_live, "end"),
             Command("Go on from here, in the selected env", timeline.go_on, "G"),
+            Command(
+                "To the next episode that is judged otherwise now", lambda: judgement.go_to_difference(1), "J"
+            ),
+            Command(
+                "To the last episode that is judged otherwise now",
+                lambda: judgement.go_to_difference(-1),
+                "J",
+                "shift",
+            ),
             Command("Next env", lambda: run.select_neighbour(1), "N"),
             Command("Previous env", lambda: run.select_neighbour(-1), "P"),
             Command("Open or close the table of envs", self._toggle_envs, "B"),

@@ -1,0 +1,222 @@
+"""The past judged again, with real processes on the example task: one that plays and one that judges."""
+
+# pyright: reportOptionalMemberAccess=false, reportArgumentType=false, reportOptionalOperand=false
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+import signal
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.session.conftest import TASKS, wait_until
+from workbench.session.history import Moment
+from workbench.session.judge import FILE_SAVED, JudgementView
+from workbench.session.messages import TaskOptions
+from workbench.session.session import Session
+from workbench.session.view import SessionView
+
+N = 3
+ORIGINAL = (TASKS / "push_cube.py").read_text()
+REWARD = "return self.compute_dense_reward(obs, action, info) / 3"
+SUCCESS = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),'
+IN_THE_JUDGE = "__import__('os').getpriority(0, 0) == 10"
+"""True in the process that judges: it has a lower priority."""
+
+
+@dataclass
+class Desk:
+    session: Session
+    file: Path
+
+    def edit(self, old: str, new: str) -> None:
+        """The file as it was first, but for this."""
+        assert old in ORIGINAL
+        self.file.write_text(ORIGINAL.replace(old, new))
+
+    def record(self, steps: int) -> list[Moment]:
+        """Start anew with the original, play, and stop at the first moment of new episodes; the whole record."""
+        session = self.session
+        session.pause()
+        loads = session.view().task_serial
+        self.file.write_text(ORIGINAL + f"# {loads}\n")
+        wait_until(session, lambda v: v.task_serial > loads and v.timeline.moments == 1, "a new history")
+        session.stop_judging()
+        wait_until(session, lambda v: v.judgement.state not in ("loading", "judging"), "its end")
+        session.set_speed(math.inf)
+        session.play()
+        wait_until(session, lambda v: v.timeline.moments >= steps, "the steps")
+        session.pause()
+        wait_until(session, lambda v: not v.playing, "the pause")
+        last = session.view().timeline.last
+        session.reset()
+        wait_until(session, lambda v: v.timeline.last > last and v.step.elapsed_steps.max() == 0, "the reset")
+        history = session._state.timeline.history
+        return list(history.between(history.first, history.last))
+
+    def judged(self, *states: str) -> JudgementView:
+        before = self.serial
+
+        def reached(view: SessionView) -> bool:
+            return view.judgement.serial > before and view.judgement.state in (states or ("done",))
+
+        return wait_until(self.session, reached, f"a judgement that is {states or 'done'}").judgement
+
+    serial = 0
+
+    def note(self) -> None:
+        """From here on `judged` waits for something new."""
+        self.serial = self.session.view().judgement.serial
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
+    folder = tmp_path_factory.mktemp("author")
+    file = Path(shutil.copy(TASKS / "push_cube.py", folder / "push_cube.py"))
+    session = Session(str(file), TaskOptions(num_envs=N), recordings=folder / "recordings")
+    wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
+    yield Desk(session, file)
+    session.close()
+
+
+@pytest.fixture
+def record(desk: Desk) -> list[Moment]:
+    moments = desk.record(130)
+    desk.note()
+    return moments
+
+
+def steps_of(record: list[Moment]) -> list[Moment]:
+    return [moment for moment in record if not moment.jumped.any()]
+
+
+def test_a_reward_that_is_doubled_is_judged_as_the_double_to_the_last_bit(desk: Desk, record) -> None:
+    desk.edit(REWARD, f"{REWARD} * 2")
+    view = desk.judged()
+    rewards = np.array([moment.step.reward for moment in steps_of(record)])
+    assert (view.done, view.total) == (len(rewards), len(rewards))
+    for env in range(N):
+        curve = desk.session.judged_curve("reward", env)
+        np.testing.assert_array_equal(curve.old, rewards[:, env])
+        np.testing.assert_array_equal(curve.new, 2 * rewards[:, env])
+    assert view.summary.drift_metres == 0 and view.summary.drift_radians == 0
+    assert view.summary.differing == view.summary.episodes == 3 * N
+    assert view.summary.mean_return[1] == pytest.approx(2 * view.summary.mean_return[0])
+    assert view.summary.differing_names == {"reward"}
+    assert not view.not_carried
+
+
+def test_code_that_comes_to_the_same_differs_nowhere(desk: Desk, record) -> None:
+    desk.edit(REWARD, f"third = 3\n        {REWARD.replace('3', 'third')}")
+    view = desk.judged()
+    assert view.summary.episodes == 3 * N
+    assert view.summary.differing == 0 and view.summary.differing_names == frozenset()
+    assert view.summary.drift_metres == 0
+
+
+def test_episodes_that_succeed_otherwise_are_listed_with_their_steps(desk: Desk, record) -> None:
+    """Success becomes "the gripper is above a height", which the recorded poses tell by themselves."""
+    hand = desk.session.view().task.geometry.body_names.index("panda/panda_hand_tcp")
+    heights = np.array([moment.step.poses[:, hand, 2] for moment in record])
+    limit = float(np.float32(np.quantile(heights, 0.8)))
+    desk.edit(SUCCESS, f'"success": self.agent.tcp.pose.p[:, 2] > {limit!r},')
+    view = desk.judged()
+    wanted = {}
+    for env in range(N):
+        begins = [k for k, moment in enumerate(record) if moment.jumped[env]]
+        for begin, end in zip(begins, [*begins[1:], len(record)], strict=True):
+            above = [k for k in range(begin, end) if heights[k, env] > limit]
+            if above and end > begin + 1:
+                step = record[above[0]]
+                wanted[env, record[begin].serial] = (int(step.step.elapsed_steps[env]), step.serial)
+    assert len(wanted) > 2
+    found = {
+        (d.env, d.first): (d.success[1], d.at) for d in view.summary.differences if d.success[1] is not None
+    }
+    assert found == wanted
+    assert all(d.success[0] is None for d in view.summary.differences)
+    assert view.summary.successes == (0, len(wanted))
+
+
+def test_code_that_raises_is_told_with_its_line_and_the_record_stays(desk: Desk, record) -> None:
+    late = "if bool((self.elapsed_steps > 20).any()): raise KeyError('late')"
+    desk.edit(REWARD, f"{late}\n        {REWARD}")
+    view = desk.judged("failed")
+    assert "KeyError: 'late'" in view.problem.message
+    assert Path(view.problem.file) == desk.file
+    assert desk.file.read_text().splitlines()[view.problem.line - 1].strip() == late
+    curve = desk.session.judged_curve("reward", 1)
+    rewards = np.array([moment.step.reward[1] for moment in steps_of(record)])
+    np.testing.assert_array_equal(curve.old, rewards)
+    assert np.isfinite(curve.new).sum() == view.done
+    assert 0 < view.done < view.total
+
+
+def test_the_next_save_takes_the_place_of_a_judgement_while_the_worker_plays_on(desk: Desk, record) -> None:
+    slow = f"__import__('time').sleep(0.1 if {IN_THE_JUDGE} else 0)"
+    desk.edit(REWARD, f"{slow}\n        {REWARD} * 2")
+    desk.judged("judging")
+    session = desk.session
+    session.set_speed(1.0)
+    session.play()
+    last = session.view().timeline.last
+    view = wait_until(session, lambda v: v.timeline.last > last + 10, "the worker that plays")
+    assert view.judgement.state == "judging"
+    session.pause()
+    desk.note()
+    desk.edit(REWARD, f"{REWARD} * 4")
+    stopped = desk.judged("stopped")
+    assert stopped.why == FILE_SAVED and stopped.done < stopped.total
+    view = desk.judged("done")
+    for env in range(N):
+        curve = session.judged_curve("reward", env)
+        # What was played since the first of the two saves was rewarded twofold when it was recorded.
+        factor = np.where(curve.serial <= record[-1].serial, 4, 2)
+        np.testing.assert_array_equal(curve.new, factor * curve.old)
+
+
+def test_a_judgement_that_loops_for_ever_can_be_stopped_and_the_next_one_runs(desk: Desk, record) -> None:
+    loop = f"while {IN_THE_JUDGE} and int(self.elapsed_steps.max()) > 20: pass"
+    desk.edit(REWARD, f"{loop}\n        {REWARD}")
+    desk.judged("judging")
+    seen = -1
+    while seen != (seen := desk.session.view().judgement.serial):
+        time.sleep(1.5)  # until nothing comes any more: it loops
+    desk.note()
+    process = desk.session._judge.pid
+    desk.session.stop_judging()
+    view = desk.judged("stopped")
+    assert view.done < view.total and "by hand" in view.why
+    wait_until(desk.session, lambda v: desk.session._judge.pid is None, "the end of the process that hangs")
+    assert not Path(f"/proc/{process}").exists()
+    desk.note()
+    desk.edit(REWARD, f"{REWARD} * 2")
+    assert desk.judged("done").summary.differing > 0
+
+
+def test_a_judge_that_dies_is_told_and_the_next_judgement_has_another(desk: Desk, record) -> None:
+    slow = f"__import__('time').sleep(0.1 if {IN_THE_JUDGE} else 0)"
+    desk.edit(REWARD, f"{slow}\n        {REWARD}")
+    desk.judged("judging")
+    first = desk.session._judge.pid
+    desk.note()
+    os.kill(first, signal.SIGKILL)
+    view = desk.judged("failed")
+    assert "killed by SIGKILL" in view.why
+    desk.note()
+    desk.edit(REWARD, f"{REWARD} * 2")
+    desk.judged("done")
+    second = desk.session._judge.pid
+    assert second not in (None, first)
+    # The process is kept for the next time.
+    desk.note()
+    desk.edit(REWARD, f"{REWARD} * 3")
+    desk.judged("stopped", "done")
+    assert desk.session._judge.pid == second

@@ -1,0 +1,182 @@
+"""The comparison of record and judgement, against one that is worked out plainly, env by env and step by step."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from workbench.core.step import StepResult
+from workbench.session.history import History
+from workbench.session.judgement import Judgement, drift
+from workbench.session.messages import Stepped
+
+BODIES = 2
+
+
+def a_step(reward: np.ndarray, success: np.ndarray, elapsed: np.ndarray) -> StepResult:
+    count = len(reward)
+    poses = np.zeros((count, BODIES, 7), np.float32)
+    poses[..., 3] = 1
+    return StepResult(
+        elapsed.astype(np.int32),
+        reward.astype(np.float32),
+        success.astype(bool),
+        np.zeros(count, bool),
+        {"success": success.astype(bool), "height": reward.astype(np.float64) + 1, "pose": poses},
+        poses,
+    )
+
+
+def recorded(steps: list[StepResult], jumped: np.ndarray, snapshots: list[bytes] | None = None) -> History:
+    history = History(len(steps[0].reward), 10**9)
+    for row, step in enumerate(steps):
+        body = b"body" if snapshots is None else snapshots[row]
+        keys, parts = ((1,), {1: b"part"}) if row == 0 else (None, {})
+        history.add(Stepped(step, jumped[row], (), None, body, keys, parts, row), row)
+    return history
+
+
+def drawn(seed: int, rows: int, envs: int) -> tuple[list[StepResult], list[StepResult], np.ndarray]:
+    """A record, what is said of it now, and its jumps."""
+    rng = np.random.default_rng(seed)
+    jumped = np.zeros((rows, envs), bool)
+    jumped[0] = True
+    for row in range(1, rows):
+        if rng.random() < 0.3:
+            jumped[row] = rng.random(envs) < rng.choice([0.4, 1.0])
+    elapsed = np.zeros(envs, int)
+    old, new = [], []
+    for row in range(rows):
+        is_step = not jumped[row].any()
+        elapsed = np.where(jumped[row], 0, elapsed + is_step)
+        values = [np.where(is_step, rng.integers(0, 3, envs), 0) for _ in range(2)]
+        flags = [rng.random(envs) < 0.2 for _ in range(2)]
+        old.append(a_step(values[0], flags[0], elapsed))
+        new.append(a_step(values[1], flags[1], elapsed))
+    return old, new, jumped
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.integers(2, 30), st.integers(1, 4), st.floats(0, 1))
+def test_differences_are_those_that_plain_loops_find(seed: int, rows: int, envs: int, part: float) -> None:
+    old, new, jumped = drawn(seed, rows, envs)
+    judgement = Judgement(recorded(old, jumped))
+    judged = [row for run in judgement.runs() for row in run][: max(1, int(part * rows))]
+    for row in judged:
+        judgement.add(row, new[row])
+
+    wanted = {}
+    for env in range(envs):
+        begins = [row for row in range(rows) if jumped[row, env]]
+        for begin, end in zip(begins, [*begins[1:], rows], strict=True):
+            inside = [r for r in range(begin, end) if r in judged and (r == begin or not jumped[r].any())]
+            steps = [r for r in inside if not jumped[r].any()]
+            if not steps:
+                continue
+            returns = tuple(float(sum(side[r].reward[env] for r in steps)) for side in (old, new))
+            success = tuple(
+                next(
+                    (int(side[r].elapsed_steps[env]) for r in inside if side[r].evaluate["success"][env]),
+                    None,
+                )
+                for side in (old, new)
+            )
+            same = all(old[r].reward[env] == new[r].reward[env] for r in steps)
+            rows_of = tuple(
+                next((r for r in inside if side[r].evaluate["success"][env]), None) for side in (old, new)
+            )
+            if not same or rows_of[0] != rows_of[1]:
+                wanted[env, begin] = (success, returns)
+    summary = judgement.summary()
+    found = {(d.env, d.first): (d.success, d.returns) for d in summary.differences}
+    assert found == wanted
+    assert summary.differing == len(wanted)
+    order = [(d.success[0] != d.success[1], abs(d.returns[1] - d.returns[0])) for d in summary.differences]
+    moved = [flag for flag, _ in order]
+    assert moved == sorted(moved, reverse=True) or any(
+        d.success[0] == d.success[1] for d in summary.differences
+    )
+    for difference in summary.differences:
+        assert jumped[difference.at].any() is np.False_ or jumped[difference.at, difference.env]
+
+
+def test_the_newest_run_is_judged_first_and_each_begins_with_a_jump_of_all() -> None:
+    old, _, _ = drawn(0, 9, 2)
+    jumped = np.zeros((9, 2), bool)
+    jumped[[0, 6]] = True
+    jumped[3, 1] = True
+    judgement = Judgement(recorded(old, jumped))
+    assert judgement.runs() == [range(6, 9), range(6)]
+    whole, envs = judgement.snapshot(3) or (None, ())
+    assert whole is not None and envs == (1,)
+    assert judgement.snapshot(4) is None
+    assert judgement.steps == 6
+
+
+def test_a_record_that_begins_in_the_middle_of_an_episode_begins_with_its_first_moment() -> None:
+    old, _, _ = drawn(1, 5, 2)
+    judgement = Judgement(recorded(old, np.zeros((5, 2), bool)))
+    assert judgement.runs() == [range(5)]
+    assert judgement.snapshot(0) is not None and judgement.steps == 4
+
+
+def test_the_record_ends_at_a_jump_that_cannot_be_put_back() -> None:
+    old, _, _ = drawn(2, 6, 2)
+    jumped = np.zeros((6, 2), bool)
+    jumped[[0, 4]] = True
+    assert Judgement(recorded(old, jumped, [b"b"] * 4 + [b""] * 2)).runs() == [range(4)]
+    assert Judgement(recorded(old, jumped, [b""] * 6)).steps == 0
+
+
+def test_equal_rewards_and_flags_are_no_difference_and_not_a_number_is_one() -> None:
+    old, _, _ = drawn(3, 5, 2)
+    jumped = np.zeros((5, 2), bool)
+    jumped[0] = True
+    judgement = Judgement(recorded(old, jumped))
+    for row in range(5):
+        judgement.add(row, old[row])
+    assert judgement.summary().differences == () and judgement.summary().differing_names == frozenset()
+    broken = replace(old[3], reward=np.array([np.nan, old[3].reward[1]], np.float32))
+    judgement.add(3, broken)
+    (difference,) = judgement.summary().differences
+    assert (difference.env, difference.at) == (0, 3) and np.isinf(difference.largest)
+
+
+def test_what_is_not_judged_yet_has_no_new_value() -> None:
+    old, new, _ = drawn(4, 5, 2)
+    jumped = np.zeros((5, 2), bool)
+    jumped[0] = True
+    judgement = Judgement(recorded(old, jumped))
+    for row in range(3):
+        judgement.add(row, new[row])
+    curve = judgement.curve("height", 1)
+    assert curve is not None and curve.serial.tolist() == [1, 2, 3, 4]
+    np.testing.assert_array_equal(curve.old, [step.reward[1] + 1 for step in old[1:]])
+    np.testing.assert_array_equal(curve.new, [new[1].reward[1] + 1, new[2].reward[1] + 1, np.nan, np.nan])
+    assert judgement.curve("pose", 0) is None and judgement.curve("reward", 9) is None
+
+
+def test_other_bodies_cannot_be_compared() -> None:
+    old, new, jumped = drawn(5, 3, 2)
+    judgement = Judgement(recorded(old, jumped))
+    with pytest.raises(ValueError, match="bodies"):
+        judgement.add(0, replace(new[0], poses=np.zeros((2, BODIES + 1, 7), np.float32)))
+
+
+def test_drift_is_the_furthest_body_in_metres_and_radians() -> None:
+    was = np.zeros((3, 2, 7), np.float32)
+    was[..., 3] = 1
+    now = was.copy()
+    now[0, 1, :3] = (0.03, 0.04, 0)
+    angle = 1e-4  # below what an arc cosine tells in single precision
+    now[1, 0, 3:] = (-np.cos(angle / 2), -np.sin(angle / 2), 0, 0)
+    was[2, 0] = now[2, 0] = np.nan  # a body that this env does not have
+    metres, radians = drift(now, was)
+    np.testing.assert_allclose(metres, [0.05, 0, 0], rtol=1e-6)
+    np.testing.assert_allclose(radians, [0, angle, 0], rtol=1e-2)
+    now[2, 1, 0] = np.nan
+    assert np.isinf(drift(now, was)[0][2])

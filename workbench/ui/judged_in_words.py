@@ -1,0 +1,88 @@
+"""What a judgement says, in sentences: the page shows these, and tests read them."""
+
+from __future__ import annotations
+
+import math
+
+from workbench.session.judge import JudgementView
+from workbench.session.judgement import EpisodeDifference, Summary
+
+FAR_METRES = 1e-3
+FAR_RADIANS = 1e-2
+"""A body that is further than this from where it was makes a comparison of rewards doubtful."""
+
+
+def headline(view: JudgementView) -> str:
+    """One sentence on what differs; empty while nothing is known."""
+    summary = view.summary
+    if summary is None:
+        return ""
+    so_far = "" if view.state == "done" else " so far"
+    if summary.differing:
+        return f"{summary.differing} of {_count(summary.episodes, 'episode')} differ{so_far}."
+    sentence = f"Nothing differs in {_count(summary.episodes, 'episode')}{so_far}: reward, success and fail are as they were."
+    others = sorted(summary.differing_names)[:4]
+    return sentence + (f" Other entries differ: {', '.join(others)}." if others else "")
+
+
+def numbers(view: JudgementView) -> list[str]:
+    """Success and return over all episodes, before and now, where they differ."""
+    summary = view.summary
+    if summary is None or summary.differing == 0:
+        return []
+    lines: list[str] = []
+    if summary.successes is not None and summary.successes[0] != summary.successes[1]:
+        lines.append(f"episodes with success: {summary.successes[0]} → {summary.successes[1]}")
+    if summary.mean_return[0] != summary.mean_return[1]:
+        lines.append(f"mean return: {change(*summary.mean_return)}")
+    return lines
+
+
+def is_far(summary: Summary) -> bool:
+    """Whether the drift is a reason to doubt the comparison."""
+    return not (summary.drift_metres <= FAR_METRES and summary.drift_radians <= FAR_RADIANS)
+
+
+def drift(summary: Summary) -> str:
+    """One sentence on how far the states are from the record."""
+    if summary.drift_metres == 0 and summary.drift_radians == 0:
+        return "Every body is where it was, to the last bit: what differs comes of the code."
+    amount = f"{metres(summary.drift_metres)} and {math.degrees(summary.drift_radians):.2g}°"
+    if not is_far(summary):
+        return f"States drifted by at most {amount}: the rewards are comparable."
+    where = "" if summary.drift_at is None else f", most in env {summary.drift_at[0]}"
+    return f"States drifted by up to {amount}{where}: where they did, what differs may come of that and not of the code."
+
+
+def difference(episode: EpisodeDifference) -> list[str]:
+    """What is otherwise in one episode: success and fail, or else the reward."""
+    flags = (("success", episode.success), ("fail", episode.fail))
+    lines = [_moved(name, was, now) for name, (was, now) in flags if was != now]
+    return lines or [f"reward by up to {_short(episode.largest)}"]
+
+
+def change(was: float, now: float) -> str:
+    return f"{_short(was)} → {_short(now)}"
+
+
+def metres(length: float) -> str:
+    """For a person: ``3.2 cm``, ``0.4 mm``, ``70 nm``."""
+    if not math.isfinite(length):
+        return "more than can be told"
+    for unit, size in (("m", 1.0), ("cm", 1e-2), ("mm", 1e-3), ("µm", 1e-6)):
+        if length >= (size if unit != "mm" else 1e-4):
+            return f"{length / size:.2g} {unit}"
+    return f"{length / 1e-9:.2g} nm"
+
+
+def _moved(name: str, was: int | None, now: int | None) -> str:
+    before = "never" if was is None else f"at step {was}"
+    return f"{name} never now, was {before}" if now is None else f"{name} now at step {now}, was {before}"
+
+
+def _short(value: float) -> str:
+    return f"{value:.4g}"
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"

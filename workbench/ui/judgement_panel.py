@@ -1,0 +1,233 @@
+"""The past judged again, under the curves: progress, the new curve over the old, and the list of what differs.
+
+Nothing is here before there is something to say. The chart shows one number of the selected env, chosen from those
+that the task returns: the record thin and grey, what the new code says of the same moments over it. A row of the
+list selects its env and goes to the moment where it differs, in the timeline and so in the 3-D view.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import viser
+import viser.uplot as uplot
+from numpy.typing import NDArray
+
+from workbench.session.judge import JudgementView
+from workbench.session.judgement import EpisodeDifference, JudgedCurve
+from workbench.session.session import Session
+from workbench.session.view import SessionView
+from workbench.ui import judged_in_words as words
+from workbench.ui.curves_panel import CURSOR, LONGEST, SELECTED_COLOUR, value_span
+from workbench.ui.fragments import render
+from workbench.ui.presses import Presses
+
+REDRAW_EVERY = 0.25
+MOST_ROWS = 8
+"""Of the list, at a time."""
+RECORD_COLOUR = "#adb5bd"
+
+
+class JudgementPanel:
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._server, self._session = server, session
+        self._status = server.gui.add_html("", visible=False)
+        self._stop = server.gui.add_button("Stop judging", icon=viser.Icon.PLAYER_STOP, visible=False)
+        self._stop.on_click(lambda _: session.stop_judging())
+        names: tuple[str, ...] = ("reward",)
+        self._name: viser.GuiDropdownHandle = server.gui.add_dropdown(
+            "Curve",
+            names,
+            visible=False,
+            hint="Which number is drawn, as recorded and as the new code has it",
+        )
+        self._folder = server.gui.add_folder(None)
+        self._chart: viser.GuiUplotHandle | None = None
+        self._list = server.gui.add_html("", visible=False)
+        self._presses = Presses(server)
+        self._first = 0
+        self._listed: tuple[EpisodeDifference, ...] = ()
+        self._drawn: object = None
+        self._drawn_at = 0.0
+
+    def draw(self, view: SessionView) -> None:
+        judged = view.judgement
+        shown = view.timeline.shown
+        wanted = (judged.serial, view.selected_env, shown, self._name.value, self._first, view.timeline.first)
+        if wanted == self._drawn or time.monotonic() - self._drawn_at < REDRAW_EVERY:
+            return
+        self._drawn, self._drawn_at = wanted, time.monotonic()
+        _show(self._status, judged.state != "none")
+        _show(self._stop, judged.state in ("loading", "judging"))
+        if judged.state == "none":
+            self._first = 0
+        else:
+            self._status.content = status_html(judged)
+        self._draw_list(judged, view)
+        self._draw_chart(judged, view)
+
+    # --- the chart -----------------------------------------------------------------------------------
+
+    def _draw_chart(self, judged: JudgementView, view: SessionView) -> None:
+        summary = judged.summary
+        names = () if summary is None else summary.names
+        differs = summary is not None and bool(summary.differing or summary.differing_names)
+        if names and self._name.options != names:
+            chosen = self._name.value
+            self._name.options = names
+            self._name.value = chosen if chosen in names else names[0]
+        # What a page sends as its choice may be anything.
+        name = self._name.value if self._name.value in names else "reward"
+        curve = self._session.judged_curve(name, view.selected_env) if differs else None
+        _show(self._name, curve is not None)
+        if curve is None or len(curve.tick) < 2:
+            if self._chart is not None:
+                _show(self._chart, False)
+            return
+        data = chart_data(curve, view.timeline.shown)
+        series = SERIES if len(data) == 3 else (*SERIES, CURSOR)
+        scales = {"x": uplot.Scale(time=False), "y": uplot.Scale(range=value_span(data[1:]))}
+        title = f"{name} of env {view.selected_env}, before and now"
+        if self._chart is None:
+            with self._folder:
+                self._chart = self._server.gui.add_uplot(
+                    data,
+                    series,
+                    title=title,
+                    scales=scales,
+                    axes=(uplot.Axis(size=30), uplot.Axis(size=46)),
+                    legend=uplot.Legend(show=True),
+                    height=160,
+                    padding=(6, 12, 0, 0),
+                )
+            return
+        # The data must fit the series in every state that the browser may see.
+        with self._server.atomic():
+            self._chart.series, self._chart.scales, self._chart.title = series, scales, title
+            self._chart.data = data
+        _show(self._chart, True)
+
+    # --- the list ------------------------------------------------------------------------------------
+
+    def _draw_list(self, judged: JudgementView, view: SessionView) -> None:
+        self._listed = () if judged.summary is None else judged.summary.differences
+        _show(self._list, bool(self._listed))
+        if not self._listed:
+            return
+        count = len(self._listed)
+        self._first = min(self._first, (count - 1) // MOST_ROWS * MOST_ROWS)
+        shown = range(self._first, min(self._first + MOST_ROWS, count))
+        self._list.content = render(
+            "differences",
+            rows=[self._row(place, view) for place in shown],
+            more=None
+            if count <= MOST_ROWS
+            else {
+                "first": shown.start + 1,
+                "last": shown.stop,
+                "of": count,
+                "back": self._presses.id_of("back", lambda _: self._turn(-MOST_ROWS)),
+                "on": self._presses.id_of("on", lambda _: self._turn(MOST_ROWS)),
+            },
+        )
+
+    def _row(self, place: int, view: SessionView) -> dict[str, object]:
+        episode = self._listed[place]
+        far = episode.drift > words.FAR_METRES
+        kept = episode.at >= view.timeline.first
+        return {
+            "env": episode.env,
+            "lines": words.difference(episode),
+            "returns": words.change(*episode.returns),
+            "drift": f"drifted {words.metres(episode.drift)}" if far else "",
+            "hint": "Show this moment" if kept else "This moment is no longer in the history",
+            "selected": view.timeline.shown == episode.at and view.selected_env == episode.env,
+            "press": self._presses.id_of(
+                ("row", place % MOST_ROWS), lambda _, k=place % MOST_ROWS: self._go(k)
+            ),
+        }
+
+    def _go(self, row: int) -> None:
+        place = self._first + row
+        if place < len(self._listed):
+            self._show_episode(self._listed[place])
+
+    def _show_episode(self, episode: EpisodeDifference) -> None:
+        if episode.at >= self._session.view().timeline.first:
+            self._session.show(episode.env, episode.at)
+        else:
+            self._session.select_env(episode.env)
+
+    def _turn(self, by: int) -> None:
+        self._first = max(0, min(self._first + by, (len(self._listed) - 1) // MOST_ROWS * MOST_ROWS))
+
+    def go_to_difference(self, by: int) -> None:
+        """Show the next (1) or last (-1) moment of the list, from the one that is shown; round the end."""
+        listed = self._listed
+        if not listed:
+            return
+        view = self._session.view()
+        here = next(
+            (k for k, e in enumerate(listed) if (e.at, e.env) == (view.timeline.shown, view.selected_env)),
+            -1 if by > 0 else 0,
+        )
+        place = (here + by) % len(listed)
+        self._first = place // MOST_ROWS * MOST_ROWS
+        self._show_episode(listed[place])
+
+
+SERIES = (
+    uplot.Series(label="step"),
+    uplot.Series(label="as recorded", stroke=RECORD_COLOUR, width=1.2, points={"show": False}),
+    uplot.Series(label="judged again", stroke=SELECTED_COLOUR, width=1.8, points={"show": False}),
+)
+
+
+def chart_data(curve: JudgedCurve, shown: int | None) -> tuple[NDArray[np.float64], ...]:
+    """As uPlot wants it: x, the record, what is said now, and a point at the moment that is shown, if one is.
+
+    Of a long record the newest part, or the part round the moment that is shown.
+    """
+    count = len(curve.tick)
+    end = count
+    if shown is not None:
+        end = int(np.searchsorted(curve.serial, shown)) + LONGEST // 2
+    end = min(max(end, LONGEST), count)
+    part = slice(max(0, end - LONGEST), end)
+    x, old, new = (np.asarray(v[part], np.float64) for v in (curve.tick, curve.old, curve.new))
+    if shown is None or shown not in curve.serial[part]:
+        return x, old, new
+    return x, old, new, np.where(curve.serial[part] == shown, np.where(np.isnan(new), old, new), np.nan)
+
+
+def status_html(judged: JudgementView) -> str:
+    summary, problem = judged.summary, judged.problem
+    file = None if problem is None else problem.file
+    return render(
+        "judgement",
+        state=judged.state,
+        done=judged.done,
+        total=judged.total,
+        percent=f"{100 * judged.done / max(1, judged.total):.0f}",
+        rate=f"{judged.steps_per_second:.0f} a second" if judged.steps_per_second >= 1 else "",
+        why=judged.why,
+        message="" if problem is None else problem.message,
+        where="" if file is None or problem is None else f"{Path(file).name}:{problem.line}",
+        path=file or "",
+        code="" if problem is None else problem.code or "",
+        headline=words.headline(judged),
+        numbers=words.numbers(judged),
+        drift="" if summary is None else words.drift(summary),
+        drifted=summary is not None and words.is_far(summary),
+        not_carried=judged.not_carried,
+    )
+
+
+def _show(
+    handle: viser.GuiHtmlHandle | viser.GuiButtonHandle | viser.GuiDropdownHandle | viser.GuiUplotHandle,
+    shown: bool,
+) -> None:
+    if handle.visible != shown:
+        handle.visible = shown
