@@ -40,8 +40,8 @@ def of_push_cube(old: str, new: str) -> Change:
         ("# Ahead of the cube", "# Before the cube", "same", ""),
         ('"""Push the blue cube', '"""Shove the blue cube', "same", "docstrings"),
         (
-            "reward = 1 - torch.tanh(5 * reach)",
-            "reward = 1 - torch.tanh(9 * reach)",
+            "reach = 1 - torch.tanh(5 * distance)",
+            "reach = 1 - torch.tanh(9 * distance)",
             "patched",
             "dense_reward",
         ),
@@ -80,7 +80,7 @@ def test_an_edit_of_the_example_asks_for_its_level(old: str, new: str, level: st
 
 
 def test_an_edit_of_two_things_is_told_as_two_and_gets_the_heavier_level() -> None:
-    new = PUSH_CUBE.replace("torch.tanh(5 * reach)", "torch.tanh(6 * reach)").replace(
+    new = PUSH_CUBE.replace("torch.tanh(5 * distance)", "torch.tanh(6 * distance)").replace(
         "eye=[0.45,", "eye=[0.5,"
     )
     found = change(PUSH_CUBE, new, "PushCubeEnv")

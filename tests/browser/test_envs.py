@@ -88,7 +88,7 @@ def test_a_row_is_pressed_and_its_env_selected_also_while_the_envs_play(page: Pa
     for env in (3, 1, 5):
         press(page, f"tr[data-env='{env}']")
         until(lambda env=env: selected(page) == [env], f"env {env} selected")
-    expect(page.get_by_text(re.compile(r"^env 5: step"))).to_be_visible()
+    expect(page.get_by_text(re.compile(r"^env 5: step")).first).to_be_visible()
     page.get_by_role("button", name="Pause", exact=True).click()
 
 
