@@ -166,7 +166,7 @@ def test_a_file_that_is_mended_gets_past_a_worker_that_hangs(
     before = session.view().task_serial
     text, _ = edited(good, "evaluate", "while True: pass")
     task_file.write_text(text)
-    wait_until(session, lambda v: v.activity.startswith("building"), "the hanging load")
+    wait_until(session, lambda v: v.activity.startswith("trying"), "the hanging load")
     hanging = session.worker_pid
     task_file.write_text(good)
     view = wait_until(session, lambda v: v.task_serial > before, "the mended version")

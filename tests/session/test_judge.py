@@ -45,9 +45,11 @@ class Desk:
         """Start anew with the original, play, and stop at the first moment of new episodes; the whole record."""
         session = self.session
         session.pause()
-        loads = session.view().task_serial
-        self.file.write_text(ORIGINAL + f"# {loads}\n")
-        wait_until(session, lambda v: v.task_serial > loads and v.timeline.moments == 1, "a new history")
+        self.file.write_text(ORIGINAL)
+        wait_until(session, lambda v: v.task.source[str(self.file)] == ORIGINAL, "the original")
+        session.reload("rebuilt")
+        first = session.view().timeline.last
+        wait_until(session, lambda v: v.timeline.first > first and v.timeline.moments == 1, "a new history")
         session.stop_judging()
         wait_until(session, lambda v: v.judgement.state not in ("loading", "judging"), "its end")
         session.set_speed(math.inf)

@@ -189,7 +189,7 @@ class BatchedCpuMixin:
             with told_whose_fault(self, untouched):
                 return super().reset(seed=seed, options=options)  # type: ignore[misc]
         except BaseException:
-            self._drop_writes()
+            self.drop_writes()
             raise
         finally:
             self._kept_controllers = None
@@ -212,10 +212,11 @@ class BatchedCpuMixin:
             with px.merging(self._sim_steps_per_control if unwatched else 1):
                 return super()._step_action(action)  # type: ignore[misc]
         except BaseException:
-            self._drop_writes()
+            self.drop_writes()
             raise
 
-    def _drop_writes(self) -> None:
+    def drop_writes(self) -> None:
+        """Forget what was written to the simulation's tensors and not applied."""
         # What a hook that raised had written (a NaN, say) would else be applied by every reset that follows,
         # and what it had applied and not fetched would make the next one raise.
         if self.scene is not None and self.scene._gpu_sim_initialized:

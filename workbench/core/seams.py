@@ -23,6 +23,7 @@ from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
 from mani_skill.agents.multi_agent import MultiAgent
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
+from mani_skill.utils import common
 from mani_skill.utils.structs.actor import Actor
 from mani_skill.utils.structs.articulation import Articulation
 from mani_skill.utils.structs.articulation_joint import ArticulationJoint
@@ -195,6 +196,13 @@ def keep_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: NDArray[np.int64
     env._episode_seed = every
 
 
+def set_reset_mask(env: BaseEnv, env_idx: list[int]) -> None:
+    """Say to ManiSkill's setters which envs are being reset: ``scene._reset_mask``; all of them between resets."""
+    mask = torch.zeros(env.num_envs, dtype=torch.bool, device=env.device)
+    mask[env_idx] = True
+    env.scene._reset_mask = mask
+
+
 def keep_observation(env: BaseEnv, obs: Any) -> None:
     """What ``reset`` and ``step`` do with what they observed: ``_last_obs``."""
     env._last_obs = obs
@@ -253,6 +261,28 @@ def sensors(env: Any) -> dict[str, Any]:
 def human_render_cameras(env: Any) -> dict[str, Any]:
     """``_human_render_cameras``; an env made without a render device has no such attribute."""
     return getattr(env, "_human_render_cameras", {})
+
+
+def forget_cameras(env: Any) -> None:
+    """Leave no camera in the env's and its scene's lists, for `set_up_sensors` to fill them again."""
+    env._sensors, env._human_render_cameras = {}, {}
+    env.scene.camera_groups.clear()
+    env.scene.sensors, env.scene.human_render_cameras = {}, {}
+
+
+def set_up_sensors(env: Any) -> None:
+    """What ``_reconfigure`` does last: configs of sensors and human cameras, and the cameras themselves."""
+    env._setup_sensors({"reconfigure": True})
+
+
+def flatten_observation(env: Any, obs: Any) -> Any:
+    """What ``step`` does to an observation after the reward has seen it: ``_flatten_raw_obs``."""
+    return env._flatten_raw_obs(obs)
+
+
+def to_cpu(obs: Any) -> Any:
+    """``common.to_cpu_tensor``, with which BaseEnv keeps its first observation."""
+    return common.to_cpu_tensor(obs)
 
 
 def camera_components(camera: Any) -> list[Any] | None:

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils import common
 from numpy.typing import NDArray
 
 from workbench.core import actions
@@ -23,7 +24,7 @@ from workbench.core.body_table import BodyTable, build_body_table, read_poses
 from workbench.core.contact_list import Contact, list_contacts
 from workbench.core.cpu_scene import batched_class
 from workbench.core.render_device import keep_render_device
-from workbench.core.seams import episode_seeds, keep_observation, set_episode_seeds
+from workbench.core.seams import episode_seeds, flatten_observation, keep_observation, set_episode_seeds
 from workbench.core.snapshot import (
     RestoreReport,
     Snapshot,
@@ -131,6 +132,7 @@ class TaskEnv:
         env: BaseEnv,
         max_episode_steps: int | None = None,
         check: Callable[[Mapping[str, Any], Any], None] | None = None,
+        like: TaskEnv | None = None,
     ) -> None:
         """
         Args:
@@ -138,12 +140,13 @@ class TaskEnv:
             max_episode_steps: the time limit that ``gym.make``'s wrapper would apply.
             check: called with what ``evaluate`` and the reward returned, before either is converted;
                 raises if the task broke its contract.
+            like: of the same env and scene; what it found out of them is taken over.
         """
         self.env = env
         self.max_episode_steps = max_episode_steps
-        self.parts = actions.action_parts(env)
-        self.table: BodyTable = build_body_table(env)
-        self.obs: Any = None
+        self.parts = actions.action_parts(env) if like is None else like.parts
+        self.table: BodyTable = build_body_table(env) if like is None else like.table
+        self.obs: Any = None if like is None else like.obs
         """The last observation, as the task's ``obs_mode`` gives it."""
         self._check = check
 
@@ -220,14 +223,35 @@ class TaskEnv:
         The step's reward is zero, as after a reset: a reward is for an action, and none was made.
         """
         report = restore_snapshot(self.env, snapshot, env_idx, source, fresh_physics)
+        return self.judge(), report
+
+    def judge(self, action: NDArray[np.float32] | None = None) -> StepResult:
+        """What the task says of the present moment: evaluate, observation, reward. Nothing moves.
+
+        Args:
+            action: (N, A) that led here, which the reward may ask for; None gives rewards of zero, as after a
+                reset: a reward is for an action, and none was made.
+        """
         # `evaluate` may count and draw, and asks about all envs: that must not happen to them twice.
         every = list(range(self.num_envs))
         memory = take_memory(self.env, every)
-        info = self.env.get_info()
-        self.obs = self.env.get_obs(info)
-        keep_observation(self.env, self.obs)
-        restore_memory(self.env, memory, every, every, whole=True)
-        return self._result(info, np.zeros(self.num_envs, np.float32), self._terminated(info), None), report
+        reward = np.zeros(self.num_envs, np.float32)
+        try:
+            info = self.env.get_info()
+            obs = self.env.get_obs(info, unflattened=True)
+            given = None
+            if action is not None:
+                flat = actions.to_env_action(self.env, self.parts, action)
+                made: Any = common.to_tensor(flat, device=self.env.device) if self.parts else None
+                given = self.env.get_reward(obs=obs, action=made, info=info)
+                reward = to_numpy(given).astype(np.float32)
+            self.obs = flatten_observation(self.env, obs)
+            keep_observation(self.env, self.obs)
+        finally:
+            restore_memory(self.env, memory, every, every, whole=True)
+        if self._check is not None:
+            self._check(info, given)
+        return self._result(info, reward, self._terminated(info), action)
 
     @property
     def observes_pictures(self) -> bool:

@@ -82,19 +82,13 @@ def what_a_load_means(
 
     If not, what the last judgement said is kept to be seen, or forgotten with the episodes.
     """
-    after = loaded.task
-    if before is None or not after.source:
-        return "forget"
-    if before.source == after.source:
-        # Saved again without a change: what that stopped is to be had all the same.
+    level = None if before is None or loaded.reload is None else loaded.reload.level
+    if level == "patched":
+        return "judge"
+    if level in ("same", "cameras"):
+        # Saved again without a change that matters: what that stopped is to be had all the same.
         return "judge" if view.state == "stopped" and view.why == FILE_SAVED else "keep"
-    same_env = (
-        before.class_name == after.class_name
-        and before.num_envs == after.num_envs
-        and before.geometry.body_names == after.geometry.body_names
-        and before.actions == after.actions
-    )
-    return "judge" if same_env else "forget"
+    return "forget"
 
 
 @dataclass

@@ -20,6 +20,11 @@ from workbench.core.step import StepResult
 
 Backend = Literal["auto", "cpu", "gpu"]
 ActionSource = Literal["hold", "zero", "random", "sliders", "policy"]
+LoadLevel = Literal["auto", "patched", "cameras", "rebuilt"]
+"""How a new version is to come in; ``auto`` for the least that is safe. See `workbench.authoring.changes`."""
+ReloadLevel = Literal["same", "patched", "cameras", "rebuilt", "restarted"]
+SCENE_KEPT: frozenset[ReloadLevel] = frozenset({"same", "patched", "cameras"})
+"""Levels that leave the env, its episodes and its past where they are."""
 EpisodeEnd = Literal["reset", "continue", "pause"]
 """What the player does with an env whose episode ends: reset that env, let it run on, or pause."""
 
@@ -77,6 +82,8 @@ class TaskDescription:
     segmentation: dict[int, str]
     """Segmentation id to body name."""
     can_render: bool
+    others: tuple[str, ...] = ()
+    """Further task classes in the file."""
 
 
 # --- requests: server to worker ------------------------------------------------------------------
@@ -91,6 +98,10 @@ class Load:
     options: TaskOptions
     source: dict[str, str] | None = None
     """Text to use in place of what is on disk: how the last good version comes back."""
+    level: LoadLevel = "auto"
+    """What is done if a version of the same task runs; a level that is named is taken as asked."""
+    snapshot: bytes | None = None
+    """Pickled `core.snapshot.Snapshot` of the moment to be shown after a build, by name, where shapes match."""
 
 
 @dataclass(frozen=True)
@@ -240,11 +251,28 @@ class Loading:
 
 
 @dataclass(frozen=True)
+class ReloadReport:
+    """How a version took the place of another."""
+
+    level: ReloadLevel
+    reason: str
+    """For example ``only compute_dense_reward changed``."""
+    milliseconds: float
+    carried: tuple[str, ...] = ()
+    """After a build: actors, articulations and attributes that are as they were, by name."""
+    not_carried: dict[str, str] = field(default_factory=dict)
+    """What is not, and why."""
+
+
+@dataclass(frozen=True)
 class Loaded:
     task: TaskDescription
     first: StepResult
     milliseconds: dict[str, float]
     """Time of each part of the load: import, build, reset, probe, geometry."""
+    reload: ReloadReport | None = None
+    """None for the first version of a task. With ``same``, ``patched`` and ``cameras`` the scene, its episodes and
+    `first`'s poses are those that were there before; of the geometry, which is large, the visuals are left out."""
 
 
 @dataclass(frozen=True)

@@ -55,13 +55,13 @@ def open_task(
     Raises:
         TaskError: with the author's file and line; nothing of the task stays behind.
     """
-    clock = _Clock()
+    clock = Clock()
     on_activity(f"importing {reference.rsplit('/', 1)[-1]}")
     loaded = load_task(reference, source=source)
     clock.lap("import")
 
     try:
-        return _build(loaded, options, clock, on_activity)
+        return build_task(loaded, options, clock, on_activity)
     except BaseException:
         # The class imported and cannot be used: without this the last good version would go on with
         # the new version's helper modules and registrations behind its back.
@@ -69,11 +69,12 @@ def open_task(
         raise
 
 
-def _build(
-    loaded: LoadedTask, options: TaskOptions, clock: _Clock, on_activity: Callable[[str], None]
+def build_task(
+    loaded: LoadedTask, options: TaskOptions, clock: Clock, on_activity: Callable[[str], None]
 ) -> OpenedTask:
+    """The second half of `open_task`; raises as it does, and leaves taking back `loaded` to the caller."""
     on_activity(f"building {options.num_envs} {'env' if options.num_envs == 1 else 'envs'}")
-    with _blamed("build", loaded):
+    with blamed("build", loaded):
         env = make_env(
             loaded.cls,
             EnvOptions(
@@ -88,8 +89,8 @@ def _build(
         )
     clock.lap("build")
     try:
-        with _blamed("build", loaded):
-            task = TaskEnv(env, loaded.max_episode_steps, check=_returns_check(loaded, options.num_envs))
+        with blamed("build", loaded):
+            task = TaskEnv(env, loaded.max_episode_steps, check=returns_check(loaded, options.num_envs))
         on_activity("trying a reset and a step")
         rehearse(task, loaded, options.seed)
         clock.lap("rehearse")
@@ -115,7 +116,7 @@ def rehearse(task: TaskEnv, loaded: LoadedTask, seed: int) -> None:
 
 def step_checked(task: TaskEnv, loaded: LoadedTask, action: Any) -> StepResult:
     """`TaskEnv.step`; what goes wrong is raised as a TaskError with the author's line."""
-    with _blamed("step", loaded, task):
+    with blamed("step", loaded, task):
         return task.step(action if task.parts else None)
 
 
@@ -126,7 +127,7 @@ def reset_checked(
     env_idx: Sequence[int] | None = None,
 ) -> StepResult:
     """`TaskEnv.reset`; what goes wrong is raised as a TaskError with the author's line."""
-    with _blamed("reset", loaded, task):
+    with blamed("reset", loaded, task):
         return task.reset(seed=seed, env_idx=env_idx)
 
 
@@ -134,7 +135,7 @@ def restore_checked(
     task: TaskEnv, loaded: LoadedTask, snapshot: Snapshot, env_idx: Sequence[int], source: Sequence[int]
 ) -> tuple[StepResult, RestoreReport]:
     """`TaskEnv.restore`; what goes wrong is raised as a TaskError with the author's line."""
-    with _blamed("restore", loaded, task):
+    with blamed("restore", loaded, task):
         return task.restore(snapshot, env_idx, source)
 
 
@@ -170,10 +171,13 @@ def describe(loaded: LoadedTask, task: TaskEnv) -> TaskDescription:
         cameras=list_cameras(env, task.table),
         segmentation=segmentation_names(env, task.table),
         can_render=can_render,
+        others=loaded.others if loaded.followed else (),
     )
 
 
-def _returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, Any], Any], None]:
+def returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, Any], Any], None]:
+    """What `TaskEnv` calls with what ``evaluate`` and the reward returned: raises TaskError for wrong shapes."""
+
     def check(evaluate: Mapping[str, Any], reward: Any) -> None:
         # An installed task is not its reader's to mend: only what the page cannot do without is asked of
         # it (PullCubeTool-v1 reports its `cube_progress` unbatched).
@@ -191,7 +195,7 @@ def _asset_ids(loaded: LoadedTask) -> list[str]:
     return [] if spec is None else list(spec.asset_download_ids or [])
 
 
-class _blamed:
+class blamed:
     """Turns what the author's code raises into a TaskError that names their line."""
 
     def __init__(self, stage: str, loaded: LoadedTask, task: TaskEnv | None = None) -> None:
@@ -240,7 +244,9 @@ def _env_on_traceback(error: BaseException, cls: type) -> Any:
     return None
 
 
-class _Clock:
+class Clock:
+    """Wall time of the parts of a load, in milliseconds."""
+
     def __init__(self) -> None:
         self._last = time.perf_counter()
         self.laps: dict[str, float] = {}

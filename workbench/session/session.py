@@ -11,7 +11,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from workbench.authoring.problem import Problem
@@ -23,6 +23,7 @@ from workbench.session.judge import FILE_SAVED, Judge, what_a_load_means
 from workbench.session.judgement import JudgedCurve, Judgement
 from workbench.session.kept_worker import Death, KeptWorker
 from workbench.session.messages import (
+    SCENE_KEPT,
     ActionSource,
     CameraRequest,
     EpisodeEnd,
@@ -31,9 +32,11 @@ from workbench.session.messages import (
     Load,
     Loaded,
     Loading,
+    LoadLevel,
     PastPictures,
     Pictures,
     Play,
+    ReloadReport,
     Request,
     Reset,
     Restore,
@@ -68,6 +71,9 @@ class _State:
     stale: bool = False
     task: TaskDescription | None = None
     task_serial: int = 0
+    scene_serial: int = 0
+    cameras_serial: int = 0
+    reload: ReloadReport | None = None
     load_milliseconds: dict[str, float] = field(default_factory=dict)
     step: StepResult | None = None
     step_serial: int = 0
@@ -154,6 +160,9 @@ class Session:
                 stale=s.stale,
                 task=s.task,
                 task_serial=s.task_serial,
+                scene_serial=s.scene_serial,
+                cameras_serial=s.cameras_serial,
+                reload=s.reload,
                 load_milliseconds=s.load_milliseconds,
                 step=s.step if shown is None else shown.step,
                 step_serial=s.step_serial if shown is None else shown.serial,
@@ -192,9 +201,21 @@ class Session:
 
     # --- what the page asks for --------------------------------------------------------------------
 
-    def reload(self) -> None:
-        """Load the file again. A worker that does not take it up (an endless loop) is replaced."""
-        self._send(self._load_request(None))
+    def reload(self, level: LoadLevel = "auto") -> None:
+        """Load the file again, by a level that is named whatever it may leave of the old version.
+
+        A worker that does not take it up (an endless loop) is replaced.
+        """
+        self._send(replace(self._load_request(None), level=level))
+
+    def choose_class(self, name: str) -> None:
+        """Another task class of the same file, one that `TaskDescription.others` names."""
+        with self._lock:
+            task = self._state.task
+            if task is None or self._own_file is None or name not in task.others:
+                return
+            self._task = f"{self._own_file}:{name}"
+        self.reload()
 
     def restart_worker(self) -> None:
         """End the worker, whatever it is doing, and start another with the file as it is now."""
@@ -475,10 +496,12 @@ class Session:
 
     def _on_loaded(self, event: Loaded) -> None:
         self._worker.ran()
-        # Episodes of the version before end here: their steps and the new ones do not belong together.
+        report, task = event.reload, event.task
+        kept = report is not None and report.level in SCENE_KEPT
         recording = self._recorder.status()
-        self._recorder.stop()
-        task = event.task
+        if not kept or (report is not None and report.level != "same"):
+            # Episodes of the version before end here: their steps and the new ones do not belong together.
+            self._recorder.stop()
         with self._lock:
             s = self._state
             meaning = what_a_load_means(s.task, event, self._judge.view)
@@ -486,14 +509,22 @@ class Session:
             if meaning == "judge" and s.timeline is not None:
                 judgement = Judgement(s.timeline.history)
             self._last_good = dict(task.source) or None
-            s.task, s.step, s.load_milliseconds = task, event.first, event.milliseconds
+            if kept and s.task is not None:
+                # The same scene: who has drawn it can see that by its being the same object.
+                task = replace(task, geometry=s.task.geometry)
+            s.task, s.step, s.load_milliseconds, s.reload = task, event.first, event.milliseconds, report
             s.task_serial += 1
-            s.past, self._curves = Past(task.num_envs), None
-            next_serial = 0 if s.timeline is None else s.timeline.history.next_serial
-            s.timeline = Timeline(task.num_envs, self._history_bytes, next_serial)
-            s.pictures, s.sliders = {}, ()
-            s.pictures_serial += 1
-            s.selected_env = min(s.selected_env, task.num_envs - 1)
+            if not kept:
+                s.scene_serial += 1
+                s.past, self._curves = Past(task.num_envs), None
+                next_serial = 0 if s.timeline is None else s.timeline.history.next_serial
+                s.timeline = Timeline(task.num_envs, self._history_bytes, next_serial)
+                s.sliders = ()
+                s.selected_env = min(s.selected_env, task.num_envs - 1)
+            if report is None or report.level not in ("same", "patched"):
+                s.cameras_serial += 1
+                s.pictures = {}
+                s.pictures_serial += 1
             s.activity = ""
             # The last good version came back after a worker's death: what killed it still stands.
             s.stale = self._restoring
@@ -507,7 +538,13 @@ class Session:
             self._judge.forget()
         self._follow(task.source_files, {} if s.stale else task.source)
         self._watch()
-        if recording.active:
+        if not recording.active:
+            return
+        if kept:
+            # The moment is not to be lost: recording goes on with each env's next episode.
+            if not self._recorder.status().active:
+                self._recorder.start(task, recording.env_idx)
+        else:
             self.start_recording(recording.env_idx)
 
     def _on_stepped(self, event: Stepped) -> None:

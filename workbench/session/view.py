@@ -16,7 +16,7 @@ from workbench.authoring.problem import Problem
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.step import StepResult
 from workbench.session.judge import JudgementView
-from workbench.session.messages import ActionSource, EpisodeEnd, TaskDescription
+from workbench.session.messages import ActionSource, EpisodeEnd, ReloadReport, TaskDescription
 from workbench.session.timeline import TimelineView
 
 State = Literal["starting", "loading", "running", "paused", "error", "stopped"]
@@ -62,7 +62,13 @@ class SessionView:
     task: TaskDescription | None
     task_serial: int
     """Grows with every load that succeeded."""
+    scene_serial: int
+    """Grows with every scene: not with a version that was put on the one that is there."""
+    cameras_serial: int
+    """Grows with every set of cameras."""
     load_milliseconds: dict[str, float]
+    reload: ReloadReport | None
+    """How the version that is shown came in; None for the first."""
     step: StepResult | None
     """What is shown: the newest step, or a moment of the past (`timeline`)."""
     step_serial: int

@@ -52,7 +52,7 @@ class CamerasPanel:
         self._session = session
         self._cameras: dict[tuple[CameraKind, str], _Camera] = {}
         self._remembered: dict[tuple[CameraKind, str, str], bool] = {}
-        self._task_serial = -1
+        self._cameras_serial = -1
         self._pictures_serial = -1
         self._env = -1
         self._drawn_at = 0.0
@@ -71,8 +71,8 @@ class CamerasPanel:
         return self._frustums.value is True
 
     def draw(self, view: SessionView) -> None:
-        if view.task is not None and view.task_serial != self._task_serial:
-            self._task_serial = view.task_serial
+        if view.task is not None and view.cameras_serial != self._cameras_serial:
+            self._cameras_serial = view.cameras_serial
             self._build(view.task)
         self._ask()
         if view.pictures_serial == self._pictures_serial and view.selected_env == self._env:

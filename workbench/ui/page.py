@@ -36,6 +36,7 @@ from workbench.ui.selection_mark import SelectionMark
 from workbench.ui.status_line import StatusLine
 from workbench.ui.timeline_panel import HEIGHT as TIMELINE_HEIGHT
 from workbench.ui.timeline_panel import TimelinePanel
+from workbench.ui.version_panel import VersionPanel
 from workbench.ui.view_panel import ViewPanel
 from workbench.ui.viewpoint import FOV, USUAL_ASPECT, USUAL_HEIGHT, Viewpoint, frame_all, frame_one
 
@@ -62,7 +63,7 @@ class Page:
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
         self._layout: EnvLayout | None = None
-        self._task_serial = -1
+        self._scene_serial = -1
         self._built: tuple[bool, int] | None = None
         self._framed: object = None
         self._waits_for_human = False
@@ -87,6 +88,7 @@ class Page:
         with run_tab:
             self._run = RunPanel(server, session)
             self._view_panel = ViewPanel(server)
+            self._version = VersionPanel(server, session)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
             self._cameras = CamerasPanel(server, session)
         with tabs.add_tab("Reward", viser.Icon.CHART_LINE):
@@ -156,6 +158,7 @@ class Page:
         self._banner.draw(view)
         self._run.draw(view)
         self._view_panel.draw(view)
+        self._version.draw(view)
         self._cameras.draw(view)
         self._numbers.draw(view)
         self._curves.draw(view)
@@ -188,8 +191,8 @@ class Page:
             return
         one = self._view_panel.only_selected and task.num_envs > 1
         env = min(view.selected_env, task.num_envs - 1)
-        if view.task_serial != self._task_serial or self._layout is None:
-            self._task_serial = view.task_serial
+        if view.scene_serial != self._scene_serial or self._layout is None:
+            self._scene_serial = view.scene_serial
             self._layout = lay_out(task.geometry, step.poses)
             self._server.gui.set_panel_label(task.env_id)
             self._built = None

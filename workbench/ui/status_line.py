@@ -8,6 +8,7 @@ import viser
 
 from workbench.session.view import SessionView
 from workbench.ui.fragments import render
+from workbench.ui.version_panel import took
 
 REDRAW_EVERY = 0.25
 """Seconds. Rates that change faster cannot be read."""
@@ -59,7 +60,7 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
         "stale": view.stale and task is not None and view.state not in ("starting", "loading"),
         "ago": None if view.timeline.shown is None else view.timeline.last - view.timeline.shown,
         "activity": view.activity,
-        "news": f"new version in {sum(view.load_milliseconds.values()) / 1000:.1f} s" if fresh else "",
+        "news": _news(view) if fresh else "",
         "task": None if task is None else task.env_id,
         "backend": "" if task is None else task.backend,
         "device": "" if task is None else task.device,
@@ -74,6 +75,13 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
         "behind": moving and view.speed != float("inf") and view.real_time_factor < 0.85 * view.speed,
         "speed": f"{view.speed:g}",
     }
+
+
+def _news(view: SessionView) -> str:
+    report = view.reload
+    if report is None:
+        return f"new version in {took(sum(view.load_milliseconds.values()))}"
+    return f"{report.level} in {took(report.milliseconds)}" + (f": {report.reason}" if report.reason else "")
 
 
 def _where(view: SessionView) -> str:

@@ -1,0 +1,274 @@
+"""The source of a task as symbols: what it defines, each as text that is equal exactly when the code is.
+
+To know what a save changed, two versions of a file are compared by what they define: functions, methods,
+constants, class attributes, imports. Each is kept as the dump of its syntax tree, so comments, docstrings,
+layout and place make no difference; and with the names that it mentions, which say whom it may reach.
+`ast` and not libcst: what makes libcst worth its price, that it keeps every blank and comment, is just what has
+to be forgotten here.
+
+Names are only names. ``x.reset`` may be anybody's ``reset``, so it is taken to be everybody's, in all files;
+and a string that could be a name is one (``getattr(self, "reset")``). Where not even that is enough, because a
+name is computed or the program looks at itself, `Symbol.dynamic` says so.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import PurePath
+from typing import Literal
+
+Kind = Literal["function", "value", "import", "class", "statements"]
+Key = tuple[str, str]
+"""File and name within it: ``("/x/push.py", "PushEnv.evaluate")``."""
+
+STATEMENTS = "(statements)"
+"""Name of what is no plain definition: it runs when the file is imported, in the order in which it stands."""
+
+_LOOKS_AT_ITSELF = frozenset(
+    (
+        "globals locals vars eval exec compile __import__ dir breakpoint __dict__ __getattribute__ __code__ "
+        "__globals__ __subclasses__ __mro__ __bases__ __defaults__ __kwdefaults__ __closure__ __wrapped__ "
+        "f_globals f_locals f_lineno _getframe attrgetter methodcaller import_module getmembers getsource "
+        "__annotations__ __func__ __reduce__ __getstate__ __setstate__ __builtins__ modules"
+    ).split()
+)
+_LOOKING_MODULES = frozenset(
+    (
+        "inspect importlib gc ctypes pickle dill cloudpickle marshal builtins runpy pkgutil threading "
+        "multiprocessing asyncio concurrent atexit signal traceback linecache"
+    ).split()
+)
+
+
+@dataclass(frozen=True)
+class Symbol:
+    path: str
+    name: str
+    kind: Kind
+    line: int
+    text: str
+    """Equal in two versions exactly when the code is."""
+    nodes: tuple[ast.AST, ...]
+    """What it is made of: a property with its setter is one symbol."""
+    mentions: frozenset[str]
+    """Names in it, of variables and attributes, and strings that could be names."""
+    shorts: frozenset[str]
+    """Names under which others may mention it."""
+    owner: str | None = None
+    """The class that it is a member of."""
+    dynamic: str | None = None
+    """Something in it that may reach what it does not name."""
+
+    @property
+    def key(self) -> Key:
+        return self.path, self.name
+
+    @property
+    def short(self) -> str:
+        """The name within its class."""
+        return self.name.rpartition(".")[2]
+
+
+def read_symbols(path: str, text: str, keep_docstrings: bool = False) -> dict[Key, Symbol]:
+    """The symbols of one file, in order. Raises SyntaxError, as ``compile`` does."""
+    tree = ast.parse(text, path)
+    if not keep_docstrings:
+        _remove_docstrings(tree)
+    return {symbol.key: symbol for symbol in _scope(path, tree.body, None)}
+
+
+def _scope(path: str, body: list[ast.stmt], owner: str | None) -> Iterator[Symbol]:
+    groups: dict[str, list[ast.stmt]] = {}
+    loose: list[ast.stmt] = []
+    for statement in body if owner is not None else _one_import_each(body):
+        name = _defines(statement, at_top=owner is None)
+        if name is not None:
+            groups.setdefault(name, []).append(statement)
+        elif not isinstance(statement, ast.Pass) and not _runs_as_script_only(statement):
+            loose.append(statement)
+    taken = {name for statement in loose for name in bound_names(statement)}
+    for name, statements in list(groups.items()):
+        several = len(statements) > 1 and not all(isinstance(s, ast.FunctionDef) for s in statements)
+        if name in taken or several:
+            # Which of them holds depends on what ran: they are told apart no further.
+            loose += groups.pop(name)
+    prefix = "" if owner is None else f"{owner}."
+    for name, statements in groups.items():
+        first = statements[0]
+        if isinstance(first, ast.ClassDef) and owner is None:
+            head = [*first.decorator_list, *first.bases, *first.keywords, *getattr(first, "type_params", [])]
+            yield _symbol(path, name, "class", first.lineno, head, {name}, None, (first,))
+            yield from _scope(path, first.body, name)
+        else:
+            functions = isinstance(first, (ast.FunctionDef, ast.AsyncFunctionDef))
+            kind: Kind = (
+                "function"
+                if functions
+                else "import"
+                if isinstance(first, (ast.Import, ast.ImportFrom))
+                else "value"
+            )
+            bound = {short for statement in statements for short in bound_names(statement)}
+            yield _symbol(path, prefix + name, kind, first.lineno, statements, bound, owner)
+    if loose:
+        loose.sort(key=lambda statement: statement.lineno)
+        bound = {name for statement in loose for name in bound_names(statement)}
+        yield _symbol(path, prefix + STATEMENTS, "statements", loose[0].lineno, loose, bound, owner)
+
+
+def _symbol(
+    path: str,
+    name: str,
+    kind: Kind,
+    line: int,
+    parts: Iterable[ast.AST],
+    shorts: set[str],
+    owner: str | None,
+    nodes: tuple[ast.AST, ...] | None = None,
+) -> Symbol:
+    parts = tuple(parts)
+    mentions, dynamic = _mentions(parts)
+    return Symbol(
+        path=path,
+        name=name,
+        kind=kind,
+        line=line,
+        text="\n".join([kind, *(ast.dump(part) for part in parts)]),
+        nodes=parts if nodes is None else nodes,
+        mentions=mentions,
+        shorts=frozenset(shorts),
+        owner=owner,
+        dynamic=dynamic,
+    )
+
+
+def _defines(statement: ast.stmt, at_top: bool) -> str | None:
+    """The name of a plain definition."""
+    if isinstance(statement, (ast.FunctionDef, ast.AsyncFunctionDef)):
+        return statement.name
+    if isinstance(statement, ast.ClassDef):
+        return statement.name if at_top else None
+    if isinstance(statement, (ast.Import, ast.ImportFrom)) and at_top:
+        alias = statement.names[0]
+        if alias.name == "*":
+            return ast.unparse(statement)
+        return alias.asname or alias.name.partition(".")[0]
+    if isinstance(statement, ast.Assign) and len(statement.targets) == 1:
+        target = statement.targets[0]
+        return target.id if isinstance(target, ast.Name) else None
+    if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
+        return statement.target.id
+    return None
+
+
+def _one_import_each(body: list[ast.stmt]) -> Iterator[ast.stmt]:
+    """``from x import a, b`` as two statements: who adds a name to it has not touched the others."""
+    for statement in body:
+        if isinstance(statement, ast.ImportFrom) and statement.module == "__future__":
+            # Annotations are not looked at, and the other futures are long past.
+            continue
+        if isinstance(statement, ast.Import):
+            yield from (ast.copy_location(ast.Import([alias]), statement) for alias in statement.names)
+        elif isinstance(statement, ast.ImportFrom):
+            module, level = statement.module, statement.level
+            for alias in statement.names:
+                yield ast.copy_location(ast.ImportFrom(module, [alias], level), statement)
+        else:
+            yield statement
+
+
+def bound_names(statement: ast.AST) -> set[str]:
+    """Names that `statement` binds in its own scope."""
+    found: set[str] = set()
+    waiting = [statement]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+            found.add(node.name)
+            continue
+        if isinstance(node, ast.Lambda):
+            continue
+        if isinstance(node, ast.Name) and isinstance(node.ctx, (ast.Store, ast.Del)):
+            found.add(node.id)
+        elif isinstance(node, ast.alias):
+            found.add(node.asname or node.name.partition(".")[0])
+        elif isinstance(node, (ast.ExceptHandler, ast.MatchAs, ast.MatchStar)) and node.name:
+            found.add(node.name)
+        waiting += ast.iter_child_nodes(node)
+    return found
+
+
+def _runs_as_script_only(statement: ast.stmt) -> bool:
+    """``if __name__ == "__main__":``, since here nothing runs as a script."""
+    if not isinstance(statement, ast.If) or statement.orelse:
+        return False
+    return ast.unparse(statement.test) in ("__name__ == '__main__'", "'__main__' == __name__")
+
+
+def _mentions(parts: Iterable[ast.AST]) -> tuple[frozenset[str], str | None]:
+    """The names in `parts`, and what may reach further than they say."""
+    names: set[str] = set()
+    dynamic: list[str] = []
+    modules: set[str] = set()
+    called = set()
+    for node in (node for part in parts for node in _walk_code(part)):
+        if isinstance(node, ast.Name):
+            names.add(node.id)
+            if node.id in ("getattr", "setattr", "delattr", "hasattr") and id(node) not in called:
+                dynamic.append(node.id)
+        elif isinstance(node, ast.Attribute):
+            names.add(node.attr)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            names.update(word for word in node.value.split(".") if word.isidentifier())
+        elif isinstance(node, ast.MatchClass):
+            names.update(node.kwd_attrs)
+        elif isinstance(node, ast.Global):
+            names.update(node.names)
+        elif isinstance(node, ast.Import):
+            modules.update(alias.name for alias in node.names)
+            names.update(word for alias in node.names for word in alias.name.split("."))
+        elif isinstance(node, ast.ImportFrom):
+            modules.add(node.module or "")
+            names.update(alias.name for alias in node.names)
+            if any(alias.name == "*" for alias in node.names):
+                dynamic.append(ast.unparse(node))
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            if node.func.id in ("getattr", "setattr", "delattr", "hasattr"):
+                name = node.args[1] if len(node.args) > 1 else None
+                if isinstance(name, ast.Constant) and isinstance(name.value, str):
+                    called.add(id(node.func))
+            elif node.func.id == "type" and len(node.args) != 1:
+                dynamic.append("type")
+    dynamic += sorted(names & _LOOKS_AT_ITSELF)
+    dynamic += sorted(module for module in modules if module.partition(".")[0] in _LOOKING_MODULES)
+    return frozenset(names), dynamic[0] if dynamic else None
+
+
+def _walk_code(node: ast.AST) -> Iterator[ast.AST]:
+    """As ``ast.walk``, parents first, without annotations: they say what is meant and do nothing."""
+    yield node
+    for name, value in ast.iter_fields(node):
+        if name in ("annotation", "returns"):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            if isinstance(child, ast.AST):
+                yield from _walk_code(child)
+
+
+def file_name(path: str) -> str:
+    return PurePath(path).name
+
+
+def _remove_docstrings(tree: ast.Module) -> None:
+    """Statements that are only a constant do nothing."""
+    for node in ast.walk(tree):
+        for name in ("body", "orelse", "finalbody"):
+            block = getattr(node, name, None)
+            if not isinstance(block, list):
+                continue
+            kept = [s for s in block if not (isinstance(s, ast.Expr) and isinstance(s.value, ast.Constant))]
+            if not kept and block and name == "body" and not isinstance(node, ast.Module):
+                kept = [ast.copy_location(ast.Pass(), block[0])]
+            block[:] = kept

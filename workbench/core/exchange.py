@@ -1,0 +1,121 @@
+"""New code on a live env: another class, or other cameras, and the scene as it was.
+
+What an env *is* lies in its attributes and in its scene; what it *does*, in its class. So an author's edited class
+can be put on an env that runs, in a microsecond and without moving a body, as long as nothing that the old class
+built would have been built otherwise (`workbench.authoring.changes` decides that). Cameras are the one part of a
+scene that can be taken out and made anew, since physics knows nothing of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+
+from workbench.core import seams
+from workbench.core.cpu_scene import BatchedCpuMixin, batched_class
+from workbench.core.cpu_state import CpuEnvState
+from workbench.core.snapshot import Snapshot, restore_memory, restore_snapshot, take_snapshot
+from workbench.core.strict import StrictMixin
+
+
+def task_class(env: BaseEnv) -> type[BaseEnv]:
+    """The author's class of an env, without what the core puts in front of it."""
+    return getattr(env, "_workbench_task", type(env))
+
+
+def put_class(env: BaseEnv, task: type[BaseEnv]) -> None:
+    """Let `env` go on as an env of `task`; its state, scene and attributes are untouched.
+
+    Args:
+        env: an unwrapped env, batched on the CPU or on the GPU.
+        task: the author's class. Not checked: that it would have built the same scene is the caller's to know.
+    """
+    own: Any = type(env)
+    if not issubclass(own, BatchedCpuMixin):
+        env.__class__ = task
+        return
+    strict: Any = False
+    if issubclass(own, StrictMixin):
+        strict = "warn" if own._strict_only_warns else True
+    env.__class__ = batched_class(task, own._workbench_threads, strict)
+
+
+def can_exchange_cameras(env: BaseEnv) -> bool:
+    """Whether `exchange_cameras` is possible: not in GPU simulation, whose camera groups cannot be undone."""
+    cameras = [*seams.sensors(env).values(), *seams.human_render_cameras(env).values()]
+    return seams.batched_system(env.scene) is not None and all(
+        seams.camera_components(camera) is not None for camera in cameras
+    )
+
+
+def exchange_cameras(env: BaseEnv) -> None:
+    """Take the env's cameras out of its scene and make those that its class configures now.
+
+    No picture may be under way. What the class raises leaves the env without the cameras that were not made:
+    call this again with a class that works.
+    """
+    if not env.scene.can_render():
+        return
+    for camera in [*seams.sensors(env).values(), *seams.human_render_cameras(env).values()]:
+        for component in seams.camera_components(camera) or ():
+            # The entity stays, empty: with one fewer, SAPIEN would number the others anew in a scene that a
+            # restored snapshot makes (see `fresh_physics`), and segmentation pictures name bodies by number.
+            component.entity.remove_component(component)
+    seams.forget_cameras(env)
+    with torch.random.fork_rng(devices=[]):
+        seams.set_up_sensors(env)
+
+
+def rehearse_hooks(env: BaseEnv, hooks: Collection[str]) -> dict[str, str]:
+    """Call hooks of resets and steps as ManiSkill does, to see that they work, and undo what they did.
+
+    What they write to the simulation is not applied, so PhysX knows nothing of it and goes on to the last bit as
+    it would have. Only where a hook applies or steps on its own is the state put back from a snapshot.
+
+    Args:
+        hooks: ``_initialize_episode``, which is tried on all envs and on one, and hooks without arguments.
+
+    Returns:
+        What could not be undone, by name, and why: attributes that these hooks made, say.
+
+    Raises:
+        Exception: whatever a hook raises; the env is as it was.
+    """
+    every = list(range(env.num_envs))
+    kept = take_snapshot(env)
+    try:
+        with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
+            for hook in sorted(hooks):
+                if hook != "_initialize_episode":
+                    getattr(env, hook)()
+                    continue
+                for chosen in [every, every[:1]] if env.num_envs > 1 else [every]:
+                    seams.set_reset_mask(env, chosen)
+                    env._initialize_episode(torch.tensor(chosen, device=env.device), {})
+    finally:
+        seams.set_reset_mask(env, every)
+        if isinstance(env, BatchedCpuMixin):
+            env.drop_writes()
+        if _simulation(take_snapshot(env)) == _simulation(kept):
+            _, missed = restore_memory(env, kept.memory, every, every, whole=True)
+        else:
+            missed = restore_snapshot(env, kept).not_carried
+    return missed
+
+
+def _simulation(snapshot: Snapshot) -> list[Any]:
+    return [
+        (state.packed, state.qf.tobytes(), state.driven.tobytes())
+        if isinstance(state, CpuEnvState)
+        else state
+        for state in snapshot.simulation
+    ]
+
+
+def keep_observation_space(env: BaseEnv, obs: Any) -> None:
+    """Let the env's spaces be those of this observation; the edited hook may return another shape."""
+    if env.obs_mode != "none":
+        env.update_obs_space(seams.to_cpu(obs))

@@ -1,0 +1,253 @@
+"""From the version that runs to the version that was saved, with as much of the moment as can be kept.
+
+Three things can happen to the env. It stays, and gets the new class (``patched``, and ``cameras`` with the cameras
+made anew). Or another is built beside it, and takes over its state by name (``rebuilt``). Or it has gone with its
+worker, and a new one takes over a snapshot that the server kept (``restarted``). Whichever it is, the new version
+must first show that it works: on a copy of the present moment where only what looks at it changed, with a reset and a
+step (which are undone) where those changed too. What fails leaves everything as it was, and raises.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from workbench.authoring.changes import RESET_HOOKS, Change, find_change
+from workbench.authoring.inherited import inherited_by
+from workbench.authoring.load import LoadedTask, load_task, take_back, with_late_imports
+from workbench.authoring.modules import decode
+from workbench.authoring.problem import TaskError
+from workbench.core import actions
+from workbench.core.exchange import (
+    can_exchange_cameras,
+    exchange_cameras,
+    keep_observation_space,
+    put_class,
+    rehearse_hooks,
+    task_class,
+)
+from workbench.core.snapshot import RestoreReport, Snapshot, restore_snapshot
+from workbench.core.step import StepResult
+from workbench.core.take_pictures import list_cameras
+from workbench.core.task_env import TaskEnv
+from workbench.session.messages import Load, ReloadReport
+from workbench.session.open_task import (
+    Clock,
+    OpenedTask,
+    blamed,
+    build_task,
+    reset_checked,
+    returns_check,
+)
+
+
+@dataclass(frozen=True)
+class Running:
+    """The version that runs now."""
+
+    request: Load
+    """How it was loaded."""
+    opened: OpenedTask
+    last: StepResult
+    """The present moment."""
+
+
+class _MustRebuild(Exception):
+    """Why the new code does not fit the live env after all."""
+
+
+def load_version(
+    request: Load, running: Running | None, on_activity: Callable[[str], None] = lambda activity: None
+) -> tuple[OpenedTask, ReloadReport | None]:
+    """Load the task, or the version of it that is on disk now, keeping what can be kept of `running`.
+
+    With the levels ``same``, ``patched`` and ``cameras`` the env of the result is that of `running`; with the
+    others it is another, and closing the old one is the caller's. No picture may be under way.
+
+    Raises:
+        TaskError: the version does not work; `running` is as it was.
+    """
+    began, clock = perf_counter(), Clock()
+    before = None if running is None else with_late_imports(running.opened.loaded)
+    on_activity(f"importing {request.task.rsplit('/', 1)[-1]}")
+    loaded = load_task(request.task, source=request.source)
+    clock.lap("import")
+    try:
+        change = _what_changed(request, running, before, loaded)
+        if running is not None and change.level != "rebuilt":
+            try:
+                on_activity("trying the new version")
+                opened, report = _exchange(running, loaded, change, clock)
+                return opened, replace(report, milliseconds=1000 * (perf_counter() - began))
+            except _MustRebuild as why:
+                change = replace(change, level="rebuilt", reason=str(why))
+        opened, report = _build(request, running, loaded, change, clock, on_activity)
+    except BaseException:
+        # The last good version must not go on with the new one's helper modules and registrations.
+        take_back(loaded)
+        raise
+    if report is not None:
+        report = replace(report, milliseconds=1000 * (perf_counter() - began))
+    return opened, report
+
+
+# --- which level -----------------------------------------------------------------------------------
+
+
+def _what_changed(
+    request: Load, running: Running | None, before: LoadedTask | None, loaded: LoadedTask
+) -> Change:
+    if running is None or before is None:
+        return Change("rebuilt", "")
+    if not loaded.followed:
+        return Change("rebuilt", "it was asked for")
+    if (before.file, before.class_name, before.env_id) != (loaded.file, loaded.class_name, loaded.env_id):
+        return Change("rebuilt", f"{loaded.class_name} is another task than {before.class_name}")
+    if replace(running.request.options, seed=0) != replace(request.options, seed=0):
+        return Change("rebuilt", "the options changed")
+    files = {*before.source, *loaded.source}
+    inherited = inherited_by(loaded.cls, files)
+    texts = {**_still_there(before, request), **loaded.source}
+    change = find_change(before.source, texts, str(loaded.file), loaded.class_name, inherited)
+    if request.level in ("auto", change.level):
+        return change
+    said = f"{request.level} was asked for"
+    if request.level != "rebuilt":
+        said += f" ({change.level} would have been chosen: {change.reason})"
+    # What was not found safe is tried as if everything had changed.
+    hooks = change.hooks if change.level in ("patched", "cameras") else RESET_HOOKS
+    return Change(request.level, said, hooks)
+
+
+def _still_there(before: LoadedTask, request: Load) -> dict[str, str]:
+    """Modules that the version before imported inside its hooks, which the new one may do as well."""
+    texts: dict[str, str] = {}
+    for path in before.source:
+        given = (request.source or {}).get(path)
+        try:
+            texts[path] = given if given is not None else decode(path, Path(path).read_bytes())
+        except (OSError, SyntaxError):
+            continue
+    return texts
+
+
+# --- the env stays -----------------------------------------------------------------------------------
+
+
+def _exchange(
+    running: Running, loaded: LoadedTask, change: Change, clock: Clock
+) -> tuple[OpenedTask, ReloadReport]:
+    opened, env = running.opened, running.opened.env.env
+    if change.level == "cameras" and not can_exchange_cameras(env):
+        raise _MustRebuild(f"{change.reason}, and GPU simulation cannot exchange cameras")
+    before = task_class(env)
+    put_class(env, loaded.cls)
+    left: dict[str, str] = {}
+    try:
+        task = TaskEnv(
+            env, loaded.max_episode_steps, check=returns_check(loaded, opened.env.num_envs), like=opened.env
+        )
+        if change.level == "cameras":
+            with blamed("build", loaded, task):
+                exchange_cameras(env)
+        if change.tried_hooks:
+            with blamed("reset", loaded, task):
+                left = rehearse_hooks(env, change.tried_hooks)
+        clock.lap("rehearse")
+        first = running.last if change.level == "same" else _judge(task, loaded, running.last, change)
+        if change.level != "same":
+            keep_observation_space(env, task.obs)
+    except BaseException:
+        put_class(env, before)
+        if change.level == "cameras":
+            exchange_cameras(env)
+        raise
+    clock.lap("judge")
+    loaded = with_late_imports(loaded)
+    description = replace(
+        opened.description,
+        source_files=tuple(str(path) for path in loaded.source_files),
+        source_hash=loaded.source_hash,
+        source=dict(loaded.source),
+        max_episode_steps=loaded.max_episode_steps,
+        others=loaded.others,
+    )
+    if change.level == "cameras":
+        description = replace(description, cameras=list_cameras(env, task.table))
+    report = ReloadReport(change.level, change.reason, 0.0, not_carried=left)
+    return OpenedTask(loaded, task, description, first, clock.laps), report
+
+
+def _judge(task: TaskEnv, loaded: LoadedTask, last: StepResult, change: Change) -> StepResult:
+    # Without an action no reward is given; it is computed all the same, or its mistakes would come out later.
+    action = last.action if last.action is not None else actions.hold_action(task.parts, task.num_envs)
+    try:
+        with blamed("step", loaded, task):
+            judged = task.judge(action)
+    except TaskError as error:
+        if change.hooks & RESET_HOOKS:
+            raise _MustRebuild(
+                f"{change.reason}, and this moment lacks what a reset makes now ({error.problem.message})"
+            ) from error
+        raise
+    if last.action is None:
+        return replace(judged, reward=np.zeros_like(judged.reward), action=None)
+    return judged
+
+
+# --- another env ---------------------------------------------------------------------------------------
+
+
+def _build(
+    request: Load,
+    running: Running | None,
+    loaded: LoadedTask,
+    change: Change,
+    clock: Clock,
+    on_activity: Callable[[str], None],
+) -> tuple[OpenedTask, ReloadReport | None]:
+    snapshot = _moment(request, running, loaded)
+    opened = build_task(loaded, request.options, clock, on_activity)
+    if snapshot is None:
+        report = ReloadReport("rebuilt", change.reason, 0.0) if running is not None else None
+        return opened, report
+    action = None if running is None else running.last.action
+    try:
+        first, restored = _restore(opened, snapshot, action)
+    except TaskError as error:
+        # The new version works, as its rehearsal has shown; only not from this moment on.
+        first = reset_checked(opened.env, opened.loaded, request.options.seed)
+        restored = RestoreReport((), {"the moment": f"the new version fails in it: {error.problem.message}"})
+    except BaseException:
+        opened.env.close()
+        raise
+    clock.lap("restore")
+    level = "restarted" if running is None else "rebuilt"
+    reason = change.reason if running is not None else "the worker was started anew"
+    report = ReloadReport(level, reason, 0.0, restored.carried, dict(restored.not_carried))
+    return replace(opened, first=first, milliseconds=clock.laps), report
+
+
+def _moment(request: Load, running: Running | None, loaded: LoadedTask) -> Snapshot | None:
+    """What is to be shown after the build; None for a fresh episode."""
+    if request.snapshot is not None:
+        return pickle.loads(request.snapshot)
+    if running is None or running.opened.loaded.class_name != loaded.class_name:
+        return None
+    return running.opened.env.snapshot()
+
+
+def _restore(
+    opened: OpenedTask, snapshot: Snapshot, action: np.ndarray | None
+) -> tuple[StepResult, RestoreReport]:
+    task = opened.env
+    there = [i for i in snapshot.env_idx if i < task.num_envs]
+    fits = action is not None and action.shape == (task.num_envs, len(actions.bounds(task.parts)[0]))
+    with blamed("reset", opened.loaded, task):
+        report = restore_snapshot(task.env, snapshot, there)
+        return task.judge(action if fits else None), report

@@ -1,0 +1,97 @@
+"""How the version that is shown came in, and the ways to bring it in again.
+
+A saved file comes in by the least that is safe, and a person must be able to see what that was: an author who
+thinks that the scene was built anew, when only the reward was exchanged, looks for a bug that is not there. So
+level, reason and time stand here, with what a build could not carry over; and beside them the buttons that choose
+otherwise. Where a file has several tasks, this is where one of them is chosen.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import viser
+
+from workbench.session.messages import LoadLevel, ReloadReport
+from workbench.session.session import Session
+from workbench.session.view import SessionView
+from workbench.ui.checked import checked_choice
+from workbench.ui.controls import Control
+from workbench.ui.fragments import render
+
+AS_NEEDED, PATCHED, CAMERAS, REBUILT = "as needed", "patch", "cameras", "rebuild"
+LEVELS: dict[str, LoadLevel] = {
+    AS_NEEDED: "auto",
+    PATCHED: "patched",
+    CAMERAS: "cameras",
+    REBUILT: "rebuilt",
+}
+MOST_SHOWN = 8
+"""Things not carried that are named; the rest is counted."""
+
+
+class VersionPanel:
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._session = session
+        self._drawn: object = None
+        self._names: tuple[str, ...] = ("",)
+        # viser's annotations take the first options for all that there will ever be.
+        add_dropdown: Any = server.gui.add_dropdown
+        with server.gui.add_folder("Version of the file"):
+            self._task = Control(
+                add_dropdown("Task", self._names, visible=False, hint="The file has several tasks."),
+                read=lambda value: checked_choice(value, self._names, "task"),
+                send=session.choose_class,
+            )
+            self._html = server.gui.add_html("")
+            self._again = server.gui.add_button_group(
+                "Load again",
+                tuple(LEVELS),
+                hint="As needed: the least that is safe. Patch: only the code. Cameras: code and cameras. Rebuild: "
+                "the scene too, with the state put back. A patch that was not found safe can leave old and new "
+                "code mixed.",
+            )
+            self._again.on_click(lambda event: self._load(event.target.value))
+
+    def draw(self, view: SessionView) -> None:
+        task = view.task
+        can_load = view.state != "stopped"
+        if self._again.visible != can_load:
+            self._again.visible = can_load
+        names = () if task is None else (task.class_name, *task.others)
+        if len(names) > 1:
+            # In one order, whichever of them is shown.
+            if tuple(sorted(names)) != self._names:
+                self._names = tuple(sorted(names))
+                self._task.handle.options = self._names
+            self._task.show(names[0])
+        if self._task.handle.visible != (len(names) > 1):
+            self._task.handle.visible = len(names) > 1
+        wanted = (view.reload, view.stale, task is None)
+        if wanted != self._drawn:
+            self._drawn = wanted
+            self._html.content = version_html(view.reload, loaded=task is not None)
+
+    def _load(self, value: object) -> None:
+        self._session.reload(LEVELS[checked_choice(value, LEVELS, "way to load")])
+
+
+def version_html(report: ReloadReport | None, loaded: bool) -> str:
+    """What the page says of the last reload; every value escaped."""
+    if report is None:
+        return render("version", report=None, loaded=loaded)
+    missing = list(report.not_carried.items())
+    return render(
+        "version",
+        report=report,
+        loaded=loaded,
+        took=took(report.milliseconds),
+        carried=len(report.carried),
+        missing=missing[:MOST_SHOWN],
+        more=max(0, len(missing) - MOST_SHOWN),
+    )
+
+
+def took(milliseconds: float) -> str:
+    """``43 ms``, ``1.2 s``."""
+    return f"{milliseconds:.0f} ms" if milliseconds < 1000 else f"{milliseconds / 1000:.1f} s"
