@@ -24,10 +24,14 @@ from workbench.session.session import Session
 from workbench.session.view import SessionView
 
 N = 3
-ORIGINAL = (TASKS / "push_cube.py").read_text()
+ORIGINAL = (
+    (TASKS / "push_cube.py")
+    .read_text()
+    .replace("from typing import Any", "import os\nimport time\nfrom typing import Any", 1)
+)
 REWARD = "return self.compute_dense_reward(obs, action, info) / 3"
 SUCCESS = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),'
-IN_THE_JUDGE = "__import__('os').getpriority(0, 0) == 10"
+IN_THE_JUDGE = "os.getpriority(os.PRIO_PROCESS, 0) == 10"
 """True in the process that judges: it has a lower priority."""
 
 
@@ -162,7 +166,7 @@ def test_code_that_raises_is_told_with_its_line_and_the_record_stays(desk: Desk,
 
 
 def test_the_next_save_takes_the_place_of_a_judgement_while_the_worker_plays_on(desk: Desk, record) -> None:
-    slow = f"__import__('time').sleep(0.1 if {IN_THE_JUDGE} else 0)"
+    slow = f"time.sleep(0.1 if {IN_THE_JUDGE} else 0)"
     desk.edit(REWARD, f"{slow}\n        {REWARD} * 2")
     desk.judged("judging")
     session = desk.session
@@ -204,7 +208,7 @@ def test_a_judgement_that_loops_for_ever_can_be_stopped_and_the_next_one_runs(de
 
 
 def test_a_judge_that_dies_is_told_and_the_next_judgement_has_another(desk: Desk, record) -> None:
-    slow = f"__import__('time').sleep(0.1 if {IN_THE_JUDGE} else 0)"
+    slow = f"time.sleep(0.1 if {IN_THE_JUDGE} else 0)"
     desk.edit(REWARD, f"{slow}\n        {REWARD}")
     desk.judged("judging")
     first = desk.session._judge.pid
