@@ -153,6 +153,10 @@ def test_episodes_that_succeed_otherwise_are_listed_with_their_steps(desk: Desk,
 
 def test_code_that_raises_is_told_with_its_line_and_the_record_stays(desk: Desk, record) -> None:
     late = "if bool((self.elapsed_steps > 20).any()): raise KeyError('late')"
+    # The process that judges now stands at the end of an episode, where the new code raises at once.
+    desk.edit(REWARD, f"{REWARD} * 2")
+    desk.judged()
+    desk.note()
     desk.edit(REWARD, f"{late}\n        {REWARD}")
     view = desk.judged("failed")
     assert "KeyError: 'late'" in view.problem.message
