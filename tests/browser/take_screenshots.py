@@ -65,6 +65,8 @@ def shoot_judged(page: Page, file: Path) -> None:
     expect(page.get_by_text("episodes differ.")).to_be_visible(timeout=120_000)
     rows = page.locator(".wb-again-table tbody tr")
     rows.nth(1).click()
+    expect(rows.nth(1)).to_have_class("wb-selected")
+    time.sleep(2.0)
     page.locator(".wb-again-more").scroll_into_view_if_needed()
     shoot(page, "judged")
     page.get_by_role("button", name="now", exact=True).click()
