@@ -134,6 +134,25 @@ def close_notice(page: Page) -> None:
         notice.first.click()
 
 
+def shoot_judged(page: Page, file: Path) -> None:
+    """A reward that asks for less is saved: what it says of the episodes so far, and one moment of them."""
+    good = file.read_text()
+    asked = "reach = 1 - torch.tanh(5 * distance)"
+    assert asked in good
+    tab(page, "Reward")
+    file.write_text(good.replace(asked, asked.replace("5", "3")))
+    expect(page.get_by_text("episodes differ.")).to_be_visible(timeout=120_000)
+    rows = page.locator(".wb-again-table tbody tr")
+    rows.nth(1).click()
+    expect(rows.nth(1)).to_have_class("wb-selected")
+    time.sleep(2.0)
+    page.locator(".wb-again-more").scroll_into_view_if_needed()
+    shoot(page, "judged")
+    page.get_by_role("button", name="now", exact=True).click()
+    file.write_text(good)
+    expect(page.get_by_text("Nothing differs").first).to_be_visible(timeout=120_000)
+
+
 def main() -> None:
     chromium = find_chromium()
     if chromium is None:
@@ -161,6 +180,7 @@ def main() -> None:
             shoot(page, "run")
             page.get_by_role("button", name="Pause", exact=True).click()
             shoot_branch(page)
+            shoot_judged(page, file)
             tab(page, "Cameras")
             for tick in page.locator("input[type=checkbox]:visible").all()[1:4]:
                 tick.check(force=True)

@@ -24,10 +24,14 @@ from workbench.session.session import Session
 from workbench.session.view import SessionView
 
 N = 3
-ORIGINAL = (TASKS / "push_cube.py").read_text()
+ORIGINAL = (
+    (TASKS / "push_cube.py")
+    .read_text()
+    .replace("from typing import Any", "import os\nimport time\nfrom typing import Any", 1)
+)
 REWARD = "return self.compute_dense_reward(obs, action, info) / 3"
 SUCCESS = '"success": (distance < GOAL_RADIUS) & (height.abs() < 0.005),'
-IN_THE_JUDGE = "__import__('os').getpriority(0, 0) == 10"
+IN_THE_JUDGE = "os.getpriority(os.PRIO_PROCESS, 0) == 10"
 """True in the process that judges: it has a lower priority."""
 
 
@@ -45,9 +49,11 @@ class Desk:
         """Start anew with the original, play, and stop at the first moment of new episodes; the whole record."""
         session = self.session
         session.pause()
-        loads = session.view().task_serial
-        self.file.write_text(ORIGINAL + f"# {loads}\n")
-        wait_until(session, lambda v: v.task_serial > loads and v.timeline.moments == 1, "a new history")
+        self.file.write_text(ORIGINAL)
+        wait_until(session, lambda v: v.task.source[str(self.file)] == ORIGINAL, "the original")
+        session.reload("rebuilt")
+        first = session.view().timeline.last
+        wait_until(session, lambda v: v.timeline.first > first and v.timeline.moments == 1, "a new history")
         session.stop_judging()
         wait_until(session, lambda v: v.judgement.state not in ("loading", "judging"), "its end")
         session.set_speed(math.inf)
@@ -147,6 +153,10 @@ def test_episodes_that_succeed_otherwise_are_listed_with_their_steps(desk: Desk,
 
 def test_code_that_raises_is_told_with_its_line_and_the_record_stays(desk: Desk, record) -> None:
     late = "if bool((self.elapsed_steps > 20).any()): raise KeyError('late')"
+    # The process that judges now stands at the end of an episode, where the new code raises at once.
+    desk.edit(REWARD, f"{REWARD} * 2")
+    desk.judged()
+    desk.note()
     desk.edit(REWARD, f"{late}\n        {REWARD}")
     view = desk.judged("failed")
     assert "KeyError: 'late'" in view.problem.message
@@ -160,7 +170,7 @@ def test_code_that_raises_is_told_with_its_line_and_the_record_stays(desk: Desk,
 
 
 def test_the_next_save_takes_the_place_of_a_judgement_while_the_worker_plays_on(desk: Desk, record) -> None:
-    slow = f"__import__('time').sleep(0.1 if {IN_THE_JUDGE} else 0)"
+    slow = f"time.sleep(0.1 if {IN_THE_JUDGE} else 0)"
     desk.edit(REWARD, f"{slow}\n        {REWARD} * 2")
     desk.judged("judging")
     session = desk.session
@@ -202,7 +212,7 @@ def test_a_judgement_that_loops_for_ever_can_be_stopped_and_the_next_one_runs(de
 
 
 def test_a_judge_that_dies_is_told_and_the_next_judgement_has_another(desk: Desk, record) -> None:
-    slow = f"__import__('time').sleep(0.1 if {IN_THE_JUDGE} else 0)"
+    slow = f"time.sleep(0.1 if {IN_THE_JUDGE} else 0)"
     desk.edit(REWARD, f"{slow}\n        {REWARD}")
     desk.judged("judging")
     first = desk.session._judge.pid

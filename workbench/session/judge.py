@@ -3,7 +3,7 @@
 After an edit of a reward the question is what it would have said of the episodes that one has just watched. They
 are all in the history: a snapshot for every beginning, and every action. So they are run again with the new code and
 compared with the record. That takes seconds or minutes, and the worker that plays must go on playing; so it happens in
-a process of its own, with a lower priority, started at the first judgement (it takes 0.5 GB and some seconds)
+a process of its own, with a lower priority, started at the first judgement (0.75 GB for 16 PushCube envs, and some seconds)
 and ended when none was asked for in a while.
 
 One thread does all of it: it sends some moments, waits for the answer, compares, and sends the next. So one
@@ -24,7 +24,6 @@ from typing import Literal
 from workbench.authoring.problem import Problem
 from workbench.session.judgement import JudgedCurve, Judgement, Summary
 from workbench.session.messages import (
-    SCENE_KEPT,
     Event,
     Failed,
     Judged,
@@ -83,15 +82,13 @@ def what_a_load_means(
 
     If not, what the last judgement said is kept to be seen, or forgotten with the episodes.
     """
-    after = loaded.task
-    if before is None or not after.source:
-        return "forget"
-    if before.source == after.source:
-        # Saved again without a change: what that stopped is to be had all the same.
+    level = None if before is None or loaded.reload is None else loaded.reload.level
+    if level == "patched":
+        return "judge"
+    if level in ("same", "cameras"):
+        # Saved again without a change that matters: what that stopped is to be had all the same.
         return "judge" if view.state == "stopped" and view.why == FILE_SAVED else "keep"
-    if loaded.reload is None or loaded.reload.level not in SCENE_KEPT:
-        return "forget"
-    return "judge" if loaded.reload.level == "patched" else "keep"
+    return "forget"
 
 
 @dataclass
@@ -236,11 +233,19 @@ class Judge:
         self._tell(job, "loading")
         if self._process is None:
             self._process = _start_process()
-        self._owed = Loaded
-        self._process.send(job.load)
-        event = self._answer(job)
+        event = self._ask_to_load(job, job.load)
+        if isinstance(event, Failed):
+            # A version is tried at the moment at which the env stands: here wherever the judgement before
+            # ended, where the new code may raise though it loads and runs from the moments of the record.
+            event = self._ask_to_load(job, replace(job.load, level="rebuilt"))
         if isinstance(event, Failed):
             raise _Failure("the new code could not be loaded to judge with", event.problem)
+
+    def _ask_to_load(self, job: _Job, load: Load) -> Event:
+        assert self._process is not None
+        self._owed = Loaded
+        self._process.send(load)
+        return self._answer(job)
 
     def _live_through(self, job: _Job, rows: range) -> None:
         assert self._process is not None

@@ -64,7 +64,7 @@ class JudgementPanel:
         if judged.state == "none":
             self._first = 0
         else:
-            self._status.content = status_html(judged)
+            _fill(self._status, status_html(judged))
         self._draw_list(judged, view)
         self._draw_chart(judged, view)
 
@@ -119,7 +119,7 @@ class JudgementPanel:
         count = len(self._listed)
         self._first = min(self._first, (count - 1) // MOST_ROWS * MOST_ROWS)
         shown = range(self._first, min(self._first + MOST_ROWS, count))
-        self._list.content = render(
+        content = render(
             "differences",
             rows=[self._row(place, view) for place in shown],
             more=None
@@ -132,6 +132,7 @@ class JudgementPanel:
                 "on": self._presses.id_of("on", lambda _: self._turn(MOST_ROWS)),
             },
         )
+        _fill(self._list, content)
 
     def _row(self, place: int, view: SessionView) -> dict[str, object]:
         episode = self._listed[place]
@@ -231,3 +232,9 @@ def _show(
 ) -> None:
     if handle.visible != shown:
         handle.visible = shown
+
+
+def _fill(handle: viser.GuiHtmlHandle, content: str) -> None:
+    # Content that is sent again is made anew in the page, under the pointer of whoever is about to press it.
+    if handle.content != content:
+        handle.content = content

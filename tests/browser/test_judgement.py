@@ -1,0 +1,125 @@
+"""The past judged again in a real Chromium: an edit is saved, and the Reward tab says what it would have changed."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page, expect, sync_playwright
+
+from tests.browser.opened import launch, new_page, open_workbench
+
+pytestmark = pytest.mark.browser
+expect.set_options(timeout=60_000)
+TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
+REWARD = "return self.compute_dense_reward(obs, action, info) / 3"
+STEPS = 60
+
+
+@dataclass
+class Desk:
+    page: Page
+    errors: list[str]
+    file: Path
+
+    def edit(self, old: str, new: str) -> None:
+        text = TASK.read_text()
+        assert old in text
+        self.file.write_text(text.replace(old, new))
+
+    def says(self, pattern: str) -> None:
+        expect(self.page.locator(".wb-again").get_by_text(re.compile(pattern)).first).to_be_visible()
+
+    @property
+    def rows(self):
+        return self.page.locator(".wb-again-table tbody tr")
+
+
+def until(reached: Callable[[], bool], what: str, seconds: float = 60.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not reached():
+        assert time.monotonic() < deadline, f"{what} did not come within {seconds} s"
+        time.sleep(0.05)
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Iterator[Desk]:
+    """Three envs that have made some sixty steps, paused, on the Reward tab."""
+    folder = tmp_path_factory.mktemp("author")
+    file = Path(shutil.copy(TASK, folder / "push_cube.py"))
+    with (
+        open_workbench(str(file), "--num-envs", "3", cwd=folder) as workbench,
+        sync_playwright() as playwright,
+    ):
+        browser = launch(playwright, chromium_path)
+        page, errors = new_page(browser, 1280, 1000)
+        page.goto(workbench.url)
+        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=90_000)
+        page.get_by_role("button", name="Play", exact=True).click()
+        strip = page.locator(".wb-timeline")
+
+        def kept() -> int:
+            found = re.search(r"MB, (\d+) steps", strip.inner_text())
+            return 0 if found is None else int(found.group(1))
+
+        until(lambda: kept() > STEPS, "some steps")
+        page.get_by_role("button", name="Pause", exact=True).click()
+        expect(page.get_by_text("paused", exact=True)).to_be_visible()
+        page.get_by_role("button", name="Reset all", exact=True).click()
+        page.get_by_role("tab", name="Reward").click()
+        yield Desk(page, errors, file)
+        browser.close()
+
+
+def test_nothing_is_shown_before_there_is_something_to_say(desk: Desk) -> None:
+    expect(desk.page.locator(".wb-again")).to_have_count(0)
+    expect(desk.page.get_by_role("button", name="Stop judging")).to_have_count(0)
+
+
+def test_an_edited_reward_is_drawn_over_the_recorded_one_and_what_differs_is_listed(desk: Desk) -> None:
+    desk.edit(REWARD, f"{REWARD} * 2")
+    desk.says(r"(\d+) of \1 episodes differ\.")
+    desk.says("mean return: .* → ")
+    desk.says("to the last bit")
+    expect(desk.page.get_by_text("reward of env 0, before and now")).to_be_visible()
+    expect(desk.page.get_by_text("judged again", exact=True)).to_be_visible()
+    until(lambda: desk.rows.count() >= 6, "the list")
+    expect(desk.page.get_by_role("button", name="Stop judging")).to_have_count(0)
+
+
+def test_a_row_shows_its_env_at_its_moment_and_a_key_goes_to_the_next(desk: Desk) -> None:
+    desk.edit(REWARD, f"{REWARD} * 2")
+    until(lambda: desk.rows.count() >= 6, "the list")
+    row = desk.rows.nth(2)
+    env = row.locator("td").first.inner_text()
+    row.click()
+    expect(desk.page.locator(".wb-timeline").get_by_text("past", exact=True)).to_be_visible()
+    expect(desk.page.get_by_role("columnheader", name=f"env {env}")).to_be_visible()
+    expect(desk.page.get_by_text(f"reward of env {env}, before and now")).to_be_visible()
+    expect(desk.rows.nth(2)).to_have_class("wb-selected")
+    desk.page.keyboard.press("j")
+    expect(desk.rows.nth(3)).to_have_class("wb-selected")
+    desk.page.keyboard.press("Shift+J")
+    expect(desk.rows.nth(2)).to_have_class("wb-selected")
+    desk.page.keyboard.press("End")
+    expect(desk.page.locator(".wb-timeline").get_by_text("live", exact=True)).to_be_visible()
+
+
+def test_an_edit_that_changes_no_number_is_one_line(desk: Desk) -> None:
+    desk.edit(REWARD, f"third = 3\n        {REWARD.replace('3', 'third')}")
+    desk.says(r"Nothing differs in \d+ episodes: reward, success and fail are as they were\.")
+    expect(desk.rows).to_have_count(0)
+    expect(desk.page.get_by_text("before and now")).to_have_count(0)
+
+
+def test_code_that_raises_on_the_way_is_told_with_its_line(desk: Desk) -> None:
+    desk.edit(REWARD, f"if self.elapsed_steps.max() > 40: raise KeyError('far')\n        {REWARD} * 2")
+    desk.says("the new code raised: KeyError")
+    desk.says(r"push_cube\.py:\d+")
+    expect(desk.page.get_by_text("before and now")).to_be_visible()
+    assert desk.errors == []

@@ -1,0 +1,185 @@
+"""What the page says of a judgement, and what it draws."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+import viser
+
+from tests.ui.scenes import running
+from workbench.authoring.problem import Problem
+from workbench.session.judge import JudgementView
+from workbench.session.judgement import EpisodeDifference, JudgedCurve, Summary
+from workbench.session.timeline import TimelineView
+from workbench.ui import judged_in_words as words
+from workbench.ui.curves_panel import LONGEST
+from workbench.ui.judgement_panel import MOST_ROWS, JudgementPanel, chart_data, status_html
+
+
+def episode(env: int = 0, **changes: Any) -> EpisodeDifference:
+    return replace(
+        EpisodeDifference(env, 10 * env, 10 * env + 5, (None, None), (None, None), (1.0, 2.0), 0.25, 0.0),
+        **changes,
+    )
+
+
+def summary(*differences: EpisodeDifference, **changes: Any) -> Summary:
+    names = ("reward", "success")
+    differing = frozenset({"reward"} if differences else ())
+    found = Summary(12, len(differences), differences, (3, 3), (1.0, 2.0), 0.0, 0.0, None, names, differing)
+    return replace(found, **changes)
+
+
+def done(found: Summary | None, **changes: Any) -> JudgementView:
+    return replace(JudgementView("done", 1, 50, 50, summary=found), **changes)
+
+
+class RecordedSession:
+    """Stands where the session stands for a panel: what it has of curves, and what it was asked for."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[object, ...]] = []
+        self.shown = running(40, timeline=TimelineView(first=0, last=1000))
+
+    def judged_curve(self, name: str, env: int) -> JudgedCurve | None:
+        tick = np.arange(20)
+        old = np.full(20, env, np.float32)
+        return JudgedCurve(tick, tick, old, 2 * old) if name in ("reward", "success") else None
+
+    def view(self) -> object:
+        return self.shown
+
+    def show(self, env: int, serial: int) -> None:
+        self.asked.append(("show", env, serial))
+
+    def select_env(self, env: int) -> None:
+        self.asked.append(("select", env))
+
+    def stop_judging(self) -> None:
+        self.asked.append(("stop",))
+
+
+@pytest.fixture
+def panel(server: viser.ViserServer) -> JudgementPanel:
+    return JudgementPanel(server, cast(Any, RecordedSession()))
+
+
+def draw(panel: JudgementPanel, judged: JudgementView, **changes: Any) -> None:
+    panel._drawn_at = 0.0
+    timeline = TimelineView(first=0, last=1000)
+    panel.draw(running(40, judgement=judged, **{"timeline": timeline, **changes}))
+
+
+def test_outcomes_are_said_before_rewards() -> None:
+    moved = episode(success=(None, 41), fail=(7, None))
+    assert words.difference(moved) == ["success now at step 41, was never", "fail never now, was at step 7"]
+    assert words.difference(episode()) == ["reward by up to 0.25"]
+
+
+def test_nothing_that_differs_is_one_sentence() -> None:
+    same = done(summary(mean_return=(1.0, 1.0)))
+    assert (
+        words.headline(same) == "Nothing differs in 12 episodes: reward, success and fail are as they were."
+    )
+    assert words.numbers(same) == []
+    other = done(summary(differing_names=frozenset({"height"})))
+    assert words.headline(other).endswith("Other entries differ: height.")
+    assert "so far" in words.headline(replace(same, state="judging"))
+
+
+@pytest.mark.parametrize(
+    ("metres", "radians", "says", "far"),
+    [
+        (0.0, 0.0, "to the last bit", False),
+        (4e-4, 1e-4, "at most 0.4 mm", False),
+        (0.032, 0.0, "up to 3.2 cm", True),
+        (0.0, 0.2, "11°", True),
+        (float("inf"), 0.0, "more than can be told", True),
+        (float("nan"), 0.0, "more than can be told", True),
+    ],
+)
+def test_drift_is_told_and_doubted_where_it_is_large(
+    metres: float, radians: float, says: str, far: bool
+) -> None:
+    found = summary(drift_metres=metres, drift_radians=radians, drift_at=(7, 3))
+    assert says in words.drift(found)
+    assert words.is_far(found) == far
+    assert ("env 7" in words.drift(found)) == far
+
+
+def test_a_problem_is_told_with_file_and_line_and_escaped() -> None:
+    problem = Problem("reward", "KeyError: '<b>'", "/home/me/push.py", 88, "raise <b>", "")
+    html = status_html(done(None, state="failed", why="the new code raised", problem=problem, done=20))
+    assert "push.py:88" in html and "20 of 50" in html
+    assert "<b>" not in html and "&lt;b&gt;" in html
+
+
+def test_nothing_is_shown_before_the_first_judgement(panel: JudgementPanel) -> None:
+    draw(panel, JudgementView())
+    assert not any(h.visible for h in (panel._status, panel._stop, panel._name, panel._list))
+    assert panel._chart is None
+
+
+def test_only_what_runs_can_be_stopped(panel: JudgementPanel) -> None:
+    for state, stoppable in (("loading", True), ("judging", True), ("done", False), ("failed", False)):
+        draw(panel, done(None, state=state, serial=hash(state)))
+        assert panel._stop.visible == stoppable and panel._status.visible
+
+
+def test_the_new_line_lies_over_the_recorded_one(panel: JudgementPanel) -> None:
+    draw(panel, done(summary(episode(3))), selected_env=3)
+    assert panel._chart is not None and panel._chart.visible
+    _, old, new = panel._chart.data
+    assert (old == 3).all() and (new == 6).all()
+    assert [series.get("label") for series in panel._chart.series] == ["step", "as recorded", "judged again"]
+    draw(panel, done(summary(), serial=2), selected_env=3)
+    assert not panel._chart.visible and not panel._name.visible
+
+
+def test_a_choice_that_is_none_draws_the_reward(panel: JudgementPanel) -> None:
+    draw(panel, done(summary(episode(1))))
+    panel._name.value = "../../etc"
+    draw(panel, done(summary(episode(1)), serial=2))
+    assert panel._chart is not None and str(panel._chart.title).startswith("reward of env")
+
+
+def test_rows_go_to_their_moment_and_forgotten_moments_only_to_their_env(panel: JudgementPanel) -> None:
+    session = cast(Any, panel._session)
+    draw(panel, done(summary(*(episode(env) for env in range(MOST_ROWS + 3)))))
+    assert f"1 to {MOST_ROWS} of {MOST_ROWS + 3}" in panel._list.content
+    panel._go(2)
+    panel._turn(MOST_ROWS)
+    panel._go(2)
+    panel._go(3)  # there is no such row on the last part
+    assert session.asked == [("show", 2, 25), ("show", MOST_ROWS + 2, 10 * (MOST_ROWS + 2) + 5)]
+    session.shown = running(40, timeline=TimelineView(first=500, last=1000))
+    panel._turn(-MOST_ROWS)
+    panel._go(0)
+    assert session.asked[-1] == ("select", 0)
+
+
+def test_the_key_goes_round(panel: JudgementPanel) -> None:
+    session = cast(Any, panel._session)
+    panel.go_to_difference(1)
+    assert session.asked == []
+    draw(panel, done(summary(episode(0), episode(1))))
+    for wanted in (("show", 0, 5), ("show", 1, 15), ("show", 0, 5)):
+        panel.go_to_difference(1)
+        assert session.asked[-1] == wanted
+        session.shown = running(
+            40, selected_env=wanted[1], timeline=TimelineView(first=0, last=1000, shown=wanted[2])
+        )
+
+
+def test_of_a_long_record_the_part_round_the_shown_moment_is_drawn() -> None:
+    count = 3 * LONGEST
+    tick = np.arange(count)
+    curve = JudgedCurve(tick, tick + 7, np.zeros(count, np.float32), np.ones(count, np.float32))
+    assert chart_data(curve, None)[0][-1] == count - 1
+    x, _, _, cursor = chart_data(curve, 7 + LONGEST)
+    assert len(x) == LONGEST
+    assert x[np.flatnonzero(np.isfinite(cursor))].tolist() == [LONGEST]
+    assert len(chart_data(curve, 10**6)) == 3
