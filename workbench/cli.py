@@ -271,10 +271,10 @@ def _env_argument(pair: str) -> tuple[str, Any]:
 def _bytes(text: str) -> int:
     """``256MB``, ``1.5 GB`` or a plain number, as bytes."""
     found = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*([kmg]?)b?\s*", text, re.IGNORECASE)
-    size = 0 if found is None else int(float(found[1]) * 1024 ** " kmg".index(found[2].lower() or " "))
+    size = 0.0 if found is None else float(found[1]) * 1024 ** " kmg".index(found[2].lower() or " ")
     if not 1024**2 <= size <= 1024**4:
         raise ValueError(f"--history takes a size from 1MB on, such as 256MB or 2GB; got {text!r}")
-    return size
+    return int(size)
 
 
 def _say(event: Event) -> None:

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -29,6 +29,7 @@ from typing import Any, Literal
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
 from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.envs.utils.observations import CameraObsTextures
 
 from workbench.authoring import registry
 from workbench.authoring.load import load_task
@@ -83,6 +84,7 @@ def make(
     """
     _refuse_contradictions(num_envs, kwargs)
     found = _find(task)
+    _refuse_unknown_modes(found.cls, kwargs)
     given = {**found.default_kwargs, **kwargs}
     if given.get("reward_mode") is None and not _stock_reward_works(found.cls):
         # Among the spec's arguments, so that a replay by gym.make has a reward too.
@@ -131,6 +133,21 @@ def _refuse_contradictions(num_envs: Any, kwargs: Mapping[str, Any]) -> None:
             'backend="cpu" (batched on the CPU), "gpu" (ManiSkill\'s GPU simulation) or "auto". '
             "For stock ManiSkill use gym.make."
         )
+
+
+def _refuse_unknown_modes(cls: type[BaseEnv], kwargs: Mapping[str, Any]) -> None:
+    textures = {*(texture.name for texture in fields(CameraObsTextures)), "rgbd"}
+    known: dict[str, set[Any]] = {
+        "obs_mode": {*cls.SUPPORTED_OBS_MODES, *_STATE_MODES, *textures},
+        "reward_mode": set(cls.SUPPORTED_REWARD_MODES),
+        "render_mode": set(cls.SUPPORTED_RENDER_MODES),
+    }
+    for name, modes in known.items():
+        value = kwargs.get(name)
+        parts = {value} if value in modes or not isinstance(value, str) else set(value.split("+"))
+        if value is not None and (parts - modes or (name != "obs_mode" and value not in modes)):
+            sums = ", or a sum of some as in rgb+depth" if name == "obs_mode" else ""
+            raise ValueError(f"{name}={value!r} is none of {', '.join(sorted(map(str, modes)))}{sums}")
     if kwargs.get("render_backend", "found") in (None, "none"):
         needs = _what_needs_pictures(None, kwargs)
         if needs is not None:

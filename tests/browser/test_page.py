@@ -93,7 +93,13 @@ def test_the_page_opens_with_the_task_and_without_an_error(desk: Desk) -> None:
 
 
 def test_tabs_that_have_nothing_to_show_are_not_there(desk: Desk) -> None:
-    assert desk.page.get_by_role("tab").all_inner_texts() == ["Run", "Cameras", "Reward", "Episodes"]
+    assert desk.page.get_by_role("tab").all_inner_texts() == [
+        "Run",
+        "Cameras",
+        "Reward",
+        "Episodes",
+        "Timeline",
+    ]
 
 
 def test_play_runs_and_pause_stops(calm: Desk) -> None:

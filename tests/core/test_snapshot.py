@@ -19,7 +19,9 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.building import actors
 from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
+from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
+import workbench
 from workbench.core.fresh_physics import renew_physics
 from workbench.core.snapshot import restore_snapshot, take_snapshot
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env
@@ -431,3 +433,51 @@ def test_a_gpu_env_goes_back_to_where_it_was() -> None:
     assert not torch.allclose(env.get_state()[1], after_reset[1])
     assert env.elapsed_steps.tolist() == [0, 5, 0, 5]
     env.close()
+
+
+@pytest.mark.parametrize(
+    ("env_idx", "source", "error", "words"),
+    [
+        (
+            torch.tensor([True, False, True, False, False, False]),
+            0,
+            TypeError,
+            "of a mask, take mask.nonzero",
+        ),
+        ([1.5], 0, TypeError, "whole numbers"),
+        ([0], [0.5], TypeError, "whole numbers"),
+        ([7], 0, IndexError, "out of range for 6 envs"),
+        ([1, 1], 0, ValueError, "twice"),
+        ([], 0, ValueError, "empty"),
+    ],
+)
+def test_what_is_no_list_of_envs_is_refused(
+    pick: BaseEnv, env_idx: Any, source: Any, error: type[Exception], words: str
+) -> None:
+    pick.reset(seed=0)
+    snapshot, before = take_snapshot(pick), packs(pick)
+    with pytest.raises(error, match=words):
+        restore_snapshot(pick, snapshot, env_idx, source)
+    assert packs(pick) == before
+
+
+def test_one_env_may_be_named_by_its_number(pick: BaseEnv) -> None:
+    pick.reset(seed=list(range(N)))
+    restore_snapshot(pick, take_snapshot(pick, 3), 5)
+    assert packs(pick)[5] == packs(pick)[3]
+
+
+def test_wrappers_are_looked_through_and_what_is_no_env_is_refused(pick: BaseEnv) -> None:
+    wrapped = workbench.make("PickCube-v1", 2, backend="cpu", render_backend="none")
+    vector = ManiSkillVectorEnv(wrapped)
+    vector.reset(seed=0)
+    assert not restore_snapshot(vector, take_snapshot(wrapped)).not_carried
+    with pytest.raises(IndexError, match="the snapshot is of envs .* and this env has 2: say with env_idx"):
+        restore_snapshot(wrapped, take_snapshot(pick))
+    vector.close()
+    with pytest.raises(RuntimeError, match="this env was closed"):
+        take_snapshot(wrapped)
+    with pytest.raises(TypeError, match="a ManiSkill env is wanted, not dict"):
+        take_snapshot({})
+    with pytest.raises(TypeError, match="a Snapshot is wanted"):
+        restore_snapshot(pick, {})

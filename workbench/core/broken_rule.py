@@ -6,6 +6,7 @@ frames that led to it, and the error carries those as the innermost of its trace
 
 from __future__ import annotations
 
+import inspect
 import sys
 from collections.abc import Sequence
 from types import FrameType, TracebackType
@@ -47,6 +48,12 @@ def frames_of_the_task(innermost: FrameType | None = None) -> tuple[Frame, ...]:
             break
         frame = frame.f_back
     return tuple(kept)
+
+
+def place_of_hook(task: type, hook: str) -> str:
+    """The file and line of a hook's definition, in brackets; or nothing."""
+    code = getattr(inspect.unwrap(getattr(task, hook)), "__code__", None)
+    return "" if code is None else f" ({code.co_filename}:{code.co_firstlineno})"
 
 
 def place_of(frames: Sequence[Frame]) -> str:

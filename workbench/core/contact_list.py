@@ -12,6 +12,7 @@ positive `separation` and no impulse is two shapes that are near and do not touc
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 
 from workbench.core import seams
 from workbench.core.body_table import BodyTable, build_body_table
+from workbench.core.open_env import open_env
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ def list_contacts(env: Any, env_idx: int, table: BodyTable | None = None) -> tup
     the list is still that of the last substep, as in stock ManiSkill.
 
     Args:
-        env: a ManiSkill env (unwrapped, reset at least once): batched on the CPU, or stock on the CPU.
+        env: a ManiSkill env (reset at least once; wrappers are looked through): batched on the CPU, or stock.
         table: the body table of the env's scene, if there is one already; making one costs milliseconds.
 
     Raises:
@@ -69,6 +71,7 @@ def list_contacts(env: Any, env_idx: int, table: BodyTable | None = None) -> tup
         NotImplementedError: the env is simulated on the GPU.
         ValueError: the env was rebuilt since the table was made.
     """
+    env, env_idx = open_env(env), operator.index(env_idx)
     if not 0 <= env_idx < env.num_envs:
         raise IndexError(f"env {env_idx} is out of range for {env.num_envs} envs")
     batched = seams.batched_system(env.scene)

@@ -24,6 +24,7 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.envs.utils.system.backend import BackendInfo
 from mani_skill.render.utils import can_render
 
+from workbench.core.broken_rule import frames_of_the_task, place_of
 from workbench.core.contacts import CpuArray
 from workbench.core.cpu_system import BatchedCpuSystem
 from workbench.core.partial_reset import KeptControllers, others, told_whose_fault
@@ -120,8 +121,9 @@ class BatchedCpuScene(ManiSkillScene):
             raise RuntimeError(
                 "self.scene._gpu_apply_all() was called twice without self.scene._gpu_fetch_all() between: "
                 "on the GPU that is an error too. Fetch after every apply, and once before the end of "
-                "_initialize_episode, after which ManiSkill applies."
+                f"_initialize_episode, after which ManiSkill applies. The first call{self._applied_at}."
             )
+        self._applied_at = place_of(frames_of_the_task()) or " was ManiSkill's own"
         self.px.apply_changes()  # type: ignore[union-attr]
         self._needs_fetch = True
 

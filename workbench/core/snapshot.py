@@ -20,12 +20,14 @@ at 10.9 rad/s in place of 11.8, one step later. ``web_assets/docs/task_ids.md`` 
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
+import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
@@ -39,6 +41,7 @@ from workbench.core.cpu_state import (
 )
 from workbench.core.episode_rng import RngReader, RngState, SharedRng, read_shared_rng, write_shared_rng
 from workbench.core.gpu_state import GpuEnvState, read_gpu_state, write_gpu_state
+from workbench.core.open_env import open_env
 from workbench.core.task_buffers import TaskState, read_task_state, write_task_state
 
 
@@ -83,16 +86,17 @@ class RestoreReport:
     """Name and reason; empty when a snapshot is put back where it was taken."""
 
 
-def take_snapshot(env: BaseEnv, env_idx: Sequence[int] | None = None) -> Snapshot:
+def take_snapshot(env: Any, env_idx: Sequence[int] | int | None = None) -> Snapshot:
     """Copy the state of the envs in `env_idx`, or of all.
 
     Args:
-        env: an unwrapped ManiSkill env, batched on the CPU or on the GPU, reset at least once.
+        env: a ManiSkill env, batched on the CPU or on the GPU, reset at least once; wrappers are looked through.
 
     Raises:
         IndexError, ValueError: `env_idx` names envs that are not there, one twice, or none.
         NotImplementedError: a stock CPU env.
     """
+    env = open_env(env)
     chosen = _checked(range(env.num_envs) if env_idx is None else env_idx, env.num_envs)
     px = seams.batched_system(env.scene)
     if px is not None:
@@ -104,9 +108,9 @@ def take_snapshot(env: BaseEnv, env_idx: Sequence[int] | None = None) -> Snapsho
 
 
 def restore_snapshot(
-    env: BaseEnv,
+    env: Any,
     snapshot: Snapshot,
-    env_idx: Sequence[int] | None = None,
+    env_idx: Sequence[int] | int | None = None,
     source: int | Sequence[int] | None = None,
     fresh_physics: bool = True,
 ) -> RestoreReport:
@@ -135,6 +139,9 @@ def restore_snapshot(
         IndexError, ValueError: `env_idx` or `source` names envs that are not there, or the numbers differ.
         TypeError: a GPU env's snapshot for a CPU env, or the other way round.
     """
+    env = open_env(env)
+    if not isinstance(snapshot, Snapshot):
+        raise TypeError(f"a Snapshot is wanted, as take_snapshot gives it, not {type(snapshot).__name__}")
     targets, positions = _pairs(env, snapshot, env_idx, source)
     px = seams.batched_system(env.scene)
     states: Any = [snapshot.simulation[k] for k in positions]
@@ -211,8 +218,20 @@ def _require_gpu(env: BaseEnv) -> None:
         )
 
 
-def _checked(env_idx: Sequence[int], num_envs: int) -> list[int]:
-    chosen = [int(i) for i in env_idx]
+def _indices(env_idx: Any) -> list[int]:
+    try:
+        each = [env_idx] if np.ndim(env_idx) == 0 else list(env_idx)
+        if any(isinstance(i, (bool, np.bool_)) or getattr(i, "dtype", None) == torch.bool for i in each):
+            raise TypeError("a mask")
+        return [operator.index(i) for i in each]
+    except TypeError as error:
+        raise TypeError(
+            f"env_idx and source are whole numbers, one an env, not {env_idx!r}: of a mask, take mask.nonzero().flatten()"
+        ) from error
+
+
+def _checked(env_idx: Sequence[int] | int, num_envs: int) -> list[int]:
+    chosen = _indices(env_idx)
     if not chosen:
         raise ValueError("env_idx is empty: name the envs, or leave it out for all")
     if any(not 0 <= i < num_envs for i in chosen):
@@ -223,18 +242,23 @@ def _checked(env_idx: Sequence[int], num_envs: int) -> list[int]:
 
 
 def _pairs(
-    env: BaseEnv, snapshot: Snapshot, env_idx: Sequence[int] | None, source: int | Sequence[int] | None
+    env: BaseEnv, snapshot: Snapshot, env_idx: Sequence[int] | int | None, source: int | Sequence[int] | None
 ) -> tuple[list[int], list[int]]:
     """The envs to be set, and for each the position of its source in the snapshot."""
     if env_idx is None and source is not None:
         raise ValueError("source says whose state to put; env_idx must say into which envs")
+    if env_idx is None and max(snapshot.env_idx) >= env.num_envs:
+        raise IndexError(
+            f"the snapshot is of envs {list(snapshot.env_idx)}, and this env has {env.num_envs}: say with env_idx which "
+            "are to be set, and with source whose state they get"
+        )
     targets = _checked(snapshot.env_idx if env_idx is None else env_idx, env.num_envs)
     if source is None:
         sources = [snapshot.env_idx[0]] * len(targets) if len(snapshot.env_idx) == 1 else targets
-    elif isinstance(source, (int, np.integer)):
-        sources = [int(source)] * len(targets)
     else:
-        sources = [int(i) for i in source]
+        sources = _indices(source)
+        if np.ndim(source) == 0:
+            sources *= len(targets)
     if len(sources) != len(targets):
         raise ValueError(f"{len(sources)} sources for {len(targets)} envs")
     position = {i: k for k, i in enumerate(snapshot.env_idx)}

@@ -30,7 +30,7 @@ from typing import Any
 import torch
 
 from workbench.core.behind_tensors import guard_scenes
-from workbench.core.broken_rule import BrokenRule, RuleWarning
+from workbench.core.broken_rule import BrokenRule, RuleWarning, place_of_hook
 from workbench.core.returns import wrong_evaluate, wrong_observation, wrong_reward
 from workbench.core.strict_system import StrictCpuSystem
 
@@ -40,8 +40,8 @@ __all__ = ["BrokenRule", "RuleWarning", "StrictMixin", "WrongReturn"]
 class WrongReturn(BrokenRule):
     """What a hook returned is not what ManiSkill takes it for: `hook` is its name, `said` the failing."""
 
-    def __init__(self, said: str, hook: str) -> None:
-        super().__init__(f"{hook}() {said}")
+    def __init__(self, said: str, hook: str, place: str) -> None:
+        super().__init__(f"{hook}() {said}{place}")
         self.said, self.hook = said, hook
 
 
@@ -57,6 +57,7 @@ class StrictMixin:
 
     num_envs: int
     scene: Any
+    _workbench_task: type
     _system_class = StrictCpuSystem
     _strict_only_warns = False
 
@@ -108,7 +109,7 @@ class StrictMixin:
                 self._strict_system.break_rule(
                     f"_initialize_episode left self.{name} with a row for each of the {count} envs that were "
                     f"reset, where it had one for each of {self.num_envs}: write self.{name}[env_idx] = ... "
-                    "instead of replacing it.",
+                    f"instead of replacing it{place_of_hook(self._workbench_task, '_initialize_episode')}.",
                     None,
                 )
 
@@ -139,7 +140,8 @@ class StrictMixin:
     def _refuse_return(self, said: str | None, hook: str) -> None:
         if said is None:
             return
+        place = place_of_hook(self._workbench_task, hook)
         if self._strict_only_warns:
-            self._strict_system.break_rule(f"{hook}() {said}", None)
+            self._strict_system.break_rule(f"{hook}() {said}{place}", None)
         else:
-            raise WrongReturn(said, hook)
+            raise WrongReturn(said, hook, place)

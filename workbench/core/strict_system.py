@@ -245,7 +245,8 @@ class StrictCpuSystem(BatchedCpuSystem):
             if links
             else f"The {what} of '{name}' in {_envs(envs[mine])} was set and not applied: on the GPU, and here, the "
             "next fetch writes it over and the simulation never sees it. Outside _initialize_episode, call "
-            "self.scene._gpu_apply_all() after the write (under `if self.gpu_sim_enabled:`).",
+            "self.scene._gpu_apply_all() and self.scene._gpu_fetch_all() after the write (under "
+            "`if self.gpu_sim_enabled:`).",
             self._frames_that_wrote(group, mine),
         )
 
@@ -415,8 +416,8 @@ class StrictCpuSystem(BatchedCpuSystem):
                 now[rows] = seen[rows]
             self.break_rule(
                 f"The {what} of '{name}' in {_envs(envs)} was set outside _initialize_episode and not applied: on the "
-                "GPU, and here, the reset of other envs applies it now. Call self.scene._gpu_apply_all() after "
-                "the write (under `if self.gpu_sim_enabled:`).",
+                "GPU, and here, the reset of other envs applies it now. Call self.scene._gpu_apply_all() and "
+                "self.scene._gpu_fetch_all() after the write (under `if self.gpu_sim_enabled:`).",
                 frames,
             )
 

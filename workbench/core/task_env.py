@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -59,6 +59,10 @@ class EnvOptions:
     def __post_init__(self) -> None:
         if self.num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, not {self.num_envs}")
+        if self.backend not in get_args(Backend):
+            raise ValueError(f"backend must be one of {', '.join(get_args(Backend))}, not {self.backend!r}")
+        if self.strict not in (True, False, "warn"):
+            raise ValueError(f"strict must be True, False or 'warn', not {self.strict!r}")
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"threads must be at least 1, or None for all cores, not {self.threads}")
 
