@@ -284,8 +284,10 @@ def _say(event: Event) -> None:
     if isinstance(event, Loaded):
         parts = ", ".join(f"{name} {ms:.0f}" for name, ms in event.milliseconds.items())
         total = sum(event.milliseconds.values())
+        how = "loaded" if event.reload is None else event.reload.level
+        why = "" if event.reload is None or not event.reload.reason else f": {escape(event.reload.reason)}"
         out.print(
-            f"[green]loaded[/] {escape(event.task.env_id)} in {total:.0f} ms [dim]({parts})[/]",
+            f"[green]{how}[/] {escape(event.task.env_id)}{why} in {total:.0f} ms [dim]({parts})[/]",
             soft_wrap=True,
         )
     elif isinstance(event, Failed):

@@ -217,7 +217,7 @@ def test_methods_of_one_name_are_taken_for_one() -> None:
 )
 def test_code_that_may_keep_or_reach_the_old_version_is_rebuilt(hooks: str, top: str, says: str) -> None:
     versions = [task(hooks.format(n=n), top.format()) for n in (1, 2)]
-    found = change(*versions, helpers="def f():\n    return 1\n")
+    found = change(versions[0], versions[1], helpers="def f():\n    return 1\n")
     assert found.level == "rebuilt", found
     assert says in found.reason
 
@@ -234,7 +234,7 @@ def test_code_that_may_keep_or_reach_the_old_version_is_rebuilt(hooks: str, top:
 )
 def test_everyday_code_is_not_taken_for_a_memory(hooks: str) -> None:
     versions = [task(hooks.format(n=n), "TABLE = [1.0, 2.0]\n") for n in (1, 2)]
-    found = change(*versions)
+    found = change(versions[0], versions[1])
     assert found.level == "patched", found.reason
 
 

@@ -10,8 +10,10 @@ import shutil
 import sys
 import tempfile
 import time
+from io import BytesIO
 from pathlib import Path
 
+from PIL import Image
 from playwright.sync_api import Page, expect, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
@@ -74,6 +76,34 @@ def shoot_judged(page: Page, file: Path) -> None:
     expect(page.get_by_text("Nothing differs").first).to_be_visible(timeout=120_000)
 
 
+def shoot_reloads(page: Page, file: Path) -> None:
+    """The Run tab's account of a patched and of a rebuilt version, side by side."""
+    tab(page, "Run")
+    folder = page.get_by_text("Version of the file", exact=True)
+    good, taken = TASK.read_text(), []
+    edits = [
+        ("patched in", "return reward\n", "return reward + 1\n"),
+        ("rebuilt in", 'name="goal")', 'name="target")'),
+    ]
+    for level, old, new in edits:
+        file.write_text(good.replace(old, new, 1))
+        expect(page.get_by_text(level).first).to_be_visible(timeout=60_000)
+        folder.scroll_into_view_if_needed()
+        page.get_by_role("button", name="Rebuild", exact=True).scroll_into_view_if_needed()
+        time.sleep(4.0)
+        box = page.locator(".wb-status").bounding_box()
+        assert box is not None
+        clip = {"x": box["x"] - 10, "y": 0, "width": 1280 - box["x"] + 10, "height": 720}
+        taken.append(Image.open(BytesIO(page.screenshot(clip=clip))))  # type: ignore[arg-type]
+    both = Image.new("RGB", (sum(image.width for image in taken), 720))
+    for i, image in enumerate(taken):
+        both.paste(image, (i * taken[0].width, 0))
+    both.save(OUT / "reload.jpg", quality=82)
+    print(OUT / "reload.jpg")
+    file.write_text(good)
+    time.sleep(4.0)
+
+
 def main() -> None:
     chromium = find_chromium()
     if chromium is None:
@@ -108,6 +138,7 @@ def main() -> None:
                 tick.check(force=True)
             time.sleep(4)
             shoot(page, "cameras")
+            shoot_reloads(page, file)
             lines = TASK.read_text().splitlines()
             place = next(i for i, line in enumerate(lines) if '"cube_to_goal": distance' in line)
             lines[place] = lines[place].replace("distance", "distanec")

@@ -158,6 +158,25 @@ def test_a_saved_edit_appears_by_itself(calm: Desk) -> None:
     expect(calm.page.get_by_text("cube_to_goal_v2", exact=True)).to_be_visible()
 
 
+def test_a_patch_keeps_the_step_and_says_so_and_a_rebuild_can_be_asked_for(calm: Desk) -> None:
+    calm.button("Step").click()
+    calm.tab("Reward")
+    until(lambda: calm.elapsed() == 1, "the step")
+    before = float(calm.row("reward")[1])
+    good = calm.file.read_text()
+    calm.file.write_text(good.replace("return reward\n", "return reward + 3\n", 1))
+    until(lambda: abs(float(calm.row("reward")[1]) - before - 1) < 0.01, "the reward of the same step")
+    assert calm.elapsed() == 1
+    calm.tab("Run")
+    expect(calm.page.get_by_text("only compute_dense_reward changed").last).to_be_visible()
+    calm.button("Rebuild").click()
+    expect(calm.page.get_by_text("rebuilt was asked for").last).to_be_visible()
+    calm.tab("Reward")
+    assert calm.elapsed() == 1
+    calm.file.write_text(good)
+    until(lambda: abs(float(calm.row("reward")[1]) - before) < 0.01, "the good version")
+
+
 def test_a_broken_edit_shows_a_banner_and_the_last_good_version_stays_usable(calm: Desk) -> None:
     lines = TASK.read_text().splitlines()
     place = next(i for i, line in enumerate(lines) if '"cube_to_goal"' in line)

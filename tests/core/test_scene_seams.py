@@ -65,3 +65,23 @@ def test_packed_poses_are_quaternion_then_position_of_every_entity_in_order() ->
     packed = np.frombuffer(scene.pack_poses(), np.float32).reshape(-1, 7)
     np.testing.assert_allclose(packed, [[0.5, 0.5, -0.5, 0.5, i, 2, 3] for i in range(3)])
     assert [e.pose.p[0] for e in scene.entities] == [0, 1, 2]
+
+
+def test_cameras_are_made_by_one_method_and_kept_in_these_lists() -> None:
+    source = inspect.getsource(sapien_env.BaseEnv._setup_sensors)
+    for line in (
+        "self._sensors = dict()",
+        "self._human_render_cameras = dict()",
+        "self.scene.sensors = self._sensors",
+        "self.scene.human_render_cameras = self._human_render_cameras",
+    ):
+        assert line in source
+    assert "self._setup_sensors(options)" in inspect.getsource(sapien_env.BaseEnv._reconfigure)
+    assert "self.camera_groups" in inspect.getsource(ManiSkillScene.__init__)
+
+
+def test_a_step_flattens_after_the_reward_and_a_reset_says_whom_it_resets() -> None:
+    step = inspect.getsource(sapien_env.BaseEnv.step)
+    assert step.index("self.get_reward(") < step.index("obs = self._flatten_raw_obs(obs)")
+    assert "self.scene._reset_mask[env_idx] = True" in inspect.getsource(sapien_env.BaseEnv.reset)
+    assert "self._init_raw_obs = obs" in inspect.getsource(sapien_env.BaseEnv.update_obs_space)

@@ -97,21 +97,21 @@ def rehearse_hooks(env: BaseEnv, hooks: Collection[str]) -> dict[str, str]:
                     env._initialize_episode(torch.tensor(chosen, device=env.device), {})
     finally:
         seams.set_reset_mask(env, every)
-        if isinstance(env, BatchedCpuMixin):
+        own = isinstance(env, BatchedCpuMixin)
+        if own:
             env.drop_writes()
-        if _simulation(take_snapshot(env)) == _simulation(kept):
+        if own and _simulation(take_snapshot(env)) == _simulation(kept):
             _, missed = restore_memory(env, kept.memory, every, every, whole=True)
         else:
             missed = restore_snapshot(env, kept).not_carried
     return missed
 
 
-def _simulation(snapshot: Snapshot) -> list[Any]:
+def _simulation(snapshot: Snapshot) -> list[tuple[bytes, bytes, bytes]]:
     return [
         (state.packed, state.qf.tobytes(), state.driven.tobytes())
-        if isinstance(state, CpuEnvState)
-        else state
         for state in snapshot.simulation
+        if isinstance(state, CpuEnvState)
     ]
 
 

@@ -19,7 +19,7 @@ from workbench.ui.checked import checked_choice
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
 
-AS_NEEDED, PATCHED, CAMERAS, REBUILT = "as needed", "patch", "cameras", "rebuild"
+AS_NEEDED, PATCHED, CAMERAS, REBUILT = "Load again", "Patch", "Cameras", "Rebuild"
 LEVELS: dict[str, LoadLevel] = {
     AS_NEEDED: "auto",
     PATCHED: "patched",
@@ -45,11 +45,11 @@ class VersionPanel:
             )
             self._html = server.gui.add_html("")
             self._again = server.gui.add_button_group(
-                "Load again",
+                "",
                 tuple(LEVELS),
-                hint="As needed: the least that is safe. Patch: only the code. Cameras: code and cameras. Rebuild: "
-                "the scene too, with the state put back. A patch that was not found safe can leave old and new "
-                "code mixed.",
+                hint="Load again: by the least that is safe. Patch: only the code. Cameras: code and cameras. "
+                "Rebuild: the scene too, with the moment put back. A patch that was not found safe can leave old "
+                "and new code mixed.",
             )
             self._again.on_click(lambda event: self._load(event.target.value))
 

@@ -1,0 +1,39 @@
+"""What the page says of a reload."""
+
+from __future__ import annotations
+
+from workbench.session.messages import ReloadReport
+from workbench.ui.version_panel import MOST_SHOWN, took, version_html
+
+
+def test_level_reason_and_time_are_said() -> None:
+    html = version_html(ReloadReport("patched", "only evaluate changed", 43.2), loaded=True)
+    assert "patched" in html and "43 ms" in html and "only evaluate changed" in html and "go on" in html
+
+
+def test_what_a_build_could_not_carry_is_named_up_to_a_number() -> None:
+    missing = {f"actor cube_{i}": "this env has none of this name" for i in range(MOST_SHOWN + 3)}
+    html = version_html(
+        ReloadReport("rebuilt", "_load_scene changed", 1500.0, ("actor goal",), missing), True
+    )
+    assert "1.5 s" in html and "put back" in html
+    assert "actor cube_0" in html and f"actor cube_{MOST_SHOWN}" not in html and "and 3 more" in html
+
+
+def test_a_build_without_a_moment_says_that_an_episode_began() -> None:
+    assert "new episode" in version_html(ReloadReport("rebuilt", "another task", 900.0), loaded=True)
+
+
+def test_what_comes_of_the_file_is_escaped() -> None:
+    report = ReloadReport("rebuilt", "<img src=x>", 1.0, (), {"<b>name</b>": "<script>why</script>"})
+    html = version_html(report, loaded=True)
+    assert "<img" not in html and "<script" not in html and "<b>name" not in html
+
+
+def test_before_the_first_reload_it_says_what_saving_does() -> None:
+    assert "Save the file" in version_html(None, loaded=True)
+    assert version_html(None, loaded=False).strip() == ""
+
+
+def test_times_are_short() -> None:
+    assert (took(42.6), took(1234.0)) == ("43 ms", "1.2 s")
