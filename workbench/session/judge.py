@@ -233,10 +233,14 @@ class Judge:
         self._tell(job, "loading")
         if self._process is None:
             self._process = _start_process()
+        else:
+            # A version is tried at the moment at which the env stands, which is where the judgement before
+            # ended: there the new code may raise or loop though it runs from the beginnings in the record.
+            self._owed = Judged
+            self._process.send(JudgeMoments((self._to_judge(job, job.judgement.runs()[0].start),)))
+            self._answer(job)
         event = self._ask_to_load(job, job.load)
         if isinstance(event, Failed):
-            # A version is tried at the moment at which the env stands: here wherever the judgement before
-            # ended, where the new code may raise though it loads and runs from the moments of the record.
             event = self._ask_to_load(job, replace(job.load, level="rebuilt"))
         if isinstance(event, Failed):
             raise _Failure("the new code could not be loaded to judge with", event.problem)

@@ -362,7 +362,7 @@ class Judged:
     steps: tuple[StepResult, ...]
     """One for each moment; fewer if one raised."""
     not_carried: dict[str, str]
-    """What the jumps among them could not put back, and why."""
+    """What jumps of all envs among them could not put back, and why."""
     problem: Problem | None = None
     """What the moment after `steps` raised."""
 
