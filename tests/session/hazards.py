@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 
@@ -84,11 +85,13 @@ def write_task(folder: Path) -> Path:
     for place, line in _HOOKS.items():
         assert text.count(line) == 1
         text = text.replace(line, f'        hazard("{place}")\n{line}')
+    # What the scene is built of: an `edit` of it cannot be put on the envs that are there.
+    text = text.replace('        hazard("build")\n', '        hazard("build")\n        assert VERSION >= 0\n')
     reward = "\n    def compute_sparse_reward(self, obs, action, info):\n"
     reward += '        hazard("reward")\n        return super().compute_sparse_reward(obs, action, info)\n'
     text = text.replace("\n\n# ManiSkill takes", reward + "\n\n# ManiSkill takes")
     before = '@register_env("WorkbenchMinimal'
-    text = text.replace(before, f'{_MISCHIEF}hazard("import")\n\n\n{before}')
+    text = text.replace(before, f'{_MISCHIEF}hazard("import")\nVERSION = 0\n\n\n{before}')
     file.write_text(text)
     return file
 
@@ -109,5 +112,7 @@ def provoked(file: Path) -> bool:
 
 
 def edit(file: Path) -> None:
-    """Save a new version that differs in nothing that matters."""
-    file.write_text(file.read_text() + "\n# edited\n")
+    """Save a new version that does the same, for which all envs are built anew."""
+    text = file.read_text()
+    number = int(re.findall(r"^VERSION = (\d+)$", text, flags=re.MULTILINE)[0])
+    file.write_text(text.replace(f"\nVERSION = {number}\n", f"\nVERSION = {number + 1}\n"))
