@@ -74,10 +74,15 @@ class Desk:
         start = time.perf_counter()
         while not reached():
             if time.perf_counter() - start > patience:
-                raise TimeoutError(self.page.evaluate("() => document.body.textContent"))
+                raise TimeoutError(page_text(self.page)[:1000])
             trips.append(self.page.evaluate(NEXT_ENV))
             time.sleep(0.05)
         return time.perf_counter() - start
+
+
+def page_text(page: Page) -> str:
+    """What can be seen; `Desk.says` also finds what stands on the other tabs."""
+    return page.inner_text("body")
 
 
 def one_way(desk: Desk, way: str) -> str:
@@ -111,7 +116,7 @@ def one_way(desk: Desk, way: str) -> str:
         back = desk.poke_until(lambda: desk.says("is back where it was"), trips)
     else:
         word = "EOFError" if way == "read" else "came too fast to be kept"
-        back = desk.poke_until(lambda: desk.says(word) and not desk.says("busy"), trips)
+        back = desk.poke_until(lambda: desk.says(word) and "busy" not in page_text(desk.page), trips)
     calm(desk.file)
     now = desk.server.cpu_times()
     cpu = now.user + now.system - usage.user - usage.system
