@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 import pytest
 import sapien
+from mani_skill.utils.registration import REGISTERED_ENVS
 
 FOLDER = Path(__file__).parents[2] / "tasks"
 IDS = {"push_cube": "WorkbenchPushCube-v1", "minimal": "WorkbenchMinimal-v1"}
@@ -24,9 +25,11 @@ def import_file(name: str) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def example_tasks() -> None:
-    for name in IDS:
-        if IDS[name] not in gym.registry:
-            import_file(name)
+    for name, env_id in IDS.items():
+        # Another test may have left an edited version, which ManiSkill would not replace.
+        gym.registry.pop(env_id, None)
+        REGISTERED_ENVS.pop(env_id, None)
+        import_file(name)
 
 
 @pytest.fixture(scope="session")
