@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, expect, sync_playwright
+from playwright.sync_api import FloatRect, Page, expect, sync_playwright
 
 from tests.browser.opened import launch, new_page, open_workbench
 
@@ -18,6 +18,7 @@ pytestmark = pytest.mark.browser
 expect.set_options(timeout=60_000)
 TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 STEPS = 8
+SLIDER = ".mantine-Slider-root"
 
 
 @dataclass
@@ -41,9 +42,15 @@ class Desk:
     def says(self, text: str) -> None:
         expect(self.page.locator(".wb-timeline").get_by_text(re.compile(text)).first).to_be_visible()
 
+    def box(self, what: str) -> FloatRect:
+        """Where it lies on the page, in pixels."""
+        box = self.page.locator(what).last.bounding_box()
+        assert box is not None, f"{what} is not on the page"
+        return box
+
     def leave_inputs(self) -> None:
-        """Click on the empty view, so that no slider has the focus."""
-        self.page.mouse.click(60, 420)
+        """So that no slider takes the keys. A click on the view would select the env that happens to lie there."""
+        self.page.evaluate("document.activeElement?.blur()")
         time.sleep(0.5)
 
 
@@ -104,10 +111,11 @@ def test_the_slider_goes_where_it_is_clicked_and_takes_an_arrow_once(desk: Desk)
     desk.page.get_by_role("button", name="zoom to episode").click()
     thumb = desk.page.get_by_role("slider").last
     expect(thumb).to_have_attribute("aria-valuemin", str(-STEPS))
-    box = desk.page.locator(".wb-strip").bounding_box()
-    assert box is not None
-    place = desk.page.locator(".mantine-Slider-root").last.bounding_box()
-    assert place is not None and abs(place["width"] - box["width"]) < 8, "the strip is as wide as the slider"
+    until(
+        lambda: abs(desk.box(".wb-strip")["width"] - desk.box(SLIDER)["width"]) < 8,
+        "a strip as wide as the slider",
+    )
+    place = desk.box(SLIDER)
     desk.page.mouse.click(place["x"] + place["width"] / 2, place["y"] + place["height"] / 2)
     desk.comes_to(STEPS // 2)
     time.sleep(1.5)
