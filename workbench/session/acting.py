@@ -6,6 +6,8 @@ repeats everything that follows it.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,7 +16,6 @@ from workbench.core import actions
 from workbench.core.task_env import TaskEnv
 from workbench.session.interrupts import Interrupted
 from workbench.session.messages import ActionSource
-from workbench.session.open_task import zero_action
 from workbench.session.policy import Policy, load_policy
 
 
@@ -59,15 +60,18 @@ class Acting:
         """
         if self._source == "random":
             return actions.random_action(task.parts, task.num_envs, self._rng)
-        if self._source == "zero":
-            return zero_action(task)
         if self._source == "policy" and self._policy is not None:
             try:
                 return actions.to_flat_action(task.env, task.parts, self._policy(task.obs))
             except (Exception, SystemExit, Interrupted) as error:
                 raise TaskError(problem_from_exception(error, "policy", ())) from error
         low, high = actions.bounds(task.parts)
+        if self._source == "zero":
+            return _same_for_all(np.clip(0.0, low, high), task)
         if self._source == "sliders" and len(self.sliders) == len(low):
-            action = np.clip(np.asarray(self.sliders, np.float32), low, high)
-            return np.broadcast_to(action, (task.num_envs, len(low))).copy()
+            return _same_for_all(np.clip(np.asarray(self.sliders, np.float32), low, high), task)
         return actions.hold_action(task.parts, task.num_envs)
+
+
+def _same_for_all(action: NDArray[Any], task: TaskEnv) -> NDArray[np.float32]:
+    return np.broadcast_to(action, (task.num_envs, len(action))).astype(np.float32)
