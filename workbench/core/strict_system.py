@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from workbench.core.broken_rule import Frame, RuleWarning, broken_at, frames_of_the_task, place_of
 from workbench.core.contacts import CpuArray
 from workbench.core.cpu_system import BatchedCpuSystem
+from workbench.core.drive_targets import Setters
 from workbench.core.returns import ENVS_NAMED
 
 Group = Literal["bodies", "links", "joints", "targets", "forces"]
@@ -89,12 +90,6 @@ class StrictCpuSystem(BatchedCpuSystem):
     def gpu_init(self) -> None:
         super().gpu_init()
         layout = self._laid_out
-        # Called for every joint in every control step, and the core's own: past the guard of behind_tensors.
-        joints = [list(articulation.active_joints) for articulation in layout.articulations]
-        self._set_target = [[_unguarded(joint, "set_drive_target") for joint in row] for row in joints]
-        self._set_velocity_target = [
-            [_unguarded(joint, "set_drive_velocity_target") for joint in row] for row in joints
-        ]
         env_of = {id(scene): env for env, scene in enumerate(self.scenes)}
         owners = [*zip(layout.body_rows, layout.bodies, strict=True)]
         owners += [*zip(layout.link_rows, layout.links, strict=True)]
@@ -108,6 +103,11 @@ class StrictCpuSystem(BatchedCpuSystem):
         self._root_in_links = np.searchsorted(layout.link_rows, layout.root_rows)
         self._stale.clear()
         self._touches.clear()
+
+    def _setters(self, method: str) -> Setters:
+        # Called for every joint in every control step, and the core's own: past the guard of behind_tensors.
+        articulations = self._laid_out.articulations
+        return [[_unguarded(joint, method) for joint in a.active_joints] for a in articulations]
 
     def break_rule(self, message: str, frames: Sequence[Frame] | None = ()) -> None:
         """Raise, or warn once a sentence.
@@ -197,8 +197,10 @@ class StrictCpuSystem(BatchedCpuSystem):
         self._fetched("joints")
 
     def gpu_fetch_articulation_target_qpos(self) -> None:
-        self._refuse_loss("targets", self._target_qpos, self._target_qpos_seen, what="drive targets")
-        self._refuse_loss("targets", self._target_qvel, self._target_qvel_seen, what="drive velocity targets")
+        self._refuse_loss("targets", self._targets.now, self._targets.seen, what="drive targets")
+        self._refuse_loss(
+            "targets", self._velocity_targets.now, self._velocity_targets.seen, what="drive velocity targets"
+        )
         super().gpu_fetch_articulation_target_qpos()
         self._fetched("targets")
 
@@ -427,8 +429,8 @@ class StrictCpuSystem(BatchedCpuSystem):
             "state": self._data.copy(),
             "qpos": self._qpos.copy(),
             "qvel": self._qvel.copy(),
-            "drive targets": self._target_qpos.copy(),
-            "drive velocity targets": self._target_qvel.copy(),
+            "drive targets": self._targets.now.copy(),
+            "drive velocity targets": self._velocity_targets.now.copy(),
         }
 
     def refuse_changes_elsewhere(self, before: dict[str, NDArray[np.float32]], reset: torch.Tensor) -> None:
