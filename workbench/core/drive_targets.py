@@ -27,7 +27,7 @@ class DriveTargets:
         Args:
             articulations_of: the rows of each env.
         """
-        self.now = np.zeros(layout.qpos_at.shape, dtype=np.float32)
+        self.now: NDArray[np.float32] = np.zeros(layout.qpos_at.shape, dtype=np.float32)
         """(A, D) the tensor that tasks write to."""
         self.seen = np.zeros_like(self.now)
         """(A, D) what the simulation is known to hold."""
@@ -63,8 +63,7 @@ class DriveTargets:
             for i in chosen:
                 refuse_nan(self.now[i], self._articulations[i].name)
         self.seen[:] = self.now
-        values: list[list[float]] = self.now.tolist()
-        written = set(chosen)
+        values, written = self.now.tolist(), set(chosen)
 
         def write(env: int) -> None:
             for i in self._articulations_of[env]:
