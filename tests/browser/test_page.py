@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import re
-import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, expect, sync_playwright
+from playwright.sync_api import Page, expect
 
-from tests.browser.opened import Opened, launch, new_page, open_workbench
+from tests.browser.opened import TASK, Opened, page_on, until
 from workbench.recording.verify import verify_rrd
 
 pytestmark = pytest.mark.browser
 expect.set_options(timeout=60_000)
-TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 
 
 @dataclass
@@ -45,26 +43,12 @@ class Desk:
         return int(self.row("elapsed steps")[1].split("/")[0])
 
 
-def until(reached: Callable[[], bool], what: str, seconds: float = 60.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not reached():
-        assert time.monotonic() < deadline, f"{what} did not come within {seconds} s"
-        time.sleep(0.05)
-
-
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Iterator[Desk]:
-    folder = tmp_path_factory.mktemp("author")
-    file = Path(shutil.copy(TASK, folder / "push_cube.py"))
-    recordings = folder / "kept"
-    arguments = (str(file), "--num-envs", "2", "--recordings", str(recordings))
-    with open_workbench(*arguments, cwd=folder) as opened, sync_playwright() as playwright:
-        browser = launch(playwright, chromium_path)
-        page, errors = new_page(browser)
-        page.goto(opened.url)
-        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=90_000)
-        yield Desk(page, errors, file, opened, recordings)
-        browser.close()
+def desk(task_file: Path, chromium_path: str) -> Iterator[Desk]:
+    recordings = task_file.parent / "kept"
+    arguments = ("--num-envs", "2", "--recordings", str(recordings))
+    with page_on(task_file, *arguments, chromium=chromium_path) as (page, errors, opened):
+        yield Desk(page, errors, task_file, opened, recordings)
 
 
 @pytest.fixture
