@@ -11,8 +11,18 @@ from workbench.core.pictures import Picture
 from workbench.session.judge import JudgementView
 from workbench.session.kept_worker import Death, Vitals
 from workbench.session.live_state import LiveState
-from workbench.session.messages import Failed, Loaded, Loading, Pictures, ReloadReport, Status, Stepped
+from workbench.session.messages import (
+    Failed,
+    Loaded,
+    Loading,
+    Pictures,
+    ReloadReport,
+    Status,
+    Stepped,
+    TaskOptions,
+)
 from workbench.session.printed import NOTHING_PRINTED
+from workbench.session.recovery import Wanted
 from workbench.session.view import RecordingStatus, SessionView
 
 N = 3
@@ -41,7 +51,7 @@ def stepped(number: int, jumped: bool = False, num_envs: int = N) -> Stepped:
 
 def running(steps: int = 3) -> LiveState:
     """It was loaded, plays, and took some steps."""
-    state = LiveState(10**8)
+    state = LiveState("push.py", TaskOptions(), 10**8)
     state.loaded(loaded(), restored=False, stale=False)
     for number in range(steps + 1):
         state.stepped(stepped(number, jumped=number == 0))
@@ -54,7 +64,7 @@ def report(level: str) -> ReloadReport:
 
 
 def test_nothing_is_shown_before_a_task_is_loaded_and_its_moments_from_then_on() -> None:
-    state = LiveState(10**8)
+    state = LiveState("push.py", TaskOptions(), 10**8)
     assert view(state).state == "starting" and view(state).curves is None and state.newest_moment() is None
     state.take(Loading("importing"))
     assert (view(state).state, view(state).activity) == ("loading", "importing")
@@ -100,13 +110,14 @@ def test_another_scene_begins_another_past_whose_moments_count_on() -> None:
 
 def test_the_last_good_version_comes_back_with_its_past_and_with_what_killed_it() -> None:
     state = running()
-    state.died(DEATH, problem("SIGSEGV"), while_loading=False)
+    told = state.died(DEATH, while_loading=False, printed="pushing")
+    assert told is not None and "SIGSEGV" in told.message and "pushing" in told.traceback
     assert (view(state).state, view(state).playing) == ("starting", False)
     state.loaded(loaded(), restored=True, stale=True)
     state.stepped(stepped(0, jumped=True))
     after = view(state)
     assert after.timeline.moments == 5 and after.stale and after.state == "paused"
-    assert after.problem is not None and after.problem.message == "SIGSEGV"
+    assert after.problem == told
     state.loaded(loaded(source_hash="b"), restored=False, stale=False)
     assert view(state).problem is None and view(state).timeline.moments == 0
 
@@ -120,7 +131,7 @@ def test_what_failed_while_running_stands_until_a_step_follows() -> None:
 
 
 def test_the_reset_that_a_new_scene_begins_with_mends_no_failure_at_run() -> None:
-    state = LiveState(10**8)
+    state = LiveState("push.py", TaskOptions(), 10**8)
     state.loaded(loaded(), restored=False, stale=False)
     state.take(Failed(problem(), kept=True))
     state.stepped(stepped(0, jumped=True))
@@ -138,11 +149,11 @@ def test_a_version_that_cannot_be_loaded_leaves_its_problem_while_the_one_before
 
 
 def test_a_worker_that_could_load_nothing_waits_with_the_problem() -> None:
-    state = LiveState(10**8, wants_play=True)
-    state.died(DEATH, problem(), while_loading=True)
+    state = LiveState("push.py", TaskOptions(), 10**8, wants_play=True)
+    state.died(DEATH, while_loading=True, printed="")
     state.waits_for_the_file()
     assert (view(state).state, state.wants_play) == ("error", False)
-    state.died(replace(DEATH, gives_up=True), None, while_loading=True)
+    assert state.died(replace(DEATH, asked=True, gives_up=True), while_loading=True, printed="") is None
     state.waits_for_the_file()
     assert view(state).state == "stopped" and view(state).problem is not None
 
@@ -169,3 +180,16 @@ def test_a_moment_of_the_past_is_shown_in_place_of_the_newest() -> None:
     shown = view(state)
     assert shown.step_serial == 1 and shown.step is not None and shown.step.elapsed_steps[0] == 1
     assert state.stretch() == (0, 3)
+
+
+def test_a_load_asks_for_the_class_and_the_seed_that_the_page_chose() -> None:
+    state = running()
+    assert not state.choose_class("Other")
+    task = state.task
+    assert task is not None
+    state.task = replace(task, others=("Other",))
+    assert state.choose_class("Other")
+    state.seed = 7
+    load = state.load_request(Wanted(None, b"moment"), "rebuilt")
+    assert load.task.endswith("push.py:Other") and load.options == TaskOptions(seed=7)
+    assert (load.source, load.level, load.snapshot) == (None, "rebuilt", b"moment")

@@ -11,13 +11,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from workbench.authoring.problem import Problem
+from workbench.authoring.reference import named_file
 from workbench.core.inspection import Inspection
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.step import StepResult
 from workbench.session.env_table import EnvTable
 from workbench.session.judge import JudgementView
 from workbench.session.kept_worker import Death, Vitals
-from workbench.session.last_words import Busy
+from workbench.session.last_words import Busy, death_problem, own_files_of
 from workbench.session.messages import (
     SCENE_KEPT,
     ActionSource,
@@ -25,19 +26,27 @@ from workbench.session.messages import (
     EpisodeEnd,
     Event,
     Failed,
+    Load,
     Loaded,
     Loading,
+    LoadLevel,
     PastPictures,
     Pictures,
     ReloadReport,
+    Request,
     Restore,
+    SetActionSource,
+    SetEpisodeEnd,
+    SetSpeed,
     Status,
     Stepped,
     TaskDescription,
+    TaskOptions,
     WatchCameras,
 )
 from workbench.session.past import Past
 from workbench.session.printed import Printed
+from workbench.session.recovery import Wanted
 from workbench.session.reward_terms import TermHistory
 from workbench.session.timeline import Timeline, TimelineView
 from workbench.session.view import Curves, RecordingStatus, SessionView, State
@@ -76,9 +85,12 @@ class Chronicle:
 class LiveState:
     """See the module's text. Not thread-safe: the session locks."""
 
+    reference: str
+    """The task that was asked for: a file, ``file.py:ClassName``, or a registered env id."""
+    options: TaskOptions
+    """How it is made, but for the seed."""
     history_bytes: int
     """What the past may take."""
-    seed: int = 0
     # --- the worker and its task ---
     state: State = "starting"
     activity: str = "starting the worker"
@@ -109,6 +121,7 @@ class LiveState:
     steps_per_second: float = 0.0
     real_time_factor: float = 0.0
     # --- what the page has chosen ---
+    seed: int = field(init=False)
     selected_env: int = 0
     cameras: tuple[CameraRequest, ...] = ()
     clients: int = 0
@@ -118,6 +131,11 @@ class LiveState:
     action_source: ActionSource = "random"
     policy: str | None = None
     sliders: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        self.seed = self.options.seed
+        self.own_file = named_file(self.reference)
+        """The file that was named, whether or not it ever loaded; None for an env id."""
 
     @property
     def timeline(self) -> Timeline | None:
@@ -207,21 +225,28 @@ class LiveState:
                 self.activity = ""
                 self._runs()
 
-    def died(self, death: Death, problem: Problem | None, while_loading: bool) -> None:
+    def died(self, death: Death, while_loading: bool, printed: str) -> Problem | None:
         """The worker is gone.
 
         Args:
-            problem: what is to be told of it; None where somebody asked for it.
             while_loading: a version was being loaded, so it is not the running one that killed it.
+            printed: the last lines.
+
+        Returns:
+            what is to be told of it; None where somebody asked for it.
         """
         self.playing, self.steps_per_second, self.real_time_factor = False, 0.0, 0.0
-        if problem is not None:
+        problem = None
+        if not death.asked or death.stack:
+            source = {} if self.task is None or while_loading else self.task.source
+            problem = death_problem(death.why, death.doing, death.stack, self.own_files(), printed, source)
             self.set_problem(problem)
             self.problem_at_run = not while_loading
         if not death.file_waits:
             self.wants_play = False
         self.state = "stopped" if death.gives_up else "starting"
         self.activity = "" if death.gives_up else "starting another worker"
+        return problem
 
     def waits_for_the_file(self) -> None:
         """A worker is up and has nothing that it could load: the problem stands."""
@@ -252,6 +277,13 @@ class LiveState:
         self._drop_pictures()
         return True
 
+    def choose_class(self, name: str) -> bool:
+        """Ask for another task class of the same file. False if the file has no such class."""
+        if self.task is None or self.own_file is None or name not in self.task.others:
+            return False
+        self.reference = f"{self.own_file}:{name}"
+        return True
+
     def seek(self, seek: Callable[[Timeline], None]) -> bool:
         """Show another moment. False if it was shown."""
         if self.timeline is None:
@@ -268,11 +300,27 @@ class LiveState:
         self.pictures_serial += 1
         return None if self.timeline is None else ask(self.timeline, self.selected_env)
 
+    def load_request(self, wanted: Wanted, level: LoadLevel = "auto") -> Load:
+        options = replace(self.options, seed=self.seed)
+        return Load(self.reference, options, wanted.source, level, wanted.snapshot)
+
+    def settings(self) -> list[Request]:
+        """What has been chosen, for a worker that knows nothing of it; the cameras are told last (`watch_request`)."""
+        return [
+            SetSpeed(self.speed),
+            SetEpisodeEnd(self.episode_end),
+            SetActionSource(self.action_source, self.policy),
+        ]
+
     def watch_request(self) -> WatchCameras:
         """The pictures that somebody looks at; none while no page is open."""
         return WatchCameras(self.selected_env, self.cameras if self.clients > 0 else ())
 
     # --- what is read --------------------------------------------------------------------------------
+
+    def own_files(self) -> list[str]:
+        """The author's files, as far as they are known."""
+        return own_files_of(() if self.task is None else self.task.source_files, self.own_file)
 
     def newest_moment(self) -> bytes | None:
         """Pickled for `Load.snapshot`; None before a task is loaded."""

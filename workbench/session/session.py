@@ -13,18 +13,15 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 
-from workbench.authoring.problem import Problem
-from workbench.authoring.reference import named_file
 from workbench.authoring.watch import SourceWatcher
 from workbench.core.inspection import Section
 from workbench.session.env_table import EnvRows
 from workbench.session.judge import FILE_SAVED, Judge, what_a_load_means
 from workbench.session.judgement import JudgedCurve, Judgement
 from workbench.session.kept_worker import Death, KeptWorker, WorkerOptions
-from workbench.session.last_words import Busy, death_problem, own_files_of
+from workbench.session.last_words import Busy
 from workbench.session.live_state import LiveState, scene_kept
 from workbench.session.messages import (
     ActionSource,
@@ -33,7 +30,6 @@ from workbench.session.messages import (
     Event,
     Failed,
     Inspect,
-    Load,
     Loaded,
     LoadLevel,
     Play,
@@ -85,14 +81,12 @@ class Session:
                 (the terminal).
             on_line: called with the lines that the worker printed, from its own threads; not with all of a flood.
         """
-        self._task = task
-        self._options = options
         self._on_event = on_event
         self._print = on_line
         self._lock = threading.Lock()
         self._changed = threading.Condition(self._lock)
         self._change = 0
-        self._state = LiveState(history_bytes, options.seed)
+        self._state = LiveState(task, options, history_bytes)
         self._closing = False
         self._recovery = Recovery(self._state.newest_moment)
         self._printed = PrintedLog(self._on_lines)
@@ -109,7 +103,6 @@ class Session:
         self._recorder = LiveRecorder(recordings, self._note)
         self._judge = Judge(self._note)
         self._watcher = SourceWatcher(self._on_files_changed)
-        self._own_file = named_file(task)
         self._follow((), {})
         self._worker.start()
 
@@ -153,7 +146,7 @@ class Session:
         A worker that does not take it up (an endless loop) is interrupted or replaced.
         """
         with self._lock:
-            request = replace(self._load_request(self._recovery.file_asked()), level=level)
+            request = self._state.load_request(self._recovery.file_asked(), level)
             stopped = self._state.state == "stopped"
         if stopped:
             self._worker.replace()  # it will be greeted with the file
@@ -163,11 +156,9 @@ class Session:
     def choose_class(self, name: str) -> None:
         """Another task class of the same file, one that `TaskDescription.others` names."""
         with self._lock:
-            task = self._state.task
-            if task is None or self._own_file is None or name not in task.others:
-                return
-            self._task = f"{self._own_file}:{name}"
-        self.reload()
+            chosen = self._state.choose_class(name)
+        if chosen:
+            self.reload()
 
     def interrupt(self) -> None:
         """Have the author's code left where it is, if it is at work; its traceback becomes the problem."""
@@ -372,14 +363,10 @@ class Session:
         """Everything that a worker before this one knew."""
         with self._lock:
             s = self._state
-            requests: list[Request] = [
-                SetSpeed(s.speed),
-                SetEpisodeEnd(s.episode_end),
-                SetActionSource(s.action_source, s.policy),
-            ]
+            requests = s.settings()
             wanted = self._recovery.wanted()
             if wanted is not None:
-                requests.append(self._load_request(wanted))
+                requests.append(self._state.load_request(wanted))
             else:
                 s.waits_for_the_file()
             if s.wants_play:
@@ -392,23 +379,11 @@ class Session:
             s = self._state
             while_loading = self._recovery.loading
             self._recovery.died(death.file_waits)
-            problem = None if death.asked and not death.stack else self._problem_of(death, while_loading)
-            s.died(death, problem, while_loading)
+            problem = s.died(death, while_loading, self._printed.tail(20))
             kept = s.task is not None
         self._note()
         if problem is not None:
             self._on_event(Failed(problem, kept))
-
-    def _problem_of(self, death: Death, while_loading: bool) -> Problem:
-        task = self._state.task
-        return death_problem(
-            death.why,
-            death.doing,
-            death.stack,
-            own_files_of(() if task is None else task.source_files, self._own_file),
-            self._printed.tail(20),
-            {} if task is None or while_loading else task.source,
-        )
 
     def _on_busy(self, busy: Busy | None) -> None:
         with self._lock:
@@ -419,8 +394,7 @@ class Session:
 
     def _own_files(self) -> list[str]:
         with self._lock:
-            task = self._state.task
-        return own_files_of(() if task is None else task.source_files, self._own_file)
+            return self._state.own_files()
 
     def _handle(self, event: Event) -> None:
         if isinstance(event, Failed) and self._worker.load_waits and "Interrupted:" in event.problem.message:
@@ -458,7 +432,7 @@ class Session:
             stale = restored and not is_on_disk(event.task.source)
             s.loaded(event, restored=restored, stale=stale)
         if judgement is not None:
-            self._judge.judge(self._load_request(Wanted(dict(event.task.source), None)), judgement)
+            self._judge.judge(self._state.load_request(Wanted(dict(event.task.source), None)), judgement)
         elif meaning == "forget":
             self._judge.forget()
         self._follow(event.task.source_files, {} if stale else event.task.source)
@@ -496,25 +470,20 @@ class Session:
 
     def _follow(self, paths: Iterable[str], texts: Mapping[str, str]) -> None:
         """Watch the task's own file, whether or not it ever loaded, and `paths` beside it."""
-        if self._own_file is None:
+        own_file = self._state.own_file
+        if own_file is None:
             return
-        beside = [Path(p) for p in paths if Path(p).is_relative_to(self._own_file.parent)]
-        self._watcher.follow({self._own_file, *beside}, texts)
+        beside = [Path(p) for p in paths if Path(p).is_relative_to(own_file.parent)]
+        self._watcher.follow({own_file, *beside}, texts)
 
     # --- small things --------------------------------------------------------------------------------
-
-    def _load_request(self, wanted: Wanted) -> Load:
-        options = TaskOptions(
-            self._options.num_envs, self._options.backend, self._state.seed, self._options.env_kwargs
-        )
-        return Load(self._task, options, wanted.source, snapshot=wanted.snapshot)
 
     def _bring_back(self, failed: Failed) -> None:
         """A fresh worker could not load the file: it is to have the last good version."""
         with self._lock:
             wanted = self._recovery.wanted() if self._recovery.failed(failed.kept) else None
         if wanted is not None:
-            self._send(self._load_request(wanted))
+            self._send(self._state.load_request(wanted))
 
     def _watch(self) -> None:
         with self._lock:
