@@ -381,9 +381,9 @@ class Session:
         """Show a moment before (negative) or after the one that is shown."""
         self._seek(lambda timeline: timeline.seek_by(steps))
 
-    def seek_tick(self, count: int) -> None:
-        """Show the batch after so many control steps since the task was built."""
-        self._seek(lambda timeline: timeline.seek_tick(count - 1))
+    def seek_step(self, env: int, step: int) -> None:
+        """Show the moment at which this env was at that step of its present episode."""
+        self._seek(lambda timeline: timeline.seek_step(env, step))
 
     def seek_event(self, direction: int) -> None:
         """Show the next (1) or last (-1) event of the selected env: reset, success, fail, truncation, branch."""
@@ -661,7 +661,7 @@ class Session:
                 s.timeline.add(event, max(0, s.past.count - 1))
                 s.step_serial = s.timeline.history.last
             if s.table is not None and s.terms is not None:
-                s.table.add(event)
+                s.table.add(event, None if s.timeline is None else s.timeline.history)
                 s.terms.add(event)
             first, self._first_due = self._first_due, False
             if s.problem is not None and s.problem_at_run and not first:
