@@ -579,7 +579,10 @@ class Session:
             if s.timeline is not None:
                 s.timeline.add_pictures(event)
             if event.pictures and event.pictures[0].env == s.selected_env:
-                s.pictures = {(picture.kind, picture.camera): picture for picture in event.pictures}
+                # They come a kind at a time; what nobody looks through any more is not to stay.
+                watched = {(camera.kind, camera.name) for camera in s.cameras}
+                made = {(picture.kind, picture.camera): picture for picture in event.pictures}
+                s.pictures = {k: p for k, p in {**s.pictures, **made}.items() if k in watched}
                 s.pictures_serial += 1
                 s.picture_milliseconds = event.milliseconds
         elif isinstance(event, Inspection):
@@ -629,8 +632,9 @@ class Session:
                 s.timeline.history.renew_last(event.first)
             if report is None or report.level not in ("same", "patched"):
                 s.cameras_serial += 1
-                s.pictures = {}
                 s.pictures_serial += 1
+                if not kept:
+                    s.pictures = {}
             s.activity = ""
             # The last good version came back after a worker's death: what killed it still stands.
             s.stale = restored and not is_on_disk(task.source)
