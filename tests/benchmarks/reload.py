@@ -140,9 +140,9 @@ def main(options: Options) -> None:
         told = statistics.median(value[1] for value in values)
         spread = f"{min(seconds):.2f} | {max(seconds):.2f} | {BARS[level]}"
         print(f"| {level} | {statistics.median(seconds):.2f} | {spread} | {told:.0f} |")
-    print(
-        f"| cold restart, stock, 1 env | {statistics.median(cold):.2f} | {min(cold):.2f} | {max(cold):.2f} | | |"
-    )
+    if cold:
+        spread = f"{min(cold):.2f} | {max(cold):.2f} | | |"
+        print(f"| cold restart, stock, 1 env | {statistics.median(cold):.2f} | {spread}")
 
 
 if __name__ == "__main__":

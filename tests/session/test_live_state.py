@@ -12,6 +12,7 @@ from workbench.session.judge import JudgementView
 from workbench.session.kept_worker import Death, Vitals
 from workbench.session.live_state import LiveState
 from workbench.session.messages import (
+    CameraRequest,
     Failed,
     Loaded,
     Loading,
@@ -164,6 +165,7 @@ def test_pictures_are_those_of_the_env_that_is_looked_at() -> None:
         return Pictures((Picture("eye", "sensor", env, np.zeros(7, np.float32), rgb),), 12.0, (0,))
 
     state = running()
+    state.cameras = (CameraRequest("eye", "sensor"),)
     state.take(pictures(0))
     assert set(view(state).pictures) == {("sensor", "eye")}
     assert state.select(99) and view(state).selected_env == N - 1 and view(state).pictures == {}

@@ -71,7 +71,7 @@ class Chronicle:
     def add(self, event: Stepped) -> None:
         self._past.add(event)
         self.timeline.add(event, max(0, self._past.count - 1))
-        self.table.add(event)
+        self.table.add(event, self.timeline.history)
         self.terms.add(event)
 
     def curves(self) -> Curves:
@@ -166,7 +166,9 @@ class LiveState:
             self.timeline.history.renew_last(event.first)
         if report is None or report.level not in ("same", "patched"):
             self.cameras_serial += 1
-            self._drop_pictures()
+            self.pictures_serial += 1
+            if not scene_kept(event):
+                self.pictures = {}
         self.activity = ""
         self.stale = stale
         if not restored:  # else what killed the worker still stands
@@ -211,7 +213,10 @@ class LiveState:
             if self.timeline is not None:
                 self.timeline.add_pictures(event)
             if event.pictures and event.pictures[0].env == self.selected_env:
-                self.pictures = {(picture.kind, picture.camera): picture for picture in event.pictures}
+                # They come a kind at a time; what nobody looks through any more is not to stay.
+                watched = {(camera.kind, camera.name) for camera in self.cameras}
+                made = {(picture.kind, picture.camera): picture for picture in event.pictures}
+                self.pictures = {k: p for k, p in {**self.pictures, **made}.items() if k in watched}
                 self.pictures_serial += 1
                 self.picture_milliseconds = event.milliseconds
         elif isinstance(event, Inspection):

@@ -277,9 +277,9 @@ class Session:
         """Show a moment before (negative) or after the one that is shown."""
         self._seek(lambda timeline: timeline.seek_by(steps))
 
-    def seek_tick(self, count: int) -> None:
-        """Show the batch after so many control steps since the task was built."""
-        self._seek(lambda timeline: timeline.seek_tick(count - 1))
+    def seek_step(self, env: int, step: int) -> None:
+        """Show the moment at which this env was at that step of its present episode."""
+        self._seek(lambda timeline: timeline.seek_step(env, step))
 
     def seek_event(self, direction: int) -> None:
         """Show the next (1) or last (-1) event of the selected env: reset, success, fail, truncation, branch."""

@@ -208,7 +208,7 @@ class Worker:
         before, self._opened = self._opened, opened
         self._loaded_by, self._last = request, opened.first
         if report is not None and report.level in SCENE_KEPT:
-            self._watch_cameras(self._watch)
+            self._look_through(self._watch)
             self._pictures.scene_changed(self._steps.number)
             # The meshes are 9 MB for a Panda, and the server has them: 0.2 s on a reload's way to the page.
             unchanged = replace(opened.description.geometry, visuals=())
@@ -220,7 +220,7 @@ class Worker:
             self._acting.seed(request.options.seed)
         self._rate.clear()
         self._acting.sliders = ()
-        self._watch_cameras(self._watch)
+        self._look_through(self._watch)
         self._steps.new_scene()
         self._send(Loaded(opened.description, opened.first, opened.milliseconds, report))
         # The past begins with the reset, and what a first step is taken back to is this.
@@ -266,6 +266,11 @@ class Worker:
         self._acting.sliders = request.action
 
     def _watch_cameras(self, request: WatchCameras) -> None:
+        # The server says it again after every load, when the first picture is under way already.
+        if request != self._watch:
+            self._look_through(request)
+
+    def _look_through(self, request: WatchCameras) -> None:
         self._watch = request
         self._pictures.settle()
         if self._opened is None:
@@ -388,6 +393,7 @@ class Worker:
         try:
             made = self._pictures.poll(self._opened.env, time.monotonic())
         except RuntimeError as error:
+            self._watch = WatchCameras(0, ())
             self._pictures.watch(0, ())
             self._fail(problem_from_exception(error, "pictures", self._opened.loaded.source_files))
             return

@@ -112,7 +112,7 @@ class Page:
         self._timeline = TimelinePanel(server, session)
         self._env_window = server.gui.add_panel(order=5.0)
         with self._env_window.add_tab("Envs", viser.Icon.LIST_DETAILS):
-            self._envs = EnvPanel(server, session, lambda env, tick: session.seek_tick(tick))
+            self._envs = EnvPanel(server, session)
         self._env_window.dock_left()
         self._env_window.set_width(ENVS_WIDTH)
         # A strip at the edge until somebody wants it: it takes half of a small screen's view.
