@@ -319,11 +319,9 @@ def test_what_slept_sleeps(pick: BaseEnv) -> None:
     assert [cube.is_sleeping for cube in cubes] == [i == 2 for i in range(N)]
 
 
-@pytest.mark.parametrize(
-    "env_id", ["PickCube-v1", "StackCube-v1", "MS-CartpoleBalance-v1", "LiftPegUpright-v1"]
-)
+@pytest.mark.parametrize("env_id", ["PickCube-v1", "StackCube-v1"])
 def test_whatever_physx_lets_sleep_is_said_to_sleep(env_id: str) -> None:
-    """Only what has no velocity is asked: so nothing that sleeps may have one."""
+    """Also with a velocity: neither a cube nor an arm that falls asleep need have lost all of it."""
     env = made(env_id, 3)
     env.reset(seed=0)
     plan = plan_cpu_state(env)

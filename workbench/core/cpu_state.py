@@ -7,8 +7,8 @@ env, and ``unpack()`` writes them; after a control step the bytes are there alre
   they mean, by the names that the rest of the workbench uses; where they differ (another task, an object more,
   an arm with another joint), the bytes for the target are put together from its own and the source's.
 * *Sleep.* Writing a pose wakes a body, and a body at rest that wakes moves by some micrometres before it
-  sleeps again. What slept is put to sleep again. Asking costs 2 us. PhysX sets the velocity of a body that
-  falls asleep to zero, so of bodies only those without any are asked; an articulation keeps its own, and always is.
+  sleeps again. What slept is put to sleep again. Every body is asked, 2 us each: a velocity in the pack does
+  not mean that one is awake (cubes of StackCube fall asleep with some left, and keep it).
 * *Forces* that ``set_qf`` left on the joints, and which drives were ever set (`BatchedCpuSystem.drive_flags`).
 * *Contacts.* PhysX lists contacts of the last substep only, so after a restore its list is that of another
   moment, and ``is_grasping`` would answer for it. The impulses that the task's queries count go along, and are
@@ -37,8 +37,6 @@ from workbench.core.cpu_layout import BODY
 from workbench.core.cpu_system import BatchedCpuSystem
 from workbench.core.fresh_physics import renew_physics
 
-_VELOCITY = np.arange(7, BODY)
-"""Where a packed body, or the root of an articulation, has its linear and angular velocity."""
 _ATTEMPTS = 4
 """How often a root pose is asked for; in all tasks that were tried, two were enough."""
 _FAR = np.float32(99999)
@@ -105,12 +103,6 @@ class CpuStatePlan:
     """Objects whose ids are used: pybind11 gives an id anew once its object is gone."""
     offsets: dict[int, tuple[int, int]]
     """Env and offset in its packed floats of an actor, by the ``id`` of its entity."""
-    articulated: list[list[tuple[int, Callable[[], bool]]]]
-    """Of each env: the articulations among its `sleepers`."""
-    loose: list[tuple[int, int, Callable[[], bool]]]
-    """Env, index into its contents, and whether it sleeps, of all other `sleepers`."""
-    velocity_at: NDArray[np.int64]
-    """(loose, 6) where the concatenated packs have the velocity of each of `loose`."""
     settled: list[dict[int, tuple[bytes, bytes]]]
     """Of each env, by offset in its packed bytes: a root pose that was wanted, and which was asked for to get it."""
 
@@ -126,10 +118,7 @@ def plan_cpu_state(env: Any) -> CpuStatePlan:
         return component.entity.name if slot is None else table.names[slot % len(table.names)]
 
     alike: dict[Contents, Contents] = {}
-    nothing = np.zeros((0, len(_VELOCITY)), np.int64)
-    plan = CpuStatePlan([], [], [], {}, [], [], {}, [], [], nothing, [{} for _ in px.systems])
-    velocities: list[NDArray[np.int64]] = []
-    packed = 0
+    plan = CpuStatePlan([], [], [], {}, [], [], {}, [{} for _ in px.systems])
     first_articulation = 0
     for index, system in enumerate(px.systems):
         bodies, links = system.rigid_dynamic_components, system.articulation_link_components
@@ -139,35 +128,25 @@ def plan_cpu_state(env: Any) -> CpuStatePlan:
         plan.bodies.append(by_name)
         plan.names.update({component: (index, name) for name, component in by_name.items()})
         parts, sleepers = [], []
-        start = packed
         for body in bodies:
-            plan.offsets[id(body.entity)] = index, packed - start
+            plan.offsets[id(body.entity)] = index, sum(part.size for part in parts)
             if not body.kinematic:
-                is_asleep = _getter(body, "is_sleeping")
-                sleepers.append((len(parts), is_asleep, body))
-                plan.loose.append((index, len(parts), is_asleep))
-                velocities.append(packed + _VELOCITY)
+                sleepers.append((len(parts), _getter(body, "is_sleeping"), body))
             parts.append(Part(name_of(body), None))
-            packed += BODY
         roots = [link for link in links if link.is_root]
-        plan.articulated.append([])
         for root in roots:
             articulation: Any = root.articulation
             name = name_of(root).rpartition("/")[0] or articulation.name
             sleepers.append((len(parts), _getter(root, "sleeping"), root))
-            plan.articulated[-1].append(sleepers[-1][:2])
             # SAPIEN's "scene-0_panda" has joints that are called "scene-0-panda_panda_joint1".
             prefix = articulation.name.replace("_", "-", 1) + "_"
             joints = tuple(joint.name.removeprefix(prefix) for joint in articulation.active_joints)
             parts.append(Part(name, joints))
-            packed += parts[-1].size
         contents = tuple(parts)
         plan.contents.append(alike.setdefault(contents, contents))
         plan.sleepers.append(sleepers)
         plan.articulations.append(slice(first_articulation, first_articulation + len(roots)))
         first_articulation += len(roots)
-    if velocities:
-        plan.velocity_at = np.stack(velocities)
     return plan
 
 
@@ -185,7 +164,6 @@ def read_cpu_state(env: Any, plan: CpuStatePlan, env_idx: list[int]) -> list[Cpu
     driven = np.stack(px.drive_flags)
     touching = _touching(px, plan)
     awake = {len(contents): (False,) * len(contents) for contents in plan.contents}
-    may_sleep = _may_sleep(plan, packs)
     states = []
     for i in env_idx:
         packed, contents, rows = packs[i], plan.contents[i], plan.articulations[i]
@@ -194,25 +172,12 @@ def read_cpu_state(env: Any, plan: CpuStatePlan, env_idx: list[int]) -> list[Cpu
             for offset, pose in true_poses[i]:
                 numbers[offset : offset + 7] = pose
             packed = numbers.tobytes()
-        sleeping = [part for part, is_asleep in may_sleep[i] if is_asleep()]
+        sleeping = [part for part, is_asleep, _ in plan.sleepers[i] if is_asleep()]
         asleep = (
             tuple([part in sleeping for part in range(len(contents))]) if sleeping else awake[len(contents)]
         )
         states.append(CpuEnvState(contents, packed, asleep, qf[rows], driven[:, rows], touching.get(i, ())))
     return states
-
-
-def _may_sleep(plan: CpuStatePlan, packs: list[bytes]) -> list[list[tuple[int, Callable[[], bool]]]]:
-    """Of each env: index into its contents, and whether it sleeps, of what has to be asked."""
-    numbers = np.frombuffer(b"".join(packs), dtype=np.float32)
-    still = np.flatnonzero(~numbers[plan.velocity_at].any(axis=1))
-    if not len(still):
-        return plan.articulated
-    asked = [list(articulations) for articulations in plan.articulated]
-    for row in still:
-        index, part, is_asleep = plan.loose[row]
-        asked[index].append((part, is_asleep))
-    return asked
 
 
 def write_cpu_state(
