@@ -66,12 +66,12 @@ def version(number: int) -> str:
 
 def save_to_seen(page: Page, file: Path, number: int) -> float:
     """Seconds from the saved file to the new entry and a new picture on the page."""
-    before = page.locator("img").first.get_attribute("src")
+    before = page.locator('img[src^="blob:"]').first.get_attribute("src")
     file.write_text(version(number))
     start = time.perf_counter()
     page.wait_for_function(
         """([entry, before]) => {
-            const image = document.querySelector('img');
+            const image = document.querySelector('img[src^="blob:"]');
             return document.body.textContent.includes(entry) && image && image.src !== before;
         }""",
         arg=[f"seen_{number}", before],
