@@ -23,7 +23,7 @@ import tyro
 from playwright.sync_api import Page, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.benchmarks.page_rate import COUNT, TASK, play_to_pause, prepare
+from tests.benchmarks.page_rate import COUNT, TASK, play_to_pause, prepare, timed_click
 from tests.benchmarks.page_rate import Options as PageOptions
 from tests.browser.opened import launch, new_page, open_workbench
 from tests.ui.tabs import Tab, open_deaf_tab, tabs_of
@@ -52,14 +52,14 @@ class Scene:
     def row(self, what: str, seconds: float = 8.0) -> None:
         """Let it play, and say how that went."""
         clicks = play_to_pause(self.page, self.options.clicks)
-        self.page.evaluate(
-            "() => [...document.querySelectorAll('button')].find((b) => b.innerText.trim() === 'Play').click()"
-        )
+        timed_click(self.page, "Play", "Pause")
         time.sleep(1.0)
-        self.server.cpu_percent(), self.worker.cpu_percent()
+        for process in (self.server, self.worker):
+            process.cpu_percent()  # counts from here
         before = [tab.megabytes for tab in self.tabs]
         applied, _ = self.page.evaluate(COUNT, seconds)
         cpu, theirs = self.server.cpu_percent(), self.worker.cpu_percent()
+        timed_click(self.page, "Pause", "Play")
         sent = [tab.megabytes - had for tab, had in zip(self.tabs, before, strict=True)]
         each = f"{statistics.median(sent) / seconds:.2f} MB/s" if sent else "-"
         print(
@@ -82,7 +82,13 @@ def main(options: Options) -> None:
         file = Path(shutil.copy(TASK, Path(name) / "push_cube.py"))
         with (
             open_workbench(
-                str(file), "--num-envs", str(options.num_envs), "--no-spare", cwd=Path(name)
+                str(file),
+                "--num-envs",
+                str(options.num_envs),
+                "--no-spare",
+                "--history",
+                "16MB",
+                cwd=Path(name),
             ) as opened,
             tabs_of(opened.url) as tabs,
             sync_playwright() as playwright,

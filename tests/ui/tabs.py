@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -42,16 +42,16 @@ def _handshake(url: str) -> tuple[str, dict[str, Any]]:
     }
 
 
-def camera_message() -> bytes:
-    """What a page says when it has drawn itself for the first time."""
+def camera_message(position: Sequence[float] = (3.0, 3.0, 3.0)) -> bytes:
+    """What a page says when it has drawn itself for the first time: where it looks from."""
     message = viser._messages.ViewerCameraMessage(
         wxyz=(1.0, 0.0, 0.0, 0.0),
-        position=(3.0, 3.0, 3.0),
+        position=(position[0], position[1], position[2]),
         fov=0.8,
         near=0.05,
         far=300.0,
         image_height=720,
-        image_width=1280,
+        image_width=800,
         look_at=(0.0, 0.0, 0.0),
         up_direction=(0.0, 0.0, 1.0),
     )
@@ -84,12 +84,12 @@ class Tabs:
         self._thread.start()
         self._tasks: dict[int, asyncio.Task[None]] = {}
 
-    def open(self) -> Tab:
-        """Open one; it is read until `close`."""
+    def open(self, position: Sequence[float] = (3.0, 3.0, 3.0)) -> Tab:
+        """Open one that looks from `position`; it is read until `close`."""
         tab = Tab()
 
         async def begin() -> None:
-            self._tasks[id(tab)] = asyncio.create_task(self._read(tab))
+            self._tasks[id(tab)] = asyncio.create_task(self._read(tab, camera_message(position)))
 
         asyncio.run_coroutine_threadsafe(begin(), self._loop).result()
         return tab
@@ -105,19 +105,23 @@ class Tabs:
         asyncio.run_coroutine_threadsafe(end(), self._loop).result(timeout=30)
 
     def stop(self) -> None:
-        """Drop all that are open."""
+        """Close all that are open."""
+
+        async def end() -> None:
+            for task in self._tasks.values():
+                task.cancel()
+            await asyncio.gather(*self._tasks.values(), return_exceptions=True)
+
+        asyncio.run_coroutine_threadsafe(end(), self._loop).result(timeout=30)
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
-        for task in self._tasks.values():
-            task.cancel()
-        self._loop.run_until_complete(asyncio.gather(*self._tasks.values(), return_exceptions=True))
         self._loop.close()
 
-    async def _read(self, tab: Tab) -> None:
+    async def _read(self, tab: Tab, greeting: bytes) -> None:
         address, options = _handshake(self._url)
         try:
             async with websockets.asyncio.client.connect(address, **options) as connection:
-                await connection.send(camera_message())
+                await connection.send(greeting)
                 async for frame in connection:
                     tab.frames += 1
                     tab.megabytes += len(frame) / 2**20

@@ -8,9 +8,9 @@ removed (a removal is kept until every client has heard of it). `websockets` wou
 however waits behind what is unsent, for ever.
 
 So the bytes on their way to each client are looked at, in the connection's own buffer and in the kernel's. If
-there are some, and for `PATIENCE` seconds their number is the same, the connection is ended. A slow line is
-not a deaf client: it takes some now and then. A page that wakes up finds its connection closed, opens another,
-and gets everything as it is by then.
+there are some, and for `PATIENCE` seconds no look finds fewer than the one before, the connection is ended. That
+new ones are written meanwhile does not count. A slow line is not a deaf client: it takes some now and then. A page
+that wakes up finds its connection closed, opens another, and gets everything as it is by then.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ async def let_go_when_deaf(connection: ServerConnection) -> None:
     while True:
         await asyncio.sleep(PATIENCE / _LOOKS)
         left = unsent(connection)
-        if left != before or left == 0:
-            before, heard = left, loop.time()
+        if left < before or left == 0:
+            heard = loop.time()
         elif loop.time() - heard > PATIENCE:
             _log.warning(
                 "Closed a browser's connection: it has read nothing for %.0f s. It may come back at any time.",
@@ -59,3 +59,4 @@ async def let_go_when_deaf(connection: ServerConnection) -> None:
             )
             connection.transport.abort()
             return
+        before = left
