@@ -12,7 +12,7 @@ import socket
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -71,7 +71,9 @@ class Tab:
     frames: int = 0
     megabytes: float = 0.0
     open: bool = False
-    """Connected, and the server's first words have come."""
+    """Connected, and all that there was at that time has come."""
+    commands: dict[str, str] = field(default_factory=dict)
+    """The commands of the palette: the id of each, by its label."""
 
 
 class Tabs:
@@ -83,6 +85,7 @@ class Tabs:
         self._thread = threading.Thread(target=self._loop.run_forever, name="tabs", daemon=True)
         self._thread.start()
         self._tasks: dict[int, asyncio.Task[None]] = {}
+        self._connections: dict[int, websockets.asyncio.client.ClientConnection] = {}
 
     def open(self, position: Sequence[float] = (3.0, 3.0, 3.0)) -> Tab:
         """Open one that looks from `position`; it is read until `close`."""
@@ -104,6 +107,12 @@ class Tabs:
 
         asyncio.run_coroutine_threadsafe(end(), self._loop).result(timeout=30)
 
+    def trigger(self, tab: Tab, label: str) -> None:
+        """Choose this command of the page, as its key or the palette does."""
+        message = viser._messages.CommandTriggerMessage(tab.commands[label])
+        said = self._connections[id(tab)].send(msgspec.msgpack.encode(message.as_serializable_dict()))
+        asyncio.run_coroutine_threadsafe(said, self._loop).result(timeout=30)
+
     def stop(self) -> None:
         """Close all that are open."""
 
@@ -122,14 +131,20 @@ class Tabs:
         try:
             async with websockets.asyncio.client.connect(address, **options) as connection:
                 await connection.send(greeting)
+                self._connections[id(tab)] = connection
                 async for frame in connection:
+                    assert isinstance(frame, bytes)
                     tab.frames += 1
                     tab.megabytes += len(frame) / 2**20
-                    tab.open = True
+                    for message in [] if tab.open else messages_in(frame):
+                        if message["type"] == "RegisterCommandMessage":
+                            tab.commands[message["props"]["label"]] = message["uuid"]
+                        tab.open = tab.open or message["type"] == "ReplayDoneMessage"
         except websockets.exceptions.ConnectionClosed:
             pass
         finally:
             tab.open = False
+            self._connections.pop(id(tab), None)
 
 
 @contextmanager

@@ -97,7 +97,7 @@ def test_a_tab_that_comes_and_goes_leaves_nothing_behind(house: House) -> None:
     server = house.door.server
 
     def come_and_go() -> None:
-        tab = house.tabs.open(server.initial_camera.position)
+        tab = house.tabs.open(server.initial_camera.position.tolist())
         until(
             lambda: house.clients() and server.get_clients().keys() <= house.page._pointed.keys(),
             "the view",
