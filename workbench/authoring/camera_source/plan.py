@@ -99,13 +99,8 @@ def _the_one(
     if not agreeing:
         raise Refused(reasons[0] if reasons else f"{uid!r} cannot be read")
     # Of several ways through the branches the one that agrees in everything else, too.
-    others = [name for name in FIELDS if name not in fields]
-
-    def strange(read: ReadCamera) -> int:
-        return sum(mismatch(read, name, before) is not None for name in others)
-
-    least = min(strange(read) for read in agreeing)
-    agreeing = [read for read in agreeing if strange(read) == least]
+    least = min(_strange(read, fields, before) for read in agreeing)
+    agreeing = [read for read in agreeing if _strange(read, fields, before) == least]
     places = {tuple(_places(read, fields)) for read in agreeing}
     if len(places) > 1:
         lines = sorted({read.call.line for read in agreeing})
@@ -115,6 +110,11 @@ def _the_one(
             "made this camera cannot be told"
         )
     return agreeing[0]
+
+
+def _strange(read: ReadCamera, fields: list[str], before: CameraSettings) -> int:
+    """In how many of the fields that stay as they are it does not say what the env has."""
+    return sum(mismatch(read, name, before) is not None for name in FIELDS if name not in fields)
 
 
 def _places(read: ReadCamera, fields: list[str]) -> list[object]:
@@ -208,7 +208,7 @@ def _edit(
     (file,) = files.values()
     check_own(file.path)
     new_text = file.replaced([change for _, change in changes.replacements])
-    found = _read_again(project, read, file, new_text, fields, after)
+    found = _read_again(project, read, file, new_text, fields, before, after)
     left = [n for n in FIELDS if n not in fields and n not in read.unknown and mismatch(read, n, before)]
     if left:
         changes.note(
@@ -242,6 +242,7 @@ def _read_again(
     file: SourceFile,
     new_text: str,
     fields: list[str],
+    before: CameraSettings,
     after: CameraSettings,
 ) -> ReadCamera:
     """The camera as the new text has it. Raises `Refused` if it, or another camera, is not as it should be."""
@@ -257,7 +258,8 @@ def _read_again(
                 if _said(project, old) != _said(changed, new):
                     raise Refused(f"the change would be one of the camera {old.name or old.where} as well")
                 continue
-            result = next((r for r in readings(changed, new) if _is_as_asked(r, fields, after)), None)
+            found = [r for r in readings(changed, new) if _is_as_asked(r, fields, after)]
+            result = min(found, key=lambda r: _strange(r, fields, before), default=None)
     if result is None:
         raise Refused("what was to be written does not read back as what was asked for")
     return result
