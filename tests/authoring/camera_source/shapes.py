@@ -294,8 +294,23 @@ WRITTEN: dict[str, str] = {
         """
     ),
     "its uid is a constant": _hook(
-        'return [CameraConfig(NAME, sapien.Pose([0.5, 0, 0.5]), 128, 128, 1.0)]\n',
+        "return [CameraConfig(NAME, sapien.Pose([0.5, 0, 0.5]), 128, 128, 1.0)]\n",
         before='NAME = "cam"\n\n\n',
+    ),
+    "remarks within look_at": _hook(
+        """\
+        pose = sapien_utils.look_at(
+            # above the table
+            eye=[
+                0.3,  # towards the robot
+                0,
+                0.6,
+            ],
+            target=TARGET,  # the cube
+        )
+        return [CameraConfig("cam", pose, 128, 128, 1.0)]
+        """,
+        before="TARGET = [-0.1, 0, 0.1]  # read once\n\n\n",
     ),
     "another up": _hook(
         """\

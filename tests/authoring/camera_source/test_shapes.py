@@ -10,9 +10,9 @@ import tokenize
 from collections.abc import Callable
 
 import pytest
+
 from tests.authoring.camera_source.real_cameras import FILE, close, real_configs, real_settings, settings_of
 from tests.authoring.camera_source.shapes import REFUSED, WRITTEN
-
 from workbench.authoring.camera_source import Refusal, SourceEdit, plan_edit
 from workbench.authoring.camera_source.rotations import angle_between, from_euler, look_at, unit
 from workbench.core.camera_settings import CameraSettings

@@ -18,7 +18,7 @@ from workbench.authoring.camera_source.changes import Changes, settled
 from workbench.authoring.camera_source.definitions import Project
 from workbench.authoring.camera_source.evaluate import MANISKILL_POSE, SAPIEN_POSE
 from workbench.authoring.camera_source.number_text import list_text, quaternion_texts
-from workbench.authoring.camera_source.read_camera import ANGLE_STEP, is_broken
+from workbench.authoring.camera_source.read_camera import ANGLE_STEP
 from workbench.authoring.camera_source.source_file import Replacement, SourceFile
 from workbench.authoring.camera_source.values import Angles, Number, PoseValue, Vector
 from workbench.core.camera_settings import CameraSettings
@@ -127,14 +127,13 @@ def _look_at(changes: Changes, pose: PoseValue, after: CameraSettings) -> bool:
 
 def _as_quaternion(changes: Changes, project: Project, pose: PoseValue, after: CameraSettings) -> None:
     """A pose in place of a look_at, with the author's own expression for where the camera stands."""
-    file = pose.at.file
-    forward = rotations.matrix(after.quaternion)[:, 0].tolist()
-    vertical = abs(forward[2]) > math.cos(1e-3)
-    if vertical or is_broken(pose):
-        way = "down" if forward[2] < 0 else "up"
+    file, node = pose.at.file, pose.at.node
+    assert isinstance(node, cst.Call)
+    height = float(rotations.matrix(after.quaternion)[2, 0])
+    if abs(height) > math.cos(1e-3):
         changes.note(
-            f"the camera looks straight {way}; look_at gives no valid rotation there (its quaternion is not of unit "
-            "length), so the pose is written with a quaternion"
+            f"the camera looks straight {'down' if height < 0 else 'up'}; look_at gives no valid rotation there (its "
+            "quaternion is not of unit length), so the pose is written with a quaternion"
         )
     else:
         changes.note(
@@ -144,12 +143,24 @@ def _as_quaternion(changes: Changes, project: Project, pose: PoseValue, after: C
     eye = pose.parts["eye"]
     assert isinstance(eye, Vector)
     _vector(changes, eye, after.position, 4)
-    known = len(pose.at.reads)
-    position = changes.rendered(eye, known, file)
+    call = pose_call(changes, project, file)
+    quaternion = f"[{', '.join(quaternion_texts(_same_side(after.quaternion, (1, 0, 0, 0))))}]"
+    shared = any(read.others is not None for read in pose.at.reads)
+    if len(node.args) == 2 and not shared:
+        # Word by word, so that what the author remarked between the arguments stays.
+        changes.replacements.append((file, Replacement(*file.span(node.func), call)))
+        for index, arg in enumerate(node.args):
+            name = ("eye", "target")[index] if arg.keyword is None else arg.keyword.value
+            if arg.keyword is not None:
+                new = "p" if name == "eye" else "q"
+                changes.replacements.append((file, Replacement(*file.span(arg.keyword), new)))
+            if name == "target":
+                changes.replacements.append((file, Replacement(*file.span(arg.value), quaternion)))
+        return
+    position = changes.rendered(eye, len(pose.at.reads), file)
     for value in (eye, *eye.items):
         changes.texts.pop(value, None)
-    texts = ", ".join(quaternion_texts(_same_side(after.quaternion, (1, 0, 0, 0))))
-    changes.texts[pose] = f"{pose_call(changes, project, file)}(p={position}, q=[{texts}])"
+    changes.texts[pose] = f"{call}(p={position}, q={quaternion})"
 
 
 def pose_call(changes: Changes, project: Project, file: SourceFile) -> str:
