@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from tests.authoring.camera_source.real_cameras import FILE, close, real_settings
 from tests.authoring.camera_source.shapes import WRITTEN
-from workbench.authoring.camera_source import SourceEdit, plan_edit
+from workbench.authoring.camera_source import Refusal, SourceEdit, plan_edit
+from workbench.authoring.camera_source.read_camera import changed_fields
 from workbench.authoring.camera_source.rotations import angle_between, look_at, unit
 from workbench.core.camera_settings import CameraSettings
 
@@ -53,15 +54,18 @@ def poses(draw: st.DrawFn) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 @pytest.mark.parametrize("form", FORMS)
-@settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
 @given(pose=poses(), fov=st.none() | st.floats(0.05, 3.0))
 def test_write_and_read_back(form: str, pose: tuple, fov: float | None) -> None:
     source = WRITTEN[form]
     before = _before(form)
     after = dataclasses.replace(before, position=pose[0], quaternion=pose[1], fov=fov or before.fov)
+    assume(changed_fields(before, after))
     plan = plan_edit({FILE: source}, "cam", before, after)
-    assert isinstance(plan, SourceEdit), plan
-    assert plan.settings is not None
+    if isinstance(plan, Refusal):
+        assert "smaller than what is written" in plan.reason
+        assume(False)
+    assert isinstance(plan, SourceEdit) and plan.settings is not None
     real = real_settings({FILE: plan.new_text}, "cam")
     assert close(plan.settings, real), plan.diff
     assert math.dist(real.position, after.position) <= 1e-4

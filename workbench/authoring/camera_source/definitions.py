@@ -16,7 +16,7 @@ from pathlib import PurePath
 
 import libcst as cst
 
-from workbench.authoring.camera_source.source_file import Scope, SourceFile, walk
+from workbench.authoring.camera_source.source_file import Scope, SourceFile, children, parsed, walk
 
 LOOPS = (cst.For, cst.While, cst.ListComp, cst.SetComp, cst.DictComp, cst.GeneratorExp)
 
@@ -45,7 +45,7 @@ class Project:
 
     def file(self, path: str) -> SourceFile:
         if path not in self._files:
-            self._files[path] = SourceFile(path, self.texts[path])
+            self._files[path] = parsed(path, self.texts[path])
         return self._files[path]
 
     def mentioning(self, word: str) -> Iterator[SourceFile]:
@@ -93,31 +93,36 @@ class Project:
                 return reaching(file, here, node if depth == 0 else None, scope)
         return []
 
-    def name_readers(self, binding: Binding, except_for: cst.CSTNode) -> str | None:
-        """Who else reads a plain name's `binding`."""
-        file, name = binding.file, binding.name
-        for node in file.nodes:
-            if not isinstance(node, cst.Name) or node.value != name or node is except_for:
+    def name_readers(self, binding: Binding, file: SourceFile, read: cst.CSTNode) -> str | None:
+        """Who reads a plain name's `binding`, other than `read` in `file`."""
+        name = binding.name
+        for node in binding.file.nodes:
+            if not isinstance(node, cst.Name) or node.value != name or node is read:
                 continue
-            if _other_element(file, node, except_for):
+            if _other_element(binding.file, node, read) or _inside(binding.file, node, read):
                 continue
-            if _is_read(file, node) and binding in self.of_name(file, node):
-                return f"line {file.line(node)}" if not _inside(file, node, except_for) else None
-        if not isinstance(file.scopes(binding.node)[0], cst.Module):
+            if _is_read(binding.file, node) and binding in self.of_name(binding.file, node):
+                return self._where(binding.file, node, file)
+        if binding.dotted is not None or not isinstance(binding.file.scopes(binding.node)[0], cst.Module):
             return None
         for other in self.mentioning(name):
-            if other is file:
+            if other is binding.file:
                 continue
             for node in other.nodes:
-                outer = other.parents.get(node)
-                if not isinstance(node, cst.Name) or node.value != name or node is except_for:
+                if not isinstance(node, cst.Name) or node.value != name or node is read:
                     continue
-                if isinstance(outer, (cst.ImportAlias, cst.Arg)) or outer is except_for:
+                outer = other.parents[node]
+                if isinstance(outer, cst.ImportAlias) and other is file:
                     continue
-                if _other_element(other, node, except_for):
+                if isinstance(outer, cst.Arg) and outer.keyword is node:
                     continue
-                return f"{other.name}, line {other.line(node)}"
+                if outer is not read and not _other_element(other, node, read):
+                    return self._where(other, node, file)
         return None
+
+    def _where(self, file: SourceFile, node: cst.CSTNode, reader: SourceFile) -> str:
+        line = f"line {file.line(node)}"
+        return line if file is reader else f"{file.name}, {line}"
 
     # --- attributes ---------------------------------------------------------------------------------
 
@@ -156,18 +161,18 @@ class Project:
         why = f"it is set again at line {which.file.line(which.node)}"
         return [Binding(which.file, name, which.node, None, why)]
 
-    def attribute_readers(self, binding: Binding, except_for: cst.CSTNode) -> str | None:
-        """Who else reads an attribute of that name."""
+    def attribute_readers(self, binding: Binding, reader: SourceFile, read: cst.CSTNode) -> str | None:
+        """Who reads an attribute of that name, other than `read`."""
         name = binding.name
         for file in self.mentioning(name):
             for node in file.nodes:
-                if node is except_for or node is binding.node:
+                if node is read or node is binding.node:
                     continue
                 if isinstance(node, cst.Attribute) and node.attr.value == name:
                     outer = file.parents[node]
                     if isinstance(outer, (cst.AssignTarget, cst.AnnAssign)):
                         continue
-                    if _other_element(file, node, except_for):
+                    if _other_element(file, node, read):
                         continue
                 elif isinstance(node, cst.SimpleString) and node.raw_value == name:
                     pass
@@ -176,8 +181,7 @@ class Project:
                         continue
                 else:
                     continue
-                where = f"line {file.line(node)}"
-                return where if file is binding.file else f"{file.name}, {where}"
+                return self._where(file, node, reader)
         return None
 
     def class_named(
@@ -260,6 +264,9 @@ _STARRED = frozenset(
 """What the cameras of a file with ``from x import *`` are likely to get by it."""
 
 
+_ASSIGNING = (cst.Assign, cst.AnnAssign, cst.AugAssign, cst.NamedExpr)
+
+
 def reaching(
     file: SourceFile, bindings: list[Binding], use: cst.CSTNode | None, scope: Scope
 ) -> list[Binding]:
@@ -271,7 +278,7 @@ def reaching(
             if any(isinstance(o, (cst.For, cst.While)) and o in around for o in file.ancestors(binding.node)):
                 found.append(Binding(file, binding.name, binding.node, None, "it changes in a loop"))
             continue
-        if use is not None and use in walk(binding.node):
+        if isinstance(binding.node, _ASSIGNING) and binding.node in around:
             continue  # the right-hand side of its own assignment
         if use is not None and _exclusive(file, binding.node, use):
             continue
@@ -350,7 +357,7 @@ def _own_nodes(scope: Scope) -> Iterator[cst.CSTNode]:
         node = waiting.pop()
         yield node
         if not isinstance(node, (cst.FunctionDef, cst.ClassDef, cst.Lambda)):
-            waiting += reversed(node.children)
+            waiting += reversed(children(node))
 
 
 def _bindings(file: SourceFile, scope: Scope) -> Iterator[Binding]:

@@ -100,8 +100,15 @@ class CameraCall:
 
 def camera_calls(project: Project, file: SourceFile) -> Iterator[CameraCall]:
     """In the order of the text."""
+    names = set(CLASSES)
     for node in file.nodes:
-        if not isinstance(node, cst.Call):
+        if isinstance(node, cst.ImportAlias) and node.asname is not None and node.evaluated_name in CLASSES:
+            names.add(node.evaluated_alias or "")
+    for node in file.nodes:
+        if not isinstance(node, cst.Call) or not isinstance(node.func, (cst.Name, cst.Attribute)):
+            continue
+        short = node.func.value if isinstance(node.func, cst.Name) else node.func.attr.value
+        if short not in names:
             continue
         dotted = project.dotted(file, node.func)
         if dotted is None or not dotted.startswith("mani_skill.") or dotted.rpartition(".")[2] not in CLASSES:

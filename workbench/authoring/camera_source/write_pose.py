@@ -183,16 +183,26 @@ def pose_call(changes: Changes, project: Project, file: SourceFile) -> str:
 
 
 def import_place(file: SourceFile) -> int:
-    """Where an import can be added: before the first one that is not of the future."""
-    for statement in file.module.body:
-        if isinstance(statement, cst.SimpleStatementLine):
-            for small in statement.body:
-                if isinstance(small, cst.Import) or (
-                    isinstance(small, cst.ImportFrom)
-                    and not (isinstance(small.module, cst.Name) and small.module.value == "__future__")
-                ):
-                    return file.line_start(file.line(statement))
-    return 0
+    """Where an import can be added: before the first one, after what has to come before any."""
+    place = 0
+    for index, statement in enumerate(file.module.body):
+        small = statement.body[0] if isinstance(statement, cst.SimpleStatementLine) else None
+        future = isinstance(small, cst.ImportFrom) and file.code(small.module or small) == "__future__"
+        text = isinstance(small, cst.Expr) and isinstance(
+            small.value, (cst.SimpleString, cst.ConcatenatedString)
+        )
+        if isinstance(small, (cst.Import, cst.ImportFrom)) and not future:
+            return file.line_start(file.line(statement))
+        if future or (text and index == 0):
+            end = file.inner_span(statement)[1]
+            place = (
+                file.line_start(file.line_at(end) + 1) if file.line_at(end) < file.lines else len(file.text)
+            )
+        elif index == 0:
+            # Above it may be lines that have to be the first: an interpreter's, an encoding's.
+            decorators = getattr(statement, "decorators", ())
+            place = file.line_start(file.line(decorators[0] if decorators else statement))
+    return place
 
 
 def _euler(changes: Changes, angles: Angles, after: CameraSettings) -> bool:
