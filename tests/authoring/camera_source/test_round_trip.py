@@ -6,7 +6,7 @@ import dataclasses
 import math
 
 import pytest
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from tests.authoring.camera_source.real_cameras import FILE, close, real_settings
@@ -54,7 +54,7 @@ def poses(draw: st.DrawFn) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 @pytest.mark.parametrize("form", FORMS)
-@settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=25, deadline=None)
 @given(pose=poses(), fov=st.none() | st.floats(0.05, 3.0))
 def test_write_and_read_back(form: str, pose: tuple, fov: float | None) -> None:
     source = WRITTEN[form]

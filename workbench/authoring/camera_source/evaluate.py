@@ -14,7 +14,8 @@ from collections.abc import Callable, Mapping
 import libcst as cst
 
 from workbench.authoring.camera_source import rotations
-from workbench.authoring.camera_source.definitions import Binding, Project
+from workbench.authoring.camera_source.bindings import Binding
+from workbench.authoring.camera_source.definitions import Project
 from workbench.authoring.camera_source.source_file import SourceFile, walk
 from workbench.authoring.camera_source.values import (
     Angles,
@@ -148,7 +149,10 @@ class Evaluator:
             return self._imported(file, node, binding, readers(binding, file, node))
         if binding.value is None:
             raise Unknown(f"`{code}` cannot be read in the file: {binding.why}")
-        return (binding.file, binding.value), readers(binding, file, node)
+        others = readers(binding, file, node)
+        if isinstance(binding.node, cst.Assign) and len(binding.node.targets) > 1:
+            others = others or f"line {binding.file.line(binding.node)} gives it to several names"
+        return (binding.file, binding.value), others
 
     def _imported(
         self, file: SourceFile, node: cst.Name | cst.Attribute, binding: Binding, others: str | None

@@ -32,6 +32,7 @@ from workbench.authoring.camera_source.result import Refusal, Refused, SourceEdi
 from workbench.authoring.camera_source.snippet import snippet
 from workbench.authoring.camera_source.source_file import Replacement, SourceFile
 from workbench.authoring.camera_source.values import Nothing, Number, PoseValue, Text, Vector
+from workbench.authoring.camera_source.wanted import check_wanted
 from workbench.authoring.camera_source.write_pose import write_pose
 from workbench.core.camera_settings import CallSite, CameraSettings
 from workbench.core.pictures import CameraKind
@@ -50,10 +51,15 @@ def plan_edit(
     `sources` are the author's files by path, as they are on disk. `site` says where the camera was made and wins
     over the name; `kind` tells apart a sensor and a camera for people of one name. Nothing is written.
     """
+    project = Project(sources)
     try:
-        return _plan(Project(sources), uid, before, after, site, kind)
+        check_wanted(after)
     except Refused as refused:
-        return Refusal(refused.reason, snippet(uid, after))
+        return Refusal(refused.reason)
+    try:
+        return _plan(project, uid, before, after, site, kind)
+    except Refused as refused:
+        return Refusal(refused.reason, snippet(uid, after, more=_mount(project, uid, kind, site)))
 
 
 def _plan(
@@ -75,11 +81,25 @@ def _plan(
             "and a change there would be one of all its cameras"
         )
     changes = Changes()
+    if call.hook is None:
+        changes.note(
+            f"the camera is made outside of a hook ({call.where}): whatever else uses it changes along"
+        )
     _write_fields(changes, project, read, fields, after)
     for name in FIELDS:
         if name in read.values:
             changes.emit(read.values[name])
     return _edit(project, read, changes, fields, before, after)
+
+
+def _mount(project: Project, uid: str, kind: CameraKind | None, site: CallSite | None) -> list[str]:
+    """What a copy of the camera has to have too: without its mount the pose is one of another frame."""
+    try:
+        call = candidates(project, uid, kind, site)[0]
+    except Refused:
+        return []
+    names = [name for name in ("entity_uid", "mount") if name in call.arguments]
+    return [f"{name}={call.file.code(call.arguments[name].value)}" for name in names]
 
 
 def _the_one(
