@@ -26,7 +26,7 @@ from playwright.sync_api import Page, expect, sync_playwright
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.benchmarks.page_rate import NO_DRAWING
 from tests.browser.opened import launch, new_page, open_workbench
-from tests.session.hazards import calm, provoke, write_task
+from tests.session.hazards import calm, provocation, provoke, write_task
 from workbench.machine.chromium import find_chromium, how_to_get_chromium
 
 HANGS = {"loop": "Interrupt", "slow": "Interrupt", "catch": "Restart", "native": "Restart"}
@@ -117,6 +117,9 @@ def one_way(desk: Desk, way: str) -> str:
     else:
         word = "EOFError" if way == "read" else "came too fast to be kept"
         back = desk.poke_until(lambda: desk.says(word) and "busy" not in page_text(desk.page), trips)
+        if way == "flood":
+            # It takes its provocation away when it ends, and would take the next one's.
+            desk.poke_until(lambda: not provocation(desk.file).exists(), trips)
     calm(desk.file)
     now = desk.server.cpu_times()
     cpu = now.user + now.system - usage.user - usage.system

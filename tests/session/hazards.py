@@ -96,14 +96,19 @@ def write_task(folder: Path) -> Path:
     return file
 
 
+def provocation(file: Path) -> Path:
+    """What makes it happen, as long as it is there."""
+    return file.with_name("hazard")
+
+
 def provoke(file: Path, place: str, what: str) -> None:
     """From now on `what` happens in the hook `place`."""
-    file.with_name("hazard").write_text(f"{place} {what}")
+    provocation(file).write_text(f"{place} {what}")
 
 
 def calm(file: Path) -> None:
     """All is well again."""
-    file.with_name("hazard").unlink(missing_ok=True)
+    provocation(file).unlink(missing_ok=True)
 
 
 def provoked(file: Path) -> bool:

@@ -7,7 +7,8 @@ env, and ``unpack()`` writes them; after a control step the bytes are there alre
   they mean, by the names that the rest of the workbench uses; where they differ (another task, an object more,
   an arm with another joint), the bytes for the target are put together from its own and the source's.
 * *Sleep.* Writing a pose wakes a body, and a body at rest that wakes moves by some micrometres before it
-  sleeps again. What slept is put to sleep again.
+  sleeps again. What slept is put to sleep again. Every body is asked, 2 us each: a velocity in the pack does
+  not mean that one is awake (cubes of StackCube fall asleep with some left, and keep it).
 * *Forces* that ``set_qf`` left on the joints, and which drives were ever set (`BatchedCpuSystem.drive_flags`).
 * *Contacts.* PhysX lists contacts of the last substep only, so after a restore its list is that of another
   moment, and ``is_grasping`` would answer for it. The impulses that the task's queries count go along, and are

@@ -97,10 +97,12 @@ class RngReader:
 
 
 def read_shared_rng(device: torch.device) -> SharedRng:
+    # The generator behind np.random's functions: the object that they are methods of.
+    (numpy_state,) = _shared_reader.read("numpy", [np.random.get_state.__self__])  # type: ignore[attr-defined]
     return SharedRng(
         torch.get_rng_state().numpy(),
         torch.cuda.get_rng_state(device).numpy() if device.type == "cuda" else None,
-        np.random.get_state(),  # type: ignore[arg-type]
+        numpy_state,
         random.getstate(),
     )
 
@@ -111,3 +113,6 @@ def write_shared_rng(state: SharedRng, device: torch.device) -> None:
         torch.cuda.set_rng_state(torch.from_numpy(state.torch_device.copy()), device)
     np.random.set_state(state.numpy)
     random.setstate(state.python)
+
+
+_shared_reader = RngReader()

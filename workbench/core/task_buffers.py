@@ -30,7 +30,7 @@ import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 
-from workbench.core.task_members import PLAIN, Found, Walk, look_over
+from workbench.core.task_members import PLAIN, Found, Walk, forget_look, look_over
 
 _LARGEST_OF_BATCH = 1 << 16
 """Elements of a tensor that holds for the whole batch; more than that is data, which nobody rewinds."""
@@ -96,6 +96,7 @@ def note_scene(env: BaseEnv) -> None:
     """Remember what the task holds now, right after its scene was built, as belonging to the scene."""
     _scenes[env.scene] = scene = _Scene()
     scene.add(_look_over(env).leaves)
+    forget_look(env)
 
 
 def note_constructed(env: BaseEnv) -> None:
@@ -105,6 +106,7 @@ def note_constructed(env: BaseEnv) -> None:
     """
     scene = _scenes.setdefault(env.scene, _Scene())
     scene.add([leaf for leaf in _look_over(env).leaves if isinstance(leaf.value, (*PLAIN, tuple))])
+    forget_look(env)
 
 
 def read_task_state(env: BaseEnv, env_idx: list[int]) -> TaskState:
