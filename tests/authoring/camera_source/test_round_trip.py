@@ -54,7 +54,7 @@ def poses(draw: st.DrawFn) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 @pytest.mark.parametrize("form", FORMS)
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(pose=poses(), fov=st.none() | st.floats(0.05, 3.0))
 def test_write_and_read_back(form: str, pose: tuple, fov: float | None) -> None:
     source = WRITTEN[form]
@@ -91,3 +91,17 @@ def test_a_second_edit_goes_on_from_the_first() -> None:
         assert isinstance(plan, SourceEdit) and plan.settings is not None
         source, before = plan.new_text, plan.settings
     assert "q=[0.5, 0.5, 0.5, -0.5]" in source
+
+
+def test_a_point_that_the_camera_was_aimed_at_is_written() -> None:
+    source = WRITTEN["a list, positional to the end"]
+    before = real_settings({FILE: source}, "cam")
+    eye, aim = (0.5, 0.25, 0.75), (0.125, 0.0, 0.02)
+    after = dataclasses.replace(before, position=eye, quaternion=unit(look_at(eye, aim)))
+    plan = plan_edit({FILE: source}, "cam", before, after, target=aim)
+    assert isinstance(plan, SourceEdit)
+    assert "look_at(eye=[0.5, 0.25, 0.75], target=[0.125, 0, 0.02])" in plan.new_text
+    # A point that it does not look at is none.
+    elsewhere = plan_edit({FILE: source}, "cam", before, after, target=(1.0, 1.0, 1.0))
+    assert isinstance(elsewhere, SourceEdit) and elsewhere.settings is not None
+    assert angle_between(elsewhere.settings.quaternion, after.quaternion) <= math.radians(0.01)

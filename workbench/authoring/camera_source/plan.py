@@ -45,11 +45,14 @@ def plan_edit(
     after: CameraSettings,
     site: CallSite | None = None,
     kind: CameraKind | None = None,
+    target: tuple[float, float, float] | None = None,
 ) -> SourceEdit | Refusal:
     """The edit that turns the camera `uid` from `before`, which the running env has, into `after`.
 
     `sources` are the author's files by path, as they are on disk. `site` says where the camera was made and wins
-    over the name; `kind` tells apart a sensor and a camera for people of one name. Nothing is written.
+    over the name; `kind` tells apart a sensor and a camera for people of one name. `target` is the point that the
+    camera was aimed at, in the frame of its position: a look_at gets it as long as `after` looks there. Nothing is
+    written.
     """
     project = Project(sources)
     try:
@@ -57,7 +60,7 @@ def plan_edit(
     except Refused as refused:
         return Refusal(refused.reason)
     try:
-        return _plan(project, uid, before, after, site, kind)
+        return _plan(project, uid, before, after, site, kind, target)
     except Refused as refused:
         return Refusal(refused.reason, snippet(uid, after, more=_mount(project, uid, kind, site)))
 
@@ -69,6 +72,7 @@ def _plan(
     after: CameraSettings,
     site: CallSite | None,
     kind: CameraKind | None,
+    target: tuple[float, float, float] | None,
 ) -> SourceEdit:
     fields = changed_fields(before, after)
     if not fields:
@@ -85,7 +89,7 @@ def _plan(
         changes.note(
             f"the camera is made outside of a hook ({call.where}): whatever else uses it changes along"
         )
-    _write_fields(changes, project, read, fields, after)
+    _write_fields(changes, project, read, fields, after, target)
     for name in FIELDS:
         if name in read.values:
             changes.emit(read.values[name])
@@ -142,7 +146,12 @@ def _places(read: ReadCamera, fields: list[str]) -> list[object]:
 
 
 def _write_fields(
-    changes: Changes, project: Project, read: ReadCamera, fields: list[str], after: CameraSettings
+    changes: Changes,
+    project: Project,
+    read: ReadCamera,
+    fields: list[str],
+    after: CameraSettings,
+    target: tuple[float, float, float] | None,
 ) -> None:
     added: list[str] = []
     call = read.call
@@ -151,7 +160,7 @@ def _write_fields(
         wanted: Any = getattr(after, name, None)  # a pose is two of its fields
         if name == "pose":
             assert isinstance(value, PoseValue)
-            write_pose(changes, project, value, after)
+            write_pose(changes, project, value, after, target)
         elif name in ("fov", "intrinsic"):
             continue
         elif isinstance(value, Number):

@@ -31,9 +31,12 @@ _METRES = (4, 5, 6)
 Triple = tuple[float, float, float]
 
 
-def write_pose(changes: Changes, project: Project, pose: PoseValue, after: CameraSettings) -> None:
+def write_pose(
+    changes: Changes, project: Project, pose: PoseValue, after: CameraSettings, target: Triple | None
+) -> None:
+    """`target` is where the camera was aimed at, if somebody has said so."""
     if pose.form == "look_at":
-        if _look_at(changes, pose, after):
+        if _look_at(changes, pose, after, target):
             return
         _as_quaternion(changes, project, pose, after)
         return
@@ -92,7 +95,7 @@ def _settled(vector: Vector, wanted: Sequence[float], decimals: int) -> Triple:
     return x, y, z
 
 
-def _look_at(changes: Changes, pose: PoseValue, after: CameraSettings) -> bool:
+def _look_at(changes: Changes, pose: PoseValue, after: CameraSettings, aim: Triple | None) -> bool:
     """Write eye and target, if a look_at can say where the camera looks."""
     eye, target = pose.parts["eye"], pose.parts["target"]
     assert isinstance(eye, Vector) and isinstance(target, Vector)
@@ -109,10 +112,14 @@ def _look_at(changes: Changes, pose: PoseValue, after: CameraSettings) -> bool:
             return math.inf
         return rotations.angle_between(quaternion, after.quaternion)
 
-    if error(after.position, target.numbers) <= _STILL_AT_TARGET:
+    for point in (aim, target.numbers):
+        if point is None or error(after.position, point) > _STILL_AT_TARGET:
+            continue
         for decimals in _METRES:
-            if error(_settled(eye, after.position, decimals), target.numbers) <= ANGLE_STEP:
+            rounded = _settled(eye, after.position, decimals), _settled(target, point, decimals)
+            if error(*rounded) <= ANGLE_STEP:
                 _vector(changes, eye, after.position, decimals)
+                _vector(changes, target, point, decimals)
                 return True
     distance = max(_LEAST_DISTANCE, math.dist(pose.position, target.numbers))
     for decimals in _METRES:
