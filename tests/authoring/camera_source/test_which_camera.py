@@ -142,6 +142,16 @@ def test_what_is_not_in_the_files_or_not_python_is_refused() -> None:
     assert isinstance(plan, Refusal) and "not valid Python" in plan.reason
 
 
+def test_a_class_of_that_name_in_the_files_is_not_taken_for_maniskills() -> None:
+    own = "class CameraConfig:\n    pass\n"
+    source = TWO.replace("from mani_skill.sensors.camera import", "from configs import")
+    before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
+    plan = plan_edit({FILE: source, "/author/configs.py": own}, "cam", before, higher(before), kind="sensor")
+    assert isinstance(plan, Refusal) and "no CameraConfig" in plan.reason
+    handed_on = TWO.replace("from mani_skill.sensors.camera import", "from mani_skill.sensors import")
+    assert edited_line(plan_edit({FILE: handed_on}, "cam", before, higher(before), kind="sensor")) == LINE
+
+
 PLACES = """\
 import numpy as np
 

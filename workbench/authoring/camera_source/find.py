@@ -110,8 +110,9 @@ def camera_calls(project: Project, file: SourceFile) -> Iterator[CameraCall]:
         short = node.func.value if isinstance(node.func, cst.Name) else node.func.attr.value
         if short not in names:
             continue
-        dotted = project.dotted(file, node.func)
-        if dotted is None or not dotted.startswith("mani_skill.") or dotted.rpartition(".")[2] not in CLASSES:
+        # From whichever library: some hand ManiSkill's class on. One in the author's own files is another.
+        module, _, cls = (project.dotted(file, node.func) or "").rpartition(".")
+        if cls not in CLASSES or project.module(module, file) is not None:
             continue
         yield _camera_call(project, file, node)
 
