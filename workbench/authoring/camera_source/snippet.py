@@ -1,0 +1,37 @@
+"""A camera as text to copy, for where the author's file is left alone."""
+
+from __future__ import annotations
+
+from workbench.authoring.camera_source.number_text import (
+    list_text,
+    matrix_text,
+    number_text,
+    quaternion_texts,
+)
+from workbench.core.camera_settings import CameraSettings
+
+
+def snippet(uid: str, settings: CameraSettings, indent: str = "") -> str:
+    """``CameraConfig(...)``, an argument a line. It needs ``import sapien``, and numpy as np for an intrinsic."""
+    quaternion = ", ".join(quaternion_texts(settings.quaternion))
+    lines = [
+        repr_text(uid),
+        f"pose=sapien.Pose(p={list_text(settings.position, 4)}, q=[{quaternion}])",
+        f"width={settings.width}",
+        f"height={settings.height}",
+    ]
+    if settings.intrinsic is not None:
+        lines.append(f"intrinsic=np.array({matrix_text(settings.intrinsic)})")
+    elif settings.fov is not None:
+        lines.append(f"fov={number_text(settings.fov, 4)}")
+    lines += [f"near={number_text(settings.near, 4)}", f"far={number_text(settings.far, 4)}"]
+    if settings.shader_pack != "minimal":
+        lines.append(f"shader_pack={repr_text(settings.shader_pack)}")
+    inside = "".join(f"{indent}    {line},\n" for line in lines)
+    return f"CameraConfig(\n{inside}{indent})"
+
+
+def repr_text(text: str) -> str:
+    """A Python string in double quotes, whatever is in it."""
+    quoted = repr("'" + text)
+    return '"' + quoted[2:-1] + '"' if quoted.startswith('"') and "\\" not in quoted else repr(text)
