@@ -8,9 +8,9 @@ where it is written, and the files in which other programs want it. All of them 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
-from workbench.core.pictures import CameraKind
-
+CameraKind = Literal["sensor", "human"]
 CameraKey = tuple[CameraKind, str]
 """Kind and name: a sensor and a camera for people may have the same name."""
 

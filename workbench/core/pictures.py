@@ -7,12 +7,11 @@ import a simulator.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-CameraKind = Literal["sensor", "human"]
+from workbench.core.camera_settings import CallSite, CameraKind, CameraSettings
 
 
 @dataclass(frozen=True)
@@ -37,6 +36,13 @@ class CameraInfo:
     modalities: tuple[str, ...]
     """What its shader gives, of ``rgb depth segmentation position normal albedo``. Only the first three
     can be asked for as a `Picture`."""
+    settings: CameraSettings | None = None
+    """What the task's own config says, wherever the camera was moved since; env 0's where they differ. None where
+    the config cannot be said in these words (a lens that differs between envs)."""
+    varies: bool = False
+    """Its pose differs between envs, or is another than its config says: the task's code moves it."""
+    site: CallSite | None = None
+    """Where the config was made; None where that was not noted."""
 
 
 @dataclass(frozen=True)
