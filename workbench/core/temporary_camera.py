@@ -40,7 +40,7 @@ class TemporaryCamera:
 
     def look(self, pose: ArrayLike) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
         """Segmentation (H, W), 0 for background, and depth (H, W) in metres, from a pose (7,) in the env's frame."""
-        p = np.asarray(pose, np.float32)
+        p = np.asarray(pose, np.float32).tolist()
         self._component.local_pose = sapien.Pose(p[:3], p[3:])
         # A camera is where its entity was at the last update, whatever its pose says by now.
         self._sub_scene.update_render()
@@ -93,7 +93,7 @@ def temporary_camera(
         beside = sapien.Scene([render_system])
         entity = sapien.Entity()
         with _minimal_shader(env):
-            component = sapien.render.RenderCameraComponent(*size)
+            component = sapien.render.RenderCameraComponent(size[0], size[1])
             entity.add_component(component)
             beside.add_entity(entity)
         after.callback(beside.remove_entity, entity)
