@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import gc
 import os
+import shutil
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 # Before anything imports rerun, which reads it once: a wrong argument raises instead of printing a warning.
 os.environ["RERUN_STRICT"] = "1"
@@ -34,6 +36,13 @@ def chromium_path() -> str:
     if path is None:
         pytest.fail(how_to_get_chromium())
     return path
+
+
+@pytest.fixture(scope="module")
+def task_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the example task in a folder of its own, for tests that edit it."""
+    example = Path(__file__).parents[1] / "tasks" / "push_cube.py"
+    return Path(shutil.copy(example, tmp_path_factory.mktemp("author")))
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -15,7 +15,7 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
 
 import tyro
 from rich.console import Console
@@ -26,6 +26,7 @@ import workbench
 if TYPE_CHECKING:
     from workbench.authoring.problem import Problem
     from workbench.session.messages import Event, TaskOptions
+    from workbench.ui.door import Door
 
 Task = Annotated[str, tyro.conf.Positional]
 """A task file, ``file.py:ClassName``, or a registered env id such as ``PickCube-v1``."""
@@ -94,16 +95,13 @@ def open_page(
     for line in (door.warning, door.notice):
         if line:
             err.print(f"[yellow]{escape(line)}[/]")
-    stop = threading.Event()
-    code = 0
+    end = _End()
 
     def on_event(event: Event) -> None:
-        nonlocal code
         _say(event)
         # A broken file is mended and saved; an env id that cannot be opened has nothing to wait for.
         if isinstance(event, Failed) and not event.kept and file is None:
-            code = 1
-            stop.set()
+            end.now(1)
 
     session = Session(
         task,
@@ -115,32 +113,17 @@ def open_page(
         on_line=_echo,
     )
     page = Page(door.server, session)
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        stop.set()
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
+    end.at_signals()
     try:
         page.start()
-        out.print(
-            f"[bold]Workbench[/] {workbench.__version__}: {escape(task)}, {num_envs} envs", soft_wrap=True
-        )
-        # Not through rich, which would break the address in a narrow terminal.
-        print(f"  page    {door.url}", flush=True)
-        print(f"  remote  {door.ssh_hint}", flush=True)
-        print("  Ctrl-C ends it.", flush=True)
-        stop.wait()
+        _announce(door, task, num_envs)
+        end.wait()
     finally:
         out.print("closing")
         page.stop()
         session.close()
         door.close()
-    # All is closed and written. The interpreter would now take its modules apart, one object after the other: a
-    # second of waiting after Ctrl-C, and several on a machine that is at work.
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(code)
+    _leave(end.code)
 
 
 @app.command
@@ -261,6 +244,45 @@ def _use_private_driver() -> None:
     from workbench.machine.software_vulkan import ensure_render_device
 
     os.environ.update(ensure_render_device(install=False).env)
+
+
+class _End:
+    """The end of a page: it comes from a signal or from an event, and with it the exit code."""
+
+    def __init__(self) -> None:
+        self.code = 0
+        self._due = threading.Event()
+
+    def now(self, code: int) -> None:
+        self.code = code
+        self._due.set()
+
+    def at_signals(self) -> None:
+        def on_signal(number: int, frame: FrameType | None) -> None:
+            self._due.set()
+
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, on_signal)
+
+    def wait(self) -> None:
+        self._due.wait()
+
+
+def _announce(door: Door, task: str, num_envs: int) -> None:
+    out.print(f"[bold]Workbench[/] {workbench.__version__}: {escape(task)}, {num_envs} envs", soft_wrap=True)
+    # Not through rich, which would break the address in a narrow terminal.
+    print(f"  page    {door.url}", flush=True)
+    print(f"  remote  {door.ssh_hint}", flush=True)
+    print("  Ctrl-C ends it.", flush=True)
+
+
+def _leave(code: int) -> NoReturn:
+    """End the process; all must be closed and written."""
+    # The interpreter would now take its modules apart, one object after the other: a second of waiting after
+    # Ctrl-C, and several on a machine that is at work.
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def _task_options(num_envs: int, backend: Backend, seed: int, env: Sequence[str]) -> TaskOptions:

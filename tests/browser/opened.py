@@ -9,13 +9,15 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from playwright.sync_api import Browser, ConsoleMessage, Page, Playwright
+from playwright.sync_api import Browser, ConsoleMessage, Page, Playwright, expect, sync_playwright
 
+TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
+"""The example task; what is edited is a copy of it."""
 CHROMIUM_ARGUMENTS = (
     "--no-sandbox",
     "--use-angle=swiftshader",
@@ -103,3 +105,28 @@ def new_page(browser: Browser, width: int = 1280, height: int = 720) -> tuple[Pa
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.set_default_timeout(60_000)
     return page, errors
+
+
+@contextmanager
+def page_on(
+    file: Path, *arguments: str, chromium: str, width: int = 1280, height: int = 720
+) -> Iterator[tuple[Page, list[str], Opened]]:
+    """A page that shows the file's task, paused; what is wrong on it so far; and the terminal."""
+    with (
+        open_workbench(str(file), *arguments, cwd=file.parent) as opened,
+        sync_playwright() as playwright,
+    ):
+        browser = launch(playwright, chromium)
+        page, errors = new_page(browser, width, height)
+        page.goto(opened.url)
+        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
+        yield page, errors, opened
+        browser.close()
+
+
+def until(reached: Callable[[], bool], what: str, seconds: float = 60.0) -> None:
+    """Wait for what Playwright's own ``expect`` cannot say."""
+    deadline = time.monotonic() + seconds
+    while not reached():
+        assert time.monotonic() < deadline, f"{what} did not come within {seconds} s"
+        time.sleep(0.05)

@@ -3,48 +3,28 @@
 from __future__ import annotations
 
 import re
-import shutil
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, expect, sync_playwright
+from playwright.sync_api import Page, expect
 
-from tests.browser.opened import launch, new_page, open_workbench
+from tests.browser.opened import page_on, until
 
 pytestmark = pytest.mark.browser
-TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 ENVS = 6
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Iterator[Page]:
-    folder = tmp_path_factory.mktemp("author")
-    file = Path(shutil.copy(TASK, folder / "push_cube.py"))
+def page(task_file: Path, chromium_path: str) -> Iterator[Page]:
     # Env 4 says from its fifth step on that it knows no height; nothing else of the task asks for it.
     good, lost = '"cube_height": height', "(self.elapsed_steps >= 5) & (torch.arange(len(height)) == 4)"
-    text = file.read_text()
+    text = task_file.read_text()
     assert text.count(good) == 1
-    file.write_text(text.replace(good, f"{good}.masked_fill({lost}, torch.nan)"))
-    with (
-        open_workbench(str(file), "--num-envs", str(ENVS), cwd=folder) as opened,
-        sync_playwright() as playwright,
-    ):
-        browser = launch(playwright, chromium_path)
-        page, errors = new_page(browser)
-        page.goto(opened.url)
-        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=90_000)
+    task_file.write_text(text.replace(good, f"{good}.masked_fill({lost}, torch.nan)"))
+    with page_on(task_file, "--num-envs", str(ENVS), chromium=chromium_path) as (page, errors, _):
         yield page
         assert not errors
-        browser.close()
-
-
-def until(reached: Callable[[], bool], what: str, seconds: float = 60.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not reached():
-        assert time.monotonic() < deadline, f"{what} did not come within {seconds} s"
-        time.sleep(0.05)
 
 
 def press(page: Page, selector: str) -> None:

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import re
-import shutil
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, expect, sync_playwright
+from playwright.sync_api import Page, expect
 
-from tests.browser.opened import launch, new_page, open_workbench
+from tests.browser.opened import TASK, page_on, until
 
 pytestmark = pytest.mark.browser
 expect.set_options(timeout=60_000)
-TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 REWARD = "return self.compute_dense_reward(obs, action, info) / 3"
 STEPS = 60
 
@@ -40,26 +37,11 @@ class Desk:
         return self.page.locator(".wb-again-table tbody tr")
 
 
-def until(reached: Callable[[], bool], what: str, seconds: float = 60.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not reached():
-        assert time.monotonic() < deadline, f"{what} did not come within {seconds} s"
-        time.sleep(0.05)
-
-
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Iterator[Desk]:
+def desk(task_file: Path, chromium_path: str) -> Iterator[Desk]:
     """Three envs that have made some sixty steps, paused, on the Reward tab."""
-    folder = tmp_path_factory.mktemp("author")
-    file = Path(shutil.copy(TASK, folder / "push_cube.py"))
-    with (
-        open_workbench(str(file), "--num-envs", "3", cwd=folder) as workbench,
-        sync_playwright() as playwright,
-    ):
-        browser = launch(playwright, chromium_path)
-        page, errors = new_page(browser, 1280, 1000)
-        page.goto(workbench.url)
-        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=90_000)
+    arguments = ("--num-envs", "3")
+    with page_on(task_file, *arguments, chromium=chromium_path, height=1000) as (page, errors, _):
         page.get_by_role("button", name="Play", exact=True).click()
         strip = page.locator(".wb-timeline")
 
@@ -72,8 +54,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Iterat
         expect(page.get_by_text("paused", exact=True)).to_be_visible()
         page.get_by_role("button", name="Reset all", exact=True).click()
         page.get_by_role("tab", name="Reward").click()
-        yield Desk(page, errors, file)
-        browser.close()
+        yield Desk(page, errors, task_file)
 
 
 def test_nothing_is_shown_before_there_is_something_to_say(desk: Desk) -> None:

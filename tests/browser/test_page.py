@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import re
-import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, expect, sync_playwright
+from playwright.sync_api import Page, expect
 
-from tests.browser.opened import Opened, launch, new_page, open_workbench
+from tests.browser.opened import TASK, Opened, page_on, until
 from workbench.recording.verify import verify_rrd
 
 pytestmark = pytest.mark.browser
 expect.set_options(timeout=60_000)
-TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 
 
 @dataclass
@@ -45,26 +43,12 @@ class Desk:
         return int(self.row("elapsed steps")[1].split("/")[0])
 
 
-def until(reached: Callable[[], bool], what: str, seconds: float = 60.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not reached():
-        assert time.monotonic() < deadline, f"{what} did not come within {seconds} s"
-        time.sleep(0.05)
-
-
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Iterator[Desk]:
-    folder = tmp_path_factory.mktemp("author")
-    file = Path(shutil.copy(TASK, folder / "push_cube.py"))
-    recordings = folder / "kept"
-    arguments = (str(file), "--num-envs", "2", "--recordings", str(recordings))
-    with open_workbench(*arguments, cwd=folder) as opened, sync_playwright() as playwright:
-        browser = launch(playwright, chromium_path)
-        page, errors = new_page(browser)
-        page.goto(opened.url)
-        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=90_000)
-        yield Desk(page, errors, file, opened, recordings)
-        browser.close()
+def desk(task_file: Path, chromium_path: str) -> Iterator[Desk]:
+    recordings = task_file.parent / "kept"
+    arguments = ("--num-envs", "2", "--recordings", str(recordings))
+    with page_on(task_file, *arguments, chromium=chromium_path) as (page, errors, opened):
+        yield Desk(page, errors, task_file, opened, recordings)
 
 
 @pytest.fixture
@@ -97,6 +81,12 @@ def test_tabs_that_have_nothing_to_show_are_not_there(desk: Desk) -> None:
     assert [tab for tab in tabs if tab not in ("Envs", "Timeline")] == [
         *("Run", "Cameras", "Reward", "Inspect", "Episodes", "Log")
     ]
+
+
+def test_all_tabs_are_on_one_row(desk: Desk) -> None:
+    names = ("Run", "Cameras", "Reward", "Inspect", "Episodes", "Log")
+    boxes = [desk.page.get_by_role("tab", name=name, exact=True).bounding_box() for name in names]
+    assert len({box["y"] for box in boxes if box is not None}) == 1 and None not in boxes
 
 
 def test_play_runs_and_pause_stops(calm: Desk) -> None:
@@ -145,6 +135,19 @@ def test_the_sensor_and_human_pictures_arrive(calm: Desk) -> None:
     expect(calm.page.get_by_text("base_camera")).to_be_visible()
     expect(calm.page.get_by_text(re.compile(r"rendered in \d+ ms")).first).to_be_visible()
     until(lambda: calm.page.locator("img").count() >= 2, "two pictures")
+
+
+def test_an_edited_camera_keeps_its_place(calm: Desk) -> None:
+    calm.tab("Cameras")
+    expect(calm.page.locator("img[src^='blob:']:visible").first).to_be_visible(timeout=90_000)
+    mark = "() => { document.querySelector('img[src^=\"blob:\"]').dataset.same = 'yes'; }"
+    calm.page.evaluate(mark)
+    calm.file.write_text(TASK.read_text().replace("width=128, height=128", "width=96, height=128"))
+    expect(calm.page.get_by_text("96 × 128")).to_be_visible()
+    until(
+        lambda: calm.page.evaluate("() => document.querySelector('img[data-same]')?.naturalWidth") == 96,
+        "a picture of the new width in the same element",
+    )
 
 
 def test_a_saved_edit_appears_by_itself(calm: Desk) -> None:

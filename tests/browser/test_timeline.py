@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import re
-import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import FloatRect, Page, expect, sync_playwright
+from playwright.sync_api import FloatRect, Page, expect
 
-from tests.browser.opened import launch, new_page, open_workbench
+from tests.browser.opened import page_on, until
 
 pytestmark = pytest.mark.browser
 expect.set_options(timeout=60_000)
-TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
 STEPS = 8
 SLIDER = ".mantine-Slider-root"
 
@@ -54,30 +52,13 @@ class Desk:
         time.sleep(0.5)
 
 
-def until(reached: Callable[[], bool], what: str, seconds: float = 60.0) -> None:
-    deadline = time.monotonic() + seconds
-    while not reached():
-        assert time.monotonic() < deadline, f"{what} did not come within {seconds} s"
-        time.sleep(0.05)
-
-
 @pytest.fixture(scope="module")
-def opened(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Iterator[Desk]:
-    folder = tmp_path_factory.mktemp("author")
-    file = Path(shutil.copy(TASK, folder / "push_cube.py"))
-    with (
-        open_workbench(str(file), "--num-envs", "2", cwd=folder) as workbench,
-        sync_playwright() as playwright,
-    ):
-        browser = launch(playwright, chromium_path)
-        page, errors = new_page(browser)
-        page.goto(workbench.url)
-        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=90_000)
+def opened(task_file: Path, chromium_path: str) -> Iterator[Desk]:
+    with page_on(task_file, "--num-envs", "2", chromium=chromium_path) as (page, errors, _):
         page.get_by_role("tab", name="Reward").click()
         # The first picture compiles shaders, and no step is made meanwhile.
         expect(page.get_by_text("elapsed steps")).to_be_visible(timeout=90_000)
         yield Desk(page, errors)
-        browser.close()
 
 
 @pytest.fixture
@@ -105,6 +86,9 @@ def test_arrow_keys_walk_through_the_past_and_end_is_live(desk: Desk) -> None:
     desk.press("End")
     desk.comes_to(STEPS)
     desk.says("live")
+    desk.press("Home")
+    until(lambda: "past" in desk.page.locator(".wb-timeline").inner_text(), "the first moment")
+    desk.comes_to(0)
 
 
 def test_the_slider_goes_where_it_is_clicked_and_takes_an_arrow_once(desk: Desk) -> None:

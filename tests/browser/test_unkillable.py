@@ -6,10 +6,10 @@ import re
 from collections.abc import Iterator
 
 import pytest
-from playwright.sync_api import expect, sync_playwright
+from playwright.sync_api import expect
 
-from tests.browser.opened import launch, new_page, open_workbench
-from tests.browser.test_page import Desk, until
+from tests.browser.opened import page_on, until
+from tests.browser.test_page import Desk
 from tests.session.hazards import calm, provoke, write_task
 
 pytestmark = pytest.mark.browser
@@ -18,16 +18,9 @@ expect.set_options(timeout=60_000)
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Iterator[Desk]:
-    folder = tmp_path_factory.mktemp("author")
-    file = write_task(folder)
-    arguments = (str(file), "--num-envs", "2", "--no-spare")
-    with open_workbench(*arguments, cwd=folder) as opened, sync_playwright() as playwright:
-        browser = launch(playwright, chromium_path)
-        page, errors = new_page(browser)
-        page.goto(opened.url)
-        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=90_000)
-        yield Desk(page, errors, file, opened, folder)
-        browser.close()
+    file = write_task(tmp_path_factory.mktemp("author"))
+    with page_on(file, "--num-envs", "2", "--no-spare", chromium=chromium_path) as (page, errors, opened):
+        yield Desk(page, errors, file, opened, file.parent)
 
 
 def test_a_loop_shows_a_banner_that_ends_it_with_its_traceback(desk: Desk) -> None:

@@ -18,6 +18,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
+from tests.core.single_env_judge import put_in_same_state
 from workbench.core.cpu_scene import batched_class
 
 STATE_ONLY = {"obs_mode": "state", "render_backend": "none"}
@@ -25,21 +26,6 @@ STATE_ONLY = {"obs_mode": "state", "render_backend": "none"}
 
 def batched(env_id: str, num_envs: int) -> BaseEnv:
     return batched_class(REGISTERED_ENVS[env_id].cls)(num_envs=num_envs, **STATE_ONLY)
-
-
-def put_in_same_state(stock: BaseEnv, batch: BaseEnv, env: int) -> None:
-    """State of env `env` of the batch into the stock env, to the last bit.
-
-    ``set_state_dict`` is not exact: PhysX keeps the root of an articulation by its centre of mass, and
-    writing a pose back rounds it. So both sides are given the same packed state.
-    """
-    state = batch.scene.px.systems[env].pack()
-    for system in (batch.scene.px.systems[env], stock.scene.px):
-        system.unpack(state)
-    batch.scene.px.note_change()
-    batch.scene._gpu_fetch_all()
-    stock.agent.controller.reset()
-    batch.agent.controller.reset()
 
 
 @pytest.fixture(scope="module")

@@ -27,6 +27,7 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
 import workbench
+from tests.core import single_env_judge
 from workbench.core.render_device import keep_render_device
 
 N, ENV = 2, 1
@@ -54,13 +55,7 @@ def put_in_same_state(batch: Any, stock: Any, env: int = ENV, seed: int = 0) -> 
     for each in (batch, stock):
         for hidden in each._hidden_objects:
             hidden.show_visual()  # hidden, it stands elsewhere in the batch and where it is in stock
-    state = batch.scene.px.systems[env].pack()
-    for system in (batch.scene.px.systems[env], stock.scene.px):
-        system.unpack(state)
-    batch.scene.px.note_change()
-    batch.scene._gpu_fetch_all()
-    for each in (batch, stock):
-        each.agent.controller.reset()
+    single_env_judge.put_in_same_state(stock, batch, env)
 
 
 def assert_same(batched: Any, single: Any, path: str, env: int = ENV) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium as gym
 import mani_skill.envs  # noqa: F401 (registers the tasks)
 import numpy as np
 import pytest
@@ -12,14 +11,13 @@ import sapien
 import torch
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 from mani_skill.sensors.camera import CameraConfig
-from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs import Pose
 
+from tests.core.drawn_envs import batched, stock
 from workbench.core.body_table import build_body_table
 from workbench.core.pictures import Picture
 from workbench.core.render_device import keep_render_device
 from workbench.core.take_pictures import list_cameras, segmentation_names, take_pictures
-from workbench.core.task_env import EnvOptions, make_env
 
 OBS_MODE = "rgb+depth+segmentation"
 ALL = ("rgb", "depth", "segmentation")
@@ -28,19 +26,6 @@ ALL = ("rgb", "depth", "segmentation")
 @pytest.fixture(scope="module", autouse=True)
 def render_device() -> None:
     keep_render_device("cpu")
-
-
-def batched(task: Any, num_envs: int = 2, render: bool = True, **kwargs: Any) -> Any:
-    cls = REGISTERED_ENVS[task].cls if isinstance(task, str) else task
-    env = make_env(cls, EnvOptions(num_envs=num_envs, backend="cpu", render=render, kwargs=kwargs))
-    env.reset(seed=3)
-    return env
-
-
-def stock(task: str, **kwargs: Any) -> Any:
-    env: Any = gym.make(task, render_backend="cpu", **kwargs).unwrapped
-    env.reset(seed=3)
-    return env
 
 
 def act(env: Any) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import mani_skill.envs  # noqa: F401 (registers the tasks)
 import numpy as np
 import pytest
@@ -14,17 +13,16 @@ import sapien.render
 import trimesh
 from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
 from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
-from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs import Pose
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from tests.core.drawn_envs import batched, stock
 from workbench.core.body_table import build_body_table, read_poses
 from workbench.core.geometry import SceneGeometry, Visual
 from workbench.core.render_device import keep_render_device
 from workbench.core.scene_geometry import Detail, read_geometry
 from workbench.core.take_pictures import list_cameras, segmentation_names, take_pictures
-from workbench.core.task_env import EnvOptions, make_env
 
 EVERYTHING = Detail(max_faces_per_visual=None, max_texture_size=None)
 
@@ -32,19 +30,6 @@ EVERYTHING = Detail(max_faces_per_visual=None, max_texture_size=None)
 @pytest.fixture(scope="module", autouse=True)
 def render_device() -> None:
     keep_render_device("cpu")
-
-
-def batched(task: Any, num_envs: int, render: bool = True, **kwargs: Any) -> Any:
-    cls = REGISTERED_ENVS[task].cls if isinstance(task, str) else task
-    env = make_env(cls, EnvOptions(num_envs=num_envs, backend="cpu", render=render, kwargs=kwargs))
-    env.reset(seed=3)
-    return env
-
-
-def stock(task: str, **kwargs: Any) -> Any:
-    env: Any = gym.make(task, render_backend="cpu", **kwargs).unwrapped
-    env.reset(seed=3)
-    return env
 
 
 # --- what it looks like ----------------------------------------------------------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -31,12 +30,6 @@ def wait_until(session: Session, reached: Callable[[SessionView], bool], what: s
     raise AssertionError(
         f"{what} did not come; state {view.state}, problem {view.problem}, {view.printed.texts[-10:]}"
     )
-
-
-@pytest.fixture(scope="module")
-def task_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the example task in a folder of its own, for tests that edit it."""
-    return Path(shutil.copy(TASKS / "push_cube.py", tmp_path_factory.mktemp("author") / "push_cube.py"))
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,7 +13,8 @@ from hypothesis import strategies as st
 from tests.ui.scenes import description, step_of, table_scene
 from workbench.core.step import StepResult
 from workbench.session.env_table import KEPT_REWARDS, EnvTable, Outcome
-from workbench.session.messages import Stepped
+from workbench.session.history import History
+from workbench.session.messages import Restored, Stepped
 
 N = 3
 
@@ -73,23 +75,47 @@ def table() -> EnvTable:
     )
 
 
+NO = {"success": False, "fail": False, "near": False}
 entry = st.fixed_dictionaries({"success": st.booleans(), "fail": st.booleans(), "near": st.booleans()})
 each = lambda strategy: st.lists(strategy, min_size=N, max_size=N)  # noqa: E731
 event = st.one_of(
     st.tuples(st.just("step"), each(st.integers(-5, 5)), each(entry), each(st.booleans())),
     st.tuples(st.just("reset"), each(st.booleans()).filter(any), each(entry), st.none()),
+    st.tuples(
+        st.just("back"),
+        each(st.booleans()).filter(any),
+        st.integers(0, 40),
+        st.none() | st.integers(0, N - 1),
+    ),
 )
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(event, max_size=40))
-def test_rows_are_what_following_each_env_by_itself_gives(events: list[tuple]) -> None:
-    ours = table()
+def test_rows_are_what_following_each_env_by_itself_and_back_in_time_gives(events: list[tuple]) -> None:
+    ours, history = table(), History(N, 10**9)
+    begin = result([0] * N, [0] * N, [NO] * N, [False] * N)
+    history.add(Stepped(begin, np.ones(N, bool)), 0)
+    ours.add(Stepped(begin, np.ones(N, bool)), history)
     episodes = [Episode() for _ in range(N)]
     last: list[Episode | None] = [None] * N
+    past = [deepcopy((episodes, last))]
     ended, succeeded, ticks = [0] * N, [0] * N, 0
     for kind, first, entries, limits in events:
-        if kind == "reset":
+        restored = None
+        if kind == "back":
+            origin, who = entries % len(past), limits
+            for env in np.flatnonzero(first).tolist():
+                if episodes[env].end >= 0:
+                    last[env] = episodes[env]
+                then, last_then = deepcopy(past[origin])
+                episodes[env] = then[env if who is None else who]
+                if who is None or who == env:
+                    last[env] = last_then[env]
+            mask, envs = np.array(first), tuple(np.flatnonzero(first).tolist())
+            restored = Restored(envs, envs if who is None else (who,) * len(envs), origin, None, {})
+            step = result([e.steps for e in episodes], [0] * N, [NO] * N, [False] * N)
+        elif kind == "reset":
             for env in range(N):
                 if first[env]:
                     if episodes[env].end >= 0:
@@ -108,10 +134,13 @@ def test_rows_are_what_following_each_env_by_itself_gives(events: list[tuple]) -
                     succeeded[env] += episode.outcome == Outcome.SUCCESS
             mask = np.zeros(N, bool)
             step = result([e.steps for e in episodes], first, entries, limits)
-        ours.add(Stepped(step, mask))
+        stepped = Stepped(step, mask, restored=restored)
+        history.add(stepped, ticks)
+        ours.add(stepped, history)
+        past.append(deepcopy((episodes, last)))
 
     rows = ours.rows()
-    assert rows.tick == ticks and rows.serial == len(events)
+    assert rows.tick == ticks and rows.serial == len(events) + 1
     assert rows.steps.tolist() == [e.steps for e in episodes]
     assert rows.outcome.tolist() == [e.outcome for e in episodes]
     assert rows.end.tolist() == [e.end for e in episodes]
@@ -123,13 +152,11 @@ def test_rows_are_what_following_each_env_by_itself_gives(events: list[tuple]) -
     for env, episode in enumerate(episodes):
         kept = rows.rewards[env]
         assert kept[np.isfinite(kept)].tolist() == episode.rewards[-KEPT_REWARDS:]
-        assert rows.tick_of(env, episode.steps) == ticks
+        lived = [(m.serial, int(m.step.elapsed_steps[of])) for m, of in history.lived(env, history.last)]
+        assert [step for _, step in lived] == list(range(episode.steps, -1, -1))
     assert rows.last.steps.tolist() == [-1 if e is None else e.end for e in last]
     assert rows.last.outcome.tolist() == [0 if e is None else e.outcome for e in last]
     assert rows.last.total.tolist() == [0 if e is None else e.total for e in last]
-
-
-NO = {"success": False, "fail": False, "near": False}
 
 
 def test_only_the_newest_rewards_of_a_long_episode_are_kept() -> None:
@@ -140,7 +167,9 @@ def test_only_the_newest_rewards_of_a_long_episode_are_kept() -> None:
 
 
 @pytest.mark.parametrize("said", [True, False], ids=["said to be a reset", "only seen in the steps"])
-def test_an_env_that_was_put_back_does_not_claim_to_know_its_return(said: bool) -> None:
+def test_an_env_that_was_put_back_nobody_knows_where_from_does_not_claim_to_know_its_return(
+    said: bool,
+) -> None:
     ours = table()
     for step in (1, 2, 3):
         ours.add(Stepped(result([step] * N, [1] * N, [NO] * N, [False] * N), np.zeros(N, bool)))
@@ -159,3 +188,11 @@ def test_rows_that_were_taken_do_not_change_with_later_steps() -> None:
     ours.add(Stepped(result([1] * N, [1] * N, [{**NO, "success": True}] * N, [False] * N), np.zeros(N, bool)))
     for before, after in zip(taken, (rows.steps, rows.total, rows.rewards, rows.end), strict=True):
         np.testing.assert_array_equal(before, after)
+
+
+def test_a_worker_that_comes_back_at_the_same_moment_begins_no_episode() -> None:
+    ours = table()
+    for step in (1, 2, 3):
+        ours.add(Stepped(result([step] * N, [1] * N, [NO] * N, [False] * N), np.zeros(N, bool)))
+    ours.add(Stepped(result([3] * N, [1] * N, [NO] * N, [False] * N), np.ones(N, bool)))
+    assert ours.rows().total.tolist() == [3] * N

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 import os
-import shutil
 import signal
 import time
 from collections.abc import Iterator
@@ -83,12 +82,11 @@ class Desk:
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
-    folder = tmp_path_factory.mktemp("author")
-    file = Path(shutil.copy(TASKS / "push_cube.py", folder / "push_cube.py"))
-    session = Session(str(file), TaskOptions(num_envs=N), recordings=folder / "recordings")
+def desk(task_file: Path) -> Iterator[Desk]:
+    recordings = task_file.parent / "recordings"
+    session = Session(str(task_file), TaskOptions(num_envs=N), recordings=recordings)
     wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
-    yield Desk(session, file)
+    yield Desk(session, task_file)
     session.close()
 
 

@@ -81,9 +81,8 @@ def open_desk(file: Path, **env_kwargs: Any) -> Desk:
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
-    file = Path(shutil.copy(TASKS / "push_cube.py", tmp_path_factory.mktemp("author") / "push_cube.py"))
-    desk = open_desk(file)
+def desk(task_file: Path) -> Iterator[Desk]:
+    desk = open_desk(task_file)
     yield desk
     desk.task.close()
 

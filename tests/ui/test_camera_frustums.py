@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import viser
 import viser.transforms
@@ -33,5 +35,8 @@ def test_frustums_follow_their_pictures_and_leave_with_them(server: viser.ViserS
     frustums.draw(cameras, {("sensor", "base"): moved}, offset)
     assert list(frustums._drawn) == [("sensor", "base")]
     np.testing.assert_allclose(frustums._drawn["sensor", "base"].position, [2, 2, 3])
+    wider = replace(camera("base"), fovy=1.5, width=12)
+    frustums.draw((wider,), {("sensor", "base"): moved}, offset)
+    assert (frustums._drawn["sensor", "base"].fov, frustums._drawn["sensor", "base"].aspect) == (1.5, 2.0)
     frustums.draw((), {("sensor", "base"): moved}, offset)
     assert frustums._drawn == {}

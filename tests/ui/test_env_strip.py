@@ -117,7 +117,6 @@ def test_an_outlier_of_the_episode_before_is_said_to_be_that() -> None:
 def test_the_moment_of_an_env_is_its_first_outlier_else_its_end() -> None:
     rows = rows_of()
     assert [moment_of(rows, env) for env in range(6)] == [None, 33, 20, 50, None, 12]
-    assert rows.tick_of(5, 12) == 100 - 18
 
 
 def test_small_curves_share_one_scale_and_stay_in_their_box() -> None:

@@ -24,12 +24,12 @@ from __future__ import annotations
 import ast
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import PurePath
 from typing import Literal
 
 from workbench.authoring.kept_values import changed_while_running, written_attributes
 from workbench.authoring.remembers import remembers, root_name
-from workbench.authoring.symbols import STATEMENTS, Key, Symbol, file_name, read_symbols
+from workbench.authoring.symbols import STATEMENTS, Key, file_name
+from workbench.authoring.two_versions import TwoVersions
 
 Level = Literal["same", "patched", "cameras", "rebuilt"]
 
@@ -119,55 +119,36 @@ class _Comparison:
     def __init__(
         self, old: Mapping[str, str], new: Mapping[str, str], task: Key, inherited: Inherited
     ) -> None:
-        keep_docstrings = any("__doc__" in text for text in (*old.values(), *new.values()))
-        self._old = _read_all(old, keep_docstrings)
-        self._new = _read_all(new, keep_docstrings)
+        self._both = TwoVersions(old, new)
         self._task, self._inherited = task, inherited
-        self._files = {*old, *new}
-        self._versions: dict[Key, list[Symbol]] = {}
-        self._named: dict[str, set[Key]] = {}
-        for symbol in (*self._old.values(), *self._new.values()):
-            self._versions.setdefault(symbol.key, []).append(symbol)
-            for name in symbol.shorts:
-                self._named.setdefault(name, set()).add(symbol.key)
-        self._reached: dict[Key, set[Key]] = {}
-        self._family_found: set[Key] = set()
-        self._libraries = self._imported_libraries()
-        self._changed = [
-            key
-            for key in self._versions
-            if key not in self._old or key not in self._new or self._old[key].text != self._new[key].text
-        ]
 
     def judge(self) -> Change:
-        family = self._family_found = self._family()
+        family = self._family()
         self._refuse_another_order(family)
-        if self._changed:
+        if self._both.changed:
             self._refuse_peculiar(family)
             self._refuse_if_built_of_it(family)
         # These hold for the smallest edit too: the new file's names begin anew with whatever level.
         self._refuse_kept_between_calls(family)
-        if not self._changed:
+        if not self._both.changed:
             return Change("same", "only comments, docstrings or layout changed")
-        affected = self._affected()
+        affected = self._both.affected()
         self._refuse_remembered(affected)
         hooks = frozenset(key[1].rpartition(".")[2] for key in affected if self._is_hook(key, family))
-        seen = self._reach(self._members(family, CAMERA_HOOKS))
-        cameras = any(key in seen for key in self._changed)
+        seen = self._both.reach(self._both.members(family, CAMERA_HOOKS))
+        cameras = any(key in seen for key in self._both.changed)
         if cameras:
             self._refuse_cameras_of_the_moment(seen)
-        reason = f"only {_listed([self._say(key) for key in self._changed])} changed"
+        reason = f"only {_listed([self._say(key) for key in self._both.changed])} changed"
         if not hooks and not cameras:
             reason += ", which no hook uses"
         elif hooks <= RESET_HOOKS and not cameras:
             reason += ": seen from the next reset on"
         return Change("cameras" if cameras else "patched", reason, hooks)
 
-    # --- who reaches whom ---------------------------------------------------------------------------
-
     def _family(self) -> set[Key]:
         """The task's class and those of its bases that are the author's."""
-        if self._task not in self._old or self._task not in self._new:
+        if self._task not in self._both.old or self._task not in self._both.new:
             raise _Heavier(
                 f"the class {self._task[1]} is not defined at the top of the file in both versions"
             )
@@ -178,77 +159,22 @@ class _Comparison:
             if key in found:
                 continue
             found.add(key)
-            for symbol in self._versions[key]:
+            for symbol in self._both.of[key]:
                 if symbol.kind != "class":
                     raise _Heavier(f"{self._say(key)} is not an ordinary class")
-                waiting += [k for k in self._mentioned(symbol) if self._versions[k][0].kind == "class"]
+                waiting += [k for k in self._both.mentioned(symbol) if self._both.of[k][0].kind == "class"]
         return found
-
-    def _mentioned(self, symbol: Symbol) -> set[Key]:
-        return {key for name in symbol.mentions & self._named.keys() for key in self._named[name]}
-
-    def _edges(self, key: Key) -> set[Key]:
-        if key not in self._reached:
-            self._reached[key] = {k for symbol in self._versions[key] for k in self._mentioned(symbol)} - {
-                key
-            }
-        return self._reached[key]
-
-    def _reach(self, roots: Iterable[Key]) -> dict[Key, Key | None]:
-        """Everything that may be reached from `roots`, each with the one that it was reached from."""
-        found: dict[Key, Key | None] = dict.fromkeys(roots)
-        waiting = list(found)
-        while waiting:
-            key = waiting.pop()
-            for reached in self._edges(key):
-                if reached not in found:
-                    found[reached] = key
-                    waiting.append(reached)
-        return found
-
-    def _affected(self) -> set[Key]:
-        """What changed, and everything that may reach it."""
-        users: dict[Key, set[Key]] = {}
-        for key in self._versions:
-            for used in self._edges(key):
-                users.setdefault(used, set()).add(key)
-        found, waiting = set(self._changed), list(self._changed)
-        while waiting:
-            for user in users.get(waiting.pop(), ()):
-                if user not in found:
-                    found.add(user)
-                    waiting.append(user)
-        return found
-
-    def _members(self, classes: Collection[Key], names: Collection[str]) -> set[Key]:
-        return {
-            key
-            for key, (symbol, *_) in self._versions.items()
-            if symbol.owner is not None and (symbol.path, symbol.owner) in classes and symbol.short in names
-        }
 
     def _is_hook(self, key: Key, family: set[Key]) -> bool:
-        return key in self._members(family, _RUNS_LATER | CAMERA_HOOKS)
-
-    def _siblings(self, family: set[Key]) -> set[Key]:
-        """Other tasks in the files, of which there is no live env."""
-        found: set[Key] = set()
-        tasks, before = {"BaseEnv", *(name for _, name in family)}, -1
-        while before != len(found):
-            before = len(found)
-            for key, versions in self._versions.items():
-                if versions[0].kind == "class" and key not in family and versions[0].mentions & tasks:
-                    found.add(key)
-                    tasks.add(key[1])
-        return found
+        return key in self._both.members(family, _RUNS_LATER | CAMERA_HOOKS)
 
     # --- what a live env was built of ---------------------------------------------------------------
 
     def _build_roots(self, family: set[Key]) -> set[Key]:
         """What may run while the file is imported or the env is built."""
         found: set[Key] = set()
-        siblings = self._siblings(family)
-        for key, versions in self._versions.items():
+        siblings = self._both.siblings(family)
+        for key, versions in self._both.of.items():
             for symbol in versions:
                 if key in siblings or (symbol.path, symbol.owner) in siblings:
                     continue
@@ -271,8 +197,8 @@ class _Comparison:
         return found
 
     def _refuse_if_built_of_it(self, family: set[Key]) -> None:
-        built = self._reach(self._build_roots(family))
-        for key in self._changed:
+        built = self._both.reach(self._build_roots(family))
+        for key in self._both.changed:
             if key not in built:
                 continue
             by, how = built[key], self._how(key)
@@ -282,11 +208,11 @@ class _Comparison:
                 by = before
             raise _Heavier(f"{self._say(key)} {how}, which {self._say(by)} uses")
         for owner in sorted(family):
-            for symbol in self._versions.get((owner[0], f"{owner[1]}.__init__"), ()):
+            for symbol in self._both.of.get((owner[0], f"{owner[1]}.__init__"), ()):
                 if _goes_on_after_super(symbol.nodes):
                     raise _Heavier(f"{symbol.name} goes on after super().__init__(), which has run a reset")
-        rewards = self._members(family, REWARD_HOOKS)
-        for key in self._changed:
+        rewards = self._both.members(family, REWARD_HOOKS)
+        for key in self._both.changed:
             if key in rewards and self._how(key) != "changed":
                 raise _Heavier(f"{self._say(key)} {self._how(key)}, so the reward mode is chosen anew")
 
@@ -294,19 +220,19 @@ class _Comparison:
 
     def _refuse_another_order(self, family: set[Key]) -> None:
         """An enum counts its members by their place, a dataclass its arguments."""
-        for key, versions in self._versions.items():
-            if versions[0].kind != "class" or key in family or key in self._changed:
+        for key, versions in self._both.of.items():
+            if versions[0].kind != "class" or key in family or key in self._both.changed:
                 continue
             before, after = (
                 [member.name for member in version.values() if (member.path, member.owner) == key]
-                for version in (self._old, self._new)
+                for version in (self._both.old, self._both.new)
             )
             if before != after:
                 raise _Heavier(f"the members of {self._say(key)} changed, or their order")
 
     def _refuse_peculiar(self, family: set[Key]) -> None:
         for key in sorted(family):
-            for symbol in self._versions[key]:
+            for symbol in self._both.of[key]:
                 (node,) = symbol.nodes
                 assert isinstance(node, ast.ClassDef)
                 if node.keywords or getattr(node, "type_params", ()):
@@ -315,12 +241,12 @@ class _Comparison:
                     if not ast.unparse(decorator).partition("(")[0].endswith("register_env"):
                         raise _Heavier(f"the class {symbol.name} is decorated with {ast.unparse(decorator)}")
                 for name in sorted(_PECULIAR):
-                    if (symbol.path, f"{symbol.name}.{name}") in self._versions:
+                    if (symbol.path, f"{symbol.name}.{name}") in self._both.of:
                         raise _Heavier(f"the class {symbol.name} has {name}")
-        for versions in self._versions.values():
+        for versions in self._both.of.values():
             for symbol in versions:
                 # A library's names, whatever they are, reach nothing of the author's.
-                from_library = symbol.kind == "import" and symbol.shorts <= self._libraries
+                from_library = symbol.kind == "import" and symbol.shorts <= self._both.libraries
                 if symbol.dynamic is not None and not from_library:
                     raise _Heavier(
                         f"{self._say(symbol.key)} uses `{symbol.dynamic}`, which may reach anything"
@@ -329,41 +255,41 @@ class _Comparison:
     # --- what may outlive an exchange of the code -----------------------------------------------------
 
     def _refuse_kept_between_calls(self, family: set[Key]) -> None:
-        every = [symbol for versions in self._versions.values() for symbol in versions]
-        found = changed_while_running(every, self._libraries)
+        every = [symbol for versions in self._both.of.values() for symbol in versions]
+        found = changed_while_running(every, self._both.libraries)
         if found is not None:
             value, code = found
             raise _Heavier(
                 f"{self._say(value.key)} may be changed while the task runs, by {self._say(code.key)}: "
                 "it would begin anew with the new file"
             )
-        running = self._reach(self._members(family, _RUNS_LATER))
+        running = self._both.reach(self._both.members(family, _RUNS_LATER))
         for key, by in running.items():
-            if by is not None and key not in family and self._versions[key][0].kind == "class":
+            if by is not None and key not in family and self._both.of[key][0].kind == "class":
                 raise _Heavier(
                     f"{self._say(by)} uses the class {self._say(key)}, of which there may be objects"
                 )
 
     def _refuse_remembered(self, affected: set[Key]) -> None:
-        libraries = self._libraries
-        for key in self._reach(affected):
-            for symbol in self._versions[key]:
+        libraries = self._both.libraries
+        for key in self._both.reach(affected):
+            for symbol in self._both.of[key]:
                 if symbol.kind != "function":
                     continue
                 for node in symbol.nodes:
                     kept = remembers(node, libraries)
                     if kept is not None:
                         raise _Heavier(f"{self._say(key)} may keep what the old version computed ({kept})")
-        still_read = {name for symbol in self._new.values() for name in symbol.mentions}
-        for key in self._changed:
-            before, after = self._old.get(key), self._new.get(key)
+        still_read = {name for symbol in self._both.new.values() for name in symbol.mentions}
+        for key in self._both.changed:
+            before, after = self._both.old.get(key), self._both.new.get(key)
             lost = written_attributes(before) - written_attributes(after)
             for name in sorted(lost & still_read):
                 raise _Heavier(f"{self._say(key)} no longer writes {name}, which is still read")
 
     def _refuse_cameras_of_the_moment(self, seen: Collection[Key]) -> None:
         """Cameras that are made now must be those that would have been made when the scene was."""
-        for key, versions in self._versions.items():
+        for key, versions in self._both.of.items():
             for symbol in versions:
                 if key not in seen:
                     for name in sorted(symbol.mentions & _CAMERAS_THEMSELVES):
@@ -376,26 +302,11 @@ class _Comparison:
                     if moves and root_name(node) == "self":
                         raise _Heavier(f"{self._say(key)} looks where something is when the scene is built")
 
-    def _imported_libraries(self) -> frozenset[str]:
-        """Names that are imported from elsewhere than the author's files."""
-        stems = {PurePath(path).stem for path in self._files} | {PurePath(p).parent.name for p in self._files}
-        found: set[str] = set()
-        for versions in self._versions.values():
-            for symbol in versions:
-                for node in symbol.nodes if symbol.kind == "import" else ():
-                    if isinstance(node, ast.ImportFrom):
-                        parts = {*(node.module or "").split("."), *(alias.name for alias in node.names)}
-                        own = node.level > 0 or bool(parts & stems)
-                    else:
-                        assert isinstance(node, ast.Import)
-                        own = any(set(alias.name.split(".")) & stems for alias in node.names)
-                    found |= set() if own else symbol.shorts
-        return frozenset(found)
-
     # --- words --------------------------------------------------------------------------------------
 
     def _how(self, key: Key) -> str:
-        return "is new" if key not in self._old else "is gone" if key not in self._new else "changed"
+        old, new = self._both.old, self._both.new
+        return "is new" if key not in old else "is gone" if key not in new else "changed"
 
     def _say(self, key: Key) -> str:
         path, name = key
@@ -405,13 +316,6 @@ class _Comparison:
         if path == self._task[0]:
             return name.removeprefix(f"{self._task[1]}.")
         return f"{name} of {file_name(path)}"
-
-
-def _read_all(texts: Mapping[str, str], keep_docstrings: bool) -> dict[Key, Symbol]:
-    found: dict[Key, Symbol] = {}
-    for path, text in texts.items():
-        found.update(read_symbols(path, text, keep_docstrings))
-    return found
 
 
 def _goes_on_after_super(nodes: Iterable[ast.AST]) -> bool:

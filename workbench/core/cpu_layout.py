@@ -4,7 +4,7 @@
 quaternion wxyz, position, linear and angular velocity; then each articulation as the same 13 numbers of
 its root, its qpos, its qvel, and target position and target velocity of each joint in turn.
 ``sapien.Scene.pack_poses()`` gives quaternion and position of each entity. Neither is documented (found
-by measuring, sapien 3.0.3); `BatchedCpuSystem` compares both with the getters when a scene is built.
+by measuring, sapien 3.0.3); so `check_layout` compares both with the getters when a scene is built.
 
 The envs need not be alike: the rows of one follow those of the other, and where an articulation has
 fewer joints than the widest, the padding reads a zero.
@@ -126,3 +126,34 @@ def lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Sce
         index_of={id(a): i for i, a in enumerate(articulations)},
         row_count=row,
     )
+
+
+def check_layout(
+    layout: Layout, packed: NDArray[np.float32], link_poses: Callable[[], NDArray[np.float32]]
+) -> None:
+    """Compare the packs with the getters, since SAPIEN documents neither their order nor their size.
+
+    Args:
+        packed: the packs of all envs, and the zero behind them.
+        link_poses: gives the poses (L, 7) that were found in the packs of poses; asked if `packed` has the size.
+
+    Raises:
+        RuntimeError: they differ.
+    """
+    expected = BODY * (len(layout.bodies) + len(layout.articulations)) + 4 * int(layout.dofs.sum())
+    agrees = len(packed) == expected + 1
+    if agrees:
+        for body, at in zip(layout.bodies, layout.body_at, strict=True):
+            pose = body.entity.pose
+            agrees &= np.allclose(packed[at[:7]], [*pose.p, *pose.q], atol=1e-5)
+        for i, articulation in enumerate(layout.articulations):
+            dof = articulation.dof
+            agrees &= np.allclose(packed[layout.qpos_at[i, :dof]], articulation.qpos, atol=1e-5)
+        for link, packed_pose in zip(layout.links, link_poses(), strict=True):
+            pose = link.entity.pose
+            agrees &= np.allclose(packed_pose, [*pose.p, *pose.q], atol=1e-5)
+    if not agrees:
+        raise RuntimeError(
+            f"sapien {sapien.__version__} packs its state in another order than the batched CPU core "
+            "was written for (3.0.3): install the pinned version."
+        )

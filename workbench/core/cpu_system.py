@@ -19,7 +19,7 @@ What makes it quick:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -30,7 +30,8 @@ import torch
 from numpy.typing import NDArray
 
 from workbench.core.contacts import BodyImpulseQuery, ContactReader, CpuArray, PairImpulseQuery
-from workbench.core.cpu_layout import BODY, Layout, lay_out
+from workbench.core.cpu_layout import BODY, Layout, check_layout, lay_out
+from workbench.core.drive_targets import DriveTargets, Setters, refuse_nan
 from workbench.core.gpu_members import applies_everything, uncommon_member
 from workbench.core.stepping import Stepper
 
@@ -135,35 +136,32 @@ class BatchedCpuSystem:
         self._qpos, self._qpos_seen = _twin(layout.qpos_at.shape)
         self._qvel, self._qvel_seen = _twin(layout.qpos_at.shape)
         self._qf, self._qf_seen = _twin(layout.qpos_at.shape)
-        self._target_qpos, self._target_qpos_seen = _twin(layout.qpos_at.shape)
-        self._target_qvel, self._target_qvel_seen = _twin(layout.qpos_at.shape)
         self._qacc = np.zeros((len(layout.articulations), width), dtype=np.float32)
         most_links = max((len(a.links) for a in layout.articulations), default=0)
         self._joint_forces = np.zeros((len(layout.articulations), most_links, 6), dtype=np.float32)
         self._force = np.zeros((layout.row_count, 3), dtype=np.float32)
         self._torque = np.zeros((layout.row_count, 3), dtype=np.float32)
         env_of = {id(scene): env for env, scene in enumerate(self.scenes)}
-        self._articulations_of: list[list[int]] = [[] for _ in self.scenes]
+        articulations_of: list[list[int]] = [[] for _ in self.scenes]
         for i, articulation in enumerate(layout.articulations):
-            self._articulations_of[env_of[id(articulation.root.entity.scene)]].append(i)
-        joints = [list(a.active_joints) for a in layout.articulations]
-        self._set_target = [[j.set_drive_target for j in row] for row in joints]
-        self._set_velocity_target = [[j.set_drive_velocity_target for j in row] for row in joints]
-        self._driven = np.zeros(len(layout.articulations), dtype=bool)
-        self._velocity_driven = np.zeros(len(layout.articulations), dtype=bool)
+            articulations_of[env_of[id(articulation.root.entity.scene)]].append(i)
+        self._targets = DriveTargets(layout, self._setters("set_drive_target"), articulations_of)
+        self._velocity_targets = DriveTargets(
+            layout, self._setters("set_drive_velocity_target"), articulations_of
+        )
         self.cuda_rigid_body_data = _array(self._data)
         self.cuda_rigid_dynamic_data = self.cuda_rigid_body_data
         self.cuda_articulation_link_data = self.cuda_rigid_body_data
         self.cuda_articulation_qpos = _array(self._qpos)
         self.cuda_articulation_qvel = _array(self._qvel)
         self.cuda_articulation_qf = _array(self._qf)
-        self.cuda_articulation_target_qpos = _array(self._target_qpos)
-        self.cuda_articulation_target_qvel = _array(self._target_qvel)
+        self.cuda_articulation_target_qpos = _array(self._targets.now)
+        self.cuda_articulation_target_qvel = _array(self._velocity_targets.now)
         self.cuda_rigid_body_force = _array(self._force)
         self.cuda_rigid_body_torque = _array(self._torque)
         self.cuda_rigid_dynamic_force = self.cuda_rigid_body_force
         self.cuda_rigid_dynamic_torque = self.cuda_rigid_body_torque
-        self._check_layout()
+        check_layout(layout, self._pack(), self._link_poses)
         self._fetch_bodies()
         self._fetch_links()
         self._fetch_joints()
@@ -190,26 +188,9 @@ class BatchedCpuSystem:
             raise RuntimeError(_TOO_EARLY)
         return uncommon_member(self, name)
 
-    def _check_layout(self) -> None:
-        """Compare the packs with the getters, since SAPIEN documents neither their order nor their size."""
-        layout, packed = self._laid_out, self._pack()
-        expected = BODY * (len(layout.bodies) + len(layout.articulations)) + 4 * int(layout.dofs.sum())
-        agrees = len(packed) == expected + 1
-        if agrees:
-            for body, at in zip(layout.bodies, layout.body_at, strict=True):
-                pose = body.entity.pose
-                agrees &= np.allclose(packed[at[:7]], [*pose.p, *pose.q], atol=1e-5)
-            for i, articulation in enumerate(layout.articulations):
-                dof = articulation.dof
-                agrees &= np.allclose(packed[layout.qpos_at[i, :dof]], articulation.qpos, atol=1e-5)
-            for link, packed_pose in zip(layout.links, self._link_poses(), strict=True):
-                pose = link.entity.pose
-                agrees &= np.allclose(packed_pose, [*pose.p, *pose.q], atol=1e-5)
-        if not agrees:
-            raise RuntimeError(
-                f"sapien {sapien.__version__} packs its state in another order than the batched CPU core "
-                "was written for (3.0.3): install the pinned version."
-            )
+    def _setters(self, method: str) -> Setters:
+        """What sets one kind of drive target, of each active joint of each articulation."""
+        return [[getattr(joint, method) for joint in a.active_joints] for a in self._laid_out.articulations]
 
     # --- reading: gpu_fetch_* ----------------------------------------------------------------------
 
@@ -333,8 +314,8 @@ class BatchedCpuSystem:
 
     def _fetch_targets(self) -> None:
         layout, packed = self._laid_out, self._pack()
-        self._target_qpos[:] = self._target_qpos_seen[:] = packed[layout.target_qpos_at]
-        self._target_qvel[:] = self._target_qvel_seen[:] = packed[layout.target_qvel_at]
+        self._targets.fetched(packed[layout.target_qpos_at])
+        self._velocity_targets.fetched(packed[layout.target_qvel_at])
 
     def replace(self, env: int, scene: sapien.Scene) -> None:
         """Another scene, over another system, has all entities of this env now, in the same order."""
@@ -353,8 +334,8 @@ class BatchedCpuSystem:
 
     @property
     def drive_flags(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """(A,), (A,) whether position, velocity targets were ever set; see `_apply_targets`."""
-        return self._driven, self._velocity_driven
+        """(A,), (A,) whether position, velocity targets were ever set; see `drive_targets`."""
+        return self._targets.driven, self._velocity_targets.driven
 
     # --- writing: gpu_apply_* ----------------------------------------------------------------------
 
@@ -366,10 +347,8 @@ class BatchedCpuSystem:
         self.gpu_apply_articulation_qf()
         self.gpu_apply_articulation_root_pose()
         self.gpu_apply_articulation_root_velocity()
-        self._apply_targets(self._target_qpos, self._target_qpos_seen, self._set_target, self._driven, False)
-        self._apply_targets(
-            self._target_qvel, self._target_qvel_seen, self._set_velocity_target, self._velocity_driven, False
-        )
+        self._apply_targets(self._targets, keep_awake=False)
+        self._apply_targets(self._velocity_targets, keep_awake=False)
 
     @applies_everything
     def gpu_apply_rigid_dynamic_data(self) -> None:
@@ -378,7 +357,7 @@ class BatchedCpuSystem:
         differs = now != seen
         for i in np.flatnonzero(differs.any(axis=1)):
             body, row = layout.bodies[i], now[i]
-            _refuse_nan(row, body.entity.name)
+            refuse_nan(row, body.entity.name)
             if differs[i, :7].any():
                 body.entity.pose = _pose(row)
             if differs[i, 7:].any() and not body.kinematic:
@@ -392,7 +371,7 @@ class BatchedCpuSystem:
         layout = self._laid_out
         now, seen = self._data[layout.root_rows, :7], self._data_seen[layout.root_rows, :7]
         for i in np.flatnonzero((now != seen).any(axis=1)):
-            _refuse_nan(now[i], layout.articulations[i].name)
+            refuse_nan(now[i], layout.articulations[i].name)
             layout.articulations[i].links[0].pose = _pose(now[i])
             self.note_change()
         self._data_seen[layout.root_rows, :7] = now
@@ -402,7 +381,7 @@ class BatchedCpuSystem:
         layout = self._laid_out
         now, seen = self._data[layout.root_rows, 7:], self._data_seen[layout.root_rows, 7:]
         for i in np.flatnonzero((now != seen).any(axis=1)):
-            _refuse_nan(now[i], layout.articulations[i].name)
+            refuse_nan(now[i], layout.articulations[i].name)
             layout.articulations[i].set_root_linear_velocity(now[i, :3])
             layout.articulations[i].set_root_angular_velocity(now[i, 3:])
             self.note_change()
@@ -422,13 +401,11 @@ class BatchedCpuSystem:
 
     @applies_everything
     def gpu_apply_articulation_target_position(self) -> None:
-        self._apply_targets(self._target_qpos, self._target_qpos_seen, self._set_target, self._driven, True)
+        self._apply_targets(self._targets, keep_awake=True)
 
     @applies_everything
     def gpu_apply_articulation_target_velocity(self) -> None:
-        self._apply_targets(
-            self._target_qvel, self._target_qvel_seen, self._set_velocity_target, self._velocity_driven, True
-        )
+        self._apply_targets(self._velocity_targets, keep_awake=True)
 
     def gpu_apply_rigid_dynamic_force(self) -> None:
         self._apply_forces(self._force, "force")
@@ -441,48 +418,21 @@ class BatchedCpuSystem:
         if self._layout is not None:
             self._data[:], self._qf[:] = self._data_seen, self._qf_seen
             self._qpos[:], self._qvel[:] = self._qpos_seen, self._qvel_seen
-            self._target_qpos[:], self._target_qvel[:] = self._target_qpos_seen, self._target_qvel_seen
+            self._targets.drop_writes()
+            self._velocity_targets.drop_writes()
 
     def _apply_joints(self, now: NDArray[np.float32], seen: NDArray[np.float32], setter: str) -> None:
         for i in np.flatnonzero((now != seen).any(axis=1)):
             articulation = self._laid_out.articulations[i]
-            _refuse_nan(now[i], articulation.name)
+            refuse_nan(now[i], articulation.name)
             getattr(articulation, setter)(now[i, : articulation.dof])
             self.note_change()
         seen[:] = now
 
-    def _apply_targets(
-        self,
-        now: NDArray[np.float32],
-        seen: NDArray[np.float32],
-        setters: list[list[Callable[[float], None]]],
-        driven: NDArray[np.bool_],
-        keep_awake: bool,
-    ) -> None:
-        """Write drive targets (A, D).
-
-        A target that is set wakes a sleeping articulation even when its value stays, and ManiSkill's
-        CPU controllers set theirs on every control step; with `keep_awake` all targets of what was
-        ever driven are therefore written, or a robot at rest would fall asleep here and not there.
-        """
-        changed = (now != seen).any(axis=1)
-        driven |= changed
-        chosen = np.flatnonzero(driven if keep_awake else changed).tolist()
-        if not np.isfinite(now).all():
-            for i in chosen:
-                _refuse_nan(now[i], self._laid_out.articulations[i].name)
-        if changed.any():
+    def _apply_targets(self, targets: DriveTargets, keep_awake: bool) -> None:
+        changed, write = targets.apply(keep_awake)
+        if changed:
             self.note_change()
-        seen[:] = now
-        values, written = now.tolist(), set(chosen)
-
-        def write(env: int) -> None:
-            for i in self._articulations_of[env]:
-                if i in written:
-                    for set_target, value in zip(setters[i], values[i], strict=False):
-                        set_target(value)
-
-        # 1200 calls a control step of 64 Pandas: in the envs' threads they cost nobody's waiting.
         self.stepper.write_before_step(write)
 
     def _apply_forces(self, values: NDArray[np.float32], kind: str) -> None:
@@ -491,7 +441,7 @@ class BatchedCpuSystem:
         every += [*zip(layout.link_rows, layout.links, strict=True)]
         for row, body in every:
             if values[row].any():
-                _refuse_nan(values[row], body.entity.name)
+                refuse_nan(values[row], body.entity.name)
                 if kind == "force":
                     body.add_force_torque(values[row], zero)
                 else:
@@ -526,9 +476,3 @@ def _array(values: NDArray[np.float32]) -> CpuArray:
 
 def _pose(row: NDArray[np.float32]) -> sapien.Pose:
     return sapien.Pose(row[:3], row[3:7])  # type: ignore[arg-type]  # the stubs want a literal shape
-
-
-def _refuse_nan(values: NDArray[np.float32], name: str) -> None:
-    # PhysX does not check: a NaN pose spreads to everything it touches and may crash the process.
-    if not np.isfinite(values).all():
-        raise ValueError(f"{name}: the state to be set holds NaN or infinity: {values}")

@@ -9,20 +9,18 @@ second; this one raises `BrokenRule` on all three.
 
 It compares values and not calls, so that what changes nothing is no fault: a pose set to what it was, an
 apply of bodies that have not moved. Where the setters of ManiSkill's structs were called from
-is kept until the write is applied (`broken_rule`): the fault is told at the line that wrote, though it shows
+is kept until the write is applied (`who_wrote`): the fault is told at the line that wrote, though it shows
 only at the fetch.
 """
 
 from __future__ import annotations
 
 import re
-import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import sapien
@@ -32,38 +30,15 @@ from numpy.typing import NDArray
 from workbench.core.broken_rule import Frame, RuleWarning, broken_at, frames_of_the_task, place_of
 from workbench.core.contacts import CpuArray
 from workbench.core.cpu_system import BatchedCpuSystem
+from workbench.core.drive_targets import Setters
 from workbench.core.returns import ENVS_NAMED
-
-Group = Literal["bodies", "links", "joints", "targets", "forces"]
-"""What one ``gpu_fetch_*`` and its ``gpu_apply_*`` carry together."""
+from workbench.core.who_wrote import TENSORS, Group, Writes
 
 _MOVING: tuple[Group, ...] = ("bodies", "links", "joints")
 """What a step moves; targets and joint forces stay what they were set to."""
-_TENSORS: dict[str, tuple[Group, ...]] = {
-    "cuda_rigid_body_data": ("bodies", "links"),
-    "cuda_rigid_dynamic_data": ("bodies", "links"),
-    "cuda_articulation_link_data": ("bodies", "links"),
-    "cuda_articulation_qpos": ("joints",),
-    "cuda_articulation_qvel": ("joints",),
-    "cuda_articulation_qf": ("forces",),
-    "cuda_articulation_target_qpos": ("targets",),
-    "cuda_articulation_target_qvel": ("targets",),
-}
-_OWN_CODE = ("workbench.core.", "mani_skill.")
 _MOVED = 1e-4
 """Metres, radians, per second. PhysX rounds the root pose of an articulation when it is set, by about 1e-7."""
 _IN_ENV = re.compile(r"^scene-\d+[-_]")
-
-
-@dataclass(frozen=True)
-class _Touch:
-    """A write to some rows of a group that may still be applied, and who made it."""
-
-    group: Group
-    rows: NDArray[np.int64] | None
-    """Rows of the group's tensor; None where the whole tensor was handed out."""
-    frames: tuple[Frame, ...]
-    """Innermost first."""
 
 
 class StrictCpuSystem(BatchedCpuSystem):
@@ -76,7 +51,7 @@ class StrictCpuSystem(BatchedCpuSystem):
     stepped_in_reset = False
 
     def __init__(self, scenes: Sequence[sapien.Scene], *args: Any, **kwargs: Any) -> None:
-        self._touches: list[_Touch] = []
+        self._writes = Writes()
         self._stale: set[Group] = set()
         self._applying = 0
         self._outdated: set[int] = set()
@@ -89,12 +64,6 @@ class StrictCpuSystem(BatchedCpuSystem):
     def gpu_init(self) -> None:
         super().gpu_init()
         layout = self._laid_out
-        # Called for every joint in every control step, and the core's own: past the guard of behind_tensors.
-        joints = [list(articulation.active_joints) for articulation in layout.articulations]
-        self._set_target = [[_unguarded(joint, "set_drive_target") for joint in row] for row in joints]
-        self._set_velocity_target = [
-            [_unguarded(joint, "set_drive_velocity_target") for joint in row] for row in joints
-        ]
         env_of = {id(scene): env for env, scene in enumerate(self.scenes)}
         owners = [*zip(layout.body_rows, layout.bodies, strict=True)]
         owners += [*zip(layout.link_rows, layout.links, strict=True)]
@@ -107,7 +76,12 @@ class StrictCpuSystem(BatchedCpuSystem):
         self._articulation_envs = self._env_of_row[layout.root_rows]
         self._root_in_links = np.searchsorted(layout.link_rows, layout.root_rows)
         self._stale.clear()
-        self._touches.clear()
+        self._writes.forget_all()
+
+    def _setters(self, method: str) -> Setters:
+        # Called for every joint in every control step, and the core's own: past the guard of behind_tensors.
+        articulations = self._laid_out.articulations
+        return [[_unguarded(joint, method) for joint in a.active_joints] for a in articulations]
 
     def break_rule(self, message: str, frames: Sequence[Frame] | None = ()) -> None:
         """Raise, or warn once a sentence.
@@ -132,7 +106,7 @@ class StrictCpuSystem(BatchedCpuSystem):
 
     def about_to_write(self, struct: Any, group: Group, index: torch.Tensor) -> None:
         """A setter of `struct` will write rows `index` of `group`'s tensor."""
-        self._touches.append(_Touch(group, index.numpy().astype(np.int64), frames_of_the_task()))
+        self._writes.note(group, index.numpy().astype(np.int64))
         if self.being_reset is not None:
             envs = struct._scene_idxs.long()
             others = struct.scene._reset_mask[envs] & ~self.being_reset[envs]
@@ -145,7 +119,7 @@ class StrictCpuSystem(BatchedCpuSystem):
     def about_to_read(self, struct: Any, group: Group, index: torch.Tensor) -> None:
         """A getter of `struct` will read rows `index` of `group`'s tensor."""
         self._catch_up()
-        if group == "links" and (self._outdated or self._touches) and not bool(struct.is_root.all()):
+        if group == "links" and (self._outdated or self._writes) and not bool(struct.is_root.all()):
             self._refuse_old_links(struct)
         if group not in self._stale:
             return
@@ -197,8 +171,10 @@ class StrictCpuSystem(BatchedCpuSystem):
         self._fetched("joints")
 
     def gpu_fetch_articulation_target_qpos(self) -> None:
-        self._refuse_loss("targets", self._target_qpos, self._target_qpos_seen, what="drive targets")
-        self._refuse_loss("targets", self._target_qvel, self._target_qvel_seen, what="drive velocity targets")
+        self._refuse_loss("targets", self._targets.now, self._targets.seen, what="drive targets")
+        self._refuse_loss(
+            "targets", self._velocity_targets.now, self._velocity_targets.seen, what="drive velocity targets"
+        )
         super().gpu_fetch_articulation_target_qpos()
         self._fetched("targets")
 
@@ -208,7 +184,7 @@ class StrictCpuSystem(BatchedCpuSystem):
 
     def _fetched(self, group: Group) -> None:
         self._stale.discard(group)
-        self._forget_touches(group)
+        self._writes.forget(group)
 
     def _refuse_loss(
         self,
@@ -247,7 +223,7 @@ class StrictCpuSystem(BatchedCpuSystem):
             "next fetch writes it over and the simulation never sees it. Outside _initialize_episode, call "
             "self.scene._gpu_apply_all() and self.scene._gpu_fetch_all() after the write (under "
             "`if self.gpu_sim_enabled:`).",
-            self._frames_that_wrote(group, mine),
+            self._writes.frames(group, mine),
         )
 
     # --- applies -------------------------------------------------------------------------------------
@@ -302,7 +278,7 @@ class StrictCpuSystem(BatchedCpuSystem):
             yield
         finally:
             self._applying -= 1
-        self._forget_touches(group)
+        self._writes.forget(group)
 
     def _note_kinematics(self, now: NDArray[np.float32], seen: NDArray[np.float32]) -> None:
         changed = np.flatnonzero((now != seen).any(axis=1)).tolist()
@@ -342,7 +318,7 @@ class StrictCpuSystem(BatchedCpuSystem):
             self.break_rule(
                 f"The joint forces (qf) of '{name}' in {_envs(envs)} were set and not applied: on the GPU, and here, "
                 "the step does not see them. Call self.scene.px.gpu_apply_articulation_qf() after the write.",
-                self._frames_that_wrote("forces", hit),
+                self._writes.frames("forces", hit),
             )
         if self.being_reset is not None:
             self.stepped_in_reset = True
@@ -370,25 +346,6 @@ class StrictCpuSystem(BatchedCpuSystem):
         truth = [packed[layout.qpos_at], packed[layout.qvel_at]]
         return np.concatenate([self._qpos, self._qvel], axis=1), np.concatenate(truth, axis=1)
 
-    def _handed_out(self, name: str) -> None:
-        caller = sys._getframe(2)
-        if not caller.f_globals.get("__name__", "").startswith(_OWN_CODE):
-            frames = frames_of_the_task(caller)
-            self._touches.extend(_Touch(group, None, frames) for group in _TENSORS[name])
-
-    def _forget_touches(self, group: Group) -> None:
-        if self._touches:
-            self._touches = [touch for touch in self._touches if touch.group != group]
-
-    def _frames_that_wrote(self, group: Group, rows: NDArray[np.int64]) -> tuple[Frame, ...]:
-        for touch in reversed(self._touches):
-            if touch.group == group and touch.rows is not None and np.isin(rows, touch.rows).any():
-                return touch.frames
-        for touch in reversed(self._touches):
-            if touch.group == group and touch.rows is None:
-                return touch.frames
-        return ()
-
     # --- partial resets --------------------------------------------------------------------------------
 
     def refuse_standing_writes(self, reset: torch.Tensor) -> None:
@@ -411,7 +368,7 @@ class StrictCpuSystem(BatchedCpuSystem):
             name = names[rows[0]]
             envs = env_of_row[[row for row in rows if names[row] == name]]
             found: Group = "links" if rigid and rows[0] in layout.link_rows else group
-            frames = self._frames_that_wrote(found, rows)
+            frames = self._writes.frames(found, rows)
             if not self.only_warn:
                 now[rows] = seen[rows]
             self.break_rule(
@@ -427,8 +384,8 @@ class StrictCpuSystem(BatchedCpuSystem):
             "state": self._data.copy(),
             "qpos": self._qpos.copy(),
             "qvel": self._qvel.copy(),
-            "drive targets": self._target_qpos.copy(),
-            "drive velocity targets": self._target_qvel.copy(),
+            "drive targets": self._targets.now.copy(),
+            "drive velocity targets": self._velocity_targets.now.copy(),
         }
 
     def refuse_changes_elsewhere(self, before: dict[str, NDArray[np.float32]], reset: torch.Tensor) -> None:
@@ -450,7 +407,7 @@ class StrictCpuSystem(BatchedCpuSystem):
                 name = names[changed[0]]
                 envs = env_of_row[[row for row in changed if names[row] == name]]
                 groups: tuple[Group, ...] = ("bodies", "links") if rigid else ("joints", "targets")
-                frames = [self._frames_that_wrote(group, changed) for group in groups]
+                frames = [self._writes.frames(group, changed) for group in groups]
                 self.break_rule(
                     f"_initialize_episode changed the {what} of '{name}' in {_envs(envs)}, which are not being "
                     "reset: only the envs of env_idx may be changed.",
@@ -463,7 +420,7 @@ def _tensor_property(name: str) -> property:
         value = self.__dict__.get(name)
         if value is None:
             return self.__getattr__(name)
-        self._handed_out(name)
+        self._writes.note_handed_out(name)
         return value
 
     def put(self: StrictCpuSystem, value: CpuArray) -> None:
@@ -472,7 +429,7 @@ def _tensor_property(name: str) -> property:
     return property(get, put)
 
 
-for _name in _TENSORS:
+for _name in TENSORS:
     setattr(StrictCpuSystem, _name, _tensor_property(_name))
 
 

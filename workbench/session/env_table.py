@@ -9,6 +9,9 @@ rows are made when somebody asks, and only for what is out of the ordinary.
 An episode *ends* with the first step that is terminated or truncated. What happens after it (the player may let
 it run on) does not change its outcome. With the usual rule the env is reset at once, and nobody would ever read
 "failed" in its row; so a row also has the outcome of the episode before.
+
+An env that is put back to a moment of the past has its row put back too: to what was said then (`Standing`), of the
+env whose moment it is. Only the counts of episodes that ended go on, since those did end.
 """
 
 from __future__ import annotations
@@ -20,8 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.step import StepResult
-from workbench.session.messages import Stepped, TaskDescription
+from workbench.session.history import History
+from workbench.session.messages import Restored, Stepped, TaskDescription
 from workbench.session.outliers import Kind, Outlier, OutlierWatch
+from workbench.session.standing import LastEpisode, Standing
 
 KEPT_REWARDS = 100
 """Steps of an episode whose rewards a row has; the newest where there are more."""
@@ -32,20 +37,6 @@ class Outcome(IntEnum):
     SUCCESS = 1
     FAIL = 2
     TRUNCATED = 3
-
-
-@dataclass(frozen=True)
-class LastEpisode:
-    """The episode before the present one, of each env; only of those that ended or had outliers."""
-
-    outcome: NDArray[np.int8]
-    """(N,) `Outcome`; RUNNING where it was cut short, or there was none (then `steps` is -1)."""
-    steps: NDArray[np.int32]
-    """(N,) control steps until its end."""
-    total: NDArray[np.float64]
-    """(N,) its return until its end."""
-    outliers: dict[int, tuple[Outlier, ...]]
-    """By env; envs without any are not in it."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +71,6 @@ class EnvRows:
     def num_envs(self) -> int:
         return len(self.steps)
 
-    def tick_of(self, env: int, step: int) -> int:
-        """The control step of the batch at which this env was at this step of its present episode."""
-        return self.tick - (int(self.steps[env]) - step)
-
 
 class EnvTable:
     """Follows the batch; `add` every event in order, ask for `rows` when they are to be shown."""
@@ -105,28 +92,42 @@ class EnvTable:
         self._rewards = np.full((count, KEPT_REWARDS), np.nan, np.float32)
         self._outliers: dict[int, tuple[Outlier, ...]] = {}
         self._shown: dict[Kind, NDArray[np.bool_]] = {kind: np.zeros(count, bool) for kind in Kind}
-        self._last_outcome = np.zeros(count, np.int8)
-        self._last_steps = np.full(count, -1, np.int32)
-        self._last_total = np.zeros(count)
-        self._last_outliers: dict[int, tuple[Outlier, ...]] = {}
+        self._last = LastEpisode(np.zeros(count, np.int8), np.full(count, -1, np.int32), np.zeros(count), {})
         self._ended = np.zeros(count, np.int64)
         self._succeeded = np.zeros(count, np.int64)
         self._begin(np.ones(count, bool), first)
 
-    def add(self, stepped: Stepped) -> None:
-        """Take one event: a reset of some envs, or a control step of all."""
+    def add(self, stepped: Stepped, history: History | None = None) -> None:
+        """Take one event: a reset of some envs, a going back, or a control step of all.
+
+        Args:
+            history: that has this event as its newest moment, which is given the rows' standing; without it the
+                rows of envs that go back begin anew, from where nobody can say what came before.
+        """
+        self._take(stepped, history)
+        moment = None if history is None else history.at(history.last)
+        if moment is not None:
+            moment.standing = Standing(
+                self._outcome, self._end, self._total, self._first_true, self._outliers, self._last
+            )
+
+    def _take(self, stepped: Stepped, history: History | None) -> None:
         step, reset = stepped.step, stepped.reset_mask
         self._serial += 1
         if reset.any():
-            # Envs that were put back to an earlier moment continue from where nobody can say what came before.
-            self._begin(reset | (step.elapsed_steps != self._steps), step)
+            # A worker that came back with the very moment at which the one before it died resets nothing.
+            resumed = (step.elapsed_steps == self._steps) & (self._steps > 0) & (stepped.restored is None)
+            anew = (reset & ~resumed) | (step.elapsed_steps != self._steps)
+            self._begin(anew, step)
+            if stepped.restored is not None and history is not None:
+                self._put_back(stepped.restored, history)
             return
         moved = step.elapsed_steps != self._steps + 1
         if moved.any():
             self._begin(moved, step)
         self._tick += 1
         self._steps = step.elapsed_steps.copy()
-        self._total += np.where(self._end < 0, step.reward, 0.0)
+        self._total = self._total + np.where(self._end < 0, step.reward, 0.0)
         column = (self._tick - 1) % KEPT_REWARDS
         self._rewards[:, column] = step.reward
         self._note_first_true(step, np.ones(len(moved), bool))
@@ -139,19 +140,14 @@ class EnvTable:
         return EnvRows(
             serial=self._serial,
             tick=self._tick,
-            outcome=self._outcome.copy(),
+            outcome=self._outcome,
             steps=self._steps.copy(),
-            end=self._end.copy(),
-            total=self._total.copy(),
-            first_true={name: steps.copy() for name, steps in self._first_true.items()},
+            end=self._end,
+            total=self._total,
+            first_true=dict(self._first_true),
             rewards=self._rewards[:, oldest_first],
             outliers=dict(self._outliers),
-            last=LastEpisode(
-                self._last_outcome.copy(),
-                self._last_steps.copy(),
-                self._last_total.copy(),
-                dict(self._last_outliers),
-            ),
+            last=self._last,
             ended=self._ended.copy(),
             succeeded=self._succeeded.copy(),
         )
@@ -159,24 +155,66 @@ class EnvTable:
     def _begin(self, envs: NDArray[np.bool_], step: StepResult) -> None:
         """A new episode in these envs (N,): what was known of the one before becomes "last"."""
         worth_keeping = envs & ((self._end >= 0) | np.isin(np.arange(len(envs)), list(self._outliers)))
-        self._last_outcome[worth_keeping] = self._outcome[worth_keeping]
-        self._last_steps[worth_keeping] = np.where(self._end < 0, self._steps, self._end)[worth_keeping]
-        self._last_total[worth_keeping] = self._total[worth_keeping]
-        for env in np.flatnonzero(worth_keeping).tolist():
-            before = self._outliers.pop(env, ())
-            self._last_outliers.pop(env, None)
-            if before:
-                self._last_outliers[env] = before
+        if worth_keeping.any():
+            kept = set(np.flatnonzero(worth_keeping).tolist())
+            before = {env: seen for env, seen in self._last.outliers.items() if env not in kept}
+            now = {env: seen for env, seen in self._outliers.items() if env in kept}
+            self._last = LastEpisode(
+                np.where(worth_keeping, self._outcome, self._last.outcome),
+                np.where(worth_keeping, np.where(self._end < 0, self._steps, self._end), self._last.steps),
+                np.where(worth_keeping, self._total, self._last.total),
+                {**before, **now},
+            )
+            self._outliers = {env: seen for env, seen in self._outliers.items() if env not in kept}
         self._steps = np.where(envs, step.elapsed_steps, self._steps)
-        self._outcome[envs], self._end[envs] = Outcome.RUNNING, -1
-        self._total[envs] = np.where(step.elapsed_steps[envs] == 0, 0.0, np.nan)
+        self._outcome = np.where(envs, np.int8(Outcome.RUNNING), self._outcome)
+        self._end = np.where(envs, np.int32(-1), self._end)
+        self._total = np.where(envs, np.where(step.elapsed_steps == 0, 0.0, np.nan), self._total)
         self._rewards[envs] = np.nan
         for shown in self._shown.values():
             shown[envs] = False
-        for steps in self._first_true.values():
-            steps[envs] = -1
+        self._first_true = {
+            name: np.where(envs, np.int32(-1), steps) for name, steps in self._first_true.items()
+        }
         self._note_first_true(step, envs)
         self._watch.begin(envs, step)
+
+    def _put_back(self, restored: Restored, history: History) -> None:
+        """The rows of these envs as they stood at the moment that they went back to."""
+        origin = history.at(restored.origin)
+        then = None if origin is None else origin.standing
+        if then is None:
+            return  # it had to go from memory while the worker was at it
+        envs, source = np.array(restored.env_idx), np.array(restored.source)
+        self._outcome = _with(self._outcome, envs, then.outcome[source])
+        self._end = _with(self._end, envs, then.end[source])
+        self._total = _with(self._total, envs, then.total[source])
+        self._first_true = {
+            name: _with(steps, envs, then.first_true[name][source]) if name in then.first_true else steps
+            for name, steps in self._first_true.items()
+        }
+        gone = set(restored.env_idx)
+        self._outliers = {env: seen for env, seen in self._outliers.items() if env not in gone}
+        for env, of in zip(restored.env_idx, restored.source, strict=True):
+            if of in then.outliers:
+                self._outliers[env] = then.outliers[of]
+            for kind, shown in self._shown.items():
+                shown[env] = any(outlier.kind == kind for outlier in then.outliers.get(of, ()))
+            rewards = history.rewards_until(of, restored.origin, KEPT_REWARDS)
+            columns = np.arange(self._tick - len(rewards), self._tick) % KEPT_REWARDS
+            self._rewards[env, columns] = rewards
+        # The episode before is an env's own, whoever's moment it goes on from.
+        own = envs[envs == source]
+        mine, last = set(own.tolist()), self._last
+        self._last = LastEpisode(
+            _with(last.outcome, own, then.last.outcome[own]),
+            _with(last.steps, own, then.last.steps[own]),
+            _with(last.total, own, then.last.total[own]),
+            {
+                **{env: seen for env, seen in last.outliers.items() if env not in mine},
+                **{env: seen for env, seen in then.last.outliers.items() if env in mine},
+            },
+        )
 
     def _note_first_true(self, step: StepResult, envs: NDArray[np.bool_]) -> None:
         for name, values in step.evaluate.items():
@@ -184,16 +222,18 @@ class EnvTable:
                 continue
             steps = self._first_true.get(name)
             if steps is None:
-                steps = self._first_true[name] = np.full(len(values), -1, np.int32)
+                steps = np.full(len(values), -1, np.int32)
+                self._first_true = {**self._first_true, name: steps}
             now = values & (steps < 0) & envs
-            steps[now] = step.elapsed_steps[now]
+            if now.any():
+                self._first_true = {**self._first_true, name: np.where(now, step.elapsed_steps, steps)}
 
     def _note_outliers(self, step: StepResult) -> None:
         for sight in self._watch.look(step):
             shown = self._shown[sight.kind]
             for env in np.flatnonzero(sight.envs & ~shown).tolist():
                 outlier = Outlier(sight.kind, int(step.elapsed_steps[env]), sight.reason(env))
-                self._outliers[env] = (*self._outliers.get(env, ()), outlier)
+                self._outliers = {**self._outliers, env: (*self._outliers.get(env, ()), outlier)}
             shown |= sight.envs
 
     def _note_ends(self, step: StepResult) -> None:
@@ -205,10 +245,17 @@ class EnvTable:
         outcome = np.where(
             success, Outcome.SUCCESS, np.where(step.terminated, Outcome.FAIL, Outcome.TRUNCATED)
         )
-        self._outcome[ends] = outcome[ends]
-        self._end[ends] = step.elapsed_steps[ends]
+        self._outcome = np.where(ends, outcome, self._outcome).astype(np.int8)
+        self._end = np.where(ends, step.elapsed_steps, self._end)
         self._ended += ends
         self._succeeded += ends & success
+
+
+def _with(values: NDArray, envs: NDArray[np.int64], new: NDArray) -> NDArray:
+    """A copy with other values for these envs."""
+    changed = values.copy()
+    changed[envs] = new
+    return changed
 
 
 def _flag(step: StepResult, name: str) -> NDArray[np.bool_]:

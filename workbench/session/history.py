@@ -16,8 +16,9 @@ from __future__ import annotations
 
 import pickle
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,7 @@ from workbench.core.pictures import CameraKind, Picture
 from workbench.core.snapshot_bytes import WholeSnapshot
 from workbench.core.step import StepResult
 from workbench.session.messages import PastPictures, Pictures, Restored, Stepped
+from workbench.session.standing import Standing
 
 RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED = 1, 2, 4, 8, 16
 """What may happen to an env at a moment. Success and failure: the first moment of it in an episode."""
@@ -60,6 +62,8 @@ class Moment:
     """Bytes, without parts and pictures."""
     pictures: dict[tuple[int, CameraKind, str], Picture] = field(default_factory=dict)
     """By env, kind and name of the camera."""
+    standing: Standing | None = None
+    """What the table of envs said then."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +119,7 @@ class History:
         """The next moment."""
         parts = self._take_parts(stepped)
         size = _OVERHEAD + len(stepped.snapshot) + _step_bytes(stepped.step)
+        size += Standing.bytes_a_step(self._num_envs)
         moment = Moment(
             serial=self._next_serial,
             step=stepped.step,
@@ -255,6 +260,32 @@ class History:
         ends = [*(begin - 1 for begin in begins[1:]), self.last]
         known = {moment.serial for moment in self._jumps if moment.jumped[env]}
         return [Stretch(env, a, b, a in known) for a, b in zip(begins, ends, strict=True)]
+
+    def lived(self, env: int, serial: int) -> Iterator[tuple[Moment, int]]:
+        """The episode of this env up to a moment, newest first, through the moments that it was put back to.
+
+        Each control step and, at the end, the reset that it began with, as far as they are kept; with the number
+        that the env had then, which is another where it was given another env's moment.
+        """
+        moment = self.at(serial)
+        while moment is not None:
+            at = moment.serial - 1
+            if not moment.jumped.any():
+                yield moment, env
+            elif moment.jumped[env]:
+                if moment.restored is None:
+                    yield moment, env
+                    return
+                at = moment.restored.origin
+                env = moment.restored.source[moment.restored.env_idx.index(env)]
+            moment = self.at(at)
+
+    def rewards_until(self, env: int, serial: int, most: int) -> NDArray[np.float32]:
+        """(K,) rewards of the episode of this env up to a moment, oldest first; at most so many, the newest."""
+        rewards = (
+            moment.step.reward[of] for moment, of in self.lived(env, serial) if not moment.jumped.any()
+        )
+        return np.array(list(islice(rewards, most))[::-1], np.float32)
 
     def last_jump(self, env: int) -> Moment | None:
         """The newest jump of this env that can be taken back: one that was not, and takes none back itself."""

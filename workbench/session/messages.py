@@ -339,7 +339,7 @@ class Stepped:
 
 @dataclass(frozen=True)
 class Pictures:
-    """The newest pictures of the cameras that are watched."""
+    """The newest pictures of the cameras that are watched, of one kind."""
 
     pictures: tuple[Picture, ...]
     milliseconds: float

@@ -15,8 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from workbench.authoring import registry
 from workbench.authoring.load import LoadedTask, load_task, take_back, with_late_imports
 from workbench.authoring.problem import Problem, TaskError, problem_from_exception
@@ -260,9 +258,3 @@ class Clock:
         now = time.perf_counter()
         self.laps[name] = self.laps.get(name, 0.0) + 1000 * (now - self._last)
         self._last = now
-
-
-def zero_action(task: TaskEnv) -> np.ndarray:
-    """(N, A) zeros, within the bounds."""
-    low, high = actions.bounds(task.parts)
-    return np.broadcast_to(np.clip(0.0, low, high), (task.num_envs, len(low))).astype(np.float32)

@@ -3,9 +3,9 @@
 A picture takes 25 to 90 ms on a software renderer; made in one go between two steps it would halve the
 rate of the player. But the renderer works on its own threads (see `begin_pictures`): so a picture is
 begun, steps go on, and it is fetched when it should be ready, by what the last ones took. Sensors come
-before human cameras, since the two see different objects and cannot be drawn at once. No more than 15
-rounds a second are made, and after each there is a pause in proportion, so that the browser on the same
-machine gets its share.
+before human cameras, since the two see different objects and cannot be drawn at once, and are handed over
+as soon as they are there. No more than 15 rounds a second are made, and after each there is a pause in
+proportion, so that the browser on the same machine gets its share.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ class PictureMaker:
         self._begun_at = 0.0
         self._ready_at = 0.0
         self._kinds_left: list[CameraKind] = []
-        self._made: list[Picture] = []
         self._round_began = 0.0
         self._expected: dict[CameraKind, float] = {"sensor": 0.0, "human": 0.0}
         self._moment = 0
         self._begun_of = 0
         self.moments: list[int] = []
-        """Which moment (as `scene_changed` was told) each picture of the last round shows."""
+        """Which moment (as `scene_changed` was told) each of the pictures that were fetched last shows."""
 
     def watch(self, env_index: int, requests: Sequence[Request]) -> None:
         """From now on these cameras of this env."""
         self._env_index, self._requests = env_index, tuple(requests)
         self._wanted = bool(requests)
+        self._next_round = 0.0  # somebody waits for these
 
     def scene_changed(self, moment: int) -> None:
         """What was drawn is old; the scene is now that of `moment`, a number of the caller's."""
@@ -63,23 +63,24 @@ class PictureMaker:
         return max(0.0, self._next_round - now) if self._wanted else None
 
     def poll(self, env: TaskEnv, now: float) -> tuple[tuple[Picture, ...], float] | None:
-        """Begin or fetch what is due; the pictures of a round and its seconds when it is complete."""
+        """Begin or fetch what is due; the pictures of a kind and their seconds when they are complete."""
         if self._begun is None:
             if not self._wanted or now < self._next_round:
                 return None
-            self._wanted, self._round_began, self._made, self.moments = False, now, [], []
+            self._wanted, self._round_began = False, now
             self._kinds_left = [kind for kind in KINDS if any(r[1] == kind for r in self._requests)]
             self._begin_next(env)
             return None
         if now < self._ready_at:
             return None
-        self._fetch()
+        made, seconds = self._fetch()
         if self._kinds_left:
             self._begin_next(env)
-            return None
-        seconds = time.monotonic() - self._round_began
-        self._next_round = max(self._round_began + _PERIOD, time.monotonic() + _PAUSE_SHARE * seconds)
-        return tuple(self._made), seconds
+        else:
+            done = time.monotonic()
+            pause = _PAUSE_SHARE * (done - self._round_began)
+            self._next_round = max(self._round_began + _PERIOD, done + pause)
+        return made, seconds
 
     def settle(self) -> None:
         """Wait for the renderer and give up the round: the scene is about to be closed or drawn anew."""
@@ -97,15 +98,15 @@ class PictureMaker:
         self._begun_at = time.monotonic()
         self._ready_at = self._begun_at + self._expected[kind]
 
-    def _fetch(self) -> None:
+    def _fetch(self) -> tuple[tuple[Picture, ...], float]:
         begun, self._begun = self._begun, None
         assert begun is not None
         asked = time.monotonic()
-        made = begun.finish()
-        self._made += made
-        self.moments += [self._begun_of] * len(made)
+        made = tuple(begun.finish())
+        self.moments = [self._begun_of] * len(made)
         done = time.monotonic()
         waited = done - asked > 0.004
         # Fetched too early, the wait tells how long it takes; otherwise it may take less than expected.
         took = done - self._begun_at
         self._expected[self._kind] = min(took, 1.0) if waited else 0.9 * self._expected[self._kind]
+        return made, took

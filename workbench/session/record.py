@@ -15,17 +15,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from workbench.authoring.problem import TaskError, problem_from_exception
-from workbench.core import actions
 from workbench.core.pictures import Picture
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import take_pictures
 from workbench.recording.episode import Episode
 from workbench.recording.rrd import episode_filename, write_rrd
+from workbench.session.acting import Acting
 from workbench.session.episodes import EpisodeGatherer, recorded_pictures
 from workbench.session.messages import Stepped, TaskOptions
-from workbench.session.open_task import OpenedTask, open_task, reset_checked, step_checked, zero_action
-from workbench.session.policy import load_policy
+from workbench.session.open_task import OpenedTask, open_task, reset_checked, step_checked
 
 _STEPS_WITHOUT_LIMIT = 200
 
@@ -72,7 +70,7 @@ def record(
     """
     if what.episodes < 1:
         raise ValueError(f"episodes must be at least 1, not {what.episodes}")
-    torch.set_num_threads(1)  # see workbench.session.worker.main
+    torch.set_num_threads(1)  # see workbench.session.worker.work
     opened = open_task(what.task, what.options, on_activity=on_activity)
     written: list[Written] = []
 
@@ -99,7 +97,7 @@ def _run(
     envs = list(range(min(what.episodes, env.num_envs)))
     gatherer = EpisodeGatherer(opened.description, envs, keep)
     limit = what.max_steps or opened.description.max_episode_steps or _STEPS_WITHOUT_LIMIT
-    act = _action_source(opened, what)
+    acting = _acting(what)
     begun = steps = 0
     running: set[int] = set()
     while True:
@@ -110,7 +108,7 @@ def _run(
                 begun += 1
         if not running:
             return
-        step = step_checked(env, opened.loaded, act())
+        step = step_checked(env, opened.loaded, acting.next_action(env))
         gatherer.take(_stepped(opened, step, None, sorted(running) if what.pictures else [], None))
         for index in sorted(running):
             over = bool(step.terminated[index] or step.truncated[index])
@@ -139,24 +137,11 @@ def _stepped(
     return Stepped(step, mask, captured, seeds)
 
 
-def _action_source(opened: OpenedTask, what: RecordOptions) -> Callable[[], np.ndarray]:
-    env = opened.env
-    if what.actions == "random":
-        rng = np.random.default_rng(what.options.seed)
-        return lambda: actions.random_action(env.parts, env.num_envs, rng)
-    if what.actions == "zero":
-        return lambda: zero_action(env)
-    if what.actions == "hold":
-        return lambda: actions.hold_action(env.parts, env.num_envs)
-    try:
-        policy = load_policy(what.actions)
-    except (Exception, SystemExit) as error:
-        raise TaskError(problem_from_exception(error, "policy", ())) from error
-
-    def act() -> np.ndarray:
-        try:
-            return actions.to_flat_action(env.env, env.parts, policy(env.obs))
-        except Exception as error:
-            raise TaskError(problem_from_exception(error, "policy", ())) from error
-
-    return act
+def _acting(what: RecordOptions) -> Acting:
+    acting = Acting()
+    acting.seed(what.options.seed)
+    if what.actions in ("hold", "zero", "random"):
+        acting.use(what.actions, None)
+    else:
+        acting.use("policy", what.actions)
+    return acting

@@ -106,10 +106,12 @@ class Timeline:
         """Some moments on (or back, if negative) from what is shown."""
         self.seek((self.history.last if self._shown is None else self._shown) + steps)
 
-    def seek_tick(self, tick: int) -> None:
-        """To the newest moment of this control step (`Moment.tick`), or the nearest that is kept."""
-        moments = self.history.between(self.history.first, self.history.last)
-        self.seek(max((m.serial for m in moments if m.tick <= tick), default=self.history.first))
+    def seek_step(self, env: int, step: int) -> None:
+        """To that control step of the present episode of this env, through its goings back; or the nearest kept."""
+        lived = self.history.lived(env, self.history.last)
+        serials = {int(moment.step.elapsed_steps[of]): moment.serial for moment, of in lived}
+        if serials:
+            self.seek(serials[min(serials, key=lambda known: abs(known - step))])
 
     def seek_event(self, env: int, direction: int) -> None:
         """To the next (1) or last (-1) event of this env; forward from the last one is live."""

@@ -7,13 +7,15 @@ due, make pictures if somebody looks, sleep until the next of these.
 
 The server starts it through `worker_start`, with one end of a socket pair. Whatever the loop does is noted in
 shared memory (`pulse`), and while it is the author's code it can be left by hand (`interrupts`).
+
+What is here is the loop, and what each request does to the env. How a version comes in is in `reload`, what the
+envs do next in `acting`, what is told of each step in `step_events`, and when pictures are made in `picture_maker`.
 """
 
 from __future__ import annotations
 
 import gc
 import pickle
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -25,20 +27,16 @@ import numpy as np
 import torch
 
 from workbench.authoring.problem import Problem, TaskError, problem_from_exception
-from workbench.core import actions
 from workbench.core.inspect_env import inspect_env
-from workbench.core.pictures import Picture
-from workbench.core.snapshot import Snapshot, restore_snapshot
-from workbench.core.snapshot_parts import PackedSnapshot, SnapshotPacker
+from workbench.core.snapshot import restore_snapshot
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import Request as PictureRequest
 from workbench.core.take_pictures import take_pictures
-from workbench.session.episodes import recorded_pictures
+from workbench.session.acting import Acting
 from workbench.session.interrupts import Interrupted, Interrupts
 from workbench.session.judge_moments import judge_moments
 from workbench.session.messages import (
     SCENE_KEPT,
-    ActionSource,
     DrawPast,
     EpisodeEnd,
     Event,
@@ -64,17 +62,16 @@ from workbench.session.messages import (
     SetSpeed,
     SingleStep,
     Status,
-    Stepped,
     WarmedUp,
     WarmUp,
     WatchCameras,
 )
-from workbench.session.open_task import OpenedTask, reset_checked, restore_checked, step_checked, zero_action
+from workbench.session.open_task import OpenedTask, reset_checked, restore_checked, step_checked
 from workbench.session.pacing import Pacer, Rate
 from workbench.session.picture_maker import PictureMaker
-from workbench.session.policy import Policy, load_policy
 from workbench.session.pulse import Doing, PulseWriter
 from workbench.session.reload import Running, load_version
+from workbench.session.step_events import StepEvents
 from workbench.session.warm_up import warm_up
 
 _STATUS_PERIOD = 0.25
@@ -89,24 +86,18 @@ class Worker:
         self._connection = connection
         self._pulse = pulse
         self._interrupts = Interrupts()
-        self._moment: Snapshot | None = None
         self._opened: OpenedTask | None = None
         self._loaded_by: Load | None = None
         self._last: StepResult | None = None
         self._playing = False
-        self._source: ActionSource = "random"
-        self._policy: Policy | None = None
-        self._sliders: tuple[float, ...] = ()
+        self._acting = Acting()
         self._episode_end: EpisodeEnd = "reset"
         self._pacer = Pacer(0.05)
         self._rate = Rate()
-        self._rng = np.random.default_rng(0)
         self._watch = WatchCameras(0, ())
         self._pictures = PictureMaker()
         self._renderer_ready = False
-        self._capture = SetCapture(())
-        self._packer: SnapshotPacker | None = SnapshotPacker()
-        self._number = 0
+        self._steps = StepEvents()
         self._status_sent = 0.0
         self._quit = False
         self._handlers: dict[type, Callable[[Any], None]] = {
@@ -160,11 +151,11 @@ class Worker:
 
     def _back_to_the_moment(self) -> None:
         """After a step was left half done: the batch stands again where the last one ended."""
-        if self._opened is None or self._moment is None:
+        if self._opened is None or self._steps.moment is None:
             return
         try:
             # Not `TaskEnv.restore`: that calls `evaluate`, which may be what would not end.
-            restore_snapshot(self._opened.env.env, self._moment)
+            restore_snapshot(self._opened.env.env, self._steps.moment)
         except (RuntimeError, ValueError, TypeError) as error:
             self._fail(problem_from_exception(error, "reset", self._opened.loaded.source_files))
 
@@ -217,8 +208,8 @@ class Worker:
         before, self._opened = self._opened, opened
         self._loaded_by, self._last = request, opened.first
         if report is not None and report.level in SCENE_KEPT:
-            self._watch_cameras(self._watch)
-            self._pictures.scene_changed(self._number)
+            self._look_through(self._watch)
+            self._pictures.scene_changed(self._steps.number)
             # The meshes are 9 MB for a Panda, and the server has them: 0.2 s on a reload's way to the page.
             unchanged = replace(opened.description.geometry, visuals=())
             description = replace(opened.description, geometry=unchanged)
@@ -226,12 +217,11 @@ class Worker:
             return
         self._pacer = Pacer(opened.env.control_dt, self._pacer.speed)
         if report is None or not report.carried:
-            self._rng = np.random.default_rng(request.options.seed)
+            self._acting.seed(request.options.seed)
         self._rate.clear()
-        self._sliders = ()
-        self._watch_cameras(self._watch)
-        self._capture = SetCapture(())
-        self._packer = SnapshotPacker()
+        self._acting.sliders = ()
+        self._look_through(self._watch)
+        self._steps.new_scene()
         self._send(Loaded(opened.description, opened.first, opened.milliseconds, report))
         # The past begins with the reset, and what a first step is taken back to is this.
         self._send_step(opened.first, np.ones(opened.env.num_envs, bool), opened.env.episode_seeds)
@@ -254,9 +244,9 @@ class Worker:
             return
         # The random actions start again with the seed, or "reset" would not repeat an episode.
         if request.seed is not None:
-            self._rng = np.random.default_rng(request.seed)
+            self._acting.seed(request.seed)
         count = 0 if request.env_idx is None else len(request.env_idx)
-        seed = self._fresh_seeds(count) if request.seed is None and count else request.seed
+        seed = self._acting.fresh_seeds(count) if request.seed is None and count else request.seed
         self._guarded(lambda opened: self._reset_envs(opened, request.env_idx, seed))
 
     def _set_speed(self, request: SetSpeed) -> None:
@@ -267,19 +257,20 @@ class Worker:
         self._episode_end = request.rule
 
     def _set_action_source(self, request: SetActionSource) -> None:
-        self._source = request.source
-        if request.source != "policy" or request.policy is None:
-            return
         try:
-            self._policy = load_policy(request.policy)
-        except (Exception, SystemExit, Interrupted) as error:
-            self._policy = None
-            self._fail(problem_from_exception(error, "policy", ()))
+            self._acting.use(request.source, request.policy)
+        except TaskError as error:
+            self._fail(error.problem)
 
     def _set_sliders(self, request: SetSliders) -> None:
-        self._sliders = request.action
+        self._acting.sliders = request.action
 
     def _watch_cameras(self, request: WatchCameras) -> None:
+        # The server says it again after every load, when the first picture is under way already.
+        if request != self._watch:
+            self._look_through(request)
+
+    def _look_through(self, request: WatchCameras) -> None:
         self._watch = request
         self._pictures.settle()
         if self._opened is None:
@@ -291,7 +282,7 @@ class Worker:
         self._pictures.watch(min(request.env, self._opened.env.num_envs - 1), wanted)
 
     def _set_capture(self, request: SetCapture) -> None:
-        self._capture = request
+        self._steps.captured_envs = request.env_idx
 
     def _restore(self, request: Restore) -> None:
         self._guarded(lambda opened: self._restore_envs(opened, request))
@@ -343,22 +334,17 @@ class Worker:
     def _step_once(self, opened: OpenedTask) -> None:
         if opened.env.observes_pictures:
             self._pictures.settle()  # the observation is about to draw the same scene
-        action = self._next_action(opened)
-        step = step_checked(opened.env, opened.loaded, action)
+        step = step_checked(opened.env, opened.loaded, self._acting.next_action(opened.env))
         self._rate.tick(time.monotonic())
         self._send_step(step, np.zeros(opened.env.num_envs, bool))
         ended = np.flatnonzero(step.terminated | step.truncated)
         if len(ended) == 0:
             return
         if self._episode_end == "reset":
-            self._reset_envs(opened, tuple(int(i) for i in ended), self._fresh_seeds(len(ended)))
+            self._reset_envs(opened, tuple(int(i) for i in ended), self._acting.fresh_seeds(len(ended)))
         elif self._episode_end == "pause":
             self._playing = False
             self._send_status(None)
-
-    def _fresh_seeds(self, count: int) -> list[int]:
-        # Each episode has a seed of its own, or a recording of it could not say how to start it again.
-        return [int(seed) for seed in self._rng.integers(2**31, size=count)]
 
     def _reset_envs(
         self, opened: OpenedTask, env_idx: tuple[int, ...] | None, seed: int | list[int] | None
@@ -380,23 +366,6 @@ class Worker:
         did = Restored(request.env_idx, request.source, request.origin, request.undoes, report.not_carried)
         self._send_step(step, mask, opened.env.episode_seeds, did)
 
-    def _next_action(self, opened: OpenedTask) -> np.ndarray:
-        env = opened.env
-        if self._source == "random":
-            return actions.random_action(env.parts, env.num_envs, self._rng)
-        if self._source == "zero":
-            return zero_action(env)
-        if self._source == "policy" and self._policy is not None:
-            try:
-                return actions.to_flat_action(env.env, env.parts, self._policy(env.obs))
-            except (Exception, SystemExit, Interrupted) as error:
-                raise TaskError(problem_from_exception(error, "policy", ())) from error
-        low, high = actions.bounds(env.parts)
-        if self._source == "sliders" and len(self._sliders) == len(low):
-            action = np.clip(np.asarray(self._sliders, np.float32), low, high)
-            return np.broadcast_to(action, (env.num_envs, len(low))).copy()
-        return actions.hold_action(env.parts, env.num_envs)
-
     def _send_step(
         self,
         step: StepResult,
@@ -406,46 +375,11 @@ class Worker:
     ) -> None:
         assert self._opened is not None
         self._last = step
-        self._number += 1
-        self._pictures.scene_changed(self._number)
-        captured: tuple[Picture, ...] = ()
-        if self._capture.env_idx:
-            self._pictures.settle()
-            wanted = recorded_pictures(self._opened.description.cameras)
-            for env in self._capture.env_idx:
-                captured += take_pictures(self._opened.env.env, env, wanted)
-        packed = self._packed_snapshot(self._opened)
-        self._send(
-            Stepped(
-                step,
-                reset_mask,
-                captured,
-                seeds,
-                packed.body,
-                packed.keys,
-                packed.new_parts,
-                self._number,
-                restored,
-            )
-        )
-
-    def _packed_snapshot(self, opened: OpenedTask) -> PackedSnapshot:
-        """The batch as it is; empty for a task whose state cannot be kept, which is said once."""
-        nothing = PackedSnapshot(b"", None, {})
-        if self._packer is None:
-            return nothing
-        try:
-            self._moment = opened.env.snapshot()
-            return self._packer.pack(self._moment)
-        except Exception as error:
-            # What a task keeps on itself is open: an array of objects that cannot be pickled must not end
-            # the run of a task that works.
-            self._packer = self._moment = None
-            print(
-                f"The past of this task can be looked at, but not gone back to: {type(error).__name__}: {error}",
-                file=sys.stderr,
-            )
-            return nothing
+        if self._steps.captured_envs:
+            self._pictures.settle()  # the same scene is about to be drawn
+        event = self._steps.event(self._opened, step, reset_mask, seeds, restored)
+        self._pictures.scene_changed(event.number)
+        self._send(event)
 
     # --- pictures and status -----------------------------------------------------------------------
 
@@ -459,6 +393,7 @@ class Worker:
         try:
             made = self._pictures.poll(self._opened.env, time.monotonic())
         except RuntimeError as error:
+            self._watch = WatchCameras(0, ())
             self._pictures.watch(0, ())
             self._fail(problem_from_exception(error, "pictures", self._opened.loaded.source_files))
             return

@@ -80,6 +80,7 @@ class CameraFrustums:
             self._worn[key] = picture
             return
         handle.wxyz, handle.position, handle.scale = wxyz, position, size
+        handle.fov, handle.aspect = camera.fovy, camera.width / camera.height
         if picture is not self._worn[key] and picture.rgb is not None:
             # Assigning encodes and sends it, also when it is the picture that is there already.
             self._worn[key] = picture

@@ -39,8 +39,13 @@ class _Camera:
     ticks: dict[str, viser.GuiCheckboxHandle]
     captions: dict[str, viser.GuiHtmlHandle]
     folder: viser.GuiFolderHandle
+    facts: viser.GuiHtmlHandle
     images: dict[str, viser.GuiImageHandle] = field(default_factory=dict)
     depth_span: DepthRange | None = None
+    drawn: tuple[Picture, tuple[str, ...]] | None = None
+    """What its images show."""
+    stale: bool = False
+    """Whether its pictures are said to be of another moment."""
 
     def wanted(self) -> tuple[str, ...]:
         return tuple(modality for modality, tick in self.ticks.items() if tick.value is True)
@@ -75,6 +80,7 @@ class CamerasPanel:
             self._cameras_serial = view.cameras_serial
             self._build(view.task)
         self._ask()
+        self._mark_stale(view)
         if view.pictures_serial == self._pictures_serial and view.selected_env == self._env:
             return
         if time.monotonic() - self._drawn_at < FASTEST:
@@ -83,7 +89,11 @@ class CamerasPanel:
         self._drawn_at = time.monotonic()
         for key, camera in self._cameras.items():
             picture = view.pictures.get(key)
-            if picture is not None and picture.env == view.selected_env and view.task is not None:
+            if picture is None or picture.env != view.selected_env or view.task is None:
+                continue
+            # Kinds come one after the other, and a picture that is sent again is decoded again.
+            if camera.drawn is None or camera.drawn[0] is not picture or camera.drawn[1] != camera.wanted():
+                camera.drawn = (picture, camera.wanted())
                 self._draw_camera(camera, picture, view.task, view.picture_milliseconds)
 
     def shown_pictures(self, view: SessionView) -> dict[tuple[CameraKind, str], Picture]:
@@ -95,13 +105,14 @@ class CamerasPanel:
         }
 
     def _build(self, task: TaskDescription) -> None:
-        """One folder a camera; ticks that were there under the same name stay as they were."""
+        """One folder a camera. One that is still there keeps it, with its ticks and its place on the page."""
         for key, camera in self._cameras.items():
             for modality, tick in camera.ticks.items():
                 self._remembered[(*key, modality)] = tick.value is True
-            camera.folder.remove()
-        self._cameras = {}
-        self._asked = None
+        before, self._cameras = self._cameras, {}
+        stay = {(c.kind, c.name): modalities_of(c) for c in task.cameras} if task.can_render else {}
+        for key in [key for key, camera in before.items() if stay.get(key) != tuple(camera.ticks)]:
+            before.pop(key).folder.remove()
         if not task.can_render:
             note = (
                 "This machine has no render device, so there are no pictures. "
@@ -120,30 +131,32 @@ class CamerasPanel:
         for camera in task.cameras:
             first_of_kind.setdefault(camera.kind, camera.name)
         with self._folder:
-            for info in task.cameras:
-                self._cameras[(info.kind, info.name)] = self._build_camera(
-                    info, first_of_kind[info.kind] == info.name
-                )
+            for order, info in enumerate(task.cameras):
+                key = (info.kind, info.name)
+                camera = before.get(key)
+                if camera is None:
+                    camera = self._build_camera(info, first_of_kind[info.kind] == info.name)
+                else:
+                    camera.info, camera.depth_span = info, None
+                    if camera.facts.content != facts(camera):
+                        camera.facts.content = facts(camera)
+                if camera.folder.order != order:
+                    camera.folder.order = order
+                self._cameras[key] = camera
 
     def _build_camera(self, info: CameraInfo, first: bool) -> _Camera:
         gui = self._server.gui
         folder = gui.add_folder(f"{info.name} · {KIND_NAMES[info.kind]}")
         ticks, captions = {}, {}
         with folder:
-            gui.add_html(
-                render(
-                    "camera_facts",
-                    size=f"{info.width} × {info.height}",
-                    fovy=f"{np.degrees(info.fovy):.0f}°",
-                    mount=info.mount,
-                ),
-                order=1.0,
-            )
-            for order, modality in enumerate(m for m in MODALITIES if m in info.modalities):
+            about = gui.add_html("", order=1.0)
+            for order, modality in enumerate(modalities_of(info)):
                 on = self._remembered.get((info.kind, info.name, modality), first and modality == "rgb")
                 ticks[modality] = gui.add_checkbox(modality, on, order=10.0 * order + 10)
                 captions[modality] = gui.add_html("", order=10.0 * order + 12)
-        return _Camera(info, ticks, captions, folder)
+        camera = _Camera(info, ticks, captions, folder, about)
+        about.content = facts(camera)
+        return camera
 
     def _ask(self) -> None:
         """Ask for exactly the pictures that have a tick."""
@@ -161,6 +174,16 @@ class CamerasPanel:
                 camera.captions[modality].visible = shown
                 if modality in camera.images:
                     camera.images[modality].visible = shown
+
+    def _mark_stale(self, view: SessionView) -> None:
+        """Say of pictures that are on the page, and are not of the moment that is, that they are not."""
+        for key, camera in self._cameras.items():
+            picture = view.pictures.get(key)
+            here = picture is not None and picture.env == view.selected_env
+            stale = not here and any(image.visible for image in camera.images.values())
+            if stale != camera.stale:
+                camera.stale = stale
+                camera.facts.content = facts(camera)
 
     def _draw_camera(
         self, camera: _Camera, picture: Picture, task: TaskDescription, milliseconds: float
@@ -197,3 +220,20 @@ class CamerasPanel:
                 )
         else:
             handle.image = pixels
+
+
+def modalities_of(info: CameraInfo) -> tuple[str, ...]:
+    """Those that can be shown, in the page's order."""
+    return tuple(modality for modality in MODALITIES if modality in info.modalities)
+
+
+def facts(camera: _Camera) -> str:
+    """The line under a camera's name."""
+    info = camera.info
+    return render(
+        "camera_facts",
+        size=f"{info.width} × {info.height}",
+        fovy=f"{np.degrees(info.fovy):.0f}°",
+        mount=info.mount,
+        stale=camera.stale,
+    )

@@ -37,19 +37,8 @@ HINTS = {
 class EnvPanel:
     """The table of envs in the present container."""
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        session: Session,
-        on_jump: Callable[[int, int], None] = lambda env, tick: None,
-    ) -> None:
-        """
-        Args:
-            on_jump: called with an env and a control step of the batch (`EnvRows.tick_of`) when a row was
-                pressed whose env had an outlier or whose episode ended: the moment to look at.
-        """
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
-        self._on_jump = on_jump
         self._handle = server.gui.add_html("")
         self._presses = Presses(server)
         self._column, self._descending = "env", False
@@ -146,7 +135,7 @@ class EnvPanel:
         self._session.select_env(env)
         step = moment_of(rows, env)
         if step is not None:
-            self._on_jump(env, rows.tick_of(env, step))
+            self._session.seek_step(env, step)
 
     def _choose_column(self, column: str) -> None:
         self._descending = not self._descending if column == self._column else False

@@ -112,7 +112,7 @@ class Page:
         self._timeline = TimelinePanel(server, session)
         self._env_window = server.gui.add_panel(order=5.0)
         with self._env_window.add_tab("Envs", viser.Icon.LIST_DETAILS):
-            self._envs = EnvPanel(server, session, lambda env, tick: session.seek_tick(tick))
+            self._envs = EnvPanel(server, session)
         self._env_window.dock_left()
         self._env_window.set_width(ENVS_WIDTH)
         # A strip at the edge until somebody wants it: it takes half of a small screen's view.
@@ -325,6 +325,7 @@ class Page:
             Command("A step on in time", lambda: timeline.step_by(1), "arrowright"),
             Command("To the event before", lambda: timeline.to_event(-1), "arrowleft", "shift"),
             Command("To the next event", lambda: timeline.to_event(1), "arrowright", "shift"),
+            Command("The first moment", timeline.go_to_the_first, "home"),
             Command("What is live", timeline.go_live, "end"),
             Command("Go on from here, in the selected env", timeline.go_on, "G"),
             Command(

@@ -1,0 +1,392 @@
+"""What a session knows: how the task stands, what its batch lived through, and what the page has chosen.
+
+Every event of the worker changes a little of this, and every snapshot that the page draws is made of it. What an
+event means for what is seen is one idea and worth reading alone, so there is no lock, no thread and no message
+in here: `Session` calls these methods under its lock, and sends whatever is to be sent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+from workbench.authoring.problem import Problem
+from workbench.authoring.reference import named_file
+from workbench.core.inspection import Inspection
+from workbench.core.pictures import CameraKind, Picture
+from workbench.core.step import StepResult
+from workbench.session.env_table import EnvTable
+from workbench.session.judge import JudgementView
+from workbench.session.kept_worker import Death, Vitals
+from workbench.session.last_words import Busy, death_problem, own_files_of
+from workbench.session.messages import (
+    SCENE_KEPT,
+    ActionSource,
+    CameraRequest,
+    EpisodeEnd,
+    Event,
+    Failed,
+    Load,
+    Loaded,
+    Loading,
+    LoadLevel,
+    PastPictures,
+    Pictures,
+    ReloadReport,
+    Request,
+    Restore,
+    SetActionSource,
+    SetEpisodeEnd,
+    SetSpeed,
+    Status,
+    Stepped,
+    TaskDescription,
+    TaskOptions,
+    WatchCameras,
+)
+from workbench.session.past import Past
+from workbench.session.printed import Printed
+from workbench.session.recovery import Wanted
+from workbench.session.reward_terms import TermHistory
+from workbench.session.timeline import Timeline, TimelineView
+from workbench.session.view import Curves, RecordingStatus, SessionView, State
+
+
+class Chronicle:
+    """What the batch lived through since its scene was built."""
+
+    def __init__(self, task: TaskDescription, first: StepResult, limit: int, first_serial: int) -> None:
+        """
+        Args:
+            first: the state that the task was loaded with.
+            limit: bytes that the moments may take.
+            first_serial: the number of the first moment.
+        """
+        self.timeline = Timeline(task.num_envs, limit, first_serial)
+        self.table = EnvTable(task, first)
+        self.terms = TermHistory(task.num_envs)
+        self._past = Past(task.num_envs)
+        self._curves: Curves | None = None
+
+    def add(self, event: Stepped) -> None:
+        self._past.add(event)
+        self.timeline.add(event, max(0, self._past.count - 1))
+        self.table.add(event, self.timeline.history)
+        self.terms.add(event)
+
+    def curves(self) -> Curves:
+        """Copied once for every control step, however often they are asked for."""
+        if self._curves is None or self._curves.serial != self._past.count:
+            self._curves = self._past.curves()
+        return self._curves
+
+
+@dataclass
+class LiveState:
+    """See the module's text. Not thread-safe: the session locks."""
+
+    reference: str
+    """The task that was asked for: a file, ``file.py:ClassName``, or a registered env id."""
+    options: TaskOptions
+    """How it is made, but for the seed."""
+    history_bytes: int
+    """What the past may take."""
+    # --- the worker and its task ---
+    state: State = "starting"
+    activity: str = "starting the worker"
+    stale: bool = False
+    task: TaskDescription | None = None
+    task_serial: int = 0
+    scene_serial: int = 0
+    cameras_serial: int = 0
+    reload: ReloadReport | None = None
+    load_milliseconds: dict[str, float] = field(default_factory=dict)
+    problem: Problem | None = None
+    problem_serial: int = 0
+    problem_at_run: bool = False
+    """It came while the task ran, not while a version was loaded."""
+    busy: Busy | None = None
+    # --- the batch ---
+    chronicle: Chronicle | None = None
+    """None before a task is loaded."""
+    step: StepResult | None = None
+    step_serial: int = 0
+    first_due: bool = False
+    """The next step is the one that a new scene begins with: it does not show that anything runs."""
+    pictures: dict[tuple[CameraKind, str], Picture] = field(default_factory=dict)
+    pictures_serial: int = 0
+    picture_milliseconds: float = 0.0
+    inspection: Inspection | None = None
+    playing: bool = False
+    steps_per_second: float = 0.0
+    real_time_factor: float = 0.0
+    # --- what the page has chosen ---
+    seed: int = field(init=False)
+    selected_env: int = 0
+    cameras: tuple[CameraRequest, ...] = ()
+    clients: int = 0
+    wants_play: bool = False
+    speed: float = 1.0
+    episode_end: EpisodeEnd = "reset"
+    action_source: ActionSource = "random"
+    policy: str | None = None
+    sliders: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        self.seed = self.options.seed
+        self.own_file = named_file(self.reference)
+        """The file that was named, whether or not it ever loaded; None for an env id."""
+
+    @property
+    def timeline(self) -> Timeline | None:
+        """None before a task is loaded."""
+        return None if self.chronicle is None else self.chronicle.timeline
+
+    # --- what the worker says ----------------------------------------------------------------------
+
+    def loaded(self, event: Loaded, *, restored: bool, stale: bool) -> None:
+        """A version runs.
+
+        Args:
+            restored: it is the last good one, brought back after a worker's death.
+            stale: the files hold another by now.
+        """
+        task, report = event.task, event.reload
+        if scene_kept(event) and self.task is not None:
+            # The same scene: who has drawn it can see that by its being the same object.
+            task = replace(task, geometry=self.task.geometry)
+        before, self.task = self.task, task
+        self.task_serial += 1
+        self.step, self.load_milliseconds, self.reload = event.first, event.milliseconds, report
+        self.first_due = not scene_kept(event)
+        if not scene_kept(event):
+            same = restored and before is not None and before.source_hash == task.source_hash
+            self._new_scene(task, event.first, its_past_stays=same)
+        elif self.timeline is not None:
+            self.timeline.history.renew_last(event.first)
+        if report is None or report.level not in ("same", "patched"):
+            self.cameras_serial += 1
+            self.pictures_serial += 1
+            if not scene_kept(event):
+                self.pictures = {}
+        self.activity = ""
+        self.stale = stale
+        if not restored:  # else what killed the worker still stands
+            self.set_problem(None)
+        self._runs()
+
+    def _new_scene(self, task: TaskDescription, first: StepResult, its_past_stays: bool) -> None:
+        self.scene_serial += 1
+        self.sliders = ()
+        self.selected_env = min(self.selected_env, task.num_envs - 1)
+        self.inspection = None
+        if self.timeline is None or not its_past_stays:
+            next_serial = 0 if self.timeline is None else self.timeline.history.next_serial
+            self.chronicle = Chronicle(task, first, self.history_bytes, next_serial)
+
+    def stepped(self, event: Stepped) -> None:
+        self.step = event.step
+        if self.chronicle is not None:
+            self.chronicle.add(event)
+            self.step_serial = self.chronicle.timeline.history.last
+        first, self.first_due = self.first_due, False
+        if self.problem is not None and self.problem_at_run and not first:
+            # What failed while running runs again: the task was reset, or the policy changed.
+            self.set_problem(None)
+            self._runs()
+
+    def take(self, event: Event) -> None:
+        """Any other event."""
+        if isinstance(event, Loading):
+            self.state, self.activity = "loading", event.activity
+        elif isinstance(event, Failed):
+            self.activity = ""
+            self.set_problem(event.problem)
+            self.problem_at_run = self.state != "loading"
+            self.state = "error"
+            self.stale = self.stale or not self.problem_at_run
+        elif isinstance(event, PastPictures):
+            if self.timeline is not None:
+                self.timeline.add_pictures(event)
+                self.pictures_serial += 1
+        elif isinstance(event, Pictures):
+            if self.timeline is not None:
+                self.timeline.add_pictures(event)
+            if event.pictures and event.pictures[0].env == self.selected_env:
+                # They come a kind at a time; what nobody looks through any more is not to stay.
+                watched = {(camera.kind, camera.name) for camera in self.cameras}
+                made = {(picture.kind, picture.camera): picture for picture in event.pictures}
+                self.pictures = {k: p for k, p in {**self.pictures, **made}.items() if k in watched}
+                self.pictures_serial += 1
+                self.picture_milliseconds = event.milliseconds
+        elif isinstance(event, Inspection):
+            self.inspection = event
+        elif isinstance(event, Status):
+            self.playing = event.playing
+            self.steps_per_second, self.real_time_factor = event.steps_per_second, event.real_time_factor
+            if event.activity:
+                self.state, self.activity = "loading", event.activity
+            elif self.state in ("running", "paused", "loading"):
+                self.activity = ""
+                self._runs()
+
+    def died(self, death: Death, while_loading: bool, printed: str) -> Problem | None:
+        """The worker is gone.
+
+        Args:
+            while_loading: a version was being loaded, so it is not the running one that killed it.
+            printed: the last lines.
+
+        Returns:
+            what is to be told of it; None where somebody asked for it.
+        """
+        self.playing, self.steps_per_second, self.real_time_factor = False, 0.0, 0.0
+        problem = None
+        if not death.asked or death.stack:
+            source = {} if self.task is None or while_loading else self.task.source
+            problem = death_problem(death.why, death.doing, death.stack, self.own_files(), printed, source)
+            self.set_problem(problem)
+            self.problem_at_run = not while_loading
+        if not death.file_waits:
+            self.wants_play = False
+        self.state = "stopped" if death.gives_up else "starting"
+        self.activity = "" if death.gives_up else "starting another worker"
+        return problem
+
+    def waits_for_the_file(self) -> None:
+        """A worker is up and has nothing that it could load: the problem stands."""
+        if self.state == "starting":
+            self.state, self.activity = "error", ""
+
+    def set_problem(self, problem: Problem | None) -> None:
+        self.problem = problem
+        self.problem_serial += 1
+
+    def _runs(self) -> None:
+        self.state = "running" if self.playing else "paused"
+
+    def _drop_pictures(self) -> None:
+        self.pictures = {}
+        self.pictures_serial += 1
+
+    # --- what the page asks for --------------------------------------------------------------------
+
+    def select(self, env: int) -> bool:
+        """Choose the env (the nearest that there is) whose pictures and numbers are shown. False if it was."""
+        last = 0 if self.task is None else self.task.num_envs - 1
+        chosen = min(max(env, 0), last)
+        if chosen == self.selected_env:
+            return False
+        self.selected_env = chosen
+        # The other env's picture must not stand beside this env's numbers until a new one comes.
+        self._drop_pictures()
+        return True
+
+    def choose_class(self, name: str) -> bool:
+        """Ask for another task class of the same file. False if the file has no such class."""
+        if self.task is None or self.own_file is None or name not in self.task.others:
+            return False
+        self.reference = f"{self.own_file}:{name}"
+        return True
+
+    def seek(self, seek: Callable[[Timeline], None]) -> bool:
+        """Show another moment. False if it was shown."""
+        if self.timeline is None:
+            return False
+        before = self.timeline.shown
+        seek(self.timeline)
+        if self.timeline.shown is before:
+            return False
+        self.pictures_serial += 1
+        return True
+
+    def travel(self, ask: Callable[[Timeline, int], Restore | None]) -> Restore | None:
+        """What is to be asked of the worker to put envs back, if anything."""
+        self.pictures_serial += 1
+        return None if self.timeline is None else ask(self.timeline, self.selected_env)
+
+    def load_request(self, wanted: Wanted, level: LoadLevel = "auto") -> Load:
+        options = replace(self.options, seed=self.seed)
+        return Load(self.reference, options, wanted.source, level, wanted.snapshot)
+
+    def settings(self) -> list[Request]:
+        """What has been chosen, for a worker that knows nothing of it; the cameras are told last (`watch_request`)."""
+        return [
+            SetSpeed(self.speed),
+            SetEpisodeEnd(self.episode_end),
+            SetActionSource(self.action_source, self.policy),
+        ]
+
+    def watch_request(self) -> WatchCameras:
+        """The pictures that somebody looks at; none while no page is open."""
+        return WatchCameras(self.selected_env, self.cameras if self.clients > 0 else ())
+
+    # --- what is read --------------------------------------------------------------------------------
+
+    def own_files(self) -> list[str]:
+        """The author's files, as far as they are known."""
+        return own_files_of(() if self.task is None else self.task.source_files, self.own_file)
+
+    def newest_moment(self) -> bytes | None:
+        """Pickled for `Load.snapshot`; None before a task is loaded."""
+        return (
+            None if self.timeline is None else self.timeline.history.snapshot_at(self.timeline.history.last)
+        )
+
+    def stretch(self) -> tuple[int, int] | None:
+        """See `Session.stretch`."""
+        if self.timeline is None or not len(self.timeline.history):
+            return None
+        shown, history = self.timeline.shown, self.timeline.history
+        return history.stretch_at(self.selected_env, history.last if shown is None else shown.serial)
+
+    def view(
+        self, *, recording: RecordingStatus, printed: Printed, vitals: Vitals, judgement: JudgementView
+    ) -> SessionView:
+        """A snapshot, with what others know."""
+        timeline = self.timeline
+        shown = None if timeline is None else timeline.shown
+        past = TimelineView() if timeline is None else timeline.view(self.selected_env, self.cameras)
+        return SessionView(
+            state=self.state,
+            activity=self.activity,
+            stale=self.stale,
+            task=self.task,
+            task_serial=self.task_serial,
+            scene_serial=self.scene_serial,
+            cameras_serial=self.cameras_serial,
+            reload=self.reload,
+            load_milliseconds=self.load_milliseconds,
+            step=self.step if shown is None else shown.step,
+            step_serial=self.step_serial if shown is None else shown.serial,
+            pictures=self.pictures
+            if timeline is None or shown is None
+            else timeline.pictures(self.selected_env),
+            pictures_serial=self.pictures_serial,
+            picture_milliseconds=self.picture_milliseconds,
+            problem=self.problem,
+            problem_serial=self.problem_serial,
+            curves=None if self.chronicle is None else self.chronicle.curves(),
+            selected_env=self.selected_env,
+            playing=self.playing,
+            speed=self.speed,
+            seed=self.seed,
+            episode_end=self.episode_end,
+            action_source=self.action_source,
+            policy=self.policy,
+            sliders=self.sliders,
+            steps_per_second=self.steps_per_second,
+            real_time_factor=self.real_time_factor,
+            recording=recording,
+            timeline=past,
+            printed=printed,
+            busy=self.busy,
+            vitals=vitals,
+            inspection=self.inspection,
+            judgement=judgement,
+        )
+
+
+def scene_kept(event: Loaded) -> bool:
+    """Whether the env, its episodes and its past are those that were there before."""
+    return event.reload is not None and event.reload.level in SCENE_KEPT
