@@ -118,7 +118,7 @@ class CameraCompare:
             "camera_pair",
             pictures=[data_address(picture.rgb, LARGEST) for picture in both if picture.rgb is not None],
             captions=(
-                "now" if asked is None or asked[1] == camera.now else "then",
+                "now" if asked is None or asked[1] == camera.now else "as it was then",
                 "the other" if asked is None else asked[3],
             ),
             env=both[0].env,
