@@ -1,5 +1,5 @@
-"""What can be done with the selected camera beside placing it: judge it, compare, have placements suggested, read a
-pixel, take its numbers elsewhere.
+"""What can be done with the selected camera beside placing it: judge it, compare, have placements suggested, take its
+numbers elsewhere.
 
 Each of these is a folder of its own, closed until somebody wants it. What runs in the background belongs to no single
 one of them (only one thing runs at a time), so its progress and the button that stops it stand above them all.
@@ -15,7 +15,6 @@ from workbench.session.studio_view import Progress
 from workbench.session.view import SessionView
 from workbench.ui.camera_compare import CameraCompare
 from workbench.ui.camera_export import CameraExport
-from workbench.ui.camera_pick import CameraPick
 from workbench.ui.camera_suggest import CameraSuggest
 from workbench.ui.camera_verdict import CameraVerdict
 from workbench.ui.fragments import render
@@ -32,12 +31,11 @@ class CameraJudging:
         self._bar = server.gui.add_html("", visible=False)
         self._stop = server.gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, visible=False)
         self._stop.on_click(lambda _: session.studio.stop())
-        self._pick = CameraPick(server, session)
         self._verdict = CameraVerdict(server, session)
         self._compare = CameraCompare(server, session)
         self._suggest = CameraSuggest(server, session)
         self._export = CameraExport(server, session)
-        self._parts = (self._pick, self._verdict, self._compare, self._suggest, self._export)
+        self._parts = (self._verdict, self._compare, self._suggest, self._export)
 
     def draw(self, view: SessionView) -> None:
         """Draw what is new."""
@@ -63,10 +61,9 @@ class CameraJudging:
                 part.folder.visible = there
 
     def draw_in_view(self, view: SessionView, offset: NDArray) -> None:
-        """Draw the point that was picked and the bounds of the eye.
+        """Draw the bounds of the eye.
 
         Args:
             offset: (3,) where the selected env stands in the view.
         """
-        self._pick.draw_in_view(view, offset)
         self._suggest.draw_in_view(view, offset)

@@ -1,51 +1,47 @@
-"""Read a pixel: press on a camera's picture, and be told what is there, how far it is, and where.
+"""Press on the chosen camera's picture, and be told what is there, how far it is, and where.
 
 The question behind "is the cube in the picture" is often "what is this pixel": the depth that a policy gets of it, and
 the name that its segmentation id stands for. The answer has the point in the env's own frame, where it is also marked
 in the 3-D view, so that one sees whether the camera looks at what one thinks.
+
+viser's pictures do not say where they are pressed. So a pane of our own HTML lies over the picture that stands before
+it in its container (``.wb-pane`` in page.css), as wide and as tall, and passes on where it was pressed.
 """
 
 from __future__ import annotations
-
-import time
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.core.pictures import Picture
 from workbench.session.session import Session
 from workbench.session.studio_view import Picked, StudioCamera
 from workbench.session.view import SessionView
 from workbench.ui.fragments import render
-from workbench.ui.inline_pictures import data_address
 from workbench.ui.presses import Presses
 
-REDRAW_EVERY = 0.25
-"""Seconds. The picture is sent inside of HTML, which the page builds anew each time."""
-LARGEST = 512
-"""Pixels along its longer side."""
 MARK_COLOUR = (230, 73, 128)
 MARK_SIZE = 0.05
 """Metres from the point to each end of its cross."""
 
 
 class CameraPick:
-    """The folder in the present container, and the mark in the view."""
+    """The pane over the picture before it, what was found, and the mark in the view.
 
-    def __init__(self, server: viser.ViserServer, session: Session) -> None:
-        self._server, self._session = server, session
+    Make it in the container of the picture, which must be there, and of a lower order, while the pane is shown.
+    """
+
+    def __init__(self, server: viser.ViserServer, session: Session, presses: Presses, order: float) -> None:
+        """
+        Args:
+            presses: of the tab or of a folder with a name around it (what has no name hides what comes after it).
+            order: viser's order of the elements of a container; that of the picture must be less.
+        """
+        self._session = session
         self._drawn: object = None
-        self._drawn_at = 0.0
-        with server.gui.add_folder("Read a pixel", expand_by_default=False) as self.folder:
-            self._on = server.gui.add_checkbox(
-                "Show the picture",
-                False,
-                hint="Press on the picture to be told what is there. It follows what the camera sees.",
-            )
-            self._html = server.gui.add_html("", visible=False)
-            self._presses = Presses(server)
-        self._press = self._presses.place_id("picture", lambda u, v, client: self._pick(u, v))
+        self._pane = server.gui.add_html("", order=order, visible=False)
+        self._found = server.gui.add_html("", order=order + 1, visible=False)
+        self._press = presses.place_id("picture", lambda u, v, client: self._pick(u, v))
         self._mark = PointMark(server)
 
     def _pick(self, u: float, v: float) -> None:
@@ -53,20 +49,26 @@ class CameraPick:
         if key is not None:
             self._session.studio.pick(key, u, v)
 
-    def draw(self, view: SessionView) -> None:
-        on = self._on.value is True
-        if self._html.visible != on:
-            self._html.visible = on
-        camera = view.studio.chosen
-        picture = None if camera is None else view.pictures.get(camera.key)
-        if picture is not None and (picture.rgb is None or picture.env != view.selected_env):
-            picture = None
-        picked = picked_here(view)
-        wanted = (None if camera is None else camera.key, id(picture), picked)
-        if not on or wanted == self._drawn or time.monotonic() - self._drawn_at < REDRAW_EVERY:
+    def draw(self, view: SessionView, shown: bool) -> None:
+        """Draw what is new.
+
+        Args:
+            shown: whether the picture of the chosen camera is.
+        """
+        camera, picked = view.studio.chosen, picked_here(view)
+        for handle, wanted in (
+            (self._pane, shown and camera is not None),
+            (self._found, shown and picked is not None),
+        ):
+            if handle.visible != wanted:
+                handle.visible = wanted
+        size = None if camera is None else (camera.info.width, camera.info.height)
+        if camera is None or not shown or (size, picked) == self._drawn:
             return
-        self._drawn, self._drawn_at = wanted, time.monotonic()
-        self._html.content = pick_html(camera, picture, picked, self._press)
+        self._drawn = (size, picked)
+        self._pane.content = pane_html(camera, picked, self._press)
+        if picked is not None:
+            self._found.content = found_html(picked)
 
     def draw_in_view(self, view: SessionView, offset: NDArray[np.float32]) -> None:
         """Mark the point that was picked.
@@ -74,8 +76,7 @@ class CameraPick:
         Args:
             offset: (3,) where the selected env stands in the view.
         """
-        picked = picked_here(view) if self._on.value is True else None
-        self._mark.draw(picked, offset)
+        self._mark.draw(picked_here(view), offset)
 
 
 def picked_here(view: SessionView) -> Picked | None:
@@ -86,33 +87,33 @@ def picked_here(view: SessionView) -> Picked | None:
     return picked
 
 
-def pick_html(camera: StudioCamera | None, picture: Picture | None, picked: Picked | None, press: str) -> str:
-    note = ""
-    if camera is None:
-        note = "Choose a camera first."
-    elif picture is None or picture.rgb is None:
-        note = f"Tick rgb of {camera.info.name}: its picture comes here, to be pressed."
-    rgb = None if picture is None or note else picture.rgb
-    point = None if picked is None else picked.point
-    numbers = "" if point is None else ", ".join(f"{x:.4f}" for x in point)
+def pane_html(camera: StudioCamera, picked: Picked | None, press: str) -> str:
+    now = camera.now
+    width, height = (camera.info.width, camera.info.height) if now is None else (now.width, now.height)
     return render(
-        "camera_pick",
-        note=note,
-        picture="" if rgb is None else data_address(rgb, LARGEST),
+        "camera_pane",
         press=press,
+        aspect=f"{width / height:.6f}",
+        picked=picked is not None,
         left="" if picked is None else f"{100 * picked.u:.2f}",
         top="" if picked is None else f"{100 * picked.v:.2f}",
-        picked=picked is not None and rgb is not None,
-        body="background" if picked is None or picked.body is None else picked.body,
-        pixel="" if picked is None else f"{picked.pixel[0]}, {picked.pixel[1]}",
-        depth="" if picked is None or picked.depth is None else f"{picked.depth:.4f}",
+    )
+
+
+def found_html(picked: Picked) -> str:
+    numbers = "" if picked.point is None else ", ".join(f"{x:.4f}" for x in picked.point)
+    return render(
+        "camera_found",
+        body=picked.body or "background",
+        pixel=f"{picked.pixel[0]}, {picked.pixel[1]}",
+        depth="" if picked.depth is None else f"{picked.depth:.4f}",
         point=numbers,
         copy=f"[{numbers}]",
     )
 
 
 class PointMark:
-    """A cross and its number in the view, at a point of the selected env."""
+    """A cross and the body's name in the view, at a point of the selected env."""
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
@@ -122,7 +123,7 @@ class PointMark:
 
     def draw(self, picked: Picked | None, offset: NDArray[np.float32]) -> None:
         point = None if picked is None else picked.point
-        wanted = None if point is None or picked is None else (point, offset.tobytes(), picked.depth)
+        wanted = None if point is None or picked is None else (point, offset.tobytes(), picked.body)
         if wanted == self._drawn:
             return
         self._drawn = wanted
