@@ -117,7 +117,7 @@ class CameraGizmo:
                 self._line.visible = False
         elif self._line is None:
             self._line = self._server.scene.add_line_segments(
-                "/studio/line of sight", wanted, colors=TARGET_COLOUR, thickness=2.0
+                "/studio/line of sight", wanted, colors=TARGET_COLOUR, thickness=2.0, thickness_units="screen"
             )
         else:
             self._line.points, self._line.visible = wanted, True

@@ -14,6 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from pathlib import PurePath
+from typing import Any
 
 import numpy as np
 import viser
@@ -62,7 +63,7 @@ class StudioPanel:
         gui = server.gui
         choices: tuple[str, ...] = (NOBODY,)
         self._note = gui.add_html(render("note", text="Cameras appear when the task is loaded."))
-        self._choice = Control(
+        self._choice: Control[Any, Any] = Control(
             gui.add_dropdown("Camera", choices, initial_value=NOBODY, visible=False),
             read=lambda value: self._names[checked_choice(value, self._names, "camera")],
             send=self.select,
