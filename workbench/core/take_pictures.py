@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from workbench.core import seams
 from workbench.core.body_table import BodyTable, build_body_table
+from workbench.core.camera_configs import rows_of_pose, settings_of
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 
 _MODALITIES = ("rgb", "depth", "segmentation", "position", "normal", "albedo")
@@ -50,7 +51,8 @@ def list_cameras(env: Any, table: BodyTable | None = None) -> tuple[CameraInfo, 
     table = table or (build_body_table(env) if cameras else None)
     infos = []
     for (kind, name), camera in cameras.items():
-        component = _components(camera)[0]
+        components = _components(camera)
+        component = components[0]
         gives = {m for modalities in camera.config.shader_config.texture_names.values() for m in modalities}
         mount = camera.camera.mount
         infos.append(
@@ -65,6 +67,9 @@ def list_cameras(env: Any, table: BodyTable | None = None) -> tuple[CameraInfo, 
                 intrinsic=np.array(component.get_intrinsic_matrix(), dtype=np.float32),
                 mount=None if mount is None or table is None else _body_name(mount, table),
                 modalities=tuple(m for m in _MODALITIES if m in gives),
+                settings=settings_of(camera.config),
+                varies=_varies(camera.config, components),
+                site=seams.camera_site(camera.config),
             )
         )
     return tuple(infos)
@@ -222,6 +227,13 @@ def _components(camera: Any) -> list[Any]:
     components = seams.camera_components(camera)
     assert components is not None, "only cameras that `_cameras` found come here"
     return components
+
+
+def _varies(config: Any, components: Sequence[Any]) -> bool:
+    """Whether the poses differ between envs, or are not those of the config."""
+    said = rows_of_pose(config)
+    real = np.array([[*c.local_pose.p, *c.local_pose.q] for c in components])
+    return bool((said != said[:1]).any() or np.abs(real - said[:1]).max() > 1e-5)
 
 
 def _body_name(mount: Any, table: BodyTable) -> str | None:
