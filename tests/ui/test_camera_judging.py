@@ -13,7 +13,7 @@ from workbench.core.camera_frames import matrix_of, pose_of
 from workbench.core.camera_settings import CameraSettings
 from workbench.core.pictures import CameraInfo
 from workbench.session.studio_view import StudioCamera
-from workbench.ui.camera_compare import differences
+from workbench.ui.camera_compare import what_differs
 from workbench.ui.camera_export import as_lists, file_name, matrices_html
 from workbench.ui.camera_suggest import box_edges
 
@@ -50,15 +50,15 @@ def camera(mount_pose: np.ndarray | None = None, mount: str = "panda/panda_hand"
 
 
 def test_two_placements_differ_by_how_far_and_how_much_they_were_turned() -> None:
-    assert differences(SETTINGS, SETTINGS) == []
+    assert what_differs(SETTINGS, SETTINGS) == []
     half = math.radians(5) / 2
     new = replace(SETTINGS, position=(0.3, 0.02, 0.6), quaternion=(math.cos(half), 0.0, math.sin(half), 0.0))
     old = replace(SETTINGS, quaternion=(1.0, 0.0, 0.0, 0.0))
-    assert differences(old, new) == ["moved 20.0 mm", "turned 5.00°"]
+    assert what_differs(old, new) == ["moved 20.0 mm", "turned 5.00°"]
     # The same orientation, said by the opposite quaternion.
     opposite = tuple(-number for number in SETTINGS.quaternion)
-    assert differences(SETTINGS, replace(SETTINGS, quaternion=opposite)) == []
-    assert differences(SETTINGS, replace(SETTINGS, fov=1.0, far=2.0, width=64)) == [
+    assert what_differs(SETTINGS, replace(SETTINGS, quaternion=opposite)) == []
+    assert what_differs(SETTINGS, replace(SETTINGS, fov=1.0, far=2.0, width=64)) == [
         "fov 90.0° → 57.3°",
         "128 × 128 → 64 × 128",
         "far 100 → 2 m",

@@ -122,13 +122,13 @@ class CameraCompare:
                 "the other" if asked is None else asked[3],
             ),
             env=both[0].env,
-            differences=[] if asked is None else differences(asked[2], asked[1]),
+            differences=[] if asked is None else what_differs(asked[2], asked[1]),
         )
         if self._html.content != content:
             self._html.content = content
 
 
-def differences(old: CameraSettings, new: CameraSettings) -> list[str]:
+def what_differs(old: CameraSettings, new: CameraSettings) -> list[str]:
     """What `new` has otherwise than `old`, each in a few words; empty if nothing is."""
     said = []
     moved = float(np.linalg.norm(np.subtract(new.position, old.position)))
