@@ -28,8 +28,10 @@ from workbench.session.studio_view import StudioCamera, StudioView
 from workbench.session.view import SessionView
 from workbench.ui.camera_frustums import Placed
 from workbench.ui.camera_gizmo import CameraGizmo
+from workbench.ui.camera_judging import CameraJudging
 from workbench.ui.camera_moves import Floats, Frame, Snap, nudged, panned
 from workbench.ui.camera_numbers import CameraNumbers
+from workbench.ui.camera_pick import CameraPick
 from workbench.ui.camera_writing import CameraWriting
 from workbench.ui.cameras_panel import FASTEST, KIND_NAMES
 from workbench.ui.checked import checked_choice
@@ -90,7 +92,10 @@ class StudioPanel:
         self._numbers = CameraNumbers(server, self._placing)
         self._look = LookThrough(server, self._placing)
         self._writing = CameraWriting(server, session, self._placing, self._new_from_viewer)
+        self._judging = CameraJudging(server, session)
         self._presses = Presses(server)
+        with self._picture_folder:
+            self._pick = CameraPick(server, session, self._presses, order=1.0)
         self._gizmo = CameraGizmo(
             server,
             self._placing,
@@ -123,6 +128,8 @@ class StudioPanel:
             offset: (3,) where the selected env stands in the view.
         """
         self._placing.offset = offset
+        self._judging.draw_in_view(view, offset)
+        self._pick.draw_in_view(view, offset)
         chosen = self._shown(view.studio)
         camera = chosen if view.timeline.shown is None else None
         self._look.draw(chosen)
@@ -157,6 +164,8 @@ class StudioPanel:
         self._numbers.draw(camera)
         self._writing.draw(studio)
         self._draw_picture(view)
+        self._pick.draw(view, shown=self._picture is not None and self._picture.visible)
+        self._judging.draw(view)
         if chosen is not None:
             _fill(self._facts, self._facts_of(chosen, view))
         if camera is not None:
@@ -205,7 +214,9 @@ class StudioPanel:
         self._drawn, self._drawn_at = (key, picture), time.monotonic()
         if self._picture is None:
             with self._picture_folder:
-                self._picture = self._server.gui.add_image(picture.rgb, format="jpeg", jpeg_quality=80)
+                self._picture = self._server.gui.add_image(
+                    picture.rgb, format="jpeg", jpeg_quality=80, order=0.0
+                )
         else:
             self._picture.image = picture.rgb
             _show(self._picture, True)
