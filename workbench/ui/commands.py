@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import viser
 from viser._messages import HotkeyKey, KeyModifier  # the types of add_command's arguments (viser 1.1.1)
 
-_NAMES = {"space": "Space", "arrowleft": "←", "arrowright": "→", "end": "End"}
+_NAMES = {"space": "Space", "arrowleft": "←", "arrowright": "→", "home": "Home", "end": "End"}
 
 
 @dataclass(frozen=True)
