@@ -81,8 +81,21 @@ class CameraWriting:
         self._write.on_click(lambda _: session.studio.write())
         self._undo.on_click(lambda _: session.studio.undo_write())
         self._drop.on_click(lambda _: session.studio.drop_plan())
+
+    def add_members(self, server: viser.ViserServer) -> None:
+        """The folder that adds, copies, renames and removes: last in the tab, since it is wanted least."""
+        gui = server.gui
+        with gui.add_folder("Add, copy, rename, remove", expand_by_default=False):
+            self._name = gui.add_text("New name", "", hint="Letters, digits, - and _.")
+            self._with_chosen = gui.add_button_group("", (DUPLICATE, RENAME, REMOVE), visible=False)
+            add = gui.add_button_group("", (ADD_SENSOR, ADD_HUMAN))
+            gui.add_html(
+                render(
+                    "note", text="A new camera stands where you look from. The change is shown above first."
+                )
+            )
         self._with_chosen.on_click(self._on_member)
-        self._add.on_click(self._on_member)
+        add.on_click(self._on_member)
 
     # --- asked -----------------------------------------------------------------------------------------
 
@@ -124,7 +137,7 @@ class CameraWriting:
             (studio.plan_duplicate if what == DUPLICATE else studio.plan_rename)(chosen.key, name)
 
     def _checked_name(self, view: StudioView, kind: str) -> str:
-        name = checked_text(self._name.value, LONGEST_NAME, "name").strip()
+        name = checked_text("" if self._name is None else self._name.value, LONGEST_NAME, "name").strip()
         if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_-]*", name):
             raise ValueError(
                 "Type a new name first: letters, digits, - and _."
@@ -140,14 +153,17 @@ class CameraWriting:
     def draw(self, studio: StudioView) -> None:
         chosen, writing = studio.chosen, studio.writing
         stale = self._is_stale(studio)
+        can_place = chosen is not None and not chosen.refused
         wants_plan = (
             chosen is not None
+            and can_place
             and chosen.moved
-            and not chosen.refused
             and (writing.stage not in ("planned", "written") or stale)
         )
-        _show(self._folder, wants_plan or writing.stage != "none")
-        _show(self._plan, wants_plan)
+        _show(self._plan, can_place)
+        if self._plan.disabled == wants_plan:
+            self._plan.disabled = not wants_plan
+        _show(self._text, writing.stage != "none")
         _show(self._write, writing.stage == "planned" and not stale)
         _show(self._drop, writing.stage in ("planned", "refused"))
         _show(self._undo, writing.stage in DONE)
@@ -158,7 +174,8 @@ class CameraWriting:
         text = writing_html(writing, chosen, stale)
         if self._text.content != text:
             self._text.content = text
-        _show(self._with_chosen, chosen is not None)
+        if self._with_chosen is not None:
+            _show(self._with_chosen, chosen is not None)
 
     def _is_stale(self, studio: StudioView) -> bool:
         """The camera was moved since the plan for it was made."""
@@ -193,7 +210,7 @@ def diff_lines(diff: str) -> list[tuple[str, str]]:
 
 
 def _show(
-    handle: viser.GuiFolderHandle | viser.GuiButtonHandle | viser.GuiButtonGroupHandle, shown: bool
+    handle: viser.GuiHtmlHandle | viser.GuiButtonHandle | viser.GuiButtonGroupHandle, shown: bool
 ) -> None:
     if handle.visible != shown:
         handle.visible = shown
