@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.camera_settings import CallSite, CameraKind, CameraSettings
+from workbench.core.camera_settings import CallSite, CameraKey, CameraKind, CameraSettings
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,11 @@ class CameraInfo:
     """Its pose differs between envs, or is another than its config says: the task's code moves it."""
     site: CallSite | None = None
     """Where the config was made; None where that was not noted."""
+
+    @property
+    def key(self) -> CameraKey:
+        """What tells it from all others."""
+        return self.kind, self.name
 
 
 @dataclass(frozen=True)

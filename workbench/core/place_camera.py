@@ -21,7 +21,7 @@ import sapien
 import sapien.render
 
 from workbench.core import seams
-from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.core.camera_settings import CameraKey, CameraSettings, why_no_camera
 
 
 @dataclass
@@ -79,35 +79,6 @@ class PlacedCameras:
                 self.place(env, key, placed.settings)
 
 
-def check_placeable(settings: CameraSettings) -> None:
-    """Raises ValueError, in words, for what is no camera."""
-    numbers = np.array([*settings.position, *settings.quaternion, settings.near, settings.far], np.float64)
-    if not np.isfinite(numbers).all():
-        raise ValueError("the camera's pose, near and far must be finite numbers")
-    if abs(float(np.linalg.norm(settings.quaternion)) - 1.0) > 1e-3:
-        raise ValueError("the camera's quaternion must be of unit length")
-    if not 0 < settings.near < settings.far:
-        raise ValueError(
-            f"near must be above 0 and below far, not {settings.near:g} and {settings.far:g} metres"
-        )
-    if not (1 <= settings.width <= MOST_PIXELS and 1 <= settings.height <= MOST_PIXELS):
-        raise ValueError(
-            f"width and height must be 1 to {MOST_PIXELS}, not {settings.width} x {settings.height}"
-        )
-    if (settings.fov is None) == (settings.intrinsic is None):
-        raise ValueError("a camera has either a fov or an intrinsic matrix")
-    if settings.fov is not None and not 0.0 < settings.fov < np.pi:
-        raise ValueError(f"the fov must be above 0 and below pi radians, not {settings.fov:g}")
-    if settings.intrinsic is not None:
-        k = np.array(settings.intrinsic, np.float64)
-        if k.shape != (3, 3) or not np.isfinite(k).all() or k[0, 0] <= 0 or k[1, 1] <= 0:
-            raise ValueError("the intrinsic matrix must be 3 x 3, finite, with focal lengths above 0")
-
-
-MOST_PIXELS = 4096
-"""On a side; a typing mistake of a digit more would take the memory of all envs."""
-
-
 def _cameras(env: Any, key: CameraKey) -> dict[str, Any]:
     return seams.sensors(env) if key[0] == "sensor" else seams.human_render_cameras(env)
 
@@ -138,7 +109,9 @@ def _pose(settings: CameraSettings) -> sapien.Pose:
 
 def _config(config: Any, settings: CameraSettings) -> Any:
     """The task's config with these settings: as if the author had written them."""
-    check_placeable(settings)
+    wrong = why_no_camera(settings)
+    if wrong is not None:
+        raise ValueError(wrong)
     shaders = seams.shader_packs()
     if settings.shader_pack != config.shader_pack and settings.shader_pack not in shaders:
         raise ValueError(

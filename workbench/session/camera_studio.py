@@ -1,24 +1,69 @@
 """The camera studio: cameras placed by hand, judged over the batch, and written into the author's file.
 
 The page calls the methods here, on any thread; each returns at once. What comes of them is in `StudioView`.
+
+A placement is known in three places: here (with its undo), in the worker's live cameras, and in the end in the
+author's file. What is here counts: after every version that comes in the worker is told again, so that neither a
+reload nor the end of a worker moves a camera. What is in the file counts more, when the author changed it there.
+What takes long (libcst, the disk) is done on a thread of its own, one thing after the other.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import threading
+import traceback
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from typing import Literal
 
-from workbench.core.camera_settings import CameraKey, CameraKind, CameraSettings
-from workbench.session.studio_view import StudioView
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.core.camera_settings import (
+    CameraKey,
+    CameraKind,
+    CameraSettings,
+    differences,
+    why_no_camera,
+)
+from workbench.core.pictures import CameraInfo
+from workbench.core.step import StepResult
+from workbench.session.camera_writing import CameraWriting, Wish, plan
+from workbench.session.messages import PlaceCamera, Placed, Request, TaskDescription
+from workbench.session.placements import Placements
+from workbench.session.studio_view import StudioCamera, StudioView
+
+_ON_THE_GPU = "in GPU simulation cameras cannot be moved; open the task with --backend cpu to place them"
 
 
 class CameraStudio:
     """See the module's text."""
 
+    def __init__(self, send: Callable[[Request], None], on_change: Callable[[], None]) -> None:
+        """
+        Args:
+            send: to the worker that plays.
+            on_change: called, on any thread, when `view` has something new.
+        """
+        self._send, self._on_change = send, on_change
+        self._lock = threading.Lock()
+        self._thread = ThreadPoolExecutor(1, "studio")
+        self._closing = False
+        self._serial = 0
+        self._task: TaskDescription | None = None
+        self._selected: CameraKey | None = None
+        self._problem = ""
+        self._placements = Placements()
+        self._writing = CameraWriting()
+
     # --- placing -------------------------------------------------------------------------------------
 
     def select(self, key: CameraKey | None) -> None:
         """Choose the camera that the page works on."""
+        with self._lock:
+            self._selected = key if key is None or self._info(key) is not None else self._selected
+        self._note()
 
     def place(self, key: CameraKey, settings: CameraSettings, gesture: int | None = None) -> None:
         """Place a camera, live. Of placements faster than the worker only the newest is made.
@@ -26,41 +71,96 @@ class CameraStudio:
         Args:
             gesture: calls with the same number, one behind the other, are one step of undo (a drag).
         """
+        with self._lock:
+            why_not = self._refusal(key) or why_no_camera(settings)
+            self._problem = f"{key[1]} is left where it is: {why_not}." if why_not else ""
+            request = None
+            if not why_not and self._placements.place(key, settings, gesture):
+                request = self._request(key)
+        self._send_all([request] if request else [])
 
     def undo(self) -> None:
         """Take the last step back."""
+        with self._lock:
+            step = self._placements.undo()
+            requests = [self._request(step.key)] if step is not None else []
+        self._send_all(requests)
 
     def redo(self) -> None:
         """Make the step again that was taken back last."""
+        with self._lock:
+            step = self._placements.redo()
+            requests = [self._request(step.key)] if step is not None else []
+        self._send_all(requests)
 
     def back_to_file(self, key: CameraKey) -> None:
         """Place a camera as the file says."""
+        with self._lock:
+            file = self._placements.file(key)
+            moved = file is not None and self._placements.place(
+                key, file, words=f"put {key[1]} back to the file"
+            )
+        self._send_all([PlaceCamera(key, None)] if moved else [])
 
     # --- into the file -------------------------------------------------------------------------------
 
     def plan_write(self, key: CameraKey) -> None:
         """Find the edit that writes the placement of a camera; it becomes `StudioView.writing`."""
+        with self._lock:
+            wish = Wish("edit", key, self._placements.now(key))
+        self._plan(wish)
 
     def plan_add(self, kind: CameraKind, name: str, settings: CameraSettings) -> None:
         """Find the edit that adds a camera."""
+        self._plan(Wish("add", (kind, name), settings))
 
     def plan_duplicate(self, key: CameraKey, name: str) -> None:
         """Find the edit that adds a copy of a camera, placed as that one is now."""
+        with self._lock:
+            wish = Wish("duplicate", key, self._placements.now(key), name)
+        self._plan(wish)
 
     def plan_rename(self, key: CameraKey, name: str) -> None:
         """Find the edit that gives a camera another name."""
+        with self._lock:
+            wish = Wish("rename", key, self._placements.now(key), name)
+        self._plan(wish)
 
     def plan_remove(self, key: CameraKey) -> None:
         """Find the edit that removes a camera."""
+        self._plan(Wish("remove", key, None))
+
+    def _plan(self, wish: Wish) -> None:
+        def work() -> None:
+            with self._lock:
+                task, info = self._task, self._info(wish.key)
+            if task is None:
+                return
+            writing = plan(task, info, wish)
+            with self._lock:
+                self._writing.planned(wish, writing)
+            self._note()
+
+        self._later(work)
 
     def write(self) -> None:
         """Make the planned edit; the file is reloaded, and the new camera compared with what was written."""
+        self._later(self._write, self._writing.write)
 
     def undo_write(self) -> None:
         """Take the edit that was made last out of the file again."""
+        self._later(self._write, self._writing.undo)
+
+    def _write(self, do: Callable[[], bool]) -> None:
+        with self._lock:  # the version with it must not come in before it is known to be awaited
+            do()
+        self._note()
 
     def drop_plan(self) -> None:
         """Forget the plan (or the message about the last one)."""
+        with self._lock:
+            self._writing.drop()
+        self._note()
 
     # --- judged ----------------------------------------------------------------------------------------
 
@@ -109,5 +209,158 @@ class CameraStudio:
             ValueError: with a sentence for the reader.
         """
 
-    def view(self) -> StudioView:
-        raise NotImplementedError
+    # --- what the page reads ---------------------------------------------------------------------------
+
+    def view(self, step: StepResult | None, env: int) -> StudioView:
+        """
+        Args:
+            step: of the shown moment.
+            env: the selected one.
+        """
+        with self._lock:
+            infos = () if self._task is None else self._task.cameras
+            return StudioView(
+                cameras=tuple(self._camera(info, step, env) for info in infos),
+                selected=self._selected,
+                undo=self._placements.undo_words,
+                redo=self._placements.redo_words,
+                writing=self._writing.view,
+                problem=self._problem,
+                serial=self._serial,
+            )
+
+    def _camera(self, info: CameraInfo, step: StepResult | None, env: int) -> StudioCamera:
+        key = info.key
+        return StudioCamera(
+            key=key,
+            info=info,
+            now=self._placements.now(key),
+            moved=self._placements.moved(key),
+            mount_pose=self._mount_pose(info, step, env),
+            refused=self._refusal(key) or "",
+        )
+
+    def _mount_pose(self, info: CameraInfo, step: StepResult | None, env: int) -> NDArray[np.float32] | None:
+        if info.mount is None or self._task is None or step is None:
+            return None
+        names = self._task.geometry.body_names
+        if info.mount not in names or step.poses.shape[1] != len(names) or env >= len(step.poses):
+            return None  # another version is coming in
+        return step.poses[env, names.index(info.mount)]
+
+    def _info(self, key: CameraKey) -> CameraInfo | None:
+        infos = () if self._task is None else self._task.cameras
+        return next((info for info in infos if info.key == key), None)
+
+    def _refusal(self, key: CameraKey) -> str | None:
+        info = self._info(key)
+        if info is None:
+            return f"there is no {key[0]} camera {key[1]}"
+        if self._task is not None and self._task.backend == "gpu":
+            return _ON_THE_GPU
+        if info.settings is None:
+            return "its pose is no pose, or its lens differs between envs, so one placement cannot be its"
+        return None
+
+    # --- what the session tells ------------------------------------------------------------------------
+
+    def loaded(self, task: TaskDescription) -> list[PlaceCamera]:
+        """A version runs, and what was written is compared with it. Calls nobody, so that it can be told under a lock.
+
+        Returns:
+            what is to be asked of the worker, so that its cameras stand where they are placed.
+        """
+        with self._lock:
+            self._task = task
+            said = {c.key: c.settings for c in task.cameras if c.settings is not None}
+            own: frozenset[CameraKey] = frozenset()
+            wish = self._writing.wish
+            if wish is not None and self._writing.is_in(task):
+                own = frozenset({wish.key, wish.result})
+                self._follow_the_file(wish)
+                self._writing.compare(task)
+            dropped = self._placements.loaded(said, own)
+            self._problem = ""
+            if dropped:
+                names = " and ".join(key[1] for key in dropped)
+                one = len(dropped) == 1
+                self._problem = (
+                    f"{names} {'was' if one else 'were'} changed in the file, so {'it stands' if one else 'they stand'} "
+                    "where the file says; Undo brings your placement back."
+                )
+            if self._info(self._selected or ("sensor", "")) is None:
+                self._selected = next(iter(said), None)
+            self._serial += 1
+            return [self._request(key) for key in self._placements.all_moved]
+
+    def _follow_the_file(self, wish: Wish) -> None:
+        """What an edit, or its being taken back, means for the placements: none is to be lost by it."""
+        placements, undone = self._placements, self._writing.view.stage == "undone"
+        now = placements.now(wish.key)
+        if wish.what == "rename":
+            pair = (wish.result, wish.key) if undone else (wish.key, wish.result)
+            placements.rename(*pair)
+        elif wish.what == "duplicate" and not undone and placements.moved(wish.key) and now is not None:
+            placements.keep(wish.result, now)
+        elif wish.what == "edit" and wish.settings is not None:
+            if undone and not placements.moved(wish.key):
+                placements.keep(wish.key, wish.settings)
+            elif not undone and now is not None and not differences(now, wish.settings):
+                placements.written(wish.key)  # but for what was rounded
+        if not undone and wish.what in ("add", "duplicate", "rename"):
+            self._selected = wish.result
+
+    def failed_to_load(self) -> None:
+        """A version does not load; the one before goes on."""
+        with self._lock:
+            self._writing.failed_to_load()
+        self._note()
+
+    def placed(self, event: Placed) -> None:
+        """The worker's answer to a placement."""
+        requests: list[PlaceCamera] = []
+        with self._lock:
+            task = self._task
+            if event.why_not:
+                self._problem = f"{event.key[1]} could not be placed: {event.why_not}."
+                self._placements.refused(event.key)
+                requests = [self._request(event.key)] if event.settings is not None else []
+            elif event.info is not None and task is not None:
+                infos = [event.info if c.key == event.key else c for c in task.cameras]
+                self._task = replace(task, cameras=tuple(infos))
+        self._send_all(requests)
+
+    def close(self) -> None:
+        """Wait for what is being written."""
+        with self._lock:
+            self._closing = True
+        self._thread.shutdown(wait=True, cancel_futures=True)
+
+    # --- small things ----------------------------------------------------------------------------------
+
+    def _request(self, key: CameraKey) -> PlaceCamera:
+        return PlaceCamera(key, self._placements.now(key) if self._placements.moved(key) else None)
+
+    def _send_all(self, requests: Sequence[Request]) -> None:
+        for request in requests:
+            self._send(request)
+        self._note()
+
+    def _later(self, work: Callable[..., None], *args: object) -> None:
+        with self._lock:
+            if not self._closing:
+                self._thread.submit(work, *args).add_done_callback(self._worked)
+
+    def _worked(self, future: Future[None]) -> None:
+        error = None if future.cancelled() else future.exception()
+        if error is None:
+            return
+        traceback.print_exception(error)
+        with self._lock:
+            self._problem = f"The workbench itself failed at this, and nothing was done: {error!r}"
+        self._note()
+
+    def _note(self) -> None:
+        with self._lock:
+            self._serial += 1
+        self._on_change()

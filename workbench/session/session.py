@@ -13,10 +13,12 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from workbench.authoring.watch import SourceWatcher
 from workbench.core.inspection import Section
+from workbench.session.camera_studio import CameraStudio
 from workbench.session.env_table import EnvRows
 from workbench.session.judge import FILE_SAVED, Judge, what_a_load_means
 from workbench.session.judgement import JudgedCurve, Judgement
@@ -32,6 +34,7 @@ from workbench.session.messages import (
     Inspect,
     Loaded,
     LoadLevel,
+    Placed,
     Play,
     Request,
     Reset,
@@ -102,6 +105,8 @@ class Session:
         )
         self._recorder = LiveRecorder(recordings, self._note)
         self._judge = Judge(self._note)
+        self.studio = CameraStudio(self._send, self._note)
+        """Cameras placed by hand."""
         self._watcher = SourceWatcher(self._on_files_changed)
         self._follow((), {})
         self._worker.start()
@@ -113,9 +118,10 @@ class Session:
         recording = self._recorder.status()
         printed, vitals = self._printed.view(), self._worker.vitals
         with self._lock:
-            return self._state.view(
+            view = self._state.view(
                 recording=recording, printed=printed, vitals=vitals, judgement=self._judge.view
             )
+        return replace(view, studio=self.studio.view(view.step, view.selected_env))
 
     def env_rows(self) -> EnvRows | None:
         """The row of every env; None before a task is loaded. Copies some 100 kB for 256 envs: not for every frame."""
@@ -355,6 +361,7 @@ class Session:
         self._watcher.stop()
         self._worker.stop()
         self._judge.close()
+        self.studio.close()
         self._recorder.close()
 
     # --- what the worker says, on the session's thread -------------------------------------------
@@ -406,8 +413,12 @@ class Session:
         else:
             with self._lock:
                 self._state.take(event)
+            if isinstance(event, Placed):
+                self.studio.placed(event)
             if isinstance(event, Failed):
                 self._bring_back(event)
+                if not self._state.problem_at_run:
+                    self.studio.failed_to_load()
             if isinstance(event, Failed) and event.problem.file is not None:
                 # A module beside the task that broke before the task had ever imported it whole.
                 known = self._state.task.source_files if self._state.task is not None else ()
@@ -431,12 +442,15 @@ class Session:
                 judgement = Judgement(s.timeline.history)
             stale = restored and not is_on_disk(event.task.source)
             s.loaded(event, restored=restored, stale=stale)
+            placements = self.studio.loaded(event.task)
         if judgement is not None:
             self._judge.judge(self._state.load_request(Wanted(dict(event.task.source), None)), judgement)
         elif meaning == "forget":
             self._judge.forget()
         self._follow(event.task.source_files, {} if stale else event.task.source)
         self._watch()
+        for request in placements:
+            self._send(request)
         if recording.active:
             self._record_on(event, recording.env_idx)
 
