@@ -24,6 +24,7 @@ from workbench.ui.placing import Placing
 
 DUPLICATE, RENAME, REMOVE = "Duplicate", "Rename", "Remove"
 ADD_SENSOR, ADD_HUMAN = "Add a sensor", "Add one for people"
+LEAVE, CLOSE = "Leave the file as it is", "Close"
 LONGEST_NAME = 64
 NEW = CameraSettings(
     position=(0.0, 0.0, 0.0),
@@ -56,27 +57,16 @@ class CameraWriting:
         gui = server.gui
         self._planned: tuple[CameraKey, CameraSettings | None] | None = None
         """Whose plan it is, and how that camera was placed then."""
-        self._folder = gui.add_folder("Into the file")
-        with self._folder:
-            self._plan = gui.add_button("Show the change", icon=viser.Icon.FILE_DIFF, visible=False)
-            self._text = gui.add_html("")
-            self._write = gui.add_button(
-                "Write it", icon=viser.Icon.DEVICE_FLOPPY, color="green", visible=False
-            )
-            self._undo = gui.add_button(
-                "Take it back out of the file", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
-            )
-            self._drop = gui.add_button("Leave the file as it is", color="gray", visible=False)
-        self._members = gui.add_folder("Add, copy, rename, remove", expand_by_default=False)
-        with self._members:
-            self._name = gui.add_text("New name", "", hint="Letters, digits, - and _.")
-            self._with_chosen = gui.add_button_group("", (DUPLICATE, RENAME, REMOVE), visible=False)
-            self._add = gui.add_button_group("", (ADD_SENSOR, ADD_HUMAN))
-            gui.add_html(
-                render(
-                    "note", text="A new camera stands where you look from. The change is shown above first."
-                )
-            )
+        # Always there: one that came with the first movement would push what is under it out of the hand.
+        self._plan = gui.add_button("Show the change", icon=viser.Icon.FILE_DIFF, visible=False)
+        self._text = gui.add_html("", visible=False)
+        self._write = gui.add_button("Write it", icon=viser.Icon.DEVICE_FLOPPY, color="green", visible=False)
+        self._undo = gui.add_button(
+            "Take it back out of the file", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
+        )
+        self._drop = gui.add_button(LEAVE, color="gray", visible=False)
+        self._name: viser.GuiTextHandle | None = None
+        self._with_chosen: viser.GuiButtonGroupHandle | None = None
         self._plan.on_click(lambda _: self._plan_write())
         self._write.on_click(lambda _: session.studio.write())
         self._undo.on_click(lambda _: session.studio.undo_write())
@@ -165,8 +155,11 @@ class CameraWriting:
             self._plan.disabled = not wants_plan
         _show(self._text, writing.stage != "none")
         _show(self._write, writing.stage == "planned" and not stale)
-        _show(self._drop, writing.stage in ("planned", "refused"))
+        _show(self._drop, writing.stage in ("planned", "refused", "undone"))
         _show(self._undo, writing.stage in DONE)
+        leave = LEAVE if writing.stage == "planned" else CLOSE
+        if self._drop.label != leave:
+            self._drop.label = leave
         name = "" if writing.edit is None else PurePath(writing.edit.file).name
         label = f"Write it to {name}" if name else "Write it"
         if self._write.label != label:
@@ -196,6 +189,7 @@ def writing_html(writing: Writing, chosen: StudioCamera | None, stale: bool) -> 
         mood="warn" if stale else MOODS.get(writing.stage, "plain"),
         file="" if edit is None else edit.file,
         name="" if edit is None else PurePath(edit.file).name,
+        folded=writing.stage in DONE,
         lines=[] if writing.stage == "undone" else diff_lines(diff),
         notes=() if edit is None or writing.stage == "undone" else edit.notes,
         reason="" if refusal is None or refusal.reason in writing.message else refusal.reason,
