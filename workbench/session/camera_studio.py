@@ -288,8 +288,8 @@ class CameraStudio:
                     f"{names} {'was' if one else 'were'} changed in the file, so {'it stands' if one else 'they stand'} "
                     "where the file says; Undo brings your placement back."
                 )
-            if self._info(self._selected or ("sensor", "")) is None:
-                self._selected = next(iter(said), None)
+            if self._selected is not None and self._info(self._selected) is None:
+                self._selected = None
             self._serial += 1
             # The dropped ones too: their placement may have been on its way while the version came in.
             return [self._request(key) for key in (*self._placements.all_moved, *dropped)]

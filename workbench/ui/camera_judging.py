@@ -54,8 +54,8 @@ class CameraJudging:
                 )
         for part in self._parts:
             part.draw(view)
-        # A camera that is not there has nothing to be judged: closed folders without a subject are dead controls.
-        there = bool(view.studio.cameras)
+        # Folders without a subject would be dead controls.
+        there = view.studio.chosen is not None
         for part in self._parts:
             if part.folder.visible != there:
                 part.folder.visible = there

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,6 +35,8 @@ Floats = NDArray[np.float64]
 
 NEAREST, FARTHEST, USUAL = 0.1, 3.0, 1.0
 """Metres in front of the eye at which the target of a camera is put that has none yet."""
+SAME = 1e-7
+"""Metres, and parts of a unit quaternion: what viser's numbers of 32 bit may differ by."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,13 @@ class Frame:
         """The same camera, at this pose (7,) of the view."""
         there = np.array(pose, np.float64)
         there[:3] -= self.offset
-        return with_pose(settings, there if self.mount is None else relative_to(self.mount, there))
+        moved = with_pose(settings, there if self.mount is None else relative_to(self.mount, there))
+        # There and back costs last digits: what was not moved is not said anew.
+        if np.allclose(moved.position, settings.position, rtol=0, atol=SAME):
+            moved = replace(moved, position=settings.position)
+        if np.allclose(moved.quaternion, settings.quaternion, rtol=0, atol=SAME):
+            moved = replace(moved, quaternion=settings.quaternion)
+        return moved
 
     def point_to_view(self, point: ArrayLike) -> Floats:
         """(3,) of a point (3,) that is said as the camera's position is."""

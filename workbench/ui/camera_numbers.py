@@ -172,7 +172,8 @@ class CameraNumbers:
             _show(control.handle, said == name)
         _show(self._left, said == AXES)
         if said == RPY:
-            self._rpy.show(rpy_of(now.quaternion))
+            # Half a turn is the same both ways round; it would flicker between the two.
+            self._rpy.show([180.0 if round(a, DEGREES) == -180 else a for a in rpy_of(now.quaternion)])
         elif said == WXYZ:
             self._wxyz.show(" ".join(f"{n:.{QUATERNION}f}" for n in rounded(now.quaternion, QUATERNION)))
         else:

@@ -28,19 +28,19 @@ MARK_SIZE = 0.05
 class CameraPick:
     """The pane over the picture before it, what was found, and the mark in the view.
 
-    Make it in the container of the picture, which must be there, and of a lower order, while the pane is shown.
+    Make it in the container of the picture, which must be the last before it.
     """
 
-    def __init__(self, server: viser.ViserServer, session: Session, presses: Presses, order: float) -> None:
+    def __init__(self, server: viser.ViserServer, session: Session, presses: Presses) -> None:
         """
         Args:
             presses: of the tab or of a folder with a name around it (what has no name hides what comes after it).
-            order: viser's order of the elements of a container; that of the picture must be less.
         """
         self._session = session
         self._drawn: object = None
-        self._pane = server.gui.add_html("", order=order, visible=False)
-        self._found = server.gui.add_html("", order=order + 1, visible=False)
+        # After a picture that is put into the container later.
+        self._pane = server.gui.add_html("", order=1e5, visible=False)
+        self._found = server.gui.add_html("", order=1e5 + 1, visible=False)
         self._press = presses.place_id("picture", lambda u, v, client: self._pick(u, v))
         self._mark = PointMark(server)
 
@@ -62,7 +62,7 @@ class CameraPick:
         ):
             if handle.visible != wanted:
                 handle.visible = wanted
-        size = None if camera is None else (camera.info.width, camera.info.height)
+        size = None if camera is None else _size(camera)
         if camera is None or not shown or (size, picked) == self._drawn:
             return
         self._drawn = (size, picked)
@@ -88,8 +88,7 @@ def picked_here(view: SessionView) -> Picked | None:
 
 
 def pane_html(camera: StudioCamera, picked: Picked | None, press: str) -> str:
-    now = camera.now
-    width, height = (camera.info.width, camera.info.height) if now is None else (now.width, now.height)
+    width, height = _size(camera)
     return render(
         "camera_pane",
         press=press,
@@ -98,6 +97,11 @@ def pane_html(camera: StudioCamera, picked: Picked | None, press: str) -> str:
         left="" if picked is None else f"{100 * picked.u:.2f}",
         top="" if picked is None else f"{100 * picked.v:.2f}",
     )
+
+
+def _size(camera: StudioCamera) -> tuple[int, int]:
+    said = camera.info if camera.now is None else camera.now
+    return said.width, said.height
 
 
 def found_html(picked: Picked) -> str:

@@ -24,6 +24,7 @@ from workbench.ui.placing import Placing
 
 DUPLICATE, RENAME, REMOVE = "Duplicate", "Rename", "Remove"
 ADD_SENSOR, ADD_HUMAN = "Add a sensor", "Add one for people"
+LEAVE, CLOSE = "Leave the file as it is", "Close"
 LONGEST_NAME = 64
 NEW = CameraSettings(
     position=(0.0, 0.0, 0.0),
@@ -56,33 +57,35 @@ class CameraWriting:
         gui = server.gui
         self._planned: tuple[CameraKey, CameraSettings | None] | None = None
         """Whose plan it is, and how that camera was placed then."""
-        self._folder = gui.add_folder("Into the file")
-        with self._folder:
-            self._plan = gui.add_button("Show the change", icon=viser.Icon.FILE_DIFF, visible=False)
-            self._text = gui.add_html("")
-            self._write = gui.add_button(
-                "Write it", icon=viser.Icon.DEVICE_FLOPPY, color="green", visible=False
-            )
-            self._undo = gui.add_button(
-                "Take it back out of the file", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
-            )
-            self._drop = gui.add_button("Leave the file as it is", color="gray", visible=False)
-        self._members = gui.add_folder("Add, copy, rename, remove", expand_by_default=False)
-        with self._members:
+        # Always there: one that came with the first movement would push what is under it out of the hand.
+        self._plan = gui.add_button("Show the change", icon=viser.Icon.FILE_DIFF, visible=False)
+        self._text = gui.add_html("", visible=False)
+        self._write = gui.add_button("Write it", icon=viser.Icon.DEVICE_FLOPPY, color="green", visible=False)
+        self._undo = gui.add_button(
+            "Take it back out of the file", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
+        )
+        self._drop = gui.add_button(LEAVE, color="gray", visible=False)
+        self._name: viser.GuiTextHandle | None = None
+        self._with_chosen: viser.GuiButtonGroupHandle | None = None
+        self._plan.on_click(lambda _: self._plan_write())
+        self._write.on_click(lambda _: session.studio.write())
+        self._undo.on_click(lambda _: session.studio.undo_write())
+        self._drop.on_click(lambda _: session.studio.drop_plan())
+
+    def add_members(self, server: viser.ViserServer) -> None:
+        """The folder that adds, copies, renames and removes: last in the tab, since it is wanted least."""
+        gui = server.gui
+        with gui.add_folder("Add, copy, rename, remove", expand_by_default=False):
             self._name = gui.add_text("New name", "", hint="Letters, digits, - and _.")
             self._with_chosen = gui.add_button_group("", (DUPLICATE, RENAME, REMOVE), visible=False)
-            self._add = gui.add_button_group("", (ADD_SENSOR, ADD_HUMAN))
+            add = gui.add_button_group("", (ADD_SENSOR, ADD_HUMAN))
             gui.add_html(
                 render(
                     "note", text="A new camera stands where you look from. The change is shown above first."
                 )
             )
-        self._plan.on_click(lambda _: self._plan_write())
-        self._write.on_click(lambda _: session.studio.write())
-        self._undo.on_click(lambda _: session.studio.undo_write())
-        self._drop.on_click(lambda _: session.studio.drop_plan())
         self._with_chosen.on_click(self._on_member)
-        self._add.on_click(self._on_member)
+        add.on_click(self._on_member)
 
     # --- asked -----------------------------------------------------------------------------------------
 
@@ -124,7 +127,7 @@ class CameraWriting:
             (studio.plan_duplicate if what == DUPLICATE else studio.plan_rename)(chosen.key, name)
 
     def _checked_name(self, view: StudioView, kind: str) -> str:
-        name = checked_text(self._name.value, LONGEST_NAME, "name").strip()
+        name = checked_text("" if self._name is None else self._name.value, LONGEST_NAME, "name").strip()
         if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_-]*", name):
             raise ValueError(
                 "Type a new name first: letters, digits, - and _."
@@ -140,17 +143,23 @@ class CameraWriting:
     def draw(self, studio: StudioView) -> None:
         chosen, writing = studio.chosen, studio.writing
         stale = self._is_stale(studio)
+        can_place = chosen is not None and not chosen.refused
         wants_plan = (
             chosen is not None
+            and can_place
             and chosen.moved
-            and not chosen.refused
             and (writing.stage not in ("planned", "written") or stale)
         )
-        _show(self._folder, wants_plan or writing.stage != "none")
-        _show(self._plan, wants_plan)
+        _show(self._plan, can_place)
+        if self._plan.disabled == wants_plan:
+            self._plan.disabled = not wants_plan
+        _show(self._text, writing.stage != "none")
         _show(self._write, writing.stage == "planned" and not stale)
-        _show(self._drop, writing.stage in ("planned", "refused"))
+        _show(self._drop, writing.stage in ("planned", "refused", "undone"))
         _show(self._undo, writing.stage in DONE)
+        leave = LEAVE if writing.stage == "planned" else CLOSE
+        if self._drop.label != leave:
+            self._drop.label = leave
         name = "" if writing.edit is None else PurePath(writing.edit.file).name
         label = f"Write it to {name}" if name else "Write it"
         if self._write.label != label:
@@ -158,7 +167,8 @@ class CameraWriting:
         text = writing_html(writing, chosen, stale)
         if self._text.content != text:
             self._text.content = text
-        _show(self._with_chosen, chosen is not None)
+        if self._with_chosen is not None:
+            _show(self._with_chosen, chosen is not None)
 
     def _is_stale(self, studio: StudioView) -> bool:
         """The camera was moved since the plan for it was made."""
@@ -179,6 +189,7 @@ def writing_html(writing: Writing, chosen: StudioCamera | None, stale: bool) -> 
         mood="warn" if stale else MOODS.get(writing.stage, "plain"),
         file="" if edit is None else edit.file,
         name="" if edit is None else PurePath(edit.file).name,
+        folded=writing.stage in DONE,
         lines=[] if writing.stage == "undone" else diff_lines(diff),
         notes=() if edit is None or writing.stage == "undone" else edit.notes,
         reason="" if refusal is None or refusal.reason in writing.message else refusal.reason,
@@ -193,7 +204,7 @@ def diff_lines(diff: str) -> list[tuple[str, str]]:
 
 
 def _show(
-    handle: viser.GuiFolderHandle | viser.GuiButtonHandle | viser.GuiButtonGroupHandle, shown: bool
+    handle: viser.GuiHtmlHandle | viser.GuiButtonHandle | viser.GuiButtonGroupHandle, shown: bool
 ) -> None:
     if handle.visible != shown:
         handle.visible = shown

@@ -43,9 +43,7 @@ from workbench.ui.placing import Placing
 from workbench.ui.presses import Presses
 
 NOBODY = "none"
-SNAPS = {"off": Snap(), "1 cm, 5°": Snap(0.01, 5.0), "5 cm, 15°": Snap(0.05, 15.0)}
-MOVE, LOOK_AT = "move and turn", "eye and target"
-WORLD, OWN = "the world's axes", "the camera's own axes"
+SNAPS = {"none": Snap(), "1 cm, 5°": Snap(0.01, 5.0), "5 cm, 15°": Snap(0.05, 15.0)}
 STEP = 0.01
 """Metres by which a key moves the camera."""
 TURN = 1.0
@@ -62,6 +60,7 @@ class StudioPanel:
         self._picture: viser.GuiImageHandle | None = None
         self._drawn: tuple[CameraKey, Picture] | None = None
         self._drawn_at = 0.0
+        self._look_at, self._own_axes, self._snap = False, False, Snap()
         gui = server.gui
         choices: tuple[str, ...] = (NOBODY,)
         self._note = gui.add_html(render("note", text="Cameras appear when the task is loaded."))
@@ -72,36 +71,25 @@ class StudioPanel:
             shown=self._name_of,
         )
         self._picture_folder = gui.add_folder(None)
+        with self._picture_folder:
+            gui.add_html(render("studio_picture"))
         self._facts = gui.add_html("", visible=False)
         self._tools = gui.add_html("", visible=False)
-        self._handles = gui.add_folder("Handles in the view", visible=False)
-        with self._handles:
-            self._mode = gui.add_dropdown(
-                "Handles",
-                (MOVE, LOOK_AT),
-                initial_value=MOVE,
-                hint="One to move and turn it; or one on the eye and one on what it looks at.",
-            )
-            self._axes = gui.add_dropdown(
-                "Along",
-                (WORLD, OWN),
-                initial_value=WORLD,
-                hint="The camera's own: red forward, green left, blue up.",
-            )
-            self._snap = gui.add_dropdown("In steps of", tuple(SNAPS), initial_value="off")
-        self._numbers = CameraNumbers(server, self._placing)
         self._look = LookThrough(server, self._placing)
         self._writing = CameraWriting(server, session, self._placing, self._new_from_viewer)
+        self._handles = gui.add_html("", visible=False)
+        self._numbers = CameraNumbers(server, self._placing)
+        self._writing.add_members(server)
         self._judging = CameraJudging(server, session)
         self._presses = Presses(server)
         with self._picture_folder:
-            self._pick = CameraPick(server, session, self._presses, order=1.0)
+            self._pick = CameraPick(server, session, self._presses)
         self._gizmo = CameraGizmo(
             server,
             self._placing,
-            snap=lambda: SNAPS.get(self._snap.value, Snap()),
-            own_axes=lambda: self._axes.value == OWN,
-            look_at=lambda: self._mode.value == LOOK_AT,
+            snap=lambda: self._snap,
+            own_axes=lambda: self._own_axes,
+            look_at=lambda: self._look_at,
         )
 
     # --- chosen ------------------------------------------------------------------------------------------
@@ -160,7 +148,6 @@ class StudioPanel:
         _show(self._facts, chosen is not None)
         _show(self._tools, camera is not None)
         _show(self._handles, camera is not None)
-        _show(self._axes, self._mode.value == MOVE)
         self._numbers.draw(camera)
         self._writing.draw(studio)
         self._draw_picture(view)
@@ -170,6 +157,7 @@ class StudioPanel:
             _fill(self._facts, self._facts_of(chosen, view))
         if camera is not None:
             _fill(self._tools, self._tools_of(camera, studio))
+            _fill(self._handles, self._handles_of())
 
     def _draw_choice(self, view: SessionView) -> None:
         studio = view.studio
@@ -214,9 +202,7 @@ class StudioPanel:
         self._drawn, self._drawn_at = (key, picture), time.monotonic()
         if self._picture is None:
             with self._picture_folder:
-                self._picture = self._server.gui.add_image(
-                    picture.rgb, format="jpeg", jpeg_quality=80, order=0.0
-                )
+                self._picture = self._server.gui.add_image(picture.rgb, format="jpeg", jpeg_quality=80)
         else:
             self._picture.image = picture.rgb
             _show(self._picture, True)
@@ -283,6 +269,67 @@ class StudioPanel:
             ],
         ]
         return render("studio_tools", rows=rows)
+
+    def _handles_of(self) -> str:
+        """What is dragged in the view, along which axes, in which steps."""
+        rows = [
+            [
+                {"label": "Drag"},
+                self._tool(
+                    "move, turn",
+                    "Move and turn the camera.",
+                    "move",
+                    self._sets(look_at=False),
+                    not self._look_at,
+                ),
+                self._tool(
+                    "eye, target",
+                    "Move the eye, or what it looks at.",
+                    "look at",
+                    self._sets(look_at=True),
+                    self._look_at,
+                ),
+            ],
+            [
+                {"label": "Along"},
+                self._tool(
+                    "world",
+                    "The world's axes.",
+                    "world",
+                    self._sets(own_axes=False),
+                    not self._own_axes,
+                    self._look_at,
+                ),
+                self._tool(
+                    "camera",
+                    "Its own: red is forward, green left, blue up.",
+                    "own",
+                    self._sets(own_axes=True),
+                    self._own_axes,
+                    self._look_at,
+                ),
+            ],
+            [
+                {"label": "Steps"},
+                *(
+                    self._tool(
+                        name, "Of what is dragged.", f"snap {name}", self._sets(snap=snap), self._snap == snap
+                    )
+                    for name, snap in SNAPS.items()
+                ),
+            ],
+        ]
+        return render("studio_tools", rows=rows)
+
+    def _sets(
+        self, look_at: bool | None = None, own_axes: bool | None = None, snap: Snap | None = None
+    ) -> Callable[[viser.ClientHandle | None], None]:
+        def pressed(_: viser.ClientHandle | None) -> None:
+            self._look_at = self._look_at if look_at is None else look_at
+            self._own_axes = self._own_axes if own_axes is None else own_axes
+            self._snap = self._snap if snap is None else snap
+
+        return pressed
 
     def _tool(
         self,
