@@ -30,7 +30,6 @@ from workbench.core.camera_configs import rows_of_pose, settings_of
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 
 _MODALITIES = ("rgb", "depth", "segmentation", "position", "normal", "albedo")
-_TAKEN = ("rgb", "depth", "segmentation")
 _INT16_END = 32.767
 """Metres. The minimal shader writes positions as int16 millimetres."""
 
@@ -252,8 +251,8 @@ def _check(
         raise ValueError(f"there is no {kind} camera {name!r} to take a picture with; there are: {there}")
     gives = {m for ms in camera.config.shader_config.texture_names.values() for m in ms}
     for modality in modalities:
-        if modality not in _TAKEN:
-            raise ValueError(f"{modality!r} cannot be shown; ask for some of {', '.join(_TAKEN)}")
+        if modality not in _MODALITIES:
+            raise ValueError(f"{modality!r} cannot be shown; ask for some of {', '.join(_MODALITIES)}")
         if modality not in gives:
             pack = camera.config.shader_config.shader_pack
             raise ValueError(f"camera {name!r} gives no {modality} with the shader pack {pack!r}")
@@ -308,7 +307,7 @@ def _read(
         made.update({m: image[0] for m, image in transformed.items() if m in modalities})
         if "depth" in gives and "depth" in modalities:
             depth = depth_in_metres(texture, data, made["depth"].numpy()[..., 0], component)
-    segmentation = made.get("segmentation")
+    segmentation, position, normal = (made.get(m) for m in ("segmentation", "position", "normal"))
     return Picture(
         camera=name,
         kind=kind,
@@ -317,6 +316,9 @@ def _read(
         rgb=np.ascontiguousarray(made["rgb"].numpy()) if "rgb" in made else None,
         depth=depth,
         segmentation=None if segmentation is None else segmentation.numpy()[..., 0].astype(np.int32),
+        position=None if position is None else position.numpy().astype(np.float32) / np.float32(1000.0),
+        normal=None if normal is None else np.ascontiguousarray(normal.numpy(), dtype=np.float32),
+        albedo=np.ascontiguousarray(made["albedo"].numpy()) if "albedo" in made else None,
     )
 
 

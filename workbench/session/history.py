@@ -403,5 +403,8 @@ def _step_bytes(step: StepResult) -> int:
 
 
 def _picture_bytes(picture: Picture) -> int:
-    arrays = (picture.rgb, picture.depth, picture.segmentation)
+    arrays = (
+        *(picture.rgb, picture.depth, picture.segmentation),
+        *(picture.position, picture.normal, picture.albedo),
+    )
     return 300 + sum(array.nbytes for array in arrays if array is not None)

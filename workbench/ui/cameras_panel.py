@@ -22,6 +22,8 @@ from workbench.session.view import SessionView
 from workbench.ui.false_colour import (
     DepthRange,
     colour_depth,
+    colour_normal,
+    colour_position,
     colour_segmentation,
     depth_range,
     segments_seen,
@@ -30,7 +32,9 @@ from workbench.ui.fragments import render
 
 FASTEST = 1 / 15
 """Seconds between two pictures of one camera."""
-MODALITIES = ("rgb", "depth", "segmentation")
+MODALITIES = ("rgb", "depth", "segmentation", "position", "normal", "albedo")
+POSITION_CAPTION = "red, green, blue: right, up, towards the camera; each over its own range in this picture"
+NORMAL_CAPTION = "red, green, blue: right, up, towards the camera"
 KIND_NAMES: dict[CameraKind, str] = {"sensor": "sensor", "human": "for people"}
 
 
@@ -216,6 +220,14 @@ class CamerasPanel:
             self._draw_image(camera, "segmentation", colour_segmentation(picture.segmentation))
             legend, more = segments_seen(picture.segmentation, task.segmentation)
             camera.captions["segmentation"].content = render("segmentation_caption", legend=legend, more=more)
+        if "position" in wanted and picture.position is not None:
+            self._draw_image(camera, "position", colour_position(picture.position))
+            camera.captions["position"].content = render("note", text=POSITION_CAPTION)
+        if "normal" in wanted and picture.normal is not None:
+            self._draw_image(camera, "normal", colour_normal(picture.normal))
+            camera.captions["normal"].content = render("note", text=NORMAL_CAPTION)
+        if "albedo" in wanted and picture.albedo is not None:
+            self._draw_image(camera, "albedo", picture.albedo)
 
     def _draw_image(self, camera: _Camera, modality: str, pixels: np.ndarray) -> None:
         handle = camera.images.get(modality)
