@@ -16,6 +16,7 @@ from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera
 from workbench.session.view import SessionView
+from workbench.ui.camera_work import WorkBar
 from workbench.ui.checked import checked_choice
 from workbench.ui.fragments import render
 from workbench.ui.inline_pictures import data_address
@@ -46,6 +47,7 @@ class CameraCompare:
                 hint="To compare it later, or return to it.",
             )
             self._compare = server.gui.add_button("Compare", icon=viser.Icon.COLUMNS_2)
+            self._bar = WorkBar(server, session)
             self._html = server.gui.add_html("", visible=False)
             self._take = server.gui.add_button(
                 "Place it as A", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
@@ -86,12 +88,14 @@ class CameraCompare:
             return
         other = camera.info.settings if choice == FILE else self._kept[camera.key]
         self._asked = (camera.key, camera.now, other, choice)
+        self._bar.asked()
         self._session.studio.compare(camera.key, other)
 
     def draw(self, view: SessionView) -> None:
         studio = view.studio
         camera = studio.chosen
         usable = camera is not None and camera.now is not None
+        self._bar.draw(studio.progress)
         for button in (self._keep, self._compare):
             if button.disabled == usable:
                 button.disabled = not usable

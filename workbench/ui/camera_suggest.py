@@ -1,24 +1,23 @@
 """Suggest placements: what must be seen, where the eye may be, and the best five with their pictures.
 
-The bounds are two corners of a box, in the frame in which the camera's own numbers are said (its mount's, if it rides
-on a body), and begin as a box round the eye. They follow the camera until somebody writes into them. The box is drawn
-in the view on demand.
+The bounds are two corners of a box in the env's frame, and begin as a box round the eye. They follow the camera until
+somebody writes into them. The box is drawn in the view on demand. A camera that rides on a body has no such place to
+search for, and the folder says so.
 """
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.core import camera_frames as frames
 from workbench.core.camera_settings import CameraKey
+from workbench.core.camera_suggestion import OfferedPlacement
 from workbench.session.messages import TaskDescription
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera, StudioView
 from workbench.session.view import SessionView
+from workbench.ui.camera_work import WorkBar
 from workbench.ui.checked import checked_int, checked_number
 from workbench.ui.fragments import render
 from workbench.ui.inline_pictures import data_address
@@ -47,6 +46,7 @@ class CameraSuggest:
         self._drawn: object = None
         self._drawn_names: object = None
         with server.gui.add_folder("Suggest a placement", expand_by_default=False) as self.folder:
+            self._mounted = server.gui.add_html("", visible=False)
             self._objects = server.gui.add_html("")
             self._low = server.gui.add_vector3(
                 "Eye from",
@@ -57,7 +57,6 @@ class CameraSuggest:
             self._high = server.gui.add_vector3(
                 "Eye to", (0.0, 0.0, 0.0), step=0.05, hint="Highest corner of that box, metres."
             )
-            self._frame = server.gui.add_html("", visible=False)
             self._show_box = server.gui.add_checkbox(
                 "Draw this box", False, hint="In the 3-D view, in the selected env."
             )
@@ -67,9 +66,10 @@ class CameraSuggest:
                 min=1,
                 max=MOST_RESETS,
                 step=1,
-                hint="Freshly reset envs over which a placement is judged.",
+                hint="Freshly reset envs in which a placement is judged; as many as there are envs at most.",
             )
             self._search = server.gui.add_button("Search", icon=viser.Icon.SEARCH)
+            self._bar = WorkBar(server, session)
             self._offers = server.gui.add_html("", visible=False)
             self._presses = Presses(server)
         self._search.on_click(self._ask)
@@ -114,17 +114,18 @@ class CameraSuggest:
                     "Not possible", str(error), color="orange", auto_close_seconds=6.0
                 )
             return
+        self._bar.asked()
         self._session.studio.suggest(key, wanted, low, high, resets)
 
     # --- drawn ---------------------------------------------------------------------------------------
 
     def draw(self, view: SessionView) -> None:
         studio, camera = view.studio, view.studio.chosen
-        able = (
-            camera is not None and camera.now is not None and not camera.refused and studio.progress is None
-        )
+        able = camera is not None and camera.now is not None and not camera.refused
         if self._search.disabled == able:
             self._search.disabled = not able
+        self._bar.draw(studio.progress)
+        self._draw_controls(camera)
         self._draw_bounds(camera)
         self._draw_names(view, studio)
         wanted = (id(studio.suggestions), studio.selected, None if camera is None else camera.now)
@@ -138,6 +139,20 @@ class CameraSuggest:
             content = self._offers_html(studio.suggestions, camera)
             if self._offers.content != content:
                 self._offers.content = content
+
+    def _draw_controls(self, camera: StudioCamera | None) -> None:
+        mount = None if camera is None else camera.info.mount
+        for handle in (self._objects, self._low, self._high, self._show_box, self._resets, self._search):
+            if handle.visible != (mount is None):
+                handle.visible = mount is None
+        if self._mounted.visible != (mount is not None):
+            self._mounted.visible = mount is not None
+        if mount is not None:
+            content = render(
+                "note", text=f"It rides on {mount}: places are searched for cameras that stand still."
+            )
+            if self._mounted.content != content:
+                self._mounted.content = content
 
     def _draw_bounds(self, camera: StudioCamera | None) -> None:
         if camera is None or camera.now is None:
@@ -175,16 +190,18 @@ class CameraSuggest:
             ],
         )
 
-    def _offers_html(self, suggestions: tuple[Any, ...], camera: StudioCamera) -> str:
+    def _offers_html(self, suggestions: tuple[OfferedPlacement, ...], camera: StudioCamera) -> str:
         return render(
             "camera_offers",
             offers=[
                 {
-                    "picture": data_address(offer.picture.rgb, LARGEST),
+                    "picture": "" if offer.picture.rgb is None else data_address(offer.picture.rgb, LARGEST),
                     "score": f"{offer.score:.2f}",
                     "words": offer.words,
                     "eye": ", ".join(f"{x:.2f}" for x in offer.settings.position),
-                    "taken": offer.settings == camera.now,
+                    "taken": camera.now is not None
+                    and (offer.settings.position, offer.settings.quaternion)
+                    == (camera.now.position, camera.now.quaternion),
                     "press": self._presses.id_of(
                         ("take", i), lambda _, i=i: self._session.studio.take_suggestion(i)
                     ),
@@ -200,7 +217,7 @@ class CameraSuggest:
             offset: (3,) where the selected env stands in the view.
         """
         camera = view.studio.chosen
-        if self._show_box.value is not True or camera is None:
+        if self._show_box.value is not True or camera is None or camera.info.mount is not None:
             self._box.draw(None, offset)
             return
         try:
@@ -208,7 +225,7 @@ class CameraSuggest:
         except ValueError:
             self._box.draw(None, offset)
             return
-        self._box.draw(box_edges(low, high, camera.mount_pose), offset)
+        self._box.draw(box_edges(low, high), offset)
 
 
 def objects_of(task: TaskDescription, studio: StudioView) -> tuple[str, ...]:
@@ -222,16 +239,10 @@ def objects_of(task: TaskDescription, studio: StudioView) -> tuple[str, ...]:
     return tuple(name for name, kind in names if kind == "dynamic")
 
 
-def box_edges(low: Corner, high: Corner, mount: NDArray[np.float32] | None) -> NDArray[np.float32]:
-    """(12, 2, 3) the edges of a box, in the env's frame.
-
-    Args:
-        mount: (7,) pose of the frame that the corners are in; None for the env's.
-    """
+def box_edges(low: Corner, high: Corner) -> NDArray[np.float32]:
+    """(12, 2, 3) the edges of a box."""
     picks = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
     corners = np.where(picks == 0, low, high)
-    if mount is not None:
-        corners = corners @ frames.rotation_matrix(mount[3:]).T + mount[:3]
     pairs = [(i, j) for i in range(8) for j in range(i) if np.abs(picks[i] - picks[j]).sum() == 1]
     return corners[np.array(pairs)].astype(np.float32)
 

@@ -12,12 +12,12 @@ from dataclasses import replace
 import viser
 
 from workbench.core.camera_report import CameraReport
-from workbench.core.camera_settings import CameraKey
 from workbench.core.pictures import Picture
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera, StudioView
 from workbench.session.view import SessionView
 from workbench.ui import camera_report_words as words
+from workbench.ui.camera_work import WorkBar
 from workbench.ui.checked import checked_choice, checked_int
 from workbench.ui.fragments import render
 from workbench.ui.inline_pictures import data_address
@@ -38,8 +38,6 @@ class CameraVerdict:
         self._session = session
         self._drawn: object = None
         self._drawn_sheet: object = None
-        self._asked: dict[CameraKey, int] = {}
-        """Camera to how many resets it was judged over; 0 for the envs as they are."""
         with server.gui.add_folder("Judge", expand_by_default=False) as self.folder:
             self._over = server.gui.add_dropdown(
                 "Over",
@@ -56,10 +54,12 @@ class CameraVerdict:
                 hint="How many, each with a seed of its own.",
             )
             self._judge = server.gui.add_button("Judge this camera", icon=viser.Icon.CHECKLIST)
+            self._bar = WorkBar(server, session)
             self._report = server.gui.add_html("", visible=False)
             self._sheet = server.gui.add_button(
                 "Pictures of all envs", icon=viser.Icon.LAYOUT_GRID, color="gray"
             )
+            self._sheet_bar = WorkBar(server, session)
             self._pictures = server.gui.add_html("", visible=False)
             self._presses = Presses(server)
         self._judge.on_click(self._ask)
@@ -80,12 +80,13 @@ class CameraVerdict:
                     "Not possible", str(error), color="orange", auto_close_seconds=6.0
                 )
             return
-        self._asked[key] = seeds
+        self._bar.asked()
         self._session.studio.judge(key, seeds)
 
     def _ask_for_sheet(self) -> None:
         key = self._session.view().studio.selected
         if key is not None:
+            self._sheet_bar.asked()
             self._session.studio.make_sheet(key)
 
     def _use(self, plane: str) -> None:
@@ -108,10 +109,8 @@ class CameraVerdict:
         fresh = self._over.value == FRESH
         if self._resets.visible != fresh:
             self._resets.visible = fresh
-        busy = studio.progress is not None
-        for button in (self._judge, self._sheet):
-            if button.disabled != (busy or camera is None):
-                button.disabled = busy or camera is None
+        self._bar.draw(studio.progress)
+        self._sheet_bar.draw(studio.progress)
         self._draw_report(studio, camera)
         self._draw_sheet(view, camera)
 
@@ -127,9 +126,7 @@ class CameraVerdict:
         uses = {
             plane: self._presses.id_of(plane, lambda _, p=plane: self._use(p)) for plane in ("near", "far")
         }
-        _fill(
-            self._report, report_html(report, camera, studio.report_stale, self._asked.get(camera.key), uses)
-        )
+        _fill(self._report, report_html(report, camera, studio.report_stale, studio.report_seeds, uses))
 
     def _draw_sheet(self, view: SessionView, camera: StudioCamera | None) -> None:
         studio = view.studio
@@ -142,7 +139,7 @@ class CameraVerdict:
         _show(self._pictures, mine)
         if not mine or camera is None:
             return
-        judged = studio.report_of == camera.key and self._asked.get(camera.key) == 0
+        judged = studio.report_of == camera.key and not studio.report_seeds
         _fill(self._pictures, self._sheet_html(sheet, studio.report if judged else None, view.selected_env))
 
     def _sheet_html(self, sheet: tuple[Picture, ...], report: CameraReport | None, selected: int) -> str:
@@ -175,7 +172,7 @@ class CameraVerdict:
 
 
 def report_html(
-    report: CameraReport, camera: StudioCamera, stale: bool, resets: int | None, uses: dict[str, str]
+    report: CameraReport, camera: StudioCamera, stale: bool, resets: int, uses: dict[str, str]
 ) -> str:
     """The table, the bars and the planes that would fit."""
     depth, info = report.depth, camera.info
@@ -192,12 +189,12 @@ def report_html(
                 "press": uses[name] if camera.now is not None and not camera.refused else "",
             }
         )
-    over = f"{len(report.envs)} envs as they are" if not resets else f"{len(report.envs)} fresh resets"
+    over = f"{len(report.envs)} fresh resets" if resets else f"{len(report.envs)} envs as they are"
     width, height = report.judged_size
     return render(
         "camera_report",
         stale=stale,
-        over=over if resets is not None else f"{len(report.envs)} envs",
+        over=over,
         how=f"{report.pictures} pictures of {width} × {height} in {report.milliseconds / 1000:.1f} s",
         headline=words.headline(report),
         rows=words.object_rows(report),
