@@ -142,3 +142,20 @@ def test_exactly_the_batched_shapes_pass(shape: tuple[int, ...], dtype: torch.dt
     assert passes["other"] == (len(shape) > 0 and shape[0] == num_envs)
     reward = check_step_returns(object, num_envs, {}, value, ()) is None
     assert reward == (shape == (num_envs,) and dtype.is_floating_point)
+
+
+@pytest.mark.parametrize(
+    ("terms", "words"),
+    [
+        (torch.zeros(N), "put into info 'reward_terms' as a float32 tensor of shape (4,); expected a dict"),
+        ({"reach": torch.zeros(N, 1)}, "'reward_terms/reach' as a float32 tensor of shape (4, 1)"),
+        ({"reach": 0.5}, "'reward_terms/reach' as float (0.5)"),
+        ({"reach": {"arm": torch.zeros(N)}}, "'reward_terms/reach' as dict"),
+        ({1: torch.zeros(N)}, "the key 1 into info['reward_terms']"),
+    ],
+)
+def test_wrong_terms_are_told_at_the_reward(terms: object, words: str, task: LoadedTask) -> None:
+    problem = check(task, {"reward_terms": terms}, torch.zeros(N))
+    assert problem is not None and words in problem.message
+    assert problem.code == "def compute_dense_reward(self, obs, action, info):"
+    assert check(task, {"reward_terms": {"reach": torch.zeros(N)}}, torch.zeros(N)) is None

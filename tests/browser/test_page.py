@@ -83,6 +83,12 @@ def test_tabs_that_have_nothing_to_show_are_not_there(desk: Desk) -> None:
     ]
 
 
+def test_all_tabs_are_on_one_row(desk: Desk) -> None:
+    names = ("Run", "Cameras", "Reward", "Inspect", "Episodes", "Log")
+    boxes = [desk.page.get_by_role("tab", name=name, exact=True).bounding_box() for name in names]
+    assert len({box["y"] for box in boxes if box is not None}) == 1 and None not in boxes
+
+
 def test_play_runs_and_pause_stops(calm: Desk) -> None:
     calm.button("Play").click()
     expect(calm.page.get_by_text("running", exact=True)).to_be_visible()
@@ -129,6 +135,19 @@ def test_the_sensor_and_human_pictures_arrive(calm: Desk) -> None:
     expect(calm.page.get_by_text("base_camera")).to_be_visible()
     expect(calm.page.get_by_text(re.compile(r"rendered in \d+ ms")).first).to_be_visible()
     until(lambda: calm.page.locator("img").count() >= 2, "two pictures")
+
+
+def test_an_edited_camera_keeps_its_place(calm: Desk) -> None:
+    calm.tab("Cameras")
+    expect(calm.page.locator("img[src^='blob:']:visible").first).to_be_visible(timeout=90_000)
+    mark = "() => { document.querySelector('img[src^=\"blob:\"]').dataset.same = 'yes'; }"
+    calm.page.evaluate(mark)
+    calm.file.write_text(TASK.read_text().replace("width=128, height=128", "width=96, height=128"))
+    expect(calm.page.get_by_text("96 × 128")).to_be_visible()
+    until(
+        lambda: calm.page.evaluate("() => document.querySelector('img[data-same]')?.naturalWidth") == 96,
+        "a picture of the new width in the same element",
+    )
 
 
 def test_a_saved_edit_appears_by_itself(calm: Desk) -> None:

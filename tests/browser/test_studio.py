@@ -104,7 +104,7 @@ def base_camera(file: Path) -> tuple[list[float], list[float]]:
 def test_a_press_on_its_frustum_chooses_a_camera(opened: Page) -> None:
     expect(opened.get_by_text("Choose a camera here, or press its frustum")).to_be_visible()
 
-    def orange() -> tuple[NDArray, NDArray]:
+    def orange() -> tuple[NDArray[np.intp], ...]:
         r, g, b = np.moveaxis(view(opened), -1, 0)
         return np.nonzero((r > 225) & (abs(g - 160) < 25) & (b < 60))
 

@@ -15,7 +15,6 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
-from mani_skill.utils.structs import Pose
 from numpy.testing import assert_allclose
 
 from tests.core.single_env_judge import Bare, batch_of

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from mani_skill.utils.wrappers import RecordEpisode
+from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+
+import workbench
 
 Make = Callable[..., Any]
 
@@ -137,3 +142,20 @@ def test_the_camera_for_people_shows_robot_cube_and_target(make: Make, render_sy
         "the target is red"
     )
     assert picture.float().std() > 30
+
+
+def test_reward_terms_pass_through_the_wrappers_of_mani_skill(tmp_path: Path) -> None:
+    env: Any = workbench.make(
+        "WorkbenchPushCube-v1", 2, backend="cpu", render_backend="none", max_episode_steps=3
+    )
+    recorded = RecordEpisode(env, str(tmp_path), save_video=False)
+    vector = ManiSkillVectorEnv(recorded, record_metrics=True)
+    vector.reset(seed=0)
+    for _ in range(3):
+        *_, info = vector.step(torch.as_tensor(vector.action_space.sample()))
+    # The step that ends the episodes resets them: what was said of the step is in final_info.
+    terms = info["final_info"]["reward_terms"]
+    assert set(terms) == {"reach", "push", "end"}
+    assert all(values.shape == (2,) for values in terms.values())
+    vector.close()
+    assert list(tmp_path.glob("*.h5"))

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from workbench.authoring.problem import Problem, hook_definition
-from workbench.core.returns import wrong_evaluate, wrong_reward
+from workbench.core.returns import wrong_evaluate, wrong_reward, wrong_reward_terms
 
 _REWARD_HOOKS = ("compute_dense_reward", "compute_normalized_dense_reward", "compute_sparse_reward")
 
@@ -43,9 +43,8 @@ def check_step_returns(
     # The reward's own entry in info, put there by another hook than evaluate.
     terms = evaluate.get("reward_terms") if isinstance(evaluate, Mapping) else None
     if terms is not None and reward is not None:
-        message = wrong_evaluate({"reward_terms": terms}, num_envs)
+        message = wrong_reward_terms(terms, num_envs)
         if message is not None:
-            message = message.replace("returned", "put into info", 1)
             return problem_from_return(cls, _REWARD_HOOKS[0], message, source_files)
     message = wrong_evaluate(evaluate, num_envs)
     if message is not None:

@@ -62,6 +62,19 @@ def wrong_reward(reward: object, num_envs: int, evaluate: Mapping[str, Any]) -> 
     return None
 
 
+def wrong_reward_terms(terms: object, num_envs: int) -> str | None:
+    """Said of ``info["reward_terms"]``, which a reward's hook may leave: a dict of numbers (N,), one a part."""
+    expected = f"expected a dict of tensors of shape ({num_envs},), one for each part of the reward"
+    if not isinstance(terms, Mapping):
+        return f"put into info 'reward_terms' as {_describe(terms)}; {expected}"
+    for name, value in terms.items():
+        if not isinstance(name, str):
+            return f"put the key {name!r} into info['reward_terms']; names of terms must be strings"
+        if not isinstance(value, torch.Tensor) or value.is_complex() or value.shape != (num_envs,):
+            return f"put into info 'reward_terms/{name}' as {_describe(value)}; {expected}"
+    return None
+
+
 def wrong_observation(obs: object, num_envs: int) -> str | None:
     """Said of an observation hook: every entry of the dict that it returns is an array (N, ...)."""
     if not isinstance(obs, Mapping):

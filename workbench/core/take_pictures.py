@@ -47,7 +47,7 @@ def list_cameras(env: Any, table: BodyTable | None = None) -> tuple[CameraInfo, 
     Args:
         table: the env's bodies, to name what a camera is mounted on; made anew if left out.
     """
-    cameras = _cameras(env)
+    cameras = cameras_of(env)
     table = table or (build_body_table(env) if cameras else None)
     infos = []
     for (kind, name), camera in cameras.items():
@@ -65,7 +65,7 @@ def list_cameras(env: Any, table: BodyTable | None = None) -> tuple[CameraInfo, 
                 near=float(component.near),
                 far=float(component.far),
                 intrinsic=np.array(component.get_intrinsic_matrix(), dtype=np.float32),
-                mount=None if mount is None or table is None else _body_name(mount, table),
+                mount=None if mount is None or table is None else body_name(mount, table),
                 modalities=tuple(m for m in _MODALITIES if m in gives),
                 settings=settings_of(camera.config),
                 varies=_varies(camera.config, components),
@@ -150,7 +150,7 @@ def begin_pictures(
     kinds = {kind for _, kind, _ in requests}
     if len(kinds) > 1:
         raise ValueError("pictures of sensors and of human cameras cannot be begun together")
-    cameras = _cameras(env)
+    cameras = cameras_of(env)
     for name, kind, modalities in requests:
         _check(name, kind, modalities, cameras)
     if not requests:
@@ -162,8 +162,8 @@ def begin_pictures(
     taken = []
     components = [_components(cameras[kind, name])[env_index] for name, kind, _ in requests]
     with (
-        _hidden_objects(env, env_index, shown=kinds == {"human"}),
-        _drawn_at(env, env_index, components, poses) as move_bodies,
+        hidden_objects(env, env_index, shown=kinds == {"human"}),
+        drawn_at(env, env_index, components, poses) as move_bodies,
     ):
         sub_scene.update_render()
         move_bodies()
@@ -176,7 +176,7 @@ def begin_pictures(
 
 
 @contextmanager
-def _drawn_at(
+def drawn_at(
     env: Any, env_index: int, components: Sequence[Any], poses: NDArray[np.float32] | None
 ) -> Iterator[Callable[[], None]]:
     """Draw the bodies of an env at `poses`, with the cameras on them, and leave the bodies where they are.
@@ -212,7 +212,7 @@ def _drawn_at(
             component.local_pose = local_pose
 
 
-def _cameras(env: Any) -> dict[tuple[CameraKind, str], Any]:
+def cameras_of(env: Any) -> dict[tuple[CameraKind, str], Any]:
     found: dict[tuple[CameraKind, str], Any] = {}
     for name, sensor in seams.sensors(env).items():
         if seams.camera_components(sensor) is not None:
@@ -225,7 +225,7 @@ def _cameras(env: Any) -> dict[tuple[CameraKind, str], Any]:
 
 def _components(camera: Any) -> list[Any]:
     components = seams.camera_components(camera)
-    assert components is not None, "only cameras that `_cameras` found come here"
+    assert components is not None, "only cameras that `cameras_of` found come here"
     return components
 
 
@@ -236,7 +236,7 @@ def _varies(config: Any, components: Sequence[Any]) -> bool:
     return bool((said != said[:1]).any() or np.abs(real - said[:1]).max() > 1e-5)
 
 
-def _body_name(mount: Any, table: BodyTable) -> str | None:
+def body_name(mount: Any, table: BodyTable) -> str | None:
     thing = seams.objects_of(mount)[0]
     entity = thing if isinstance(thing, sapien.Entity) else thing.entity
     slot = table.slot_of.get(id(entity))
@@ -260,7 +260,7 @@ def _check(
 
 
 @contextmanager
-def _hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]:
+def hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]:
     """Draw the task's hidden objects in this env, or do not, and put everything back afterwards."""
     was_visible: list[tuple[Any, float]] = []
     was_at: list[tuple[Any, sapien.Pose]] = []
@@ -307,7 +307,7 @@ def _read(
         transformed = config.texture_transforms[texture](torch.from_numpy(data)[None])
         made.update({m: image[0] for m, image in transformed.items() if m in modalities})
         if "depth" in gives and "depth" in modalities:
-            depth = _depth(texture, data, made["depth"].numpy()[..., 0], component)
+            depth = depth_in_metres(texture, data, made["depth"].numpy()[..., 0], component)
     segmentation = made.get("segmentation")
     return Picture(
         camera=name,
@@ -320,7 +320,7 @@ def _read(
     )
 
 
-def _depth(texture: str, data: NDArray, transformed: NDArray, component: Any) -> NDArray[np.float32]:
+def depth_in_metres(texture: str, data: NDArray, transformed: NDArray, component: Any) -> NDArray[np.float32]:
     """(H, W) metres, 0 for background, from the texture `data` and ManiSkill's own reading of it.
 
     ManiSkill's standard is int16 millimetres. Where the texture holds float positions in metres, as

@@ -291,7 +291,8 @@ class CameraStudio:
             if self._selected is not None and self._info(self._selected) is None:
                 self._selected = None
             self._serial += 1
-            return [self._request(key) for key in self._placements.all_moved]
+            # The dropped ones too: their placement may have been on its way while the version came in.
+            return [self._request(key) for key in (*self._placements.all_moved, *dropped)]
 
     def _follow_the_file(self, wish: Wish) -> None:
         """What an edit, or its being taken back, means for the placements: none is to be lost by it."""

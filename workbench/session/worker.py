@@ -200,7 +200,7 @@ class Worker:
             self._quit = True
 
     def _load(self, request: Load) -> None:
-        self._pictures.settle()
+        self._settle()
         running = None
         if self._opened is not None and self._loaded_by is not None and self._last is not None:
             running = Running(self._loaded_by, self._opened, self._last)

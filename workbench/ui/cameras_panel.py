@@ -43,6 +43,8 @@ class _Camera:
     facts: viser.GuiHtmlHandle
     images: dict[str, viser.GuiImageHandle] = field(default_factory=dict)
     depth_span: DepthRange | None = None
+    drawn: tuple[Picture, tuple[str, ...]] | None = None
+    """What its images show."""
     stale: bool = False
     """Whether its pictures are said to be of another moment."""
 
@@ -91,7 +93,11 @@ class CamerasPanel:
         self._drawn_at = time.monotonic()
         for key, camera in self._cameras.items():
             picture = view.pictures.get(key)
-            if picture is not None and picture.env == view.selected_env and view.task is not None:
+            if picture is None or picture.env != view.selected_env or view.task is None:
+                continue
+            # Kinds come one after the other, and a picture that is sent again is decoded again.
+            if camera.drawn is None or camera.drawn[0] is not picture or camera.drawn[1] != camera.wanted():
+                camera.drawn = (picture, camera.wanted())
                 self._draw_camera(camera, picture, view.task, view.picture_milliseconds)
 
     def shown_pictures(self, view: SessionView) -> dict[tuple[CameraKind, str], Picture]:

@@ -21,6 +21,7 @@ _NAMES = {
     "arrowdown": "↓",
     "pageup": "Page up",
     "pagedown": "Page down",
+    "home": "Home",
     "end": "End",
 }
 

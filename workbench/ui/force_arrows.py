@@ -1,8 +1,8 @@
 """Contact forces of one env as arrows in the 3-D view.
 
 One arrow a contact point, from the point in the direction of the force on the first body of the pair. Forces span
-five decades (a cube's weight, a hand that is pressed into a table), so the length grows with the root of the
-force and is bounded: it says "much" or "little", the numbers are in the Inspect tab.
+five decades (a cube's weight on four corners, a hand that is pressed into a table), so the length grows with the
+cube root of the force and is bounded: it says "much" or "little", the numbers are in the Inspect tab.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from workbench.core.inspection import Inspection
 
-COLOUR = (240, 140, 0)
-METRES_AT_ONE_NEWTON = 0.03
+COLOUR = (255, 70, 20)
+METRES_AT_ONE_NEWTON = 0.06
 LONGEST = 0.25
 WEAKEST = 1e-3
 """Newtons; weaker is drawn by nobody's wish."""
@@ -43,7 +43,7 @@ class ForceArrows:
                 self._handle = None
         elif self._handle is None:
             self._handle = self._server.scene.add_arrows(
-                "/forces", arrows, COLOUR, shaft_radius=0.002, head_radius=0.005, head_length=0.012
+                "/forces", arrows, COLOUR, shaft_radius=0.0025, head_radius=0.006, head_length=0.014
             )
         else:
             self._handle.points = arrows
@@ -59,5 +59,5 @@ def arrows_of(inspection: Inspection) -> NDArray[np.float32]:
     size = np.linalg.norm(forces, axis=1)
     shown = np.isfinite(size) & (size > WEAKEST)
     points, forces, size = points[shown], forces[shown], size[shown]
-    length = np.minimum(METRES_AT_ONE_NEWTON * np.sqrt(size), LONGEST)
+    length = np.minimum(METRES_AT_ONE_NEWTON * np.cbrt(size), LONGEST)
     return np.stack([points, points + forces / size[:, None] * length[:, None]], axis=1).astype(np.float32)

@@ -69,8 +69,9 @@ class InspectPanel:
         self._handle.content = inspect_html(choice, view, self._now, self._before)
 
     def forces(self, view: SessionView) -> Inspection | None:
-        """The reading whose contacts are to be drawn in the view; None draws none."""
-        shown = self._forces.value is True and self._now is not None and self._now.env == view.selected_env
+        """The reading whose contacts are to be drawn in the view; None draws none: they are of what is live."""
+        here = self._now is not None and self._now.env == view.selected_env
+        shown = self._forces.value is True and here and view.timeline.shown is None
         return self._now if shown else None
 
     def _ask(self, view: SessionView, choice: str) -> None:
@@ -132,6 +133,8 @@ def inspect_html(choice: str, view: SessionView, now: Inspection | None, before:
             leaves = leaf_rows(now.observation or (), before.observation if before else None)
         elif section == "state":
             leaves = leaf_rows(now.state or (), before.state if before else None)
+        if view.timeline.shown is not None:
+            note += "; this is live, since of the past only the poses are kept"
         if section in ("observation", "state"):
             note += "; numbers that changed since the reading before are blue"
     return render(

@@ -334,6 +334,7 @@ class Page:
             Command("A step on in time", lambda: timeline.step_by(1), "arrowright"),
             Command("To the event before", lambda: timeline.to_event(-1), "arrowleft", "shift"),
             Command("To the next event", lambda: timeline.to_event(1), "arrowright", "shift"),
+            Command("The first moment", timeline.go_to_the_first, "home"),
             Command("What is live", timeline.go_live, "end"),
             Command("Go on from here, in the selected env", timeline.go_on, "G"),
             Command(

@@ -55,8 +55,10 @@ class TimelinePanel:
                 send=self._seek,
             )
             self._strip = gui.add_html("")
-            self._walk = gui.add_button_group("", WALK)
+            # It comes and goes, and the panel grows upwards: under the row below, a second press on "step" would
+            # meet another button.
             self._travel = gui.add_button_group("", (GO_ON,), visible=False)
+            self._walk = gui.add_button_group("", WALK)
         self._walk.on_click(lambda event: self._on_walk(event.target.value))
         self._travel.on_click(lambda event: self._on_travel(event.target.value))
         # Across the bottom of the view: viser docks panels at the sides only.
@@ -89,6 +91,10 @@ class TimelinePanel:
 
     def go_live(self) -> None:
         self._session.seek(None)
+
+    def go_to_the_first(self) -> None:
+        """To the left end of the slider, which may have the focus and go there as well."""
+        self._session.seek(self._range[0] if self._episode_only else 0)
 
     def go_on(self) -> None:
         self._session.go_on("this")
