@@ -25,7 +25,7 @@ LEFT_ALONE = 5.0
 """Seconds without a movement after which a gizmo that was never let go (a page that went away) is free again."""
 PIXELS = 75.0
 TARGET_PIXELS = 45.0
-TARGET_COLOUR = (240, 140, 0)
+SIGHT_COLOUR = (34, 139, 230)
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 
 
@@ -117,7 +117,7 @@ class CameraGizmo:
                 self._line.visible = False
         elif self._line is None:
             self._line = self._server.scene.add_line_segments(
-                "/studio/line of sight", wanted, colors=TARGET_COLOUR, thickness=2.0, thickness_units="screen"
+                "/studio/line of sight", wanted, colors=SIGHT_COLOUR, thickness=2.0, thickness_units="screen"
             )
         else:
             self._line.points, self._line.visible = wanted, True

@@ -150,7 +150,8 @@ class CameraWriting:
             and chosen.moved
             and (writing.stage not in ("planned", "written") or stale)
         )
-        _show(self._plan, can_place)
+        # Not at the place of the button that writes: a second press must not write what was not read.
+        _show(self._plan, can_place and (writing.stage != "planned" or stale))
         if self._plan.disabled == wants_plan:
             self._plan.disabled = not wants_plan
         _show(self._text, writing.stage != "none")
@@ -198,9 +199,15 @@ def writing_html(writing: Writing, chosen: StudioCamera | None, stale: bool) -> 
 
 
 def diff_lines(diff: str) -> list[tuple[str, str]]:
-    """Each line of a unified diff with its kind (``add``, ``del``, ``at``, ``same``), less the names of the files."""
+    """Each line of a unified diff with its kind (``add``, ``del``, ``at``, ``same``), less the names of the files.
+
+    The indentation that all of them have is left out: the panel is narrow.
+    """
     kinds = {"+": "add", "-": "del", "@": "at"}
-    return [(kinds.get(line[:1], "same"), line) for line in diff.splitlines()[2:]]
+    lines = [(kinds.get(line[:1], "same"), line) for line in diff.splitlines()[2:]]
+    code = [line[1:] for kind, line in lines if kind != "at" and line[1:].strip()]
+    indent = min((len(line) - len(line.lstrip()) for line in code), default=0)
+    return [(kind, line if kind == "at" else line[:1] + " " + line[1 + indent :]) for kind, line in lines]
 
 
 def _show(

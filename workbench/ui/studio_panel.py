@@ -63,13 +63,13 @@ class StudioPanel:
         self._look_at, self._own_axes, self._snap = False, False, Snap()
         gui = server.gui
         choices: tuple[str, ...] = (NOBODY,)
-        self._note = gui.add_html(render("note", text="Cameras appear when the task is loaded."))
         self._choice: Control[Any, Any] = Control(
             gui.add_dropdown("Camera", choices, initial_value=NOBODY, visible=False),
             read=lambda value: self._names[checked_choice(value, self._names, "camera")],
             send=self.select,
             shown=self._name_of,
         )
+        self._note = gui.add_html(render("note", text="Cameras appear when the task is loaded."))
         self._picture_folder = gui.add_folder(None)
         with self._picture_folder:
             gui.add_html(render("studio_picture"))
@@ -211,7 +211,7 @@ class StudioPanel:
         info = camera.info
         return render(
             "studio_facts",
-            refused=camera.refused,
+            refused=camera.refused and f"{camera.refused[0].upper()}{camera.refused[1:].rstrip('.')}.",
             moved=camera.moved,
             file="" if info.site is None else PurePath(info.site.file).name,
             line=None if info.site is None else info.site.line,
