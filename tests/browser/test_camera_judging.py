@@ -23,7 +23,7 @@ CAMERA = "base_camera"
 def page(task_file: Path, chromium_path: str) -> Iterator[Page]:
     """The Studio tab on base_camera, with every folder that judges open."""
     arguments = ("--num-envs", str(ENVS), "--no-spare")
-    with page_on(task_file, *arguments, chromium=chromium_path, height=2400) as (page, errors, _):
+    with page_on(task_file, *arguments, chromium=chromium_path, height=900) as (page, errors, _):
         page.get_by_role("tab", name="Studio").click()
         page.locator("input[aria-haspopup=listbox]:visible").first.click()
         page.get_by_role("option", name=f"{CAMERA} · sensor", exact=True).click()
@@ -75,9 +75,9 @@ def test_judged_over_the_envs_planes_that_fit_are_used_and_the_report_is_then_of
     press(page, "Keep this placement as A")
     page.locator(".wb-planes [data-press]").last.click()
     expect(page.get_by_text("judge it again")).to_be_visible()
-    press(page, "Compare")
+    press(page, "Show side by side")
     expect(page.locator(".wb-pair img")).to_have_count(2)
-    expect(page.get_by_text(re.compile(r"far 100 → \d"))).to_be_visible()
+    expect(page.get_by_text(re.compile(r"far 10 → \d"))).to_be_visible()
     press(page, "Place it as A")
     expect(page.get_by_text("judge it again")).to_have_count(0)
 

@@ -46,7 +46,7 @@ class CameraCompare:
                 color="gray",
                 hint="To compare it later, or return to it.",
             )
-            self._compare = server.gui.add_button("Compare", icon=viser.Icon.COLUMNS_2)
+            self._compare = server.gui.add_button("Show side by side", icon=viser.Icon.COLUMNS_2)
             self._bar = WorkBar(server, session)
             self._html = server.gui.add_html("", visible=False)
             self._take = server.gui.add_button(

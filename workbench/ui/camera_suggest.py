@@ -159,12 +159,6 @@ class CameraSuggest:
             return
         if camera.key != self._of:
             self._of, self._touched, self._chosen = camera.key, False, None
-            mounted = camera.info.mount
-            self._frame.visible = mounted is not None
-            if mounted is not None:
-                self._frame.content = render(
-                    "note", text=f"These are in the frame of {mounted}, which it rides on."
-                )
         if self._touched:
             return
         for handle, sign in ((self._low, -1), (self._high, 1)):
