@@ -13,9 +13,11 @@ from workbench.core.camera_frames import (
     LookAt,
     axes_of,
     compose,
+    intrinsic_of,
     make_pose,
     normalised,
     pose_from_look_at,
+    project,
     quaternion_from_rpy,
     rpy_of,
     with_pose,
@@ -29,6 +31,7 @@ from workbench.ui.camera_moves import (
     looking_at,
     nudged,
     panned,
+    picture_corners,
     snapped,
     target_of,
     turned_in_world,
@@ -135,6 +138,14 @@ def test_viewer_s_rotation_is_opencv_s() -> None:
 def test_a_narrow_view_opens_until_the_whole_picture_is_in_it() -> None:
     assert fov_that_shows_all(1.0, 1.0, 1.6) == pytest.approx(1.0)
     assert np.tan(fov_that_shows_all(1.0, 2.0, 1.0) / 2) == pytest.approx(2 * np.tan(0.5))
+
+
+@given(poses, st.floats(0.1, 2.5))
+def test_corners_of_the_picture_fall_on_its_corners(pose, fov: float) -> None:
+    camera = replace(SETTINGS, fov=fov)
+    pixels, depth = project(picture_corners(camera, pose, 0.2), pose, intrinsic_of(camera))
+    np.testing.assert_allclose(pixels, [[0, 0], [64, 0], [64, 48], [0, 48]], atol=1e-6)
+    np.testing.assert_allclose(depth, 0.2)
 
 
 def test_typing_one_number_keeps_the_others_beyond_their_digits() -> None:
