@@ -176,8 +176,10 @@ class _Search:
             raise IndexError(f"envs {envs} are out of range for {env.num_envs} envs")
         self.env, self.space, self.envs, self.poses, self.table = env, space, envs, poses, table
         self.progress, self.cancelled = progress, cancelled
-        self.objects = list_objects(env, table)
-        self.wanted = [_wanted(self.objects, name, space.kind) for name in space.objects]
+        every = list_objects(env, table)
+        self.wanted = [_wanted(every, name, space.kind) for name in space.objects]
+        # Each is also looked at alone; the others are drawn, and hide what they hide.
+        self.objects = [thing for thing in every if thing.robot or thing in self.wanted]
         self.size = small_size(space.lens.width, space.lens.height)
         self.rng = np.random.default_rng(space.seed)
         self.low, self.high = np.array(space.low, np.float64), np.array(space.high, np.float64)
@@ -188,6 +190,7 @@ class _Search:
         near = 8 * space.best
         self.total = len(envs) * (space.candidates + self.keep + ROUNDS * (near + 2 * space.best))
         self.done = 0
+        self.began = time.perf_counter()
         self.best = float("nan")
         self.found: list[tuple[float, _Candidate, CameraReport]] = []
 
@@ -205,39 +208,51 @@ class _Search:
 
     def _look_at_best_of(self, candidates: list[_Candidate], keep: int, stage: str) -> None:
         """Score all without the robot, and the best `keep` of them with it."""
-        bare = self._reports(candidates, stage, robot=False)
-        order = np.argsort([-score_of(report, self.space.objects) for report in bare], kind="stable")
-        kept = [candidates[i] for i in order[:keep] if score_of(bare[i], self.space.objects) > 0]
-        for candidate, report in zip(kept, self._reports(kept, "looking past the robot", robot=True)):
+        bare = self._measure(candidates, stage)
+        scores = [score_of(self._report(row), self.space.objects) for row in bare]
+        order = [int(i) for i in np.argsort([-score for score in scores], kind="stable") if scores[i] > 0][
+            :keep
+        ]
+        kept = [candidates[i] for i in order]
+        whole = self._measure(kept, "looking past the robot", [bare[i] for i in order])
+        for candidate, row in zip(kept, whole, strict=False):
+            report = self._report(row)
             score = score_of(report, self.space.objects)
             self.found.append((score, candidate, report))
             self.best = max(score, self.best) if np.isfinite(self.best) else score
 
-    def _reports(self, candidates: list[_Candidate], stage: str, robot: bool) -> list[CameraReport]:
-        """One report a candidate; none at all where the search is cancelled on the way."""
-        began = time.perf_counter()
+    def _measure(
+        self, candidates: list[_Candidate], stage: str, bare: list[list[Measured]] | None = None
+    ) -> list[list[Measured]]:
+        """Each candidate in each env: with the robot if `bare` is given, without it otherwise.
+
+        None at all where the search is cancelled on the way.
+        """
         measured: list[list[Measured]] = [[] for _ in candidates]
         placement = Placement(self.space.lens, self.space.kind)
         poses = [pose_from_look_at(_look_at(candidate)) for candidate in candidates]
-        for e in self.envs:
-            robots = [x for thing in self.objects if thing.robot for x in entities_of(thing, e, self.table)]
+        for position, e in enumerate(self.envs):
             moment = None if self.poses is None else self.poses[e]
-            # One camera an env, moved about: to switch the robot off and on costs as much as a look.
+            robots = [x for thing in self.objects if thing.robot for x in entities_of(thing, e, self.table)]
             with (
                 placed_camera(self.env, e, placement, self.size, moment) as view,
-                undrawn([] if robot else robots),
+                undrawn(robots if bare is None else []),
             ):
                 for i, pose in enumerate(poses):
                     if self.cancelled():
                         return []
-                    measured[i].append(measure(view, pose, e, self.objects, self.table, self.space.kind))
+                    known = None if bare is None else bare[i][position]
+                    measured[i].append(
+                        measure(view, pose, e, self.objects, self.table, self.space.kind, known)
+                    )
                     self.done += 1
                     self.progress(SearchProgress(stage, self.done, self.total, self.best))
-        each = 1000 * (time.perf_counter() - began) / max(1, len(candidates))
+        return measured
+
+    def _report(self, measured: list[Measured]) -> CameraReport:
+        milliseconds = 1000 * (time.perf_counter() - self.began)
         key = (self.space.kind, "suggested")
-        return [
-            report_of(key, self.space.lens, self.size, self.envs, self.objects, m, each) for m in measured
-        ]
+        return report_of(key, self.space.lens, self.size, self.envs, self.objects, measured, milliseconds)
 
     def _chosen(self) -> list[tuple[float, _Candidate, CameraReport]]:
         """The best that stand apart."""

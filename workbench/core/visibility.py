@@ -312,35 +312,44 @@ def measure(
     objects: Sequence[SceneObject],
     table: BodyTable,
     kind: CameraKind,
+    bare: Measured | None = None,
 ) -> Measured:
-    """Look; once more without the robot, if it is in view; and at each object alone; and count."""
+    """Look; once more without the robot, if it is in view; and at each object alone; and count.
+
+    Args:
+        bare: what was measured from this pose with the robot not drawn, if that was; then one look is enough.
+    """
     entities = [entities_of(thing, e, table) for thing in objects]
     ids = [[entity.per_scene_id for entity in row] for row in entities]
     segmentation, depth = view.look(pose)
     pictures = 1
-    bare = segmentation
     # Comparing with few numbers is ten times faster than np.isin, and this is done for hundreds of pictures.
     here = set(np.unique(segmentation).tolist())
-    robot = [entity for thing, row in zip(objects, entities, strict=True) if thing.robot for entity in row]
-    if any(entity.per_scene_id in here for entity in robot):
-        with undrawn(robot):
-            bare, _ = view.look(pose)
-        pictures += 1
-    pixels, unhindered, alone, margin = (np.zeros(len(objects), np.float32) for _ in range(4))
-    bare_here = set(np.unique(bare).tolist())
-    every = [entity for entity in table.entities[e] if entity is not None]
-    for i, (thing, row) in enumerate(zip(objects, ids, strict=True)):
-        pixels[i] = _mask(segmentation, here.intersection(row)).sum()
-        mask = _mask(bare, bare_here.intersection(row))
-        unhindered[i] = mask.sum()
-        if not (thing.robot or thing.scenery or (thing.hidden and kind == "sensor")):
-            own = set(row)
-            with undrawn([entity for entity in every if entity.per_scene_id not in own]):
-                mask, _ = view.look(pose)
-            mask = mask != 0
+    pixels = np.array([_mask(segmentation, here.intersection(row)).sum() for row in ids], np.float32)
+    if bare is None:
+        unhindered, alone, margin = (np.zeros(len(objects), np.float32) for _ in range(3))
+        without = segmentation
+        robot = [
+            entity for thing, row in zip(objects, entities, strict=True) if thing.robot for entity in row
+        ]
+        if any(entity.per_scene_id in here for entity in robot):
+            with undrawn(robot):
+                without, _ = view.look(pose)
             pictures += 1
-        alone[i] = mask.sum()
-        margin[i] = _margin(mask)
+        left = set(np.unique(without).tolist())
+        every = [entity for entity in table.entities[e] if entity is not None]
+        for i, (thing, row) in enumerate(zip(objects, ids, strict=True)):
+            mask = _mask(without, left.intersection(row))
+            unhindered[i] = mask.sum()
+            if not (thing.robot or thing.scenery or (thing.hidden and kind == "sensor")):
+                own = set(row)
+                with undrawn([entity for entity in every if entity.per_scene_id not in own]):
+                    mask = view.look(pose)[0] != 0
+                pictures += 1
+            alone[i] = mask.sum()
+            margin[i] = _margin(mask)
+    else:
+        unhindered, alone, margin = bare.unhindered, bare.alone, bare.margin
     cut = (alone > 0) & (margin == 0)
     counted = [number for thing, row in zip(objects, ids, strict=True) if not thing.scenery for number in row]
     something = segmentation != 0
