@@ -1,0 +1,119 @@
+"""The judge of these tests: ManiSkill itself, asked what the cameras of a source text are."""
+
+from __future__ import annotations
+
+import sys
+import types
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+from mani_skill.sensors.camera import CameraConfig, parse_camera_configs
+
+from workbench.authoring.camera_source.rotations import unit
+from workbench.core.camera_settings import CameraSettings
+
+FILE = "/author/task.py"
+HEADER = """\
+import math
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils import sapien_utils
+from mani_skill.utils.structs import Pose
+from transforms3d.euler import euler2quat
+
+
+class Base:
+    robot_uids = "panda"
+    camera_link = None
+
+
+"""
+HOOKS = ("_default_sensor_configs", "_default_human_render_camera_configs", "_sensor_configs")
+
+
+@contextmanager
+def _modules(sources: Mapping[str, str]) -> Iterator[dict[str, Any]]:
+    """The sources executed as modules, whichever order they need."""
+    made = {PurePath(path).stem: types.ModuleType(PurePath(path).stem) for path in sources}
+    before = {name: sys.modules.get(name) for name in made}
+    try:
+        for path in sorted(sources, key=lambda path: path == FILE):
+            name = PurePath(path).stem
+            sys.modules[name] = made[name]
+            exec(compile(sources[path], path, "exec"), vars(made[name]))
+        yield vars(made[PurePath(FILE).stem])
+    finally:
+        for name, module in before.items():
+            if module is None:
+                sys.modules.pop(name, None)
+            else:
+                sys.modules[name] = module
+
+
+def real_configs(sources: Mapping[str, str], class_name: str = "Task") -> dict[tuple[str, str], CameraConfig]:
+    """Every camera of the class, by hook and name, made by its own code."""
+    with _modules(sources) as names:
+        task = names[class_name]()
+        return {
+            (hook, name): config
+            for hook in HOOKS
+            if hasattr(task, hook)
+            for name, config in parse_camera_configs(getattr(task, hook)).items()
+        }
+
+
+def settings_of(config: CameraConfig) -> CameraSettings:
+    pose = config.pose.raw_pose[0].double().tolist()
+    intrinsic = None
+    if config.intrinsic is not None:
+        rows = np.array(config.intrinsic, float).tolist()
+        intrinsic = (tuple(rows[0]), tuple(rows[1]), tuple(rows[2]))
+    return CameraSettings(
+        position=(pose[0], pose[1], pose[2]),
+        quaternion=unit(pose[3:]),
+        fov=None if config.fov is None else float(config.fov),
+        intrinsic=intrinsic,
+        width=config.width,
+        height=config.height,
+        near=float(config.near),
+        far=float(config.far),
+        shader_pack=str(config.shader_pack),
+    )
+
+
+def real_settings(
+    sources: Mapping[str, str], uid: str, hook: str | None = None, class_name: str = "Task"
+) -> CameraSettings:
+    found = [
+        config
+        for (in_hook, name), config in real_configs(sources, class_name).items()
+        if name == uid and hook in (None, in_hook)
+    ]
+    assert len(found) == 1, (uid, found)
+    return settings_of(found[0])
+
+
+def close(a: CameraSettings, b: CameraSettings, tolerance: float = 1e-6) -> bool:
+    """Equal but for what single precision does to a pose; q and -q are one orientation."""
+    sign = 1 if sum(x * y for x, y in zip(a.quaternion, b.quaternion, strict=True)) >= 0 else -1
+    apart = [x - y for x, y in zip(a.position, b.position, strict=True)]
+    apart += [x - sign * y for x, y in zip(a.quaternion, b.quaternion, strict=True)]
+    if a.fov is not None and b.fov is not None:
+        apart.append(a.fov - b.fov)
+    if a.intrinsic is not None and b.intrinsic is not None:
+        apart += (np.array(a.intrinsic) - np.array(b.intrinsic)).ravel().tolist()
+    apart += [a.near - b.near, a.far - b.far]
+    same = (a.width, a.height, a.shader_pack, a.fov is None, a.intrinsic is None)
+    return max(map(abs, apart)) <= tolerance and same == (
+        b.width,
+        b.height,
+        b.shader_pack,
+        b.fov is None,
+        b.intrinsic is None,
+    )

@@ -1,0 +1,118 @@
+"""Edits on real files: whole or not at all, with everything kept that a text does not show."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from tests.authoring.camera_source.real_cameras import FILE, real_settings
+from tests.authoring.camera_source.shapes import WRITTEN
+from workbench.authoring.camera_source import Refusal, SourceEdit, apply, plan_edit, revert
+from workbench.authoring.modules import decode
+
+SOURCE = WRITTEN["an argument a line, with remarks"]
+
+
+def planned(path: Path, text: str | None = None) -> SourceEdit:
+    text = decode(str(path), path.read_bytes()) if text is None else text
+    before = real_settings({FILE: SOURCE}, "cam")
+    after = dataclasses.replace(before, fov=0.9, near=0.05, shader_pack="default")
+    plan = plan_edit({str(path): text}, "cam", before, after)
+    assert isinstance(plan, SourceEdit), plan
+    return plan
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "latin-1"])
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_line_ends_encoding_and_mode_stay(tmp_path: Path, encoding: str, end: str) -> None:
+    path = tmp_path / "task.py"
+    head = "# -*- coding: latin-1 -*-\n" if encoding == "latin-1" else ""
+    old = f"{head}# Größe\n{SOURCE}".replace("\n", end).encode(encoding)
+    path.write_bytes(old)
+    path.chmod(0o640)
+    edit = planned(path)
+    assert apply(edit) is None
+    expected = edit.new_text.replace("\n", end).encode(encoding)
+    assert path.read_bytes() == expected != old
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    assert revert(edit) is None
+    assert path.read_bytes() == old
+    assert os.listdir(tmp_path) == ["task.py"]
+
+
+def test_mixed_line_ends_stay_where_they_are(tmp_path: Path) -> None:
+    path = tmp_path / "task.py"
+    lines = SOURCE.splitlines()
+    old = "".join(line + ("\r\n" if index % 3 else "\n") for index, line in enumerate(lines)).encode()
+    path.write_bytes(old)
+    edit = planned(path)
+    assert apply(edit) is None
+    new = path.read_bytes().splitlines(keepends=True)
+    kept = [line for line in old.splitlines(keepends=True) if line in new]
+    assert len(kept) == len(lines) - 2
+    assert revert(edit) is None
+    assert path.read_bytes() == old
+
+
+def test_text_as_it_is_on_disk_can_be_given_too(tmp_path: Path) -> None:
+    path = tmp_path / "task.py"
+    path.write_bytes(b"\xef\xbb\xbf" + SOURCE.replace("\n", "\r\n").encode())
+    edit = planned(path, path.read_bytes().decode())
+    assert "\r\n" in edit.new_text and "\n" not in edit.new_text.replace("\r\n", "")
+    assert apply(edit) is None
+    assert path.read_bytes() == edit.new_text.encode()
+
+
+def test_a_file_that_moved_on_is_left_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "task.py"
+    path.write_text(SOURCE)
+    edit = planned(path)
+    path.write_text(SOURCE + "# more\n")
+    refused = apply(edit)
+    assert isinstance(refused, Refusal) and "was edited since the change was shown" in refused.reason
+    assert path.read_text() == SOURCE + "# more\n"
+    path.write_text(SOURCE)
+    assert apply(edit) is None
+    path.write_text(path.read_text() + "# more\n")
+    refused = revert(edit)
+    assert isinstance(refused, Refusal) and "was edited since the camera" in refused.reason
+    assert path.read_text() == edit.new_text + "# more\n"
+
+
+def test_a_link_goes_on_leading_to_the_file(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    path, link = tmp_path / "real" / "task.py", tmp_path / "task.py"
+    path.write_text(SOURCE)
+    link.symlink_to(path)
+    edit = planned(link)
+    assert apply(edit) is None
+    assert link.is_symlink() and path.read_text() == edit.new_text
+
+
+def test_a_file_that_may_not_be_written_is_left_as_it_is(tmp_path: Path) -> None:
+    path = tmp_path / "task.py"
+    path.write_text(SOURCE)
+    path.chmod(0o444)
+    refused = apply(planned(path))
+    assert isinstance(refused, Refusal) and "read-only" in refused.reason
+    edit = planned(path)
+    path.unlink()
+    refused = apply(edit)
+    assert isinstance(refused, Refusal) and "cannot be read" in refused.reason
+    path.mkdir()
+    refused = apply(edit)
+    assert isinstance(refused, Refusal) and "not an ordinary file" in refused.reason
+
+
+def test_an_installed_file_is_not_written_through_a_link(tmp_path: Path) -> None:
+    path = tmp_path / "site-packages" / "tasks" / "task.py"
+    path.parent.mkdir(parents=True)
+    path.write_text(SOURCE)
+    (tmp_path / "task.py").symlink_to(path)
+    refused = apply(planned(tmp_path / "task.py"))
+    assert isinstance(refused, Refusal) and "installed" in refused.reason
+    assert path.read_text() == SOURCE

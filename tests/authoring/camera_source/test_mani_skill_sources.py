@@ -1,0 +1,127 @@
+"""ManiSkill's own tasks and robots as authors' files: every camera in them is edited, or refused for a known reason."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import mani_skill
+import pytest
+from mani_skill.sensors.camera import CameraConfig, parse_camera_configs
+
+from tests.authoring.camera_source.real_cameras import close, settings_of
+from workbench.authoring.camera_source import Refusal, SourceEdit, plan_edit
+from workbench.authoring.camera_source.definitions import Project
+from workbench.authoring.camera_source.find import HOOKS, camera_calls
+from workbench.authoring.camera_source.rotations import look_at, unit
+from workbench.core.camera_settings import CallSite
+
+PACKAGE = Path(mani_skill.__file__).parent
+FILES = sorted(
+    path
+    for folder in ("envs", "agents")
+    for path in (PACKAGE / folder).rglob("*.py")
+    if "CameraConfig(" in path.read_text()
+)
+REFUSED = {"base_env": "something else changes it"}
+"""The other of two branches that make a camera of one name."""
+
+
+class Anything:
+    """A task that has whatever a hook asks it for: links to mount cameras on, an agent."""
+
+    robot_uids = "panda"
+    domain_randomization = False
+
+    def __getattr__(self, name: str) -> Anything:
+        return self
+
+    def __getitem__(self, key: object) -> Anything:
+        return self
+
+
+def hook_results(path: Path, text: str) -> dict[tuple[str, int], dict[str, CameraConfig]]:
+    """What each hook in the file returns, by its name and how many of that name came before."""
+    tree = ast.parse(text)
+    top = [s for s in tree.body if isinstance(s, (ast.Import, ast.ImportFrom)) or _constant(s)]
+    module = ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
+    names: dict[str, Any] = {
+        "__name__": module,
+        "__package__": module.rpartition(".")[0],
+        "__file__": str(path),
+    }
+    exec(compile(ast.Module(top, []), str(path), "exec"), names)
+    found: dict[tuple[str, int], dict[str, CameraConfig]] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef) and node.name in HOOKS and "CameraConfig(" in ast.unparse(node):
+            node.decorator_list, node.returns = [], None
+            exec(compile(ast.Module([node], []), str(path), "exec"), names)
+            count = sum(name == node.name for name, _ in found)
+            try:
+                found[node.name, count] = parse_camera_configs(names[node.name](Anything()))
+            except (TypeError, ValueError):  # numbers that only a real task has
+                found[node.name, count] = {}
+    return found
+
+
+def _constant(statement: ast.stmt) -> bool:
+    targets = statement.targets if isinstance(statement, ast.Assign) else []
+    return bool(targets) and all(isinstance(target, ast.Name) for target in targets)
+
+
+def cameras(path: Path, first_line: int) -> Iterator[tuple[CallSite, tuple[str, int], str, CameraConfig]]:
+    text = path.read_text()
+    calls = list(camera_calls(project := Project({"/author/task.py": text}), project.file("/author/task.py")))
+    for hook, configs in hook_results(path, text).items():
+        for uid, config in configs.items():
+            fitting = [call for call in calls if call.name == uid and call.hook == hook[0]]
+            owners = list(
+                dict.fromkeys(call.file.function(call.node) for call in calls if call.hook == hook[0])
+            )
+            fitting = [c for c in fitting if c.file.function(c.node) == owners[hook[1]]]
+            function = next(n for n in ast.walk(ast.parse(text)) if getattr(n, "lineno", 0) == first_line)
+            last_line = getattr(function, "end_lineno", 0)
+            for call in (call for call in fitting if first_line <= call.line <= last_line):
+                yield CallSite("/author/task.py", call.line, owners[hook[1]]), hook, uid, config
+
+
+def kinds_of_cameras() -> Iterator[Any]:
+    """One of each way of writing, whatever the numbers."""
+    seen: set[str] = set()
+    for path in FILES:
+        functions = {}
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef) and "CameraConfig(" in (code := ast.unparse(node)):
+                functions[node.lineno] = re.sub(
+                    r"\"[^\"]*\"|'[^']*'|-?\d[\d.]*", "0", code.partition("\n")[2]
+                )
+        for line, code in functions.items():
+            if code not in seen:
+                seen.add(code)
+                yield pytest.param(path, line, id=f"{path.stem}:{line}")
+
+
+@pytest.mark.parametrize(("path", "first_line"), list(kinds_of_cameras()))
+def test_each_camera_is_edited_right_or_refused(path: Path, first_line: int) -> None:
+    text = path.read_text()
+    for site, hook, uid, config in cameras(path, first_line):
+        before = settings_of(config)
+        eye = (before.position[0] + 0.11, before.position[1] + 0.02, before.position[2] + 0.21)
+        after = dataclasses.replace(before, position=eye, quaternion=unit(look_at(eye, (0.01, 0.02, 0.03))))
+        if before.fov is not None:
+            after = dataclasses.replace(after, fov=0.9)
+        plan = plan_edit({"/author/task.py": text}, uid, before, after, site)
+        if isinstance(plan, Refusal):
+            assert path.stem in REFUSED and REFUSED[path.stem] in plan.reason, plan.reason
+            continue
+        assert isinstance(plan, SourceEdit) and plan.settings is not None
+        results = hook_results(path, plan.new_text)
+        assert close(settings_of(results[hook][uid]), plan.settings), plan.diff
+        for other, configs in hook_results(path, text).items():
+            for name, was in configs.items():
+                if (other, name) != (hook, uid):
+                    assert close(settings_of(results[other][name]), settings_of(was)), plan.diff

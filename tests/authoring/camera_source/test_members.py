@@ -1,0 +1,175 @@
+"""Cameras added, duplicated, renamed and removed, as ManiSkill then has them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from tests.authoring.camera_source.real_cameras import FILE, HEADER, close, real_configs, settings_of
+from tests.authoring.camera_source.shapes import REFUSED, WRITTEN
+from tests.authoring.camera_source.test_shapes import comments
+from workbench.authoring.camera_source import (
+    Refusal,
+    SourceEdit,
+    plan_add,
+    plan_duplicate,
+    plan_remove,
+    plan_rename,
+)
+from workbench.authoring.camera_source.rotations import unit
+from workbench.core.camera_settings import CameraSettings
+from workbench.core.pictures import CameraKind
+
+NEW = CameraSettings((0.1, 0.25, 1.5), (0.5, 0.5, 0.5, -0.5), 1.25, None, 64, 48, 0.02, 12.0, "default")
+HUMAN = "_default_human_render_camera_configs"
+SENSOR = "_default_sensor_configs"
+ALONE = (
+    "configs with names of their own",
+    "a name used for one after the other",
+    "made by a method",
+    "a function within the hook",
+)
+TOP = [name for name, text in WRITTEN.items() if SENSOR in text]
+
+
+def cameras(text: str) -> dict[tuple[str, str], CameraSettings]:
+    return {key: settings_of(config) for key, config in real_configs({FILE: text}).items()}
+
+
+def same_cameras(a: dict[tuple[str, str], CameraSettings], b: dict[tuple[str, str], CameraSettings]) -> bool:
+    return list(a) == list(b) and all(close(a[key], b[key]) for key in a)
+
+
+@pytest.mark.parametrize("name", TOP)
+def test_a_camera_is_added_last(name: str) -> None:
+    source = WRITTEN[name]
+    plan = plan_add({FILE: source}, FILE, "Task", "sensor", "added", NEW)
+    if isinstance(plan, Refusal):
+        assert name == "branches with other values" and "2 returns" in plan.reason and plan.snippet
+        return
+    assert same_cameras(cameras(plan.new_text), cameras(source) | {(SENSOR, "added"): NEW}), plan.diff
+    assert comments(plan.new_text) == comments(source)
+    assert plan.settings is not None and close(plan.settings, cameras(plan.new_text)[SENSOR, "added"])
+
+
+@pytest.mark.parametrize("kind", ["sensor", "human"])
+def test_a_hook_is_made_where_there_is_none(kind: CameraKind) -> None:
+    source = "from __future__ import annotations\n\nclass Task:\n    eye = 1\n\n\nx = 2\n"
+    plan = plan_add({FILE: source}, FILE, "Task", kind, "added", NEW)
+    assert isinstance(plan, SourceEdit), plan
+    hook = SENSOR if kind == "sensor" else HUMAN
+    assert same_cameras(cameras(plan.new_text), {(hook, "added"): NEW})
+    assert len(plan.notes) == 2
+    again = plan_add({FILE: plan.new_text}, FILE, "Task", kind, "more", NEW)
+    assert isinstance(again, SourceEdit) and not again.notes
+    assert list(cameras(again.new_text)) == [(hook, "added"), (hook, "more")]
+    twice = plan_add({FILE: plan.new_text}, FILE, "Task", kind, "added", NEW)
+    assert isinstance(twice, Refusal) and "already" in twice.reason
+
+
+def test_what_cannot_be_added_to_is_refused() -> None:
+    plan = plan_add({FILE: REFUSED["a comprehension"][0]}, FILE, "Task", "sensor", "added", NEW)
+    assert isinstance(plan, Refusal) and "neither" in plan.reason
+    assert 'CameraConfig(\n    "added"' in plan.snippet
+    parent = WRITTEN["a pose of nothing"] + "\n\nclass Child(Task):\n    pass\n"
+    plan = plan_add({FILE: parent}, FILE, "Child", "sensor", "added", NEW)
+    assert isinstance(plan, Refusal) and "inherits" in plan.reason
+    library = "from mani_skill.envs.tasks import PickCubeEnv\n\n\nclass Task(PickCubeEnv):\n    pass\n"
+    plan = plan_add({FILE: library}, FILE, "Task", "sensor", "added", NEW)
+    assert isinstance(plan, Refusal) and "would take away" in plan.reason
+    for name in ("no name", 'x"); import os; ("', ""):
+        plan = plan_add({FILE: parent}, FILE, "Task", "sensor", name, NEW)
+        assert isinstance(plan, Refusal) and "is not a name" in plan.reason
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_copy_stands_beside_its_original(name: str) -> None:
+    source = WRITTEN[name]
+    now = cameras(source)
+    key = next(key for key in now if key[1] == "cam")
+    plan = plan_duplicate({FILE: source}, "cam", "copy", now[key])
+    if isinstance(plan, Refusal):
+        assert "stands alone" in plan.reason and plan.snippet
+        assert name in ALONE
+        return
+    assert same_cameras(cameras(plan.new_text), now | {(key[0], "copy"): now[key]}), plan.diff
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_camera_has_another_name(name: str) -> None:
+    source = WRITTEN[name]
+    now = cameras(source)
+    key = next(key for key in now if key[1] == "cam")
+    plan = plan_rename({FILE: source}, "cam", "front", now[key])
+    assert isinstance(plan, SourceEdit), plan
+    wanted = {(hook, "front" if uid == "cam" else uid): value for (hook, uid), value in now.items()}
+    assert same_cameras(cameras(plan.new_text), wanted), plan.diff
+    other = next((uid for _, uid in now if uid != "cam"), None)
+    if other is not None:
+        assert isinstance(plan_rename({FILE: source}, "cam", other, now[key]), Refusal)
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_camera_is_taken_out(name: str) -> None:
+    source = WRITTEN[name]
+    plan = plan_remove({FILE: source}, "cam")
+    if isinstance(plan, Refusal):
+        assert "by hand" in plan.reason
+        assert name in ALONE
+        return
+    wanted = {key: value for key, value in cameras(source).items() if key[1] != "cam"}
+    assert same_cameras(cameras(plan.new_text), wanted), plan.diff
+    assert plan.settings is None
+
+
+def test_what_is_made_in_a_loop_is_refused() -> None:
+    source = REFUSED["a loop with a plain name"][0]
+    for plan in (
+        plan_remove({FILE: source}, "cam"),
+        plan_rename({FILE: source}, "cam", "front", NEW),
+        plan_duplicate({FILE: source}, "cam", "front", NEW),
+    ):
+        assert isinstance(plan, Refusal) and "loop" in plan.reason
+
+
+def test_settings_are_those_that_are_written() -> None:
+    source = WRITTEN["a pose of nothing"]
+    exact = dataclasses.replace(
+        NEW, position=(1 / 3, 0.0, 2 / 3), quaternion=unit((1, 2, 3, 4)), fov=1.23456789
+    )
+    plan = plan_add({FILE: source}, FILE, "Task", "sensor", "added", exact)
+    assert isinstance(plan, SourceEdit) and plan.settings is not None
+    assert plan.settings.position == (0.3333, 0.0, 0.6667) and plan.settings.fov == 1.2346
+    assert close(plan.settings, cameras(plan.new_text)[SENSOR, "added"])
+
+
+def test_tidy_text_comes_of_it() -> None:
+    source = HEADER + (
+        "class Task(Base):\n"
+        "    @property\n"
+        "    def _default_sensor_configs(self):\n"
+        '        return CameraConfig("cam", sapien.Pose([0.5, 0, 0.5]), 128, 128, 1.0)\n'
+    )
+    plan = plan_add({FILE: source}, FILE, "Task", "sensor", "top", NEW)
+    assert isinstance(plan, SourceEdit)
+    assert plan.new_text.endswith(
+        """\
+        return [
+            CameraConfig("cam", sapien.Pose([0.5, 0, 0.5]), 128, 128, 1.0),
+            CameraConfig(
+                "top",
+                pose=sapien.Pose(p=[0.1, 0.25, 1.5], q=[0.5, 0.5, 0.5, -0.5]),
+                width=64,
+                height=48,
+                fov=1.25,
+                near=0.02,
+                far=12.0,
+                shader_pack="default",
+            ),
+        ]
+"""
+    )
+    back = plan_remove({FILE: plan.new_text}, "cam")
+    assert isinstance(back, SourceEdit)
+    assert 'return [\n            CameraConfig(\n                "top"' in back.new_text

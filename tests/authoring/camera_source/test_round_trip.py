@@ -1,0 +1,107 @@
+"""Any pose and any lens, in any form: what the edit says is what ManiSkill makes of the text, and what was asked for."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+
+from tests.authoring.camera_source.real_cameras import FILE, close, real_settings
+from tests.authoring.camera_source.shapes import WRITTEN
+from workbench.authoring.camera_source import Refusal, SourceEdit, plan_edit
+from workbench.authoring.camera_source.read_camera import changed_fields
+from workbench.authoring.camera_source.rotations import angle_between, look_at, unit
+from workbench.core.camera_settings import CameraSettings
+
+FORMS = (
+    "a list, positional to the end",
+    "sapien.Pose, positional",
+    "a pose of nothing",
+    "Pose.create_from_pq in a robot",
+    "euler angles in degrees",
+    "constants that are read twice",
+    "arithmetic with a height",
+    "almost straight down",
+)
+metres = st.floats(-4, 4, allow_nan=False)
+points = st.tuples(metres, metres, metres)
+quaternions = (
+    st.tuples(*[st.floats(-1, 1) for _ in range(4)]).filter(lambda q: math.hypot(*q) > 0.1).map(unit)
+)
+
+
+@st.composite
+def poses(draw: st.DrawFn) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Of all kinds: level ones, rolled ones, and such as look straight up or down, or almost."""
+    eye = draw(points)
+    kind = draw(st.sampled_from(("level", "any", "vertical")))
+    if kind == "any":
+        return eye, draw(quaternions)
+    if kind == "vertical":
+        aside = draw(st.sampled_from((0.0, 1e-7, 1e-5, 1e-4, 1e-3, 1e-2)))
+        target = (eye[0] + aside, eye[1] - aside / 2, eye[2] + draw(st.sampled_from((-1, 1))))
+    else:
+        target = draw(points)
+    quaternion = look_at(eye, target)
+    length = math.hypot(*quaternion)
+    if abs(length - 1) > 1e-4:
+        quaternion = draw(st.sampled_from(((0.5, 0.5, 0.5, -0.5), (0.7071068, 0, -0.7071068, 0))))
+    assume(math.dist(eye, target) > 1e-3)
+    return eye, unit(quaternion)
+
+
+@pytest.mark.parametrize("form", FORMS)
+@settings(max_examples=20, deadline=None)
+@given(pose=poses(), fov=st.none() | st.floats(0.05, 3.0))
+def test_write_and_read_back(form: str, pose: tuple, fov: float | None) -> None:
+    source = WRITTEN[form]
+    before = _before(form)
+    after = dataclasses.replace(before, position=pose[0], quaternion=pose[1], fov=fov or before.fov)
+    assume(changed_fields(before, after))
+    plan = plan_edit({FILE: source}, "cam", before, after)
+    if isinstance(plan, Refusal):
+        assert "smaller than what is written" in plan.reason
+        assume(False)
+    assert isinstance(plan, SourceEdit) and plan.settings is not None
+    real = real_settings({FILE: plan.new_text}, "cam")
+    assert close(plan.settings, real), plan.diff
+    assert math.dist(real.position, after.position) <= 1e-4
+    assert angle_between(real.quaternion, after.quaternion) <= math.radians(0.011), plan.diff
+    assert abs((real.fov or 0) - (after.fov or 0)) <= math.radians(0.01)
+
+
+_known: dict[str, CameraSettings] = {}
+
+
+def _before(form: str) -> CameraSettings:
+    if form not in _known:
+        _known[form] = real_settings({FILE: WRITTEN[form]}, "cam")
+    return _known[form]
+
+
+def test_a_second_edit_goes_on_from_the_first() -> None:
+    source = WRITTEN["a list, positional to the end"]
+    before = real_settings({FILE: source}, "cam")
+    for pose in (((0.4, 0.1, 0.7), (0.1, 0.2, 0.3, 0.4)), ((0.2, 0.0, 0.9), (0.5, 0.5, 0.5, -0.5))):
+        after = dataclasses.replace(before, position=pose[0], quaternion=unit(pose[1]))
+        plan = plan_edit({FILE: source}, "cam", before, after)
+        assert isinstance(plan, SourceEdit) and plan.settings is not None
+        source, before = plan.new_text, plan.settings
+    assert "q=[0.5, 0.5, 0.5, -0.5]" in source
+
+
+def test_a_point_that_the_camera_was_aimed_at_is_written() -> None:
+    source = WRITTEN["a list, positional to the end"]
+    before = real_settings({FILE: source}, "cam")
+    eye, aim = (0.5, 0.25, 0.75), (0.125, 0.0, 0.02)
+    after = dataclasses.replace(before, position=eye, quaternion=unit(look_at(eye, aim)))
+    plan = plan_edit({FILE: source}, "cam", before, after, target=aim)
+    assert isinstance(plan, SourceEdit)
+    assert "look_at(eye=[0.5, 0.25, 0.75], target=[0.125, 0, 0.02])" in plan.new_text
+    # A point that it does not look at is none.
+    elsewhere = plan_edit({FILE: source}, "cam", before, after, target=(1.0, 1.0, 1.0))
+    assert isinstance(elsewhere, SourceEdit) and elsewhere.settings is not None
+    assert angle_between(elsewhere.settings.quaternion, after.quaternion) <= math.radians(0.01)

@@ -1,0 +1,26 @@
+"""A camera's settings written into the author's file, as the smallest edit that says them.
+
+Text in, text out: nothing of the author's is executed and no simulator is imported, since the server process does
+this. `plan_edit` and its siblings give a `SourceEdit`, to be shown and then handed to `apply`, or a `Refusal` with
+the reason and a snippet to copy.
+"""
+
+from workbench.authoring.camera_source.disk import apply, not_writable, revert
+from workbench.authoring.camera_source.members import plan_add, plan_duplicate, plan_remove, plan_rename
+from workbench.authoring.camera_source.plan import plan_edit
+from workbench.authoring.camera_source.result import Refusal, SourceEdit
+from workbench.authoring.camera_source.snippet import snippet
+
+__all__ = [
+    "Refusal",
+    "SourceEdit",
+    "apply",
+    "not_writable",
+    "plan_add",
+    "plan_duplicate",
+    "plan_edit",
+    "plan_remove",
+    "plan_rename",
+    "revert",
+    "snippet",
+]

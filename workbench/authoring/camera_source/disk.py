@@ -1,0 +1,128 @@
+"""An edit made on disk, or taken back: whole or not at all, and never over somebody else's newer text.
+
+The author has the same file open in an editor and saves when they like. So the file must still have the text that
+the edit was planned on; it is replaced by a rename, which no reader sees half done; and what a text does not show
+stays as it was: line ends, encoding, byte order mark, permissions, a link that leads to the file.
+"""
+
+from __future__ import annotations
+
+import difflib
+import io
+import os
+import re
+import stat
+import tempfile
+import tokenize
+from contextlib import suppress
+from pathlib import Path
+
+from workbench.authoring.camera_source.find import check_own
+from workbench.authoring.camera_source.result import Refusal, Refused, SourceEdit
+from workbench.authoring.camera_source.source_file import BOM
+
+_LINES = re.compile(r"[^\r\n]*(?:\r\n|\r|\n|$)")
+
+
+def apply(edit: SourceEdit) -> Refusal | None:
+    """Write the edit. None when it is done; the file is as it was when there is a reason why not."""
+    return _exchange(edit.file, edit.old_text, edit.new_text, "since the change was shown")
+
+
+def revert(edit: SourceEdit) -> Refusal | None:
+    """Take an applied edit back, as long as nothing else was changed in the file since."""
+    return _exchange(edit.file, edit.new_text, edit.old_text, "since the camera was written into it")
+
+
+def not_writable(path: str) -> str | None:
+    """Why an edit of this file would be refused, as far as can be told without trying."""
+    try:
+        real = Path(path).resolve(strict=True)
+        check_own(str(real))
+        mode = real.stat().st_mode
+    except Refused as refused:
+        return refused.reason
+    except OSError as exc:
+        return f"{path} cannot be read: {exc.strerror}"
+    if not stat.S_ISREG(mode):
+        return f"{path} is not an ordinary file"
+    # To a rename the file's own mode is nothing, and to root neither is any other: so it is asked for here.
+    if not mode & 0o222 or not os.access(real, os.W_OK):
+        return f"{path} is read-only"
+    if not os.access(real.parent, os.W_OK):
+        return f"the folder {real.parent} is read-only"
+    return None
+
+
+def _exchange(path: str, expected: str, wanted: str, since: str) -> Refusal | None:
+    reason = not_writable(path)
+    if reason is not None:
+        return Refusal(reason)
+    real = Path(path).resolve()
+    try:
+        raw = real.read_bytes()
+        encoding, _ = tokenize.detect_encoding(io.BytesIO(raw).readline)
+        text = raw.decode(encoding)
+        if _plain(text) != _plain(expected):
+            return Refusal(f"{real.name} was edited {since}, so it is left as it is; ask again")
+        new = _with_line_ends_of(text, wanted).encode(encoding)
+        if not _replace(real, raw, new):
+            return Refusal(
+                f"{real.name} was saved by somebody else just now, so it is left as it is; ask again"
+            )
+    except (UnicodeError, SyntaxError) as exc:
+        return Refusal(f"{real.name} cannot be written in its encoding: {exc}")
+    except OSError as exc:
+        return Refusal(f"{real.name} cannot be written: {exc.strerror}")
+    return None
+
+
+def _replace(real: Path, old: bytes, new: bytes) -> bool:
+    """Rename a new file over `real`, unless that is no longer `old`."""
+    handle, name = tempfile.mkstemp(dir=real.parent, prefix=f".{real.name}.", suffix=".tmp")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(new)
+            file.flush()
+            os.fsync(file.fileno())
+        status = real.stat()
+        os.chmod(name, stat.S_IMODE(status.st_mode))
+        with suppress(PermissionError):  # a group's file that somebody else in the group owns
+            os.chown(name, status.st_uid, status.st_gid)
+        if real.read_bytes() != old:
+            return False
+        os.replace(name, real)
+        return True
+    finally:
+        with suppress(FileNotFoundError):
+            os.unlink(name)
+
+
+def _plain(text: str) -> str:
+    """As Python reads it: one kind of line end, no mark at the start."""
+    return text.removeprefix(BOM).replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _lines(text: str) -> list[str]:
+    return [line for line in _LINES.findall(text) if line]
+
+
+def _with_line_ends_of(text: str, wanted: str) -> str:
+    """`wanted` with the line ends that `text` has, line by line where a file mixes them."""
+    old = _lines(text)
+    new = _lines(_plain(wanted))
+    ends = [line[len(line.rstrip("\r\n")) :] for line in old]
+    common = max(("\n", "\r\n", "\r"), key=ends.count)
+    found: list[str] = []
+    matcher = difflib.SequenceMatcher(None, [_plain(line) for line in old], new, autojunk=False)
+    for tag, a, b, c, d in matcher.get_opcodes():
+        for index in range(c, d):
+            line = new[index]
+            if not line.endswith("\n"):
+                found.append(line)
+                continue
+            paired = a + index - c
+            same = tag == "equal" or (tag == "replace" and paired < b)
+            end = ends[paired] if same and ends[paired] else common
+            found.append(line[:-1] + end)
+    return "".join(found)

@@ -1,0 +1,48 @@
+"""What comes of wanting a camera written into the author's file: an edit to be shown first, or the reason why not."""
+
+from __future__ import annotations
+
+import difflib
+from dataclasses import dataclass
+from pathlib import PurePath
+
+from workbench.core.camera_settings import CameraSettings
+
+
+@dataclass(frozen=True)
+class SourceEdit:
+    """A change of one file, not made yet: `workbench.authoring.camera_source.apply` makes it."""
+
+    file: str
+    old_text: str
+    new_text: str
+    notes: tuple[str, ...]
+    """Sentences for the author: what was done otherwise than they may expect."""
+    settings: CameraSettings | None
+    """What the new text gives the camera, rounded as it is written. None for a camera that was removed."""
+
+    @property
+    def diff(self) -> str:
+        """As ``diff -u`` writes it, with three lines around each change."""
+        name = PurePath(self.file).name
+        lines = difflib.unified_diff(
+            self.old_text.splitlines(), self.new_text.splitlines(), name, name, lineterm=""
+        )
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why the file is left alone, and what the author can copy into it themselves."""
+
+    reason: str
+    snippet: str = ""
+    """``CameraConfig(...)`` with the wanted settings; empty where there are none."""
+
+
+class Refused(Exception):
+    """Ends a plan from anywhere inside; the public functions turn it into a `Refusal`."""
+
+    @property
+    def reason(self) -> str:
+        return str(self.args[0])
