@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import psutil
@@ -11,8 +12,17 @@ import pytest
 
 from tests.browser.opened import open_workbench
 from tests.session.hazards import provoke, provoked, write_task
+from tests.ui.tabs import open_deaf_tab, tabs_of
+from workbench.recording.verify import verify_rrd
 
 PATIENCE = 15.0
+
+
+def until(reached: Callable[[], object], what: str) -> None:
+    deadline = time.monotonic() + 90
+    while not reached():
+        assert time.monotonic() < deadline, f"{what} did not come"
+        time.sleep(0.05)
 
 
 def gone(processes: list[psutil.Process]) -> bool:
@@ -26,12 +36,39 @@ def test_a_worker_that_hangs_ends_with_its_server(tmp_path: Path, number: signal
     provoke(file, "build", "catch")
     with open_workbench(str(file), "--num-envs", "1", "--no-spare", cwd=tmp_path) as opened:
         server = psutil.Process(opened.process.pid)
-        deadline = time.monotonic() + 60
-        while not provoked(file):
-            assert time.monotonic() < deadline, "the task was not built"
-            time.sleep(0.1)
+        until(lambda: provoked(file), "the building of the task")
         (worker,) = server.children(recursive=True)
         began = time.monotonic()
         server.send_signal(number)
         assert gone([server, worker])
         print(f"{number.name}: all gone after {time.monotonic() - began:.2f} s")
+
+
+def test_ctrl_c_ends_all_that_there_can_be(tmp_path: Path) -> None:
+    """Tabs, one of which reads nothing; a recording; a worker in an endless loop; a spare one and one that judges."""
+    file = write_task(tmp_path)
+    # Without a renderer: the first picture takes a software renderer some 15 s.
+    arguments = (str(file), "--num-envs", "2", "--env", "render_backend=none")
+    with open_workbench(*arguments, cwd=tmp_path) as opened, tabs_of(opened.url) as tabs:
+        server = psutil.Process(opened.process.pid)
+        opened.wait_for_line("loaded", 90)
+        tab, _ = tabs.open(), tabs.open()
+        deaf = open_deaf_tab(opened.url)
+        until(lambda: tab.open, "the tab")
+        tabs.trigger(tab, "Start or stop recording")
+        tabs.trigger(tab, "Play or pause")
+        until(lambda: list((tmp_path / "recordings").glob("*.rrd")), "the first episodes")
+        file.write_text(file.read_text().replace("> 0.05}", "> 0.06}"))
+        opened.wait_for_line("patched", 90)
+        until(lambda: len(server.children()) == 3, "the spare worker and the judging one")
+        provoke(file, "evaluate", "catch")
+        until(lambda: provoked(file), "the loop")
+        processes = [server, *server.children(recursive=True)]
+        began = time.monotonic()
+        server.send_signal(signal.SIGINT)
+        assert gone(processes)
+        print(f"all gone after {time.monotonic() - began:.2f} s")
+        deaf.close()
+    recordings = list((tmp_path / "recordings").iterdir())
+    assert recordings and not [problem for problem in map(verify_rrd, recordings) if problem is not None]
+    assert "Traceback" not in "\n".join(opened.lines)

@@ -91,14 +91,15 @@ def play_to_pause(page: Page, clicks: int) -> list[float]:
     """Seconds from clicking Play to the button that says Pause."""
     times = []
     for _ in range(clicks):
-        times.append(_timed_click(page, "Play", "Pause"))
+        times.append(timed_click(page, "Play", "Pause"))
         time.sleep(0.2)
-        _timed_click(page, "Pause", "Play")
+        timed_click(page, "Pause", "Play")
         time.sleep(0.2)
     return times
 
 
-def _timed_click(page: Page, label: str, effect: str) -> float:
+def timed_click(page: Page, label: str, effect: str) -> float:
+    """Seconds from a click on this button to the button that it becomes."""
     # Timed inside the page, so that the way between this script and Chromium does not count.
     return page.evaluate(
         """([label, effect]) => new Promise((done) => {
@@ -142,7 +143,7 @@ def main(options: Options) -> None:
             clicks = play_to_pause(page, options.clicks)
             steps = key_to_step(page, options.clicks)
             page.get_by_role("tab", name="Run").click()
-            _timed_click(page, "Play", "Pause")
+            timed_click(page, "Play", "Pause")
             time.sleep(2.0)
             applied, frames = page.evaluate(COUNT, options.seconds)
     drawing = "Chromium draws in software" if options.software else "draw calls replaced by nothing"

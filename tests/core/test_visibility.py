@@ -133,7 +133,16 @@ def test_what_the_robot_stands_before_is_said(env: Any) -> None:
     free = judge_placement(env, Placement(above), [0])
     cube = seen(free, "cube")
     assert cube.pixels[0] == cube.unhindered[0] > 50 and cube.hidden_share[0] == 0 and not cube.cut[0]
-    assert free.env_marks(["cube"])[0] > 0.7
+    assert free.env_marks(["cube"])[0] > 0.7 and 0.3 < cube.margin[0] < 0.5
+
+
+def test_what_stands_behind_another_object_is_said(env: Any) -> None:
+    # From under the table: the table is in the way, and the robot is not.
+    x, y, z = cube_at(env, 0)
+    report = judge_placement(env, Placement(looking(LookAt((x + 0.02, y, -0.3), (x, y, z)))), [0])
+    cube = seen(report, "cube")
+    assert cube.unhindered[0] == cube.pixels[0] == 0 and cube.alone[0] > 20 and cube.covered_share[0] == 1
+    assert cube.summary().covered == 1 and cube.summary().wholly_hidden == 0
 
 
 def test_a_cut_object_and_one_out_of_view_are_told_apart(env: Any) -> None:

@@ -153,9 +153,12 @@ def test_pictures_come_of_the_selected_env_and_only_while_somebody_looks(session
     assert picture.rgb.shape == (sensor.height, sensor.width, 3) and picture.rgb.std() > 5
     assert picture.depth.shape == (sensor.height, sensor.width) and picture.depth.max() > 0.1
     assert set(np.unique(picture.segmentation)) - {0} <= view.task.segmentation.keys()
-    session.watch_cameras(())
     session.set_clients(0)
     session.select_env(0)
+    session.step()
+    wait_until(session, lambda v: v.step.elapsed_steps[0] == 2, "another step")
+    assert not session.view().pictures, "nobody looks any more"
+    session.watch_cameras(())
 
 
 def test_recording_writes_an_episode_that_rerun_verifies(session: Session) -> None:

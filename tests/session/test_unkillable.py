@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -19,8 +21,10 @@ from tests.session.conftest import wait_until
 from tests.session.hazards import calm, edit, line_of, provoke, write_task
 from workbench.recording.read import read_properties
 from workbench.recording.verify import verify_rrd
+from workbench.session.interrupts import INTERRUPT_SIGNAL
 from workbench.session.kept_worker import WorkerOptions
 from workbench.session.messages import TaskOptions
+from workbench.session.process import _signal_main_thread
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 
@@ -269,3 +273,21 @@ def test_a_worker_that_is_killed_while_it_waits_comes_back(session: Session) -> 
     before = session.view()
     os.kill(session.worker_pid, signal.SIGKILL)
     assert "was killed by SIGKILL" in died_and_came_back(session, before).problem.message
+
+
+def test_an_interrupt_is_for_the_thread_that_python_handles_signals_in() -> None:
+    """The kernel may give a signal for the process to a thread of torch's, and then nothing leaves the loop."""
+    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    child.send_signal(signal.SIGSTOP)
+    try:
+        _signal_main_thread(child.pid, INTERRUPT_SIGNAL)
+        status = Path(f"/proc/{child.pid}/status").read_text()
+        pending = {
+            line.split(":")[0]: int(line.split()[1], 16) for line in status.splitlines() if "Pnd" in line
+        }
+        bit = 1 << (INTERRUPT_SIGNAL - 1)
+        assert pending["SigPnd"] & bit and not pending["ShdPnd"] & bit
+    finally:
+        child.kill()
+        child.wait()
+    _signal_main_thread(child.pid, INTERRUPT_SIGNAL)  # gone: nothing to interrupt

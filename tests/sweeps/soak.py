@@ -2,8 +2,8 @@
 
     python tests/sweeps/soak.py [--reloads 500] [--deaths 50] [--num-envs 4] [--no-spare]
 
-Versions of `tests/session/hazards.py`'s task are saved one after the other: two that are good, one with a wrong
-syntax, one that raises in ``evaluate``. In between the worker dies, in one of several ways. After each tenth of
+Versions of `tests/session/hazards.py`'s task are saved one after the other: one that can be put on the envs as they
+are, one with a wrong syntax, one for which all envs are built anew, one that raises in ``evaluate``. In between the worker dies, in one of several ways. After each tenth of
 it all a row says what the server and the worker hold: memory, threads, open files, child processes. The last
 lines say how much the server's figures grew from the first row to the last, and what was left at the end.
 """
@@ -13,6 +13,7 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,18 +71,23 @@ def reach(session: Session, reached: Callable[[SessionView], bool], what: str) -
     raise TimeoutError(f"{what} did not come: {session.view().state}, {session.view().problem}")
 
 
-def save(session: Session, file: Path, good: str, number: int) -> None:
-    """Save version `number` and see it loaded, or refused."""
+def save(session: Session, file: Path, good: str, number: int, levels: Counter[str]) -> None:
+    """Save version `number` and see it loaded, which `levels` counts, or refused."""
     before = session.view()
     if number % 4 == 1:
         file.write_text(good + f"\ndef broken(:  # {number}\n")
     elif number % 4 == 3:
         file.write_text(good.replace('hazard("evaluate")', f"raise KeyError({number})"))
     else:
-        file.write_text(
-            good.replace('{"success"', f'{{"version": self.cube.pose.p[:, 0] * 0 + {number}, "success"')
+        changed = good.replace(
+            '{"success"', f'{{"version": self.cube.pose.p[:, 0] * 0 + {number - number % 4}, "success"'
         )
-        reach(session, lambda v: v.task_serial > before.task_serial, f"version {number}")
+        scene = number if number % 4 == 2 else max(0, number - 2)  # of the scene that stands
+        changed = changed.replace("\nVERSION = 0\n", f"\nVERSION = {scene}\n")
+        file.write_text(changed)
+        view = reach(session, lambda v: v.task_serial > before.task_serial, f"version {number}")
+        if view.reload is not None:
+            levels[view.reload.level] += 1
         return
     reach(
         session, lambda v: v.problem is not None and v.problem_serial > before.problem_serial, "the problem"
@@ -116,8 +122,9 @@ def main(options: Options) -> None:
         per_death = max(1, options.reloads // max(1, options.deaths))
         rows: list[Holds] = []
         back: list[float] = []
+        levels: Counter[str] = Counter()
         for number in range(options.reloads):
-            save(session, file, good, number)
+            save(session, file, good, number, levels)
             if number % per_death == per_death - 1 and len(back) < options.deaths:
                 file.write_text(good)
                 reach(session, lambda v: v.problem is None and not v.stale, "the good version")
@@ -135,7 +142,7 @@ def main(options: Options) -> None:
         f"server from the first row to the last: {last.megabytes - first.megabytes:+.0f} MB, "
         f"{last.threads - first.threads:+d} threads, {last.files - first.files:+d} files"
     )
-    print(f"after the end: {end}")
+    print(f"after the end: {end}; reloads that were good: {dict(levels)}")
     if back:
         print(f"back after a death: median {sorted(back)[len(back) // 2]:.2f} s, worst {max(back):.2f} s")
 

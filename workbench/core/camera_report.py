@@ -38,6 +38,8 @@ class ObjectSummary:
     """How much of it the robot covers, on average over the envs where it would be seen without the robot."""
     wholly_hidden: float
     """Share of the envs that have it in which nothing but the robot keeps it from being seen."""
+    covered: float
+    """How much of it other things than the robot cover, on average over the envs where it is in the picture."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +58,12 @@ class ObjectSeen:
     """(E,) seen, in pixels of the camera's own size, also where smaller pictures were judged."""
     unhindered: NDArray[np.float32]
     """(E,) what they would be if the robot were not drawn."""
+    alone: NDArray[np.float32]
+    """(E,) what they would be if nothing else were drawn; `unhindered` for scenery, of which that is not asked."""
     cut: NDArray[np.bool_]
-    """(E,) it reaches the border of the picture, seen without the robot."""
+    """(E,) it reaches the border of the picture, seen alone."""
+    margin: NDArray[np.float32]
+    """(E,) from it to the nearest border, as a share of the picture's shorter side; 0 where it is cut or not seen."""
 
     @property
     def hidden_share(self) -> NDArray[np.float32]:
@@ -66,14 +72,21 @@ class ObjectSeen:
             share = 1 - self.pixels / self.unhindered
         return np.where(self.unhindered > 0, np.clip(share, 0, 1), np.nan).astype(np.float32)
 
+    @property
+    def covered_share(self) -> NDArray[np.float32]:
+        """(E,) how much of it other things than the robot cover; NaN where it is out of the picture."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = 1 - self.unhindered / self.alone
+        return np.where(self.alone > 0, np.clip(share, 0, 1), np.nan).astype(np.float32)
+
     def marks(self, enough_pixels: float = ENOUGH_PIXELS) -> NDArray[np.float32]:
         """(E,) 0 where it is not seen, 1 where it is whole, in the open and large enough; NaN where it is absent.
 
-        The product of what is left to see: the share that the robot leaves, half where the border cuts it, and
+        The product of what is left to see: the share that nothing covers, half where the border cuts it, and
         for small objects the square root of their pixels (a length: twice as far away is half as good).
         """
-        size = np.sqrt(np.clip(self.unhindered / enough_pixels, 0, 1))
-        open_share = np.nan_to_num(1 - self.hidden_share, nan=0.0)
+        size = np.sqrt(np.clip(self.alone / enough_pixels, 0, 1))
+        open_share = np.clip(self.pixels / np.maximum(self.alone, 1e-6), 0, 1)
         marks = np.where(self.pixels > 0, size * open_share * np.where(self.cut, 0.5, 1.0), 0.0)
         return np.where(self.present, marks, np.nan).astype(np.float32)
 
@@ -81,8 +94,8 @@ class ObjectSeen:
         here = self.present
         count = int(here.sum())
         if not count:
-            return ObjectSummary(0, *[float("nan")] * 5)
-        could = here & (self.unhindered > 0)
+            return ObjectSummary(0, *[float("nan")] * 6)
+        could, inside = here & (self.unhindered > 0), here & (self.alone > 0)
         return ObjectSummary(
             present=count,
             seen=float((self.pixels[here] > 0).mean()),
@@ -90,6 +103,7 @@ class ObjectSeen:
             cut=float(self.cut[here].mean()),
             hidden=float(self.hidden_share[could].mean()) if could.any() else float("nan"),
             wholly_hidden=float((could & (self.pixels == 0)).sum() / count),
+            covered=float(self.covered_share[inside].mean()) if inside.any() else float("nan"),
         )
 
 
@@ -194,7 +208,9 @@ def join_reports(reports: Sequence[CameraReport]) -> CameraReport:
             present=np.concatenate([thing.present for thing in same]),
             pixels=np.concatenate([thing.pixels for thing in same]),
             unhindered=np.concatenate([thing.unhindered for thing in same]),
+            alone=np.concatenate([thing.alone for thing in same]),
             cut=np.concatenate([thing.cut for thing in same]),
+            margin=np.concatenate([thing.margin for thing in same]),
         )
         for same in zip(*[report.objects for report in reports], strict=True)
     )

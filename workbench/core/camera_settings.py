@@ -55,28 +55,30 @@ CLOSE = 1e-6
 of near and far, as a share. A config keeps its pose in single precision."""
 
 
-def differences(a: CameraSettings, b: CameraSettings) -> tuple[str, ...]:
+def differences(a: CameraSettings, b: CameraSettings, close: float = CLOSE) -> tuple[str, ...]:
     """Which of ``position orientation fov intrinsic width height near far shader_pack`` are not the same."""
     found: list[str] = []
-    if not _close(a.position, b.position):
+    if not _close(a.position, b.position, close):
         found.append("position")
     turned = tuple(-x for x in b.quaternion)
-    if not _close(a.quaternion, b.quaternion) and not _close(a.quaternion, turned):
+    if not _close(a.quaternion, b.quaternion, close) and not _close(a.quaternion, turned, close):
         found.append("orientation")
-    if (a.fov is None) != (b.fov is None) or (a.fov and b.fov and not _close((a.fov,), (b.fov,))):
+    if (a.fov is None) != (b.fov is None) or (a.fov and b.fov and not _close((a.fov,), (b.fov,), close)):
         found.append("fov")
     flat = [None if c.intrinsic is None else tuple(x for row in c.intrinsic for x in row) for c in (a, b)]
-    if (flat[0] is None) != (flat[1] is None) or (flat[0] and flat[1] and not _close(flat[0], flat[1])):
+    if (flat[0] is None) != (flat[1] is None) or (
+        flat[0] and flat[1] and not _close(flat[0], flat[1], close)
+    ):
         found.append("intrinsic")
     found += [name for name in ("width", "height") if getattr(a, name) != getattr(b, name)]
-    found += [name for name in ("near", "far") if not _close((getattr(a, name),), (getattr(b, name),))]
+    found += [name for name in ("near", "far") if not _close((getattr(a, name),), (getattr(b, name),), close)]
     if a.shader_pack != b.shader_pack:
         found.append("shader_pack")
     return tuple(found)
 
 
-def _close(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
-    return all(abs(x - y) <= CLOSE * max(1.0, abs(x), abs(y)) for x, y in zip(a, b, strict=True))
+def _close(a: tuple[float, ...], b: tuple[float, ...], close: float) -> bool:
+    return all(abs(x - y) <= close * max(1.0, abs(x), abs(y)) for x, y in zip(a, b, strict=True))
 
 
 MOST_PIXELS = 4096

@@ -45,6 +45,11 @@ class PlacedCameras:
         """The cameras that were placed are gone, with their env or without it."""
         self._placed.clear()
 
+    def settings(self, key: CameraKey) -> CameraSettings | None:
+        """As a camera was placed; None where the task has it as it likes."""
+        placed = self._placed.get(key)
+        return None if placed is None else placed.settings
+
     def place(self, env: Any, key: CameraKey, settings: CameraSettings | None) -> bool:
         """Place a camera in all envs; None puts it back where the task had it.
 

@@ -50,6 +50,10 @@ class TemporaryCamera:
         depth = depth_in_metres(_TEXTURE, data, -data[..., 2], self._component)
         return data[..., 3].astype(np.int32), depth
 
+    def colours(self) -> NDArray[np.uint8]:
+        """(H, W, 3) RGB of what was looked at last."""
+        return np.ascontiguousarray(self._component.get_picture("Color")[..., :3])
+
 
 @contextmanager
 def temporary_camera(

@@ -2,13 +2,14 @@
 
 Whether the cube is in view can be computed from boxes and frustums, and is then wrong wherever something stands
 before it. So it is rendered: the segmentation says whose every pixel is, and rendering once more with the robot's
-visuals switched off says what the robot stood before. That costs two pictures an env (one where the robot is not in
-view), and their size may be less than the camera's own, with the same view.
+visuals switched off says what the robot stood before; rendering each object with all else switched off says where the
+border cuts it and what other things cover. Nearly all of a picture's cost is the robot's meshes (30 ms with a Panda on
+a software driver, 2 ms without), so the pictures without it come almost free. Their size may be less than the camera's
+own, with the same view.
 
 Any placement can be judged, a camera that exists and one that is only thought of alike; nothing of the env changes
 (see `temporary_camera`). What a sensor must not see it does not see here: a goal marker that the task hides counts
-as never drawn, and one that is part of the scene counts like any object. Only the robot's hiding is told apart from
-mere smallness: an object that stands behind another, or in a box, has few pixels and no reason.
+as never drawn, and one that is part of the scene counts like any object.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from workbench.core.body_table import BodyTable, build_body_table, read_poses
 from workbench.core.camera_frames import compose, intrinsic_of, make_pose, matrix3, scaled_intrinsic
 from workbench.core.camera_report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen
 from workbench.core.camera_settings import CameraKey, CameraSettings
-from workbench.core.pictures import CameraKind
+from workbench.core.pictures import CameraKind, Picture
 from workbench.core.take_pictures import body_name, cameras_of
 from workbench.core.temporary_camera import TemporaryCamera, temporary_camera, undrawn
 
@@ -152,6 +153,18 @@ def judge_placement(
     return _judge(env, (placement.kind, name), lambda e: placement, envs, size, poses, table, cancelled)
 
 
+def picture_of(
+    env: Any, e: int, placement: Placement, table: BodyTable, poses: NDArray[np.float32] | None = None
+) -> Picture:
+    """What a camera that does not exist sees of one env, in its own size; raises as `judge_placement`."""
+    bodies = read_poses(env, table)[e] if poses is None else poses
+    pose = pose_in_env(placement, bodies, table)
+    with placed_camera(env, e, placement, None, poses) as view:
+        segmentation, depth = view.look(pose)
+        rgb = view.colours()
+    return Picture("suggested", placement.kind, e, pose.astype(np.float32), rgb, depth, segmentation)
+
+
 def settings_of(camera: Any, env_index: int) -> CameraSettings:
     """How one env's camera stands and sees now; `camera` as `cameras_of` gives it.
 
@@ -186,13 +199,15 @@ def small_size(width: int, height: int, shorter: int = SMALL) -> tuple[int, int]
 
 
 @dataclass(frozen=True)
-class _Measured:
-    """One env's pictures, counted."""
+class Measured:
+    """One env's pictures, counted; objects as `list_objects` gives them, with pixels of the judged size."""
 
     present: NDArray[np.bool_]
     pixels: NDArray[np.float32]
     unhindered: NDArray[np.float32]
+    alone: NDArray[np.float32]
     cut: NDArray[np.bool_]
+    margin: NDArray[np.float32]
     counts: NDArray[np.int64]
     background: float
     beyond: float
@@ -219,20 +234,32 @@ def _judge(
         raise IndexError(f"envs {list(envs)} are out of range for {env.num_envs} envs")
     objects = list_objects(env, table)
     bodies = read_poses(env, table) if poses is None else poses
-    measured: list[_Measured] = []
+    measured: list[Measured] = []
     judged: list[int] = []
     shown: list[Placement] = []
     for e in envs:
         if measured and cancelled():
             break
         placement = placement_in(e)
-        settings = placement.settings
         with placed_camera(env, e, placement, size, None if poses is None else poses[e]) as view:
             pose = pose_in_env(placement, bodies[e], table)
-            measured.append(measure(view, pose, e, objects, table))
+            measured.append(measure(view, pose, e, objects, table, camera[0]))
         judged.append(e)
         shown.append(placement)
-    settings = shown[0].settings
+    milliseconds = 1000 * (time.perf_counter() - began)
+    return report_of(camera, shown[0].settings, size, judged, objects, measured, milliseconds)
+
+
+def report_of(
+    camera: CameraKey,
+    settings: CameraSettings,
+    size: tuple[int, int] | None,
+    envs: Sequence[int],
+    objects: Sequence[SceneObject],
+    measured: Sequence[Measured],
+    milliseconds: float,
+) -> CameraReport:
+    """What was measured in each of `envs`, put together."""
     own = (settings.width, settings.height)
     judged_size = size or own
     scale = own[0] * own[1] / (judged_size[0] * judged_size[1])
@@ -240,7 +267,7 @@ def _judge(
         camera=camera,
         size=own,
         judged_size=judged_size,
-        envs=tuple(judged),
+        envs=tuple(envs),
         objects=tuple(_seen(objects, measured, camera[0], scale)),
         depth=DepthReport(
             counts=np.stack([m.counts for m in measured]),
@@ -251,7 +278,7 @@ def _judge(
             farthest_object=np.array([m.farthest_object for m in measured], np.float32),
         ),
         pictures=sum(m.pictures for m in measured),
-        milliseconds=1000 * (time.perf_counter() - began),
+        milliseconds=milliseconds,
     )
 
 
@@ -279,32 +306,64 @@ def pose_in_env(placement: Placement, bodies: NDArray[np.float32], table: BodyTa
 
 
 def measure(
-    view: TemporaryCamera, pose: NDArray, e: int, objects: Sequence[SceneObject], table: BodyTable
-) -> _Measured:
-    """Look once, and once more without the robot if it is in view, and count."""
-    entities = [[table.entities[e, body] for body in thing.bodies] for thing in objects]
-    ids = [[entity.per_scene_id for entity in row if entity is not None] for row in entities]
+    view: TemporaryCamera,
+    pose: NDArray,
+    e: int,
+    objects: Sequence[SceneObject],
+    table: BodyTable,
+    kind: CameraKind,
+    bare: Measured | None = None,
+) -> Measured:
+    """Look; once more without the robot, if it is in view; and at each object alone; and count.
+
+    Args:
+        bare: what was measured from this pose with the robot not drawn, if that was; then one look is enough.
+    """
+    entities = [entities_of(thing, e, table) for thing in objects]
+    ids = [[entity.per_scene_id for entity in row] for row in entities]
     segmentation, depth = view.look(pose)
-    robot_ids = [number for thing, row in zip(objects, ids, strict=True) if thing.robot for number in row]
     pictures = 1
-    bare = segmentation
-    if np.isin(segmentation, robot_ids).any():
-        robot = [x for thing, row in zip(objects, entities, strict=True) if thing.robot for x in row]
-        with undrawn(robot):
-            bare, _ = view.look(pose)
-        pictures = 2
-    border = np.concatenate([bare[0], bare[-1], bare[:, 0], bare[:, -1]])
+    # Comparing with few numbers is ten times faster than np.isin, and this is done for hundreds of pictures.
+    here = set(np.unique(segmentation).tolist())
+    pixels = np.array([_mask(segmentation, here.intersection(row)).sum() for row in ids], np.float32)
+    if bare is None:
+        unhindered, alone, margin = (np.zeros(len(objects), np.float32) for _ in range(3))
+        without = segmentation
+        robot = [
+            entity for thing, row in zip(objects, entities, strict=True) if thing.robot for entity in row
+        ]
+        if any(entity.per_scene_id in here for entity in robot):
+            with undrawn(robot):
+                without, _ = view.look(pose)
+            pictures += 1
+        left = set(np.unique(without).tolist())
+        every = [entity for entity in table.entities[e] if entity is not None]
+        for i, (thing, row) in enumerate(zip(objects, ids, strict=True)):
+            mask = _mask(without, left.intersection(row))
+            unhindered[i] = mask.sum()
+            if not (thing.robot or thing.scenery or (thing.hidden and kind == "sensor")):
+                own = set(row)
+                with undrawn([entity for entity in every if entity.per_scene_id not in own]):
+                    mask = view.look(pose)[0] != 0
+                pictures += 1
+            alone[i] = mask.sum()
+            margin[i] = _margin(mask)
+    else:
+        unhindered, alone, margin = bare.unhindered, bare.alone, bare.margin
+    cut = (alone > 0) & (margin == 0)
     counted = [number for thing, row in zip(objects, ids, strict=True) if not thing.scenery for number in row]
     something = segmentation != 0
     far = depth[something]
-    of_objects = depth[np.isin(segmentation, counted)]
+    of_objects = depth[_mask(segmentation, here.intersection(counted))]
     limit = float(of_objects.max()) if len(of_objects) else np.nan
     counts, _ = np.histogram(np.clip(far, DEPTH_EDGES[0], DEPTH_EDGES[-1]), DEPTH_EDGES)
-    return _Measured(
+    return Measured(
         present=np.array([bool(row) for row in ids]),
-        pixels=np.array([np.isin(segmentation, row).sum() for row in ids], np.float32),
-        unhindered=np.array([np.isin(bare, row).sum() for row in ids], np.float32),
-        cut=np.array([bool(np.isin(border, row).any()) for row in ids]),
+        pixels=pixels,
+        unhindered=unhindered,
+        alone=alone,
+        cut=cut,
+        margin=margin,
         counts=counts.astype(np.int64),
         background=float(1 - something.mean()),
         # Where nothing counts is in view, all of it is room.
@@ -316,8 +375,29 @@ def measure(
     )
 
 
+def entities_of(thing: SceneObject, e: int, table: BodyTable) -> list[Any]:
+    """The ``sapien.Entity`` of each body of an object that env `e` has."""
+    return [entity for entity in table.entities[e, list(thing.bodies)] if entity is not None]
+
+
+def _mask(segmentation: NDArray[np.int32], numbers: Collection[int]) -> NDArray[np.bool_]:
+    mask = np.zeros(segmentation.shape, bool)
+    for number in numbers:
+        mask |= segmentation == number
+    return mask
+
+
+def _margin(mask: NDArray[np.bool_]) -> float:
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not len(rows):
+        return 0.0
+    height, width = mask.shape
+    least = min(rows[0], height - 1 - rows[-1], columns[0], width - 1 - columns[-1])
+    return float(least) / min(width, height)
+
+
 def _seen(
-    objects: Sequence[SceneObject], measured: Sequence[_Measured], kind: CameraKind, scale: float
+    objects: Sequence[SceneObject], measured: Sequence[Measured], kind: CameraKind, scale: float
 ) -> Iterator[ObjectSeen]:
     for i, thing in enumerate(objects):
         if thing.robot or thing.name == "ground":
@@ -329,7 +409,9 @@ def _seen(
             present=np.array([m.present[i] for m in measured]),
             pixels=np.array([m.pixels[i] for m in measured], np.float32) * np.float32(scale),
             unhindered=np.array([m.unhindered[i] for m in measured], np.float32) * np.float32(scale),
+            alone=np.array([m.alone[i] for m in measured], np.float32) * np.float32(scale),
             cut=np.array([m.cut[i] for m in measured]),
+            margin=np.array([m.margin[i] for m in measured], np.float32),
         )
 
 

@@ -20,6 +20,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.authoring import camera_files
+from workbench.core.camera_frames import Convention, Direction, relative_to, with_pose
 from workbench.core.camera_settings import (
     CameraKey,
     CameraKind,
@@ -29,24 +31,35 @@ from workbench.core.camera_settings import (
 )
 from workbench.core.pictures import CameraInfo
 from workbench.core.step import StepResult
+from workbench.session.camera_judging import CameraJudging, ShownMoment
+from workbench.session.camera_messages import CameraAnswer
 from workbench.session.camera_writing import CameraWriting, Wish, plan
-from workbench.session.messages import PlaceCamera, Placed, Request, TaskDescription
+from workbench.session.messages import Load, PlaceCamera, Placed, Request, TaskDescription
 from workbench.session.placements import Placements
 from workbench.session.studio_view import StudioCamera, StudioView
 
+MOST_SEEDS = 1000
 _ON_THE_GPU = "in GPU simulation cameras cannot be moved; open the task with --backend cpu to place them"
 
 
 class CameraStudio:
     """See the module's text."""
 
-    def __init__(self, send: Callable[[Request], None], on_change: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        send: Callable[[Request], None],
+        on_change: Callable[[], None],
+        shown: Callable[[], ShownMoment],
+        load: Callable[[], Load | None],
+    ) -> None:
         """
         Args:
             send: to the worker that plays.
             on_change: called, on any thread, when `view` has something new.
+            shown: what the page shows now.
+            load: how another worker gets the version that runs; None before there is one.
         """
-        self._send, self._on_change = send, on_change
+        self._send, self._on_change, self._shown, self._load = send, on_change, shown, load
         self._lock = threading.Lock()
         self._thread = ThreadPoolExecutor(1, "studio")
         self._closing = False
@@ -56,6 +69,9 @@ class CameraStudio:
         self._problem = ""
         self._placements = Placements()
         self._writing = CameraWriting()
+        self._judging = CameraJudging(send, self._note)
+        self._drawn: tuple[StepResult | None, int] = (None, 0)
+        """What was shown last: the step and the selected env."""
 
     # --- placing -------------------------------------------------------------------------------------
 
@@ -168,8 +184,14 @@ class CameraStudio:
         """Judge a camera as it is placed over all envs.
 
         Args:
-            seeds: 0 for the envs as they are now; else over so many freshly reset ones, in the background.
+            seeds: 0 for the envs at the shown moment; else over so many freshly reset ones, in the background.
         """
+        with self._lock:
+            known, now, moved = self._known(key), self._placements.now(key), self._placements.moved(key)
+        if known and seeds <= 0:
+            self._judging.judge(key, now, self._shown())
+        elif known and (load := self._load()) is not None:
+            self._judging.judge_seeds(key, now, moved, load, min(seeds, MOST_SEEDS))
 
     def suggest(
         self,
@@ -180,34 +202,120 @@ class CameraStudio:
         seeds: int,
     ) -> None:
         """Search placements that see these objects over so many seeds, with the eye between two corners."""
+        with self._lock:
+            known, lens, info = self._known(key), self._placements.now(key), self._info(key)
+            if known and info is not None and info.mount is not None:
+                self._problem = (
+                    f"{key[1]} rides on {info.mount}: places are searched for cameras that stand still."
+                )
+                known = False
+            elif known and lens is None:
+                self._problem = f"{key[1]} cannot be placed: {self._refusal(key)}."
+        if known and lens is not None and (load := self._load()) is not None:
+            self._judging.suggest(key, lens, tuple(objects), low, high, load, seeds)
+        self._note()
 
     def take_suggestion(self, index: int) -> None:
         """Place the camera as suggested."""
+        looked = self._judging.looked
+        key = looked.suggestions_of
+        if key is None or not 0 <= index < len(looked.suggestions):
+            return
+        found = looked.suggestions[index].settings
+        with self._lock:
+            now = self._placements.now(key)
+        if now is not None:
+            self.place(key, replace(now, position=found.position, quaternion=found.quaternion))
 
     def stop(self) -> None:
-        """Stop whatever runs in the background."""
+        """Stop whatever runs in the background; what is known stays."""
+        self._judging.stop()
 
     def compare(self, key: CameraKey, other: CameraSettings) -> None:
-        """Two pictures of the shown env: the camera as it is, and as it would be with other settings."""
+        """Two pictures of the shown env: the camera as it is placed, and as it would be with other settings."""
+        with self._lock:
+            why_not = self._refusal(key) or why_no_camera(other)
+            if why_not:
+                self._problem = f"{key[1]} is not compared: {why_not}."
+        if not why_not:
+            self._judging.compare(key, other, self._shown())
+        self._note()
 
     def make_sheet(self, key: CameraKey) -> None:
-        """The pictures of all envs by one camera."""
+        """The pictures of all envs by one camera, worst first if it was judged over them."""
+        with self._lock:
+            known = self._known(key)
+        if known:
+            self._judging.make_sheet(key, self._shown())
 
     def pick(self, key: CameraKey, u: float, v: float) -> None:
         """What is seen at a place of the picture: 0, 0 is its upper left corner, 1, 1 its lower right one."""
+        with self._lock:
+            info, task = self._info(key), self._task
+        if info is not None and task is not None:
+            self._judging.pick(info, u, v, self._shown(), task.segmentation)
+
+    def _known(self, key: CameraKey) -> bool:
+        if self._info(key) is None:
+            self._problem = f"There is no {key[0]} camera {key[1]}."
+            return False
+        return True
 
     # --- in other words --------------------------------------------------------------------------------
 
     def export(self, keys: Sequence[CameraKey], form: Literal["json", "opencv", "ros"]) -> str:
-        """The cameras as they are placed, as the text of a file."""
-        raise NotImplementedError
+        """The cameras as they are placed, at the shown moment of the selected env, as the text of a file.
 
-    def import_pose(self, key: CameraKey, text: str, direction: str, convention: str) -> None:
-        """Place a camera as a calibration says.
+        ROS's form is one file a camera: of several, one document after the other.
+
+        Raises:
+            ValueError: one of them is not there, or cannot be said; a sentence for the reader.
+        """
+        with self._lock:
+            cameras = [self._to_export(key) for key in keys]
+        if form == "json":
+            return camera_files.cameras_as_json(cameras)
+        if form == "opencv":
+            return camera_files.cameras_as_opencv_yaml(cameras)
+        return "---\n".join(camera_files.camera_as_ros_yaml(camera) for camera in cameras)
+
+    def _to_export(self, key: CameraKey) -> camera_files.CameraToExport:
+        info, now = self._info(key), self._placements.now(key)
+        if info is None or now is None:
+            raise ValueError(f"there is no {key[0]} camera {key[1]} whose settings are known")
+        return camera_files.CameraToExport(key, now, info.mount, self._mount_pose(info, *self._drawn))
+
+    def import_pose(
+        self,
+        key: CameraKey,
+        text: str,
+        direction: Direction | None,
+        convention: Convention | None,
+        metres_per_unit: float = 1.0,
+    ) -> None:
+        """Place a camera as a calibration says: in the env's frame, or in its mount's if it is mounted.
+
+        Our own JSON says itself which pose is which; of anything else the person says it.
 
         Raises:
             ValueError: with a sentence for the reader.
         """
+        found = camera_files.find_poses(text)
+        chosen = [pose for pose in found if key[1] in pose.label] or list(found)
+        if len(chosen) > 1:
+            labels = ", ".join(pose.label for pose in chosen)
+            raise ValueError(f"there are several poses in it ({labels}): paste the one that is meant")
+        pose = camera_files.camera_pose(chosen[0], convention, direction, metres_per_unit)
+        with self._lock:
+            info, now = self._info(key), self._placements.now(key)
+            mount = None if info is None else self._mount_pose(info, *self._drawn)
+        if now is None or info is None:
+            raise ValueError(f"there is no {key[0]} camera {key[1]} that can be placed")
+        if chosen[0].said is not None and info.mount is not None:
+            if mount is None:
+                raise ValueError(f"where {info.mount} is, on which {key[1]} rides, is not known yet")
+            pose = relative_to(mount, pose)  # ours is of the env's frame
+        self.place(key, with_pose(now, pose))
 
     # --- what the page reads ---------------------------------------------------------------------------
 
@@ -217,15 +325,31 @@ class CameraStudio:
             step: of the shown moment.
             env: the selected one.
         """
+        looked, progress = self._judging.looked, self._judging.progress
         with self._lock:
+            self._drawn = step, env
             infos = () if self._task is None else self._task.cameras
+            judged = None if looked.report_of is None else self._placements.now(looked.report_of)
+            was = looked.report_settings
+            # Not what is rounded away when it is written.
+            moved = judged is None or was is None or bool(differences(judged, was, close=3e-4))
             return StudioView(
                 cameras=tuple(self._camera(info, step, env) for info in infos),
+                report=looked.report,
+                report_of=looked.report_of,
+                report_seeds=looked.report_seeds,
+                report_stale=looked.report is not None and (moved or looked.outdated),
+                suggestions=looked.suggestions,
+                suggestions_of=looked.suggestions_of,
+                compared=looked.compared,
+                picked=looked.picked,
+                sheet=looked.sheet,
+                progress=progress,
                 selected=self._selected,
                 undo=self._placements.undo_words,
                 redo=self._placements.redo_words,
                 writing=self._writing.view,
-                problem=self._problem,
+                problem=self._problem or looked.problem,
                 serial=self._serial,
             )
 
@@ -265,7 +389,7 @@ class CameraStudio:
     # --- what the session tells ------------------------------------------------------------------------
 
     def loaded(self, task: TaskDescription) -> list[PlaceCamera]:
-        """A version runs, and what was written is compared with it. Calls nobody, so that it can be told under a lock.
+        """A version runs, and what was written is compared with it. To be told under the session's lock: calls nobody.
 
         Returns:
             what is to be asked of the worker, so that its cameras stand where they are placed.
@@ -311,6 +435,18 @@ class CameraStudio:
         if not undone and wish.what in ("add", "duplicate", "rename"):
             self._selected = wish.result
 
+    def answered(self, answer: CameraAnswer) -> None:
+        """The worker that plays answered a question about a camera."""
+        self._judging.take(answer)
+
+    def interrupted(self) -> None:
+        """The file was saved, or the worker is gone: what is under way is about what there was before."""
+        self._judging.stop()
+
+    def outdated(self) -> None:
+        """The version that runs is another in more than its cameras: what was seen is of the one before."""
+        self._judging.outdate()
+
     def failed_to_load(self) -> None:
         """A version does not load; the one before goes on."""
         with self._lock:
@@ -335,6 +471,7 @@ class CameraStudio:
         """Wait for what is being written."""
         with self._lock:
             self._closing = True
+        self._judging.close()
         self._thread.shutdown(wait=True, cancel_futures=True)
 
     # --- small things ----------------------------------------------------------------------------------

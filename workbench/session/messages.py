@@ -19,6 +19,11 @@ from workbench.core.geometry import SceneGeometry
 from workbench.core.inspection import Inspection, Section
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.core.step import StepResult
+from workbench.session.camera_messages import (
+    CameraAnswer,
+    CameraQuestion,
+    Searching,
+)
 
 Backend = Literal["auto", "cpu", "gpu"]
 ActionSource = Literal["hold", "zero", "random", "sliders", "policy"]
@@ -262,6 +267,7 @@ Request = (
     | SetSliders
     | WatchCameras
     | PlaceCamera
+    | CameraQuestion
     | SetCapture
     | Restore
     | DrawPast
@@ -421,6 +427,8 @@ Event = (
     | Stepped
     | Pictures
     | Placed
+    | CameraAnswer
+    | Searching
     | PastPictures
     | Inspection
     | Judged

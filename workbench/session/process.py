@@ -12,6 +12,8 @@ it is, it says from a signal handler into a file in memory, whatever its interpr
 
 from __future__ import annotations
 
+import ctypes
+import errno
 import fcntl
 import os
 import signal
@@ -178,7 +180,7 @@ class WorkerProcess:
     def interrupt(self) -> None:
         """Leave the author's code if Python runs it; see `interrupts`."""
         if self.beat().number > 0 and self._process.poll() is None:
-            os.kill(self.pid, INTERRUPT_SIGNAL)
+            _signal_main_thread(self.pid, INTERRUPT_SIGNAL)
 
     # --- its end -----------------------------------------------------------------------------------
 
@@ -259,3 +261,19 @@ def describe_exit(code: int | None) -> str:
     if code < 0:
         return f"was killed by {signal.Signals(-code).name}"
     return f"ended with exit code {code}"
+
+
+def _signal_main_thread(pid: int, number: signal.Signals) -> None:
+    """Send a signal to the thread of a process that Python's handlers run in.
+
+    The kernel hands a signal for the whole process to any of its threads, on a busy machine also to one of torch's
+    or the renderer's. CPython 3.11 then notes the signal and does not tell the main thread, whose endless loop goes
+    on until another Python thread wants to run: never.
+    """
+    if _libc.tgkill(pid, pid, int(number)) != 0:
+        error = ctypes.get_errno()
+        if error != errno.ESRCH:  # it died meanwhile: `receive` says so
+            raise OSError(error, os.strerror(error))
+
+
+_libc = ctypes.CDLL(None, use_errno=True)

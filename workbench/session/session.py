@@ -15,9 +15,12 @@ import threading
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 from workbench.authoring.watch import SourceWatcher
 from workbench.core.inspection import Section
+from workbench.session.camera_judging import ShownMoment
+from workbench.session.camera_messages import CameraAnswer
 from workbench.session.camera_studio import CameraStudio
 from workbench.session.env_table import EnvRows
 from workbench.session.judge import FILE_SAVED, Judge, what_a_load_means
@@ -32,6 +35,7 @@ from workbench.session.messages import (
     Event,
     Failed,
     Inspect,
+    Load,
     Loaded,
     LoadLevel,
     Placed,
@@ -105,7 +109,7 @@ class Session:
         )
         self._recorder = LiveRecorder(recordings, self._note)
         self._judge = Judge(self._note)
-        self.studio = CameraStudio(self._send, self._note)
+        self.studio = CameraStudio(self._send, self._note, self._shown_moment, self._same_version)
         """Cameras placed by hand."""
         self._watcher = SourceWatcher(self._on_files_changed)
         self._follow((), {})
@@ -382,6 +386,7 @@ class Session:
 
     def _on_death(self, death: Death) -> None:
         self._recorder.stop()
+        self.studio.interrupted()
         with self._lock:
             s = self._state
             while_loading = self._recovery.loading
@@ -415,6 +420,8 @@ class Session:
                 self._state.take(event)
             if isinstance(event, Placed):
                 self.studio.placed(event)
+            if isinstance(event, get_args(CameraAnswer)):
+                self.studio.answered(event)  # type: ignore[arg-type]
             if isinstance(event, Failed):
                 self._bring_back(event)
                 if not self._state.problem_at_run:
@@ -451,6 +458,8 @@ class Session:
         self._watch()
         for request in placements:
             self._send(request)
+        if event.reload is None or event.reload.level not in ("same", "cameras"):
+            self.studio.outdated()
         if recording.active:
             self._record_on(event, recording.env_idx)
 
@@ -470,8 +479,22 @@ class Session:
             self._state.stepped(event)
         self._recorder.take(event)
 
+    def _shown_moment(self) -> ShownMoment:
+        with self._lock:
+            s = self._state
+            past = None if s.timeline is None else s.timeline.shown
+            count = 0 if s.task is None else s.task.num_envs
+            return ShownMoment(s.selected_env, count, None if past is None else past.step.poses)
+
+    def _same_version(self) -> Load | None:
+        """How another worker gets the version that runs."""
+        with self._lock:
+            task = self._state.task
+            return None if task is None else self._state.load_request(Wanted(dict(task.source), None))
+
     def _on_files_changed(self, paths: set[Path]) -> None:
         self._judge.stop(FILE_SAVED)
+        self.studio.interrupted()
         with self._lock:
             self._state.stale = True
         self._note()

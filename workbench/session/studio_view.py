@@ -6,12 +6,14 @@ Everything here is plain data and numpy. What can be done is in `camera_studio`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.core.camera_report import CameraReport
 from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.core.camera_suggestion import OfferedPlacement
 from workbench.core.pictures import CameraInfo, Picture
 
 if TYPE_CHECKING:
@@ -91,13 +93,15 @@ class StudioView:
     """What `CameraStudio.undo` takes back, in words (``moved base_camera``); None if there is nothing."""
     redo: str | None = None
     writing: Writing = Writing()
-    report: Any = None
-    """`CameraReport` of the last judgement."""
+    report: CameraReport | None = None
+    """Of the last judgement."""
     report_of: CameraKey | None = None
+    report_seeds: int = 0
+    """Fresh episodes that it is of; 0 for the envs at the moment that was shown."""
     report_stale: bool = False
     """The camera was moved since."""
-    suggestions: tuple[Any, ...] = ()
-    """`Suggestion`, best first."""
+    suggestions: tuple[OfferedPlacement, ...] = ()
+    """Best first."""
     suggestions_of: CameraKey | None = None
     compared: tuple[Picture, Picture] | None = None
     """The camera as it is placed, and as `CameraStudio.compare` was told."""

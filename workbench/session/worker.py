@@ -37,6 +37,14 @@ from workbench.core.step import StepResult
 from workbench.core.take_pictures import Request as PictureRequest
 from workbench.core.take_pictures import list_cameras, take_pictures
 from workbench.session.acting import Acting
+from workbench.session.camera_answers import answer
+from workbench.session.camera_messages import (
+    CameraQuestion,
+    CameraQuestionFailed,
+    DrawCamera,
+    JudgeCamera,
+    SuggestCameras,
+)
 from workbench.session.interrupts import Interrupted, Interrupts
 from workbench.session.judge_moments import judge_moments
 from workbench.session.messages import (
@@ -119,6 +127,9 @@ class Worker:
             SetSliders: self._set_sliders,
             WatchCameras: self._watch_cameras,
             PlaceCamera: self._place_camera,
+            DrawCamera: self._answer_about_camera,
+            JudgeCamera: self._answer_about_camera,
+            SuggestCameras: self._answer_about_camera,
             SetCapture: self._set_capture,
             Restore: self._restore,
             DrawPast: self._draw_past,
@@ -295,6 +306,18 @@ class Worker:
             (c.name, c.kind, c.modalities) for c in request.cameras if (c.name, c.kind) in known
         ]
         self._pictures.watch(min(request.env, self._opened.env.num_envs - 1), wanted)
+
+    def _answer_about_camera(self, question: CameraQuestion) -> None:
+        if self._opened is None:
+            self._send(CameraQuestionFailed(question.number, "no task is loaded"))
+            return
+        self._settle()
+        self._pulse.begin("drawing")
+        told = answer(
+            self._opened, self._placed, question, self._send, lambda: bool(self._connection.poll(0))
+        )
+        self._pulse.begin("idle")
+        self._send(told)
 
     def _place_camera(self, request: PlaceCamera) -> None:
         # Not at once: the picture under way is finished first, or a drag faster than the renderer would see none.

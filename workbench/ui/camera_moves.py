@@ -19,6 +19,7 @@ from workbench.core.camera_frames import (
     LookAt,
     axes_of,
     compose,
+    intrinsic_of,
     look_at_of,
     make_pose,
     pose_from_look_at,
@@ -174,6 +175,16 @@ def viewer_pose(position: ArrayLike, wxyz: ArrayLike) -> Floats:
 def fov_that_shows_all(fov: float, aspect: float, view_aspect: float) -> float:
     """Vertical field of view of a view of another shape (width over height) in which the whole picture fits."""
     return 2 * math.atan(math.tan(fov / 2) * max(1.0, aspect / view_aspect))
+
+
+def picture_corners(settings: CameraSettings, pose: ArrayLike, depth: float) -> Floats:
+    """(4, 3) where the borders of the picture meet, `depth` metres in front of a camera at this pose (7,)."""
+    k, p = intrinsic_of(settings), np.asarray(pose, np.float64)
+    forward, left, up = axes_of(p[3:])
+    w, h = settings.width, settings.height
+    right = (np.array([0, w, w, 0]) - k[0, 2]) / k[0, 0]
+    down = (np.array([0, 0, h, h]) - k[1, 2]) / k[1, 1]
+    return p[:3] + depth * (forward - right[:, None] * left - down[:, None] * up)
 
 
 def kept_where_equal(

@@ -17,12 +17,15 @@ import viser
 from workbench.core.camera_frames import axes_of, intrinsic_of, vertical_fov
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.session.studio_view import StudioCamera
-from workbench.ui.camera_moves import Floats, Frame, fov_that_shows_all, viewer_pose
+from workbench.ui.camera_moves import Floats, Frame, fov_that_shows_all, picture_corners, viewer_pose
 from workbench.ui.placing import Placing
 from workbench.ui.viewpoint import USUAL_ASPECT
 
 WIDEST = math.radians(150)
 """Of the page's own view: what is wider it cannot draw."""
+BORDER_AT = 0.15
+"""Metres in front of the eye: as near as the page draws, or things would hide it."""
+BORDER_COLOUR = (245, 159, 0)
 UPRIGHT = np.array([0.0, 0.0, 1.0])
 
 
@@ -42,6 +45,8 @@ class LookThrough:
         self._server, self._placing = server, placing
         self._lock = threading.Lock()
         self._looking: dict[int, _Looking] = {}
+        self._border: viser.LineSegmentsHandle | None = None
+        self._drawn: bytes | None = None
 
     @property
     def any(self) -> bool:
@@ -75,6 +80,25 @@ class LookThrough:
                     self._back(client)
                 else:
                     self._show(client, camera)
+        self._draw_border(camera if self._looking else None)
+
+    def _draw_border(self, camera: StudioCamera | None) -> None:
+        """A view is wider than the picture; what is inside of this line is in it."""
+        if camera is None or camera.now is None:
+            if self._border is not None and self._border.visible:
+                self._border.visible = False
+            return
+        corners = picture_corners(camera.now, self._placing.frame(camera).to_view(camera.now), BORDER_AT)
+        points = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1).astype(np.float32)
+        if self._border is None:
+            self._border = self._server.scene.add_line_segments(
+                "/studio/border", points, colors=BORDER_COLOUR, thickness=2.0, thickness_units="screen"
+            )
+        elif points.tobytes() != self._drawn:
+            self._border.points = points
+        self._drawn = points.tobytes()
+        if not self._border.visible:
+            self._border.visible = True
 
     def settings_from(
         self, client: viser.ClientHandle, settings: CameraSettings, frame: Frame

@@ -210,6 +210,7 @@ class Page:
         if clients.keys() != self._arrivals.keys():
             now = time.monotonic()
             self._arrivals = {number: self._arrivals.get(number, now) for number in clients}
+            self._pointed = {number: at for number, at in self._pointed.items() if number in clients}
             self._session.set_clients(len(clients))
         return len(clients)
 

@@ -97,11 +97,6 @@ class StudioPanel:
     def select(self, key: CameraKey | None) -> None:
         self._session.studio.select(key)
 
-    @property
-    def watched(self) -> CameraKey | None:
-        """The camera whose picture is wanted here, ticked or not."""
-        return self._session.view().studio.selected
-
     def _name_of(self, key: CameraKey | None) -> str | None:
         return next((name for name, known in self._names.items() if known == key), NOBODY)
 

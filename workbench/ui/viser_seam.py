@@ -6,7 +6,8 @@ refuse a message from a client, or to keep quiet. All four are needed (see `work
 while a `viser.ViserServer` is being made, the name ``websockets`` in that one viser module stands for
 a look-alike whose ``serve`` is ours. Ours gives the real one the same arguments, with three changed:
 the socket (ours, already bound), ``process_request`` (viser's own hook, handed to the caller to wrap)
-and the handler (viser's own, but every message from a client is looked at before viser sees it).
+and the handler (viser's own, but every message from a client is looked at before viser sees it, and a
+client that reads nothing is let go, see `workbench.ui.deaf_clients`).
 
 Two nets below that: `missing_names` lists what an upgrade of viser took away, and is asked before
 anything starts; and `workbench.ui.door` sends a request that must be refused through the finished
@@ -15,6 +16,7 @@ server before it tells anyone the address.
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import logging
 import math
@@ -35,6 +37,8 @@ import viser.infra._infra
 import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
+
+from workbench.ui.deaf_clients import let_go_when_deaf
 
 WRITTEN_FOR = "1.1.1"
 
@@ -187,10 +191,10 @@ def admits(raw: object) -> bool:
     return True
 
 
-def _with_checked_messages(
+def _watched(
     handler: Callable[[ServerConnection], Awaitable[None]],
 ) -> Callable[[ServerConnection], Awaitable[None]]:
-    async def checked(connection: ServerConnection) -> None:
+    async def watched(connection: ServerConnection) -> None:
         receive = connection.recv
 
         async def receive_checked() -> object:
@@ -200,6 +204,7 @@ def _with_checked_messages(
                     return raw
 
         connection.recv = receive_checked  # type: ignore[method-assign,assignment]
+        listening = asyncio.create_task(let_go_when_deaf(connection))
         try:
             await handler(connection)
         except MalformedMessage as error:
@@ -207,8 +212,10 @@ def _with_checked_messages(
             # author's terminal for every frame that a stranger cares to send.
             _log.warning("Closed a browser's connection: it sent %s.", error)
             await connection.close(1008, "malformed message")
+        finally:
+            listening.cancel()
 
-    return checked
+    return watched
 
 
 @contextlib.contextmanager
@@ -296,7 +303,7 @@ def make_viser(
             open_timeout=response_seconds,
             logger=_quiet_logger(),
         )
-        made = real_serve(_with_checked_messages(handler), sock=listening, **options)
+        made = real_serve(_watched(handler), sock=listening, **options)
         serving.append(made)
         return made
 

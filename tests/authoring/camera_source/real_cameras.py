@@ -83,7 +83,7 @@ def settings_of(config: CameraConfig) -> CameraSettings:
         height=config.height,
         near=float(config.near),
         far=float(config.far),
-        shader_pack=config.shader_pack,
+        shader_pack=str(config.shader_pack),
     )
 
 

@@ -368,6 +368,42 @@ WRITTEN: dict[str, str] = {
         return [CameraConfig("cam", pose, 128, 128, fov=1.0, **common)]
         """
     ),
+    "a pose of the class for two cameras": _hook(
+        """\
+        return [CameraConfig("cam", self.POSE, 64, 64, 1.0), CameraConfig("other", Task.POSE, 64, 64, 1.0)]
+        """,
+        members="EYE = (0.3, 0, 0.6)\nPOSE = sapien_utils.look_at(EYE, [0, 0, EYE[2] / 2])\n",
+    ),
+    "one list under two names": _hook(
+        """\
+        eye = start = [0.3, 0, 0.6]
+        other = CameraConfig("other", sapien_utils.look_at(start, [0, 0, 0]), 64, 64, 1.0)
+        return [CameraConfig("cam", sapien_utils.look_at(eye, [0, 0, 0]), 64, 64, 1.0), other]
+        """
+    ),
+    "made by a method": _hook(
+        "return [self.camera()]\n",
+        members=(
+            "def camera(self):\n"
+            "    try:\n"
+            "        eye = [0.3, 0, 0.6]\n"
+            "    except ValueError:\n"
+            "        eye = [0.5, 0, 0.6]\n"
+            '    return CameraConfig("cam", sapien_utils.look_at(eye, target=[0, 0, 0]), 64, 64, fov := 1.0)\n'
+        ),
+    ).replace("fov := 1.0", "(1.0)"),
+    "a function within the hook": _hook(
+        """\
+        height = 0.6
+        target = [0, 0, 0]
+
+        def camera():
+            return CameraConfig("cam", pose=sapien_utils.look_at(target=target, eye=[0.3, 0, height]),
+                                width=64, height=64, fov=1.0, near=.01)
+
+        return [camera()]
+        """
+    ),
     "all on one line of code": _hook(
         "x = 0.3; return [CameraConfig('cam', sapien.Pose([x, 0, 0.5]), 128, 128, 1.0)]\n"
     ),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,12 +27,8 @@ FILES = sorted(
     for path in (PACKAGE / folder).rglob("*.py")
     if "CameraConfig(" in path.read_text()
 )
-REASONS = (
-    "cannot be read in the file",  # set from a table by the robot, as PickCube does
-    "computed when the task runs",
-    "the same values",
-    "something else changes it",
-)
+REFUSED = {"base_env": "something else changes it"}
+"""The other of two branches that make a camera of one name."""
 
 
 class Anything:
@@ -50,7 +47,7 @@ class Anything:
 def hook_results(path: Path, text: str) -> dict[tuple[str, int], dict[str, CameraConfig]]:
     """What each hook in the file returns, by its name and how many of that name came before."""
     tree = ast.parse(text)
-    top = [s for s in tree.body if isinstance(s, (ast.Import, ast.ImportFrom, ast.Assign, ast.AnnAssign))]
+    top = [s for s in tree.body if isinstance(s, (ast.Import, ast.ImportFrom)) or _constant(s)]
     module = ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
     names: dict[str, Any] = {
         "__name__": module,
@@ -71,7 +68,12 @@ def hook_results(path: Path, text: str) -> dict[tuple[str, int], dict[str, Camer
     return found
 
 
-def cameras(path: Path) -> Iterator[tuple[CallSite, tuple[str, int], str, CameraConfig]]:
+def _constant(statement: ast.stmt) -> bool:
+    targets = statement.targets if isinstance(statement, ast.Assign) else []
+    return bool(targets) and all(isinstance(target, ast.Name) for target in targets)
+
+
+def cameras(path: Path, first_line: int) -> Iterator[tuple[CallSite, tuple[str, int], str, CameraConfig]]:
     text = path.read_text()
     calls = list(camera_calls(project := Project({"/author/task.py": text}), project.file("/author/task.py")))
     for hook, configs in hook_results(path, text).items():
@@ -81,14 +83,32 @@ def cameras(path: Path) -> Iterator[tuple[CallSite, tuple[str, int], str, Camera
                 dict.fromkeys(call.file.function(call.node) for call in calls if call.hook == hook[0])
             )
             fitting = [c for c in fitting if c.file.function(c.node) == owners[hook[1]]]
-            for call in fitting:
+            function = next(n for n in ast.walk(ast.parse(text)) if getattr(n, "lineno", 0) == first_line)
+            last_line = getattr(function, "end_lineno", 0)
+            for call in (call for call in fitting if first_line <= call.line <= last_line):
                 yield CallSite("/author/task.py", call.line, owners[hook[1]]), hook, uid, config
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
-def test_each_camera_is_edited_right_or_refused(path: Path) -> None:
+def kinds_of_cameras() -> Iterator[Any]:
+    """One of each way of writing, whatever the numbers."""
+    seen: set[str] = set()
+    for path in FILES:
+        functions = {}
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef) and "CameraConfig(" in (code := ast.unparse(node)):
+                functions[node.lineno] = re.sub(
+                    r"\"[^\"]*\"|'[^']*'|-?\d[\d.]*", "0", code.partition("\n")[2]
+                )
+        for line, code in functions.items():
+            if code not in seen:
+                seen.add(code)
+                yield pytest.param(path, line, id=f"{path.stem}:{line}")
+
+
+@pytest.mark.parametrize(("path", "first_line"), list(kinds_of_cameras()))
+def test_each_camera_is_edited_right_or_refused(path: Path, first_line: int) -> None:
     text = path.read_text()
-    for site, hook, uid, config in cameras(path):
+    for site, hook, uid, config in cameras(path, first_line):
         before = settings_of(config)
         eye = (before.position[0] + 0.11, before.position[1] + 0.02, before.position[2] + 0.21)
         after = dataclasses.replace(before, position=eye, quaternion=unit(look_at(eye, (0.01, 0.02, 0.03))))
@@ -96,7 +116,7 @@ def test_each_camera_is_edited_right_or_refused(path: Path) -> None:
             after = dataclasses.replace(after, fov=0.9)
         plan = plan_edit({"/author/task.py": text}, uid, before, after, site)
         if isinstance(plan, Refusal):
-            assert any(reason in plan.reason for reason in REASONS), plan.reason
+            assert path.stem in REFUSED and REFUSED[path.stem] in plan.reason, plan.reason
             continue
         assert isinstance(plan, SourceEdit) and plan.settings is not None
         results = hook_results(path, plan.new_text)
@@ -105,16 +125,3 @@ def test_each_camera_is_edited_right_or_refused(path: Path) -> None:
             for name, was in configs.items():
                 if (other, name) != (hook, uid):
                     assert close(settings_of(results[other][name]), settings_of(was)), plan.diff
-
-
-def test_most_of_them_can_be_edited() -> None:
-    edited, refused = 0, []
-    for path in FILES:
-        for site, _, uid, config in cameras(path):
-            before = settings_of(config)
-            after = dataclasses.replace(before, position=(1.0, 2.0, 3.0), quaternion=unit((1, 2, 3, 4)))
-            plan = plan_edit({"/author/task.py": path.read_text()}, uid, before, after, site)
-            edited += isinstance(plan, SourceEdit)
-            refused += [f"{path.stem}: {plan.reason}"] if isinstance(plan, Refusal) else []
-    assert edited >= 80, refused
-    assert len(refused) <= 4, refused

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
 from tests.authoring.camera_source.real_cameras import FILE, HEADER, close, real_configs, settings_of
@@ -15,12 +17,19 @@ from workbench.authoring.camera_source import (
     plan_remove,
     plan_rename,
 )
+from workbench.authoring.camera_source.rotations import unit
 from workbench.core.camera_settings import CameraSettings
 from workbench.core.pictures import CameraKind
 
 NEW = CameraSettings((0.1, 0.25, 1.5), (0.5, 0.5, 0.5, -0.5), 1.25, None, 64, 48, 0.02, 12.0, "default")
 HUMAN = "_default_human_render_camera_configs"
 SENSOR = "_default_sensor_configs"
+ALONE = (
+    "configs with names of their own",
+    "a name used for one after the other",
+    "made by a method",
+    "a function within the hook",
+)
 TOP = [name for name, text in WRITTEN.items() if SENSOR in text]
 
 
@@ -41,7 +50,7 @@ def test_a_camera_is_added_last(name: str) -> None:
         return
     assert same_cameras(cameras(plan.new_text), cameras(source) | {(SENSOR, "added"): NEW}), plan.diff
     assert comments(plan.new_text) == comments(source)
-    assert plan.settings == NEW
+    assert plan.settings is not None and close(plan.settings, cameras(plan.new_text)[SENSOR, "added"])
 
 
 @pytest.mark.parametrize("kind", ["sensor", "human"])
@@ -50,7 +59,7 @@ def test_a_hook_is_made_where_there_is_none(kind: CameraKind) -> None:
     plan = plan_add({FILE: source}, FILE, "Task", kind, "added", NEW)
     assert isinstance(plan, SourceEdit), plan
     hook = SENSOR if kind == "sensor" else HUMAN
-    assert cameras(plan.new_text) == {(hook, "added"): NEW}
+    assert same_cameras(cameras(plan.new_text), {(hook, "added"): NEW})
     assert len(plan.notes) == 2
     again = plan_add({FILE: plan.new_text}, FILE, "Task", kind, "more", NEW)
     assert isinstance(again, SourceEdit) and not again.notes
@@ -66,6 +75,9 @@ def test_what_cannot_be_added_to_is_refused() -> None:
     parent = WRITTEN["a pose of nothing"] + "\n\nclass Child(Task):\n    pass\n"
     plan = plan_add({FILE: parent}, FILE, "Child", "sensor", "added", NEW)
     assert isinstance(plan, Refusal) and "inherits" in plan.reason
+    library = "from mani_skill.envs.tasks import PickCubeEnv\n\n\nclass Task(PickCubeEnv):\n    pass\n"
+    plan = plan_add({FILE: library}, FILE, "Task", "sensor", "added", NEW)
+    assert isinstance(plan, Refusal) and "would take away" in plan.reason
     for name in ("no name", 'x"); import os; ("', ""):
         plan = plan_add({FILE: parent}, FILE, "Task", "sensor", name, NEW)
         assert isinstance(plan, Refusal) and "is not a name" in plan.reason
@@ -79,7 +91,7 @@ def test_a_copy_stands_beside_its_original(name: str) -> None:
     plan = plan_duplicate({FILE: source}, "cam", "copy", now[key])
     if isinstance(plan, Refusal):
         assert "stands alone" in plan.reason and plan.snippet
-        assert name in ("configs with names of their own", "a name used for one after the other")
+        assert name in ALONE
         return
     assert same_cameras(cameras(plan.new_text), now | {(key[0], "copy"): now[key]}), plan.diff
 
@@ -104,7 +116,7 @@ def test_a_camera_is_taken_out(name: str) -> None:
     plan = plan_remove({FILE: source}, "cam")
     if isinstance(plan, Refusal):
         assert "by hand" in plan.reason
-        assert name in ("configs with names of their own", "a name used for one after the other")
+        assert name in ALONE
         return
     wanted = {key: value for key, value in cameras(source).items() if key[1] != "cam"}
     assert same_cameras(cameras(plan.new_text), wanted), plan.diff
@@ -119,6 +131,17 @@ def test_what_is_made_in_a_loop_is_refused() -> None:
         plan_duplicate({FILE: source}, "cam", "front", NEW),
     ):
         assert isinstance(plan, Refusal) and "loop" in plan.reason
+
+
+def test_settings_are_those_that_are_written() -> None:
+    source = WRITTEN["a pose of nothing"]
+    exact = dataclasses.replace(
+        NEW, position=(1 / 3, 0.0, 2 / 3), quaternion=unit((1, 2, 3, 4)), fov=1.23456789
+    )
+    plan = plan_add({FILE: source}, FILE, "Task", "sensor", "added", exact)
+    assert isinstance(plan, SourceEdit) and plan.settings is not None
+    assert plan.settings.position == (0.3333, 0.0, 0.6667) and plan.settings.fov == 1.2346
+    assert close(plan.settings, cameras(plan.new_text)[SENSOR, "added"])
 
 
 def test_tidy_text_comes_of_it() -> None:

@@ -14,7 +14,7 @@ import pytest
 from tests.authoring.camera_source.real_cameras import FILE, close, real_configs, real_settings, settings_of
 from tests.authoring.camera_source.shapes import REFUSED, WRITTEN
 from workbench.authoring.camera_source import Refusal, SourceEdit, plan_edit
-from workbench.authoring.camera_source.rotations import angle_between, from_euler, look_at, unit
+from workbench.authoring.camera_source.rotations import angle_between, look_at, unit
 from workbench.core.camera_settings import CameraSettings
 
 Edit = Callable[[CameraSettings], CameraSettings]
@@ -30,10 +30,6 @@ def level(now: CameraSettings) -> CameraSettings:
     return dataclasses.replace(now, position=eye, quaternion=unit(look_at(eye, (0.05, 0.1, 0.02))))
 
 
-def rolled(now: CameraSettings) -> CameraSettings:
-    return dataclasses.replace(now, quaternion=unit(from_euler(0.4, 0.7, -2.0)))
-
-
 def down(now: CameraSettings) -> CameraSettings:
     return dataclasses.replace(now, position=(0.1, 0.0, 1.1), quaternion=unit((0.5, 0.5, 0.5, -0.5)))
 
@@ -45,7 +41,7 @@ def lens(now: CameraSettings) -> CameraSettings:
     return dataclasses.replace(now, fov=now.fov * 0.81, width=320, near=0.02)
 
 
-EDITS: list[Edit] = [moved, level, rolled, down, lens]
+EDITS: list[Edit] = [moved, level, down, lens]
 
 
 @pytest.mark.parametrize("name", WRITTEN)

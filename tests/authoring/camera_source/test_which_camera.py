@@ -6,6 +6,7 @@ import dataclasses
 import subprocess
 import sys
 from textwrap import dedent
+from typing import Any
 
 import pytest
 
@@ -75,10 +76,47 @@ def test_a_computed_name_is_found_by_its_place() -> None:
     assert edited_line(plan_edit({FILE: TWO}, "cam", before, higher(before), site)) == LINE + 11
 
 
+def test_a_place_that_remarks_have_moved_is_still_found() -> None:
+    before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
+    for line in (1, LINE + 4, 1000):
+        site = CallSite(FILE, line, "Task._default_sensor_configs")
+        assert edited_line(plan_edit({FILE: TWO}, "cam", before, higher(before), site)) == LINE
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"shader_pack": '"); import os; ("'},
+        {"position": (float("nan"), 0.0, 0.0)},
+        {"position": (1e300, 0.0, 0.0)},
+        {"quaternion": (0.0, 0.0, 0.0, 0.0)},
+        {"fov": 4.0},
+        {"fov": None},
+        {"near": 5.0, "far": 1.0},
+        {"width": 0},
+        {"height": 2.5},
+    ],
+)
+def test_what_is_no_camera_never_reaches_the_file(change: dict[str, Any]) -> None:
+    before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
+    plan = plan_edit({FILE: TWO}, "cam", before, dataclasses.replace(before, **change), kind="sensor")
+    assert isinstance(plan, Refusal) and not plan.snippet
+
+
+def test_the_snippet_of_a_mounted_camera_has_its_mount() -> None:
+    source = TWO.replace(
+        "sapien.Pose([0.5, 0, 0.5]), 128, 128, 1.0)", "POSE.inv(), 128, 128, 1.0, mount=self.link)"
+    )
+    before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
+    plan = plan_edit({FILE: source}, "cam", before, higher(before), kind="sensor")
+    assert isinstance(plan, Refusal) and "    mount=self.link,\n" in plan.snippet
+
+
 @pytest.mark.parametrize(
     ("site", "reason"),
     [
-        (CallSite("/site-packages/x.py", 3, "f"), "not one of your files"),
+        (CallSite("/usr/site-packages/x.py", 3, "f"), "copy the task"),
+        (CallSite("/other/x.py", 3, "f"), "not one of your files"),
         (CallSite(FILE, 1, "f"), "edited since"),
     ],
 )
@@ -102,6 +140,16 @@ def test_what_is_not_in_the_files_or_not_python_is_refused() -> None:
     assert isinstance(plan, Refusal) and "'hand'" in plan.reason
     plan = plan_edit({FILE: "cam = (\n"}, "cam", before, higher(before))
     assert isinstance(plan, Refusal) and "not valid Python" in plan.reason
+
+
+def test_a_class_of_that_name_in_the_files_is_not_taken_for_maniskills() -> None:
+    own = "class CameraConfig:\n    pass\n"
+    source = TWO.replace("from mani_skill.sensors.camera import", "from configs import")
+    before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
+    plan = plan_edit({FILE: source, "/author/configs.py": own}, "cam", before, higher(before), kind="sensor")
+    assert isinstance(plan, Refusal) and "no CameraConfig" in plan.reason
+    handed_on = TWO.replace("from mani_skill.sensors.camera import", "from mani_skill.sensors import")
+    assert edited_line(plan_edit({FILE: handed_on}, "cam", before, higher(before), kind="sensor")) == LINE
 
 
 PLACES = """\

@@ -14,7 +14,8 @@ from collections.abc import Callable, Mapping
 import libcst as cst
 
 from workbench.authoring.camera_source import rotations
-from workbench.authoring.camera_source.definitions import Binding, Project
+from workbench.authoring.camera_source.bindings import Binding
+from workbench.authoring.camera_source.definitions import Project
 from workbench.authoring.camera_source.source_file import SourceFile, walk
 from workbench.authoring.camera_source.values import (
     Angles,
@@ -138,17 +139,20 @@ class Evaluator:
         file: SourceFile,
         node: cst.Name | cst.Attribute,
         bindings: list[Binding],
-        readers: Callable[[Binding, cst.CSTNode], str | None],
+        readers: Callable[[Binding, SourceFile, cst.CSTNode], str | None],
     ) -> tuple[tuple[SourceFile, cst.BaseExpression], str | None]:
         code = file.code(node)
         if not bindings:
             raise Unknown(f"where `{code}` gets its value cannot be read in the file")
         binding = bindings[0 if len(bindings) == 1 else self._choose(node, len(bindings))]
         if binding.dotted is not None and binding.value is None:
-            return self._imported(file, node, binding, readers(binding, node))
+            return self._imported(file, node, binding, readers(binding, file, node))
         if binding.value is None:
             raise Unknown(f"`{code}` cannot be read in the file: {binding.why}")
-        return (binding.file, binding.value), readers(binding, node)
+        others = readers(binding, file, node)
+        if isinstance(binding.node, cst.Assign) and len(binding.node.targets) > 1:
+            others = others or f"line {binding.file.line(binding.node)} gives it to several names"
+        return (binding.file, binding.value), others
 
     def _imported(
         self, file: SourceFile, node: cst.Name | cst.Attribute, binding: Binding, others: str | None
@@ -161,7 +165,7 @@ class Evaluator:
         found = inside[0 if len(inside) == 1 else self._choose(node, len(inside))]
         if found.value is None:
             raise Unknown(f"`{file.code(node)}` cannot be read in {other.name}: {found.why}")
-        return (found.file, found.value), others or self.project.name_readers(found, node)
+        return (found.file, found.value), others or self.project.name_readers(found, file, node)
 
     def _element(
         self, file: SourceFile, node: cst.Subscript

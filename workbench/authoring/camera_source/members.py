@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Literal
 
 import libcst as cst
 
@@ -21,20 +20,14 @@ from workbench.authoring.camera_source.find import (
     candidates,
     check_own,
 )
-from workbench.authoring.camera_source.read_camera import readings
+from workbench.authoring.camera_source.hooks import HOOK_OF, appended, needed_imports, new_hook, returned
+from workbench.authoring.camera_source.read_camera import FIELDS, ReadCamera, mismatch, readings
 from workbench.authoring.camera_source.result import Refusal, Refused, SourceEdit
 from workbench.authoring.camera_source.snippet import repr_text, snippet
-from workbench.authoring.camera_source.source_file import Replacement, SourceFile, walk
-from workbench.authoring.camera_source.write_pose import import_place
+from workbench.authoring.camera_source.source_file import Replacement, SourceFile
+from workbench.authoring.camera_source.wanted import check_wanted
 from workbench.core.camera_settings import CallSite, CameraSettings
 from workbench.core.pictures import CameraKind
-
-Hook = Literal["_default_sensor_configs", "_default_human_render_camera_configs"]
-_HOOK: dict[CameraKind, Hook] = {
-    "sensor": "_default_sensor_configs",
-    "human": "_default_human_render_camera_configs",
-}
-_CONFIG = "from mani_skill.sensors.camera import CameraConfig\n"
 
 
 def plan_add(
@@ -47,9 +40,13 @@ def plan_add(
 ) -> SourceEdit | Refusal:
     """A new camera that stands still, in the hook of `class_name`, which is made if the class has none."""
     try:
+        check_wanted(settings)
+    except Refused as refused:
+        return Refusal(refused.reason)
+    try:
         project = Project(sources)
         _check_uid(project, uid, kind, file, class_name)
-        return _add(project, file, class_name, kind, uid, settings, None)
+        return _add(project, file, class_name, kind, uid, settings)
     except Refused as refused:
         return Refusal(refused.reason, snippet(uid, settings))
 
@@ -94,7 +91,7 @@ def plan_rename(
         elsewhere = len(re.findall(rf"[\"']{re.escape(uid)}[\"']", new_text))
         if elsewhere:
             notes.append(f"{uid!r} still stands in {elsewhere} other place(s) of {call.file.name}")
-        _check(project, call, new_text, added=None, removed=uid, renamed=new_uid)
+        _check(project, call.file, call, new_text, new_uid)
         return SourceEdit(call.file.path, call.file.text, new_text, tuple(notes), settings)
     except Refused as refused:
         return Refusal(refused.reason, snippet(new_uid, settings))
@@ -150,6 +147,12 @@ def _check_new_uid(project: Project, new_uid: str, call: CameraCall) -> None:
         _check_uid(project, new_uid, HOOKS[call.hook], call.file.path, classes[-1].name.value)
 
 
+def _is_hooks_own(call: CameraCall) -> bool:
+    """True if what the call's function returns is what the hook returns."""
+    function = call.file.scopes(call.node)[0]
+    return isinstance(function, cst.FunctionDef) and function.name.value in HOOKS
+
+
 # --- adding --------------------------------------------------------------------------------------
 
 
@@ -160,7 +163,6 @@ def _add(
     kind: CameraKind,
     uid: str,
     settings: CameraSettings,
-    text: str | None,
 ) -> SourceEdit:
     file = project.file(path)
     check_own(path)
@@ -169,138 +171,17 @@ def _add(
     )
     if cls is None:
         raise Refused(f"there is no class {class_name} in {file.name}")
-    imports, notes = _imports(project, file, settings)
-    hook = _HOOK[kind]
+    imports, notes = needed_imports(project, file, settings)
+    hook = HOOK_OF[kind]
     functions = [n for n in cls.body.body if isinstance(n, cst.FunctionDef) and n.name.value == hook]
     if functions:
-        returned = _returned(file, functions[-1])
-        replacement = _appended(file, returned, uid, lambda indent: snippet(uid, settings, indent))
+        value = returned(file, functions[-1])
+        replacement = appended(file, value, uid, lambda indent: snippet(uid, settings, indent))
     else:
-        replacement = _new_hook(project, file, cls, hook, uid, settings)
+        replacement = new_hook(project, file, cls, hook, uid, settings)
     new_text = file.replaced([*imports, *replacement])
-    _check(project, None, new_text, added=uid, removed=None, file=file)
-    return SourceEdit(file.path, file.text, new_text, tuple(notes), settings)
-
-
-def _imports(
-    project: Project, file: SourceFile, settings: CameraSettings
-) -> tuple[list[Replacement], list[str]]:
-    wanted = [("CameraConfig", _CONFIG), ("sapien", "import sapien\n")]
-    if settings.intrinsic is not None:
-        wanted.append(("np", "import numpy as np\n"))
-    bindings = project.bindings(file, file.module)
-    missing = [line for name, line in wanted if not _imported_as(bindings.get(name, []), name)]
-    if not missing:
-        return [], []
-    place = import_place(file)
-    text = "".join(sorted(missing, key=lambda line: line.startswith("from")))
-    return [Replacement(place, place, text)], [
-        f"`{line.strip()}` is added at the top of the file" for line in missing
-    ]
-
-
-def _imported_as(bindings: list, name: str) -> bool:
-    dotted = bindings[-1].dotted if bindings else None
-    if bindings and dotted is None:
-        raise Refused(
-            f"`{name}` means something else in this file (line {bindings[-1].file.line(bindings[-1].node)})"
-        )
-    return dotted is not None
-
-
-def _returned(file: SourceFile, function: cst.FunctionDef) -> cst.BaseExpression:
-    """The one expression that a hook returns."""
-    found = [node for node in walk(function.body) if isinstance(node, cst.Return)]
-    found = [node for node in found if file.scopes(node)[0] is function]
-    name = function.name.value
-    if len(found) != 1 or found[0].value is None:
-        raise Refused(
-            f"{name} (line {file.line(function)}) has {len(found)} returns; one is needed to add to"
-        )
-    value = found[0].value
-    if isinstance(value, cst.Name):
-        assigned = [
-            node
-            for node in walk(function.body)
-            if isinstance(node, cst.Assign)
-            and any(isinstance(t.target, cst.Name) and t.target.value == value.value for t in node.targets)
-        ]
-        if len(assigned) == 1 and isinstance(assigned[0].value, (cst.List, cst.Dict)):
-            return assigned[0].value
-    return value
-
-
-def _appended(file: SourceFile, value: cst.BaseExpression, uid: str, text) -> list[Replacement]:
-    """`text(indent)` as one more of what `value` holds."""
-    line = file.line_text(file.line(value))
-    indent = line[: len(line) - len(line.lstrip())]
-    if isinstance(value, (cst.List, cst.Tuple)):
-        start, end = file.span(value)
-        return _into_brackets(file, value.elements, start, end, indent, text)
-    if isinstance(value, cst.Dict):
-        start, end = file.span(value)
-        return _into_brackets(
-            file, value.elements, start, end, indent, lambda i: f"{repr_text(uid)}: {text(i)}"
-        )
-    if isinstance(value, cst.Call) and file.code(value.func) == "dict":
-        close = file.inner_span(value)[1] - 1
-        open_ = file.span(value.func)[1]
-        return _into_brackets(file, value.args, open_, close + 1, indent, lambda i: f"{uid}={text(i)}")
-    if isinstance(value, cst.Call) and file.code(value.func).rpartition(".")[2].endswith("CameraConfig"):
-        start, end = file.span(value)
-        inner = file.text[start:end].replace("\n", "\n    ")
-        new = f"[\n{indent}    {inner},\n{indent}    {text(indent + '    ')},\n{indent}]"
-        return [Replacement(start, end, new)]
-    raise Refused(
-        f"what is returned at line {file.line(value)} is neither a CameraConfig(...) nor a list or dict of them"
-    )
-
-
-def _into_brackets(file: SourceFile, elements, start: int, end: int, indent: str, text) -> list[Replacement]:
-    close = end - 1
-    if not elements:
-        new = f"\n{indent}    {text(indent + '    ')},\n{indent}"
-        return [Replacement(start + 1, close, new)]
-    last = elements[-1]
-    last_end = file.span(last.value)[1]
-    comma = isinstance(last.comma, cst.Comma)
-    closing = file.line_at(close)
-    before = file.text[file.line_start(closing) : close]
-    if not before.strip() and closing != file.line_at(start):
-        own = before + "    "
-        at = file.line_start(closing)
-        found = [Replacement(at, at, f"{own}{text(own)},\n")]
-        return found if comma else [Replacement(last_end, last_end, ","), *found]
-    own = indent + "    "
-    if comma:
-        last_end = file.text.index(",", last_end) + 1
-    return [Replacement(last_end, close, f"{'' if comma else ','}\n{own}{text(own)},\n{indent}")]
-
-
-def _new_hook(
-    project: Project, file: SourceFile, cls: cst.ClassDef, hook: Hook, uid: str, settings: CameraSettings
-) -> list[Replacement]:
-    if not isinstance(cls.body, cst.IndentedBlock) or not cls.body.body:
-        raise Refused(f"the class {cls.name.value} has no body to add {hook} to")
-    for base in cls.bases:
-        named = project.class_named(file, base.value)
-        if named is not None and hook in project.bindings(*named):
-            raise Refused(
-                f"{cls.name.value} inherits {hook} from {named[1].name.value} ({named[0].name}); add the camera there"
-            )
-    first = cls.body.body[0]
-    line = file.line_text(file.line(first))
-    indent = line[: len(line) - len(line.lstrip())]
-    inner = indent + "    "
-    end = file.span(cls.body.body[-1])[1]
-    end = file.text.find("\n", end)
-    at = len(file.text) if end < 0 else end + 1
-    lead = "\n" if end >= 0 else "\n\n"
-    text = (
-        f"{lead}{indent}@property\n{indent}def {hook}(self):\n{inner}return [\n"
-        f"{inner}    {snippet(uid, settings, inner + '    ')},\n{inner}]\n"
-    )
-    return [Replacement(at, at, text)]
+    found = _check(project, file, None, new_text, uid)
+    return SourceEdit(file.path, file.text, new_text, tuple(notes), _as_written(found, settings))
 
 
 def _insert_beside(
@@ -309,7 +190,7 @@ def _insert_beside(
     file = call.file
     outer = file.parents[call.node]
     value: cst.CSTNode | None
-    if isinstance(outer, cst.Return):
+    if isinstance(outer, cst.Return) and _is_hooks_own(call):
         value = call.node
     elif isinstance(outer, (cst.Element, cst.DictElement)):
         value = file.parents[outer]
@@ -331,9 +212,9 @@ def _insert_beside(
             [first, *(indent + r[len(old_indent) :] if r.startswith(old_indent) else r for r in rest)]
         )
 
-    new_text = file.replaced(_appended(file, value, uid, indented))
-    _check(project, None, new_text, added=uid, removed=None, file=file)
-    return SourceEdit(file.path, file.text, new_text, (), settings)
+    new_text = file.replaced(appended(file, value, uid, indented))
+    found = _check(project, file, None, new_text, uid)
+    return SourceEdit(file.path, file.text, new_text, (), _as_written(found, settings))
 
 
 # --- renaming ------------------------------------------------------------------------------------
@@ -375,7 +256,7 @@ def _renamed_text(project: Project, call: CameraCall, new_uid: str) -> str:
 def _remove(project: Project, call: CameraCall, uid: str) -> SourceEdit:
     file = call.file
     outer = file.parents[call.node]
-    if isinstance(outer, cst.Return):
+    if isinstance(outer, cst.Return) and _is_hooks_own(call):
         start, end = file.span(call.node)
         replacement = Replacement(start, end, "[]")
     elif isinstance(outer, (cst.Element, cst.DictElement)) or (
@@ -386,9 +267,11 @@ def _remove(project: Project, call: CameraCall, uid: str) -> SourceEdit:
         elements = list(container.args if isinstance(container, cst.Call) else container.elements)
         replacement = _without(file, elements, elements.index(outer), isinstance(container, cst.Tuple))
     else:
-        raise Refused(f"the camera is made at {call.where} and used under a name; take it out by hand")
+        raise Refused(
+            f"the camera is made at {call.where} and used elsewhere under a name; take it out by hand"
+        )
     new_text = file.replaced([replacement])
-    _check(project, call, new_text, added=None, removed=uid)
+    _check(project, file, call, new_text, None)
     pose = call.arguments.get("pose")
     notes = []
     if pose is not None and isinstance(pose.value, cst.Name):
@@ -431,29 +314,39 @@ def _without(file: SourceFile, elements: list, index: int, is_tuple: bool) -> Re
 
 
 def _check(
-    project: Project,
-    call: CameraCall | None,
-    new_text: str,
-    *,
-    added: str | None,
-    removed: str | None,
-    renamed: str | None = None,
-    file: SourceFile | None = None,
-) -> None:
-    """Read the new text again: the other cameras must be what they were."""
-    file = file or (call.file if call is not None else None)
-    assert file is not None
+    project: Project, file: SourceFile, without: CameraCall | None, new_text: str, uid: str | None
+) -> list[ReadCamera]:
+    """Read the new text again: the cameras of before but `without` one, and one more if it has a `uid`.
+
+    Returns how that one reads.
+    """
     changed = Project({**project.texts, file.path: new_text})
-    old = [_said(project, c) for c in camera_calls(project, file) if call is None or c.node is not call.node]
-    new = [_said(changed, c) for c in camera_calls(changed, changed.file(file.path))]
-    for kept in old:
-        if kept not in new:
-            raise Refused("the change would be one of another camera as well")
-        new.remove(kept)
-    names = [said[0] for said in new]
-    wanted = [name for name in (added, renamed) if name is not None]
-    if names != wanted and not (removed is not None and renamed is None and not names):
+    kept = [
+        _said(project, call)
+        for call in camera_calls(project, file)
+        if without is None or call.node is not without.node
+    ]
+    more: list[CameraCall] = []
+    for call in camera_calls(changed, changed.file(file.path)):
+        said = _said(changed, call)
+        if said in kept:
+            kept.remove(said)
+        else:
+            more.append(call)
+    if kept:
+        raise Refused("the change would be one of another camera as well")
+    if [call.name for call in more] != ([] if uid is None else [uid]):
         raise Refused("the file could not be changed without changing what else it does")
+    return list(readings(changed, more[0])) if more else []
+
+
+def _as_written(found: list[ReadCamera], settings: CameraSettings) -> CameraSettings:
+    """`settings` as the text has them, rounded; of several branches the one that is closest."""
+
+    def apart(read: ReadCamera) -> int:
+        return sum(mismatch(read, name, settings) is not None for name in FIELDS)
+
+    return min(found, key=apart).settings(settings) if found else settings
 
 
 def _said(project: Project, call: CameraCall) -> tuple[str | None, int, tuple[str, ...]]:

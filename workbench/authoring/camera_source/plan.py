@@ -32,6 +32,7 @@ from workbench.authoring.camera_source.result import Refusal, Refused, SourceEdi
 from workbench.authoring.camera_source.snippet import snippet
 from workbench.authoring.camera_source.source_file import Replacement, SourceFile
 from workbench.authoring.camera_source.values import Nothing, Number, PoseValue, Text, Vector
+from workbench.authoring.camera_source.wanted import check_wanted
 from workbench.authoring.camera_source.write_pose import write_pose
 from workbench.core.camera_settings import CallSite, CameraSettings
 from workbench.core.pictures import CameraKind
@@ -44,16 +45,24 @@ def plan_edit(
     after: CameraSettings,
     site: CallSite | None = None,
     kind: CameraKind | None = None,
+    target: tuple[float, float, float] | None = None,
 ) -> SourceEdit | Refusal:
     """The edit that turns the camera `uid` from `before`, which the running env has, into `after`.
 
     `sources` are the author's files by path, as they are on disk. `site` says where the camera was made and wins
-    over the name; `kind` tells apart a sensor and a camera for people of one name. Nothing is written.
+    over the name; `kind` tells apart a sensor and a camera for people of one name. `target` is the point that the
+    camera was aimed at, in the frame of its position: a look_at gets it as long as `after` looks there. Nothing is
+    written.
     """
+    project = Project(sources)
     try:
-        return _plan(Project(sources), uid, before, after, site, kind)
+        check_wanted(after)
     except Refused as refused:
-        return Refusal(refused.reason, snippet(uid, after))
+        return Refusal(refused.reason)
+    try:
+        return _plan(project, uid, before, after, site, kind, target)
+    except Refused as refused:
+        return Refusal(refused.reason, snippet(uid, after, more=_mount(project, uid, kind, site)))
 
 
 def _plan(
@@ -63,6 +72,7 @@ def _plan(
     after: CameraSettings,
     site: CallSite | None,
     kind: CameraKind | None,
+    target: tuple[float, float, float] | None,
 ) -> SourceEdit:
     fields = changed_fields(before, after)
     if not fields:
@@ -75,11 +85,25 @@ def _plan(
             "and a change there would be one of all its cameras"
         )
     changes = Changes()
-    _write_fields(changes, project, read, fields, after)
+    if call.hook is None:
+        changes.note(
+            f"the camera is made outside of a hook ({call.where}): whatever else uses it changes along"
+        )
+    _write_fields(changes, project, read, fields, after, target)
     for name in FIELDS:
         if name in read.values:
             changes.emit(read.values[name])
     return _edit(project, read, changes, fields, before, after)
+
+
+def _mount(project: Project, uid: str, kind: CameraKind | None, site: CallSite | None) -> list[str]:
+    """What a copy of the camera has to have too: without its mount the pose is one of another frame."""
+    try:
+        call = candidates(project, uid, kind, site)[0]
+    except Refused:
+        return []
+    names = [name for name in ("entity_uid", "mount") if name in call.arguments]
+    return [f"{name}={call.file.code(call.arguments[name].value)}" for name in names]
 
 
 def _the_one(
@@ -122,7 +146,12 @@ def _places(read: ReadCamera, fields: list[str]) -> list[object]:
 
 
 def _write_fields(
-    changes: Changes, project: Project, read: ReadCamera, fields: list[str], after: CameraSettings
+    changes: Changes,
+    project: Project,
+    read: ReadCamera,
+    fields: list[str],
+    after: CameraSettings,
+    target: tuple[float, float, float] | None,
 ) -> None:
     added: list[str] = []
     call = read.call
@@ -131,7 +160,7 @@ def _write_fields(
         wanted: Any = getattr(after, name, None)  # a pose is two of its fields
         if name == "pose":
             assert isinstance(value, PoseValue)
-            write_pose(changes, project, value, after)
+            write_pose(changes, project, value, after, target)
         elif name in ("fov", "intrinsic"):
             continue
         elif isinstance(value, Number):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
+
 from workbench.authoring.camera_source.number_text import (
     list_text,
     matrix_text,
@@ -11,8 +14,11 @@ from workbench.authoring.camera_source.number_text import (
 from workbench.core.camera_settings import CameraSettings
 
 
-def snippet(uid: str, settings: CameraSettings, indent: str = "") -> str:
-    """``CameraConfig(...)``, an argument a line. It needs ``import sapien``, and numpy as np for an intrinsic."""
+def snippet(uid: str, settings: CameraSettings, indent: str = "", more: Sequence[str] = ()) -> str:
+    """``CameraConfig(...)``, an argument a line, with `more` of them as they are.
+
+    It needs ``import sapien``, and numpy as np for an intrinsic.
+    """
     quaternion = ", ".join(quaternion_texts(settings.quaternion))
     lines = [
         repr_text(uid),
@@ -27,11 +33,11 @@ def snippet(uid: str, settings: CameraSettings, indent: str = "") -> str:
     lines += [f"near={number_text(settings.near, 4)}", f"far={number_text(settings.far, 4)}"]
     if settings.shader_pack != "minimal":
         lines.append(f"shader_pack={repr_text(settings.shader_pack)}")
+    lines += more
     inside = "".join(f"{indent}    {line},\n" for line in lines)
     return f"CameraConfig(\n{inside}{indent})"
 
 
 def repr_text(text: str) -> str:
-    """A Python string in double quotes, whatever is in it."""
-    quoted = repr("'" + text)
-    return '"' + quoted[2:-1] + '"' if quoted.startswith('"') and "\\" not in quoted else repr(text)
+    """A Python string in double quotes, whatever is in it: JSON's escapes are all Python's too."""
+    return json.dumps(text, ensure_ascii=False)

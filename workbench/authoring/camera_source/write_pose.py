@@ -31,9 +31,12 @@ _METRES = (4, 5, 6)
 Triple = tuple[float, float, float]
 
 
-def write_pose(changes: Changes, project: Project, pose: PoseValue, after: CameraSettings) -> None:
+def write_pose(
+    changes: Changes, project: Project, pose: PoseValue, after: CameraSettings, target: Triple | None
+) -> None:
+    """`target` is where the camera was aimed at, if somebody has said so."""
     if pose.form == "look_at":
-        if _look_at(changes, pose, after):
+        if _look_at(changes, pose, after, target):
             return
         _as_quaternion(changes, project, pose, after)
         return
@@ -92,7 +95,7 @@ def _settled(vector: Vector, wanted: Sequence[float], decimals: int) -> Triple:
     return x, y, z
 
 
-def _look_at(changes: Changes, pose: PoseValue, after: CameraSettings) -> bool:
+def _look_at(changes: Changes, pose: PoseValue, after: CameraSettings, aim: Triple | None) -> bool:
     """Write eye and target, if a look_at can say where the camera looks."""
     eye, target = pose.parts["eye"], pose.parts["target"]
     assert isinstance(eye, Vector) and isinstance(target, Vector)
@@ -109,10 +112,14 @@ def _look_at(changes: Changes, pose: PoseValue, after: CameraSettings) -> bool:
             return math.inf
         return rotations.angle_between(quaternion, after.quaternion)
 
-    if error(after.position, target.numbers) <= _STILL_AT_TARGET:
+    for point in (aim, target.numbers):
+        if point is None or error(after.position, point) > _STILL_AT_TARGET:
+            continue
         for decimals in _METRES:
-            if error(_settled(eye, after.position, decimals), target.numbers) <= ANGLE_STEP:
+            rounded = _settled(eye, after.position, decimals), _settled(target, point, decimals)
+            if error(*rounded) <= ANGLE_STEP:
                 _vector(changes, eye, after.position, decimals)
+                _vector(changes, target, point, decimals)
                 return True
     distance = max(_LEAST_DISTANCE, math.dist(pose.position, target.numbers))
     for decimals in _METRES:
@@ -183,16 +190,26 @@ def pose_call(changes: Changes, project: Project, file: SourceFile) -> str:
 
 
 def import_place(file: SourceFile) -> int:
-    """Where an import can be added: before the first one that is not of the future."""
-    for statement in file.module.body:
-        if isinstance(statement, cst.SimpleStatementLine):
-            for small in statement.body:
-                if isinstance(small, cst.Import) or (
-                    isinstance(small, cst.ImportFrom)
-                    and not (isinstance(small.module, cst.Name) and small.module.value == "__future__")
-                ):
-                    return file.line_start(file.line(statement))
-    return 0
+    """Where an import can be added: before the first one, after what has to come before any."""
+    place = 0
+    for index, statement in enumerate(file.module.body):
+        small = statement.body[0] if isinstance(statement, cst.SimpleStatementLine) else None
+        future = isinstance(small, cst.ImportFrom) and file.code(small.module or small) == "__future__"
+        text = isinstance(small, cst.Expr) and isinstance(
+            small.value, (cst.SimpleString, cst.ConcatenatedString)
+        )
+        if isinstance(small, (cst.Import, cst.ImportFrom)) and not future:
+            return file.line_start(file.line(statement))
+        if future or (text and index == 0):
+            end = file.inner_span(statement)[1]
+            place = (
+                file.line_start(file.line_at(end) + 1) if file.line_at(end) < file.lines else len(file.text)
+            )
+        elif index == 0:
+            # Above it may be lines that have to be the first: an interpreter's, an encoding's.
+            decorators = getattr(statement, "decorators", ())
+            place = file.line_start(file.line(decorators[0] if decorators else statement))
+    return place
 
 
 def _euler(changes: Changes, angles: Angles, after: CameraSettings) -> bool:

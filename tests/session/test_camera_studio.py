@@ -1,6 +1,6 @@
-"""Cameras placed by hand in a real session: live, undone, kept over reloads, and written into the file."""
+"""The camera studio in a real session: cameras placed, undone, kept over reloads, written into the file, and judged."""
 
-# pyright: reportOptionalMemberAccess=false, reportArgumentType=false, reportOptionalSubscript=false
+# pyright: reportOptionalMemberAccess=false, reportOptionalIterable=false, reportArgumentType=false, reportOptionalSubscript=false
 
 from __future__ import annotations
 
@@ -157,6 +157,86 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     # The placement was not written any more, but it is not lost.
     assert moved(view) == {BASE} and view.studio.camera(BASE).info.settings == start
     wait_until(session, seen_from(BASE, view.studio.camera(BASE).now), "the camera where it was placed")
+
+
+def settled(session: Session, reached: Callable[[StudioView], bool], what: str) -> StudioView:
+    """The studio once its work in the background is done."""
+    view = wait_until(session, said(lambda s: s.progress is None and (reached(s) or bool(s.problem))), what)
+    assert not view.studio.problem, view.studio.problem
+    return view.studio
+
+
+def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved(session: Session) -> None:
+    session.studio.judge(BASE)
+    report = settled(session, lambda s: s.report_of == BASE, "the judgement").report
+    assert sorted(report.envs) == [0, 1] and not session.view().studio.report_stale
+    (cube,) = report.wanted_objects(("cube",))
+    assert cube.summary().seen == 1.0
+    session.studio.make_sheet(BASE)
+    sheet = settled(session, lambda s: len(s.sheet) == 2, "the pictures of all envs").sheet
+    assert [p.env for p in sheet] == [report.envs[i] for i in report.worst_first()]
+    # Turned to the sky.
+    start = camera(session, BASE).now
+    away = replace(start, quaternion=(0.7071067811865476, 0.0, -0.7071067811865476, 0.0))
+    session.studio.place(BASE, away)
+    assert session.view().studio.report_stale
+    session.studio.judge(BASE)
+    studio = settled(session, lambda s: s.report is not report, "the judgement of the placement")
+    assert studio.report.wanted_objects(("cube",))[0].summary().seen == 0.0 and not studio.report_stale
+    session.studio.compare(BASE, start)
+    here, there = settled(session, lambda s: s.compared is not None, "the comparison").compared
+    assert np.allclose(here.pose[3:], away.quaternion) and np.allclose(there.pose[3:], start.quaternion)
+    wait_until(session, seen_from(BASE, away), "the camera where it was placed, after the comparison")
+
+
+def test_a_picked_pixel_is_the_place_of_what_is_seen_there(session: Session) -> None:
+    view = session.view()
+    cube = view.step.poses[0, list(view.task.geometry.body_names).index("cube")]
+    looking_down = replace(
+        camera(session, BASE).now,
+        position=(float(cube[0]), float(cube[1]), 0.6),
+        quaternion=(0.7071067811865476, 0.0, 0.7071067811865476, 0.0),
+    )
+    session.studio.place(BASE, looking_down)
+    session.studio.pick(BASE, 0.5, 0.5)
+    picked = settled(session, lambda s: s.picked is not None and s.picked.body == "cube", "the pixel").picked
+    assert abs(picked.depth - (0.6 - cube[2] - 0.02)) < 2e-3
+    assert np.allclose(picked.point, [cube[0], cube[1], cube[2] + 0.02], atol=6e-3)
+
+
+def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session: Session) -> None:
+    studio = session.studio
+    studio.judge(BASE, 3)
+    assert session.view().studio.progress is not None
+    found = settled(session, lambda s: s.report_seeds == 3, "three seeds")
+    assert len(found.report.envs) == 3 and found.report_of == BASE
+    studio.suggest(BASE, ("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2)
+    offered = settled(session, lambda s: len(s.suggestions) > 0, "suggestions").suggestions
+    assert offered[0].score >= offered[-1].score > 0 and "cube: in 2 of 2 envs" in offered[0].words
+    studio.take_suggestion(0)
+    wait_until(session, lambda v: moved(v) == {BASE}, "the suggestion taken")
+    studio.judge(BASE, 500)
+    wait_until(
+        session, said(lambda s: s.progress is not None and s.progress.total == 500), "a long judgement"
+    )
+    studio.stop()
+    wait_until(session, said(lambda s: s.progress is None), "its end")
+    studio.suggest(BASE, ("nothing",), (0.0, 0.0, 0.3), (0.1, 0.1, 0.4), 1)
+    wait_until(session, said(lambda s: "no object 'nothing'" in s.problem), "why not")
+
+
+def test_cameras_go_out_and_poses_come_in(session: Session) -> None:
+    start = camera(session, BASE).now
+    text = session.studio.export([BASE, PEOPLE], "json")
+    session.studio.place(BASE, replace(start, position=(0.0, 0.0, 1.0)))
+    session.studio.import_pose(BASE, text, None, None)
+    assert not camera(session, BASE).moved
+    for form in ("opencv", "ros"):
+        assert session.studio.export([BASE, PEOPLE], form)
+    session.studio.import_pose(BASE, "1 0 0 5\n0 1 0 6\n0 0 1 7\n0 0 0 1", "camera_to_world", "maniskill")
+    assert camera(session, BASE).now.position == (5.0, 6.0, 7.0)
+    with pytest.raises(ValueError, match="no pose is in it"):
+        session.studio.import_pose(BASE, "{}", None, None)
 
 
 def test_placements_outlive_reloads_and_workers_until_the_file_says_otherwise(

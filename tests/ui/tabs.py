@@ -1,0 +1,172 @@
+"""Tabs without a browser: they connect as viser's page does, take what is sent, and throw it away.
+
+A real page for each of twenty clients would be twenty times Chromium on two cores. To the server these are the
+same: the handshake with cookie and subprotocol, the first camera message (before it viser does not count a client
+as connected), and every byte read as it comes.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import msgspec
+import viser
+import viser._messages
+import websockets.asyncio.client
+import websockets.exceptions
+import websockets.sync.client
+import zstandard
+from websockets.sync.connection import Connection
+from websockets.typing import Subprotocol
+
+from workbench.ui.gate import cookie_name
+
+
+def _handshake(url: str) -> tuple[str, dict[str, Any]]:
+    """Address and arguments of `websockets`' clients for the page at the printed `url`."""
+    split = urlsplit(url)
+    token = parse_qs(split.query).get("token", [""])[0]
+    return f"ws://{split.netloc}/", {
+        "origin": f"http://{split.netloc}",
+        "additional_headers": {"Cookie": f"{cookie_name(split.port or 80)}={token}"},
+        "subprotocols": [Subprotocol(f"viser-v{viser.__version__}")],
+        "compression": None,
+        "max_size": None,
+    }
+
+
+def camera_message(position: Sequence[float] = (3.0, 3.0, 3.0)) -> bytes:
+    """What a page says when it has drawn itself for the first time: where it looks from."""
+    message = viser._messages.ViewerCameraMessage(
+        wxyz=(1.0, 0.0, 0.0, 0.0),
+        position=(position[0], position[1], position[2]),
+        fov=0.8,
+        near=0.05,
+        far=300.0,
+        image_height=720,
+        image_width=800,
+        look_at=(0.0, 0.0, 0.0),
+        up_direction=(0.0, 0.0, 1.0),
+    )
+    return msgspec.msgpack.encode(message.as_serializable_dict())
+
+
+def messages_in(frame: bytes) -> list[dict[str, Any]]:
+    """The messages of one batch from the server, arrays left out."""
+    size = int.from_bytes(frame[8:16], "little")
+    return msgspec.msgpack.decode(zstandard.decompress(frame[16 : 16 + size]))["messages"]
+
+
+@dataclass
+class Tab:
+    """What one tab has had so far."""
+
+    frames: int = 0
+    megabytes: float = 0.0
+    open: bool = False
+    """Connected, and all that there was at that time has come."""
+    commands: dict[str, str] = field(default_factory=dict)
+    """The commands of the palette: the id of each, by its label."""
+
+
+class Tabs:
+    """Any number of tabs, on one thread."""
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, name="tabs", daemon=True)
+        self._thread.start()
+        self._tasks: dict[int, asyncio.Task[None]] = {}
+        self._connections: dict[int, websockets.asyncio.client.ClientConnection] = {}
+
+    def open(self, position: Sequence[float] = (3.0, 3.0, 3.0)) -> Tab:
+        """Open one that looks from `position`; it is read until `close`."""
+        tab = Tab()
+
+        async def begin() -> None:
+            self._tasks[id(tab)] = asyncio.create_task(self._read(tab, camera_message(position)))
+
+        asyncio.run_coroutine_threadsafe(begin(), self._loop).result()
+        return tab
+
+    def close(self, tab: Tab) -> None:
+        """Close it as a browser does; returns when that is done."""
+        task = self._tasks.pop(id(tab))
+
+        async def end() -> None:
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
+
+        asyncio.run_coroutine_threadsafe(end(), self._loop).result(timeout=30)
+
+    def trigger(self, tab: Tab, label: str) -> None:
+        """Choose this command of the page, as its key or the palette does."""
+        message = viser._messages.CommandTriggerMessage(tab.commands[label])
+        said = self._connections[id(tab)].send(msgspec.msgpack.encode(message.as_serializable_dict()))
+        asyncio.run_coroutine_threadsafe(said, self._loop).result(timeout=30)
+
+    def stop(self) -> None:
+        """Close all that are open."""
+
+        async def end() -> None:
+            for task in self._tasks.values():
+                task.cancel()
+            await asyncio.gather(*self._tasks.values(), return_exceptions=True)
+
+        asyncio.run_coroutine_threadsafe(end(), self._loop).result(timeout=30)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+
+    async def _read(self, tab: Tab, greeting: bytes) -> None:
+        address, options = _handshake(self._url)
+        try:
+            async with websockets.asyncio.client.connect(address, **options) as connection:
+                await connection.send(greeting)
+                self._connections[id(tab)] = connection
+                async for frame in connection:
+                    assert isinstance(frame, bytes)
+                    tab.frames += 1
+                    tab.megabytes += len(frame) / 2**20
+                    for message in [] if tab.open else messages_in(frame):
+                        if message["type"] == "RegisterCommandMessage":
+                            tab.commands[message["props"]["label"]] = message["uuid"]
+                        tab.open = tab.open or message["type"] == "ReplayDoneMessage"
+        except websockets.exceptions.ConnectionClosed:
+            pass
+        finally:
+            tab.open = False
+            self._connections.pop(id(tab), None)
+
+
+@contextmanager
+def tabs_of(url: str) -> Iterator[Tabs]:
+    tabs = Tabs(url)
+    try:
+        yield tabs
+    finally:
+        tabs.stop()
+
+
+def open_deaf_tab(url: str) -> Connection:
+    """A tab that connects, says that it is there, and reads nothing from then on."""
+    address, options = _handshake(url)
+    split = urlsplit(address)
+    assert split.hostname is not None and split.port is not None
+    small = socket.socket()
+    small.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    small.connect((split.hostname, split.port))
+    # One frame fills the queue, and then the library stops to read the socket, pings and all.
+    connection = websockets.sync.client.connect(
+        address, sock=small, max_queue=1, ping_interval=None, close_timeout=0.1, **options
+    )
+    connection.send(camera_message())
+    return connection
