@@ -128,6 +128,28 @@ def shoot_envs(chromium: str) -> None:
             shoot(page, "envs")
 
 
+def shoot_studio(page: Page) -> None:
+    """A camera is chosen, moved with keys, and the change is shown."""
+    tab(page, "Studio")
+    page.locator("input[aria-haspopup=listbox]:visible").first.click()
+    page.get_by_role("option", name="base_camera · sensor", exact=True).click()
+    expect(page.get_by_role("button", name="Show the change")).to_be_visible()
+    page.evaluate("document.activeElement.blur()")
+    for key in 12 * ["Alt+ArrowLeft"] + 8 * ["Alt+Shift+ArrowRight"]:
+        page.keyboard.press(key)
+        time.sleep(0.1)
+    page.get_by_role("button", name="Show the change").click()
+    write = page.get_by_role("button", name=re.compile("^Write it to"))
+    expect(write).to_be_visible()
+    write.scroll_into_view_if_needed()
+    shoot(page, "studio")
+    page.get_by_role("button", name="Leave the file as it is").click()
+    page.keyboard.press("Control+z")
+    page.keyboard.press("Control+z")
+    page.locator("input[aria-haspopup=listbox]:visible").first.click()
+    page.get_by_role("option", name="none", exact=True).click()
+
+
 def close_notice(page: Page) -> None:
     notice = page.locator(".mantine-Notification-closeButton")
     if notice.count():
@@ -186,6 +208,7 @@ def main() -> None:
                 tick.check(force=True)
             time.sleep(4)
             shoot(page, "cameras")
+            shoot_studio(page)
             shoot_reloads(page, file)
             lines = TASK.read_text().splitlines()
             place = next(i for i, line in enumerate(lines) if '"cube_to_goal": distance' in line)

@@ -62,11 +62,20 @@ def test_sensor_pictures_are_maniskills_observation(task: str, make: Any) -> Non
 
 @pytest.mark.parametrize("make", [stock, batched])
 def test_float_shaders_agree_too(make: Any) -> None:
-    env = make("PickCube-v1", obs_mode=OBS_MODE, sensor_configs={"shader_pack": "default"})
+    more = ("position", "normal", "albedo")
+    mode = "+".join((OBS_MODE, *more))
+    env = make("PickCube-v1", obs_mode=mode, sensor_configs={"shader_pack": "default"})
     act(env)
     obs = env.get_obs(env.get_info())["sensor_data"]["base_camera"]
-    (picture,) = take_pictures(env, 0, [("base_camera", "sensor", ALL)])
+    (picture,) = take_pictures(env, 0, [("base_camera", "sensor", (*ALL, *more))])
     assert_same(picture, obs, float_shader=True)
+    assert picture.position is not None and picture.normal is not None and picture.depth is not None
+    np.testing.assert_array_equal(picture.position, obs["position"][0].numpy().astype(np.float32) / 1000)
+    np.testing.assert_array_equal(picture.normal, obs["normal"][0].numpy())
+    np.testing.assert_array_equal(picture.albedo, obs["albedo"][0].numpy())
+    np.testing.assert_allclose(-picture.position[..., 2], picture.depth, atol=1e-3)
+    lengths = np.linalg.norm(picture.normal, axis=-1)
+    np.testing.assert_allclose(lengths[picture.depth > 0], 1, atol=1e-2)
     env.close()
 
 
@@ -206,7 +215,7 @@ def test_without_a_renderer_there_are_no_cameras() -> None:
         (-1, ("base_camera", "sensor", ["rgb"]), IndexError, "out of range"),
         (0, ("base_camera", "human", ["rgb"]), ValueError, r"base_camera \(sensor\)"),
         (0, ("nothing", "sensor", ["rgb"]), ValueError, r"render_camera \(human\)"),
-        (0, ("base_camera", "sensor", ["albedo"]), ValueError, "cannot be shown"),
+        (0, ("base_camera", "sensor", ["albedo"]), ValueError, "gives no albedo"),
         (0, ("base_camera", "sensor", ["heat"]), ValueError, "cannot be shown"),
     ],
 )

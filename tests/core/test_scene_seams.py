@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
+import re
+import sys
 
 import numpy as np
 import pytest
@@ -13,6 +16,8 @@ from mani_skill.sensors.camera import Camera, CameraConfig
 from mani_skill.utils.structs import Actor
 from mani_skill.utils.structs.base import BaseStruct, PhysxRigidBodyComponentStruct
 from mani_skill.utils.structs.render_camera import RenderCamera
+
+from workbench.core import seams
 
 
 @pytest.mark.parametrize("name", ["_objs", "_scene_idxs"])
@@ -85,3 +90,43 @@ def test_a_step_flattens_after_the_reward_and_a_reset_says_whom_it_resets() -> N
     assert step.index("self.get_reward(") < step.index("obs = self._flatten_raw_obs(obs)")
     assert "self.scene._reset_mask[env_idx] = True" in inspect.getsource(sapien_env.BaseEnv.reset)
     assert "self._init_raw_obs = obs" in inspect.getsource(sapien_env.BaseEnv.update_obs_space)
+
+
+def test_what_placing_a_camera_writes_is_there() -> None:
+    cached = {
+        f"_cached_{name}" for name in ("model_matrix", "extrinsic_matrix", "intrinsic_matrix", "local_pose")
+    }
+    assert cached == {name for name in RenderCamera.__dataclass_fields__ if name.startswith("_cached")}
+    source = inspect.getsource(sapien_env.BaseEnv._setup_sensors)
+    assert "self._sensor_configs" in source and "self._human_render_camera_configs" in source
+    assert "set_shader_pack(self.config.shader_config)" in inspect.getsource(Camera.__init__)
+    # What `Camera` keeps of its config, and what else it is made of.
+    assert set(re.findall(r"self\.(\w+) =", inspect.getsource(Camera.__init__))) == {"entity", "camera"}
+    assert "Pose.create(self.pose)" in inspect.getsource(CameraConfig.__post_init__)
+
+
+def test_a_config_knows_where_it_was_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(CameraConfig, "__init__", CameraConfig.__init__)  # to be put back
+    seams.mark_camera_configs()
+    seams.mark_camera_configs()
+
+    def hook() -> list[CameraConfig]:
+        pose = sapien.Pose()
+        return [
+            CameraConfig("a", pose, 8, 6, fov=1.0),
+            CameraConfig(
+                "b",
+                pose=sapien.Pose(
+                    [0, 0, 1]
+                ),
+                width=8, height=6, fov=1.0,
+            ),
+        ]  # fmt: skip
+
+    first = inspect.getsourcelines(hook)[1]
+    sites = [seams.camera_site(copy.copy(config)) for config in hook()]
+    assert [site and (site.file, site.line - first) for site in sites] == [(__file__, 3), (__file__, 4)]
+    if sys.version_info >= (3, 11):
+        assert sites[0].function == "test_a_config_knows_where_it_was_made.<locals>.hook"  # type: ignore[union-attr]
+    monkeypatch.undo()
+    assert seams.camera_site(hook()[0]) is None

@@ -15,7 +15,7 @@ GREY = np.full((6, 8, 3), 128, np.uint8)
 
 
 def test_camera_that_looks_along_x_looks_along_opencv_s_z() -> None:
-    wxyz, position = frustum_pose(Picture("c", "sensor", 0, POSE), np.array([10, 0, 0], np.float32))
+    wxyz, position = frustum_pose(POSE, np.array([10, 0, 0], np.float32))
     turn = viser.transforms.SO3(wxyz)
     np.testing.assert_allclose(turn.apply(np.array([0.0, 0.0, 1.0])), [1, 0, 0], atol=1e-9)
     np.testing.assert_allclose(turn.apply(np.array([0.0, 1.0, 0.0])), [0, 0, -1], atol=1e-9)

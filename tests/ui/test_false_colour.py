@@ -12,6 +12,8 @@ from workbench.ui.false_colour import (
     VIRIDIS,
     DepthRange,
     colour_depth,
+    colour_normal,
+    colour_position,
     colour_segmentation,
     depth_range,
     segment_colour,
@@ -76,3 +78,19 @@ def test_legend_names_the_largest_first_and_counts_the_rest() -> None:
     assert [name for _, name in legend][:3] == ["background", "cube", "id 2"]
     assert len(legend) == LONGEST_LEGEND
     assert more == 4
+
+
+def test_normals_are_drawn_as_normal_maps_and_background_is_dark() -> None:
+    normal = np.array([[[1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, 0]]], np.float32)
+    wanted = [[255, 128, 128], [128, 0, 128], [128, 128, 255], NOTHING.tolist()]
+    assert colour_normal(normal)[0].tolist() == wanted
+
+
+@given(hnp.arrays(np.float32, (5, 7, 3), elements=st.floats(-100, 100, width=32)))
+def test_positions_take_the_whole_scale_and_background_is_dark(position: np.ndarray) -> None:
+    met = position[..., 2] < 0
+    coloured = colour_position(position)
+    assert (coloured[~met] == NOTHING).all()
+    farthest_right = np.where(met, position[..., 0], -np.inf)
+    if met.sum() > 1 and np.ptp(position[met][:, 0]) > 0.1:
+        assert (coloured[farthest_right == farthest_right.max()][:, 0] == 255).all()

@@ -7,10 +7,11 @@ where it is written, and the files in which other programs want it. All of them 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Literal
 
-from workbench.core.pictures import CameraKind
-
+CameraKind = Literal["sensor", "human"]
 CameraKey = tuple[CameraKind, str]
 """Kind and name: a sensor and a camera for people may have the same name."""
 
@@ -47,3 +48,62 @@ class CallSite:
     """Of the call, counted from 1: its first line."""
     function: str
     """Qualified name of the code that it is in, as Python has it: ``PushCubeEnv._default_sensor_configs``."""
+
+
+CLOSE = 1e-6
+"""How far two cameras may be apart that are called the same: metres, quaternion components, radians; of pixels and
+of near and far, as a share. A config keeps its pose in single precision."""
+
+
+def differences(a: CameraSettings, b: CameraSettings, close: float = CLOSE) -> tuple[str, ...]:
+    """Which of ``position orientation fov intrinsic width height near far shader_pack`` are not the same."""
+    found: list[str] = []
+    if not _close(a.position, b.position, close):
+        found.append("position")
+    turned = tuple(-x for x in b.quaternion)
+    if not _close(a.quaternion, b.quaternion, close) and not _close(a.quaternion, turned, close):
+        found.append("orientation")
+    if (a.fov is None) != (b.fov is None) or (a.fov and b.fov and not _close((a.fov,), (b.fov,), close)):
+        found.append("fov")
+    flat = [None if c.intrinsic is None else tuple(x for row in c.intrinsic for x in row) for c in (a, b)]
+    if (flat[0] is None) != (flat[1] is None) or (
+        flat[0] and flat[1] and not _close(flat[0], flat[1], close)
+    ):
+        found.append("intrinsic")
+    found += [name for name in ("width", "height") if getattr(a, name) != getattr(b, name)]
+    found += [name for name in ("near", "far") if not _close((getattr(a, name),), (getattr(b, name),), close)]
+    if a.shader_pack != b.shader_pack:
+        found.append("shader_pack")
+    return tuple(found)
+
+
+def _close(a: tuple[float, ...], b: tuple[float, ...], close: float) -> bool:
+    return all(abs(x - y) <= close * max(1.0, abs(x), abs(y)) for x, y in zip(a, b, strict=True))
+
+
+MOST_PIXELS = 4096
+"""On a side; a typing mistake of a digit more would take the memory of all envs."""
+
+
+def why_no_camera(settings: CameraSettings) -> str | None:
+    """Why there can be no such camera, as a sentence without its end; None if there can."""
+    numbers = (*settings.position, *settings.quaternion, settings.near, settings.far)
+    if not all(math.isfinite(number) for number in numbers):
+        return "the camera's pose, near and far must be finite numbers"
+    if abs(math.hypot(*settings.quaternion) - 1.0) > 1e-3:
+        return "the camera's quaternion must be of unit length"
+    if not 0 < settings.near < settings.far:
+        return f"near must be above 0 and below far, not {settings.near:g} and {settings.far:g} metres"
+    if not (1 <= settings.width <= MOST_PIXELS and 1 <= settings.height <= MOST_PIXELS):
+        return f"width and height must be 1 to {MOST_PIXELS}, not {settings.width} x {settings.height}"
+    if (settings.fov is None) == (settings.intrinsic is None):
+        return "a camera has either a fov or an intrinsic matrix"
+    if settings.fov is not None and not 0.0 < settings.fov < math.pi:
+        return f"the fov must be above 0 and below pi radians, not {settings.fov:g}"
+    if settings.intrinsic is not None:
+        rows = settings.intrinsic
+        if [len(row) for row in rows] != [3, 3, 3] or not all(math.isfinite(x) for row in rows for x in row):
+            return "the intrinsic matrix must be 3 x 3 finite numbers"
+        if rows[0][0] <= 0 or rows[1][1] <= 0:
+            return "the intrinsic matrix must have focal lengths above 0"
+    return None

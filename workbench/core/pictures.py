@@ -7,12 +7,11 @@ import a simulator.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-CameraKind = Literal["sensor", "human"]
+from workbench.core.camera_settings import CallSite, CameraKey, CameraKind, CameraSettings
 
 
 @dataclass(frozen=True)
@@ -35,8 +34,19 @@ class CameraInfo:
     mount: str | None
     """Body name that the camera rides on, or None when it stands still."""
     modalities: tuple[str, ...]
-    """What its shader gives, of ``rgb depth segmentation position normal albedo``. Only the first three
-    can be asked for as a `Picture`."""
+    """What its shader gives, of ``rgb depth segmentation position normal albedo``."""
+    settings: CameraSettings | None = None
+    """What the task's own config says, wherever the camera was moved since; env 0's where they differ. None where
+    the config cannot be said in these words (a lens that differs between envs)."""
+    varies: bool = False
+    """Its pose differs between envs, or is another than its config says: the task's code moves it."""
+    site: CallSite | None = None
+    """Where the config was made; None where that was not noted."""
+
+    @property
+    def key(self) -> CameraKey:
+        """What tells it from all others."""
+        return self.kind, self.name
 
 
 @dataclass(frozen=True)
@@ -55,3 +65,10 @@ class Picture:
     this in whole millimetres as int16, which ends at 32.767 m; here there is no such end."""
     segmentation: NDArray[np.int32] | None = None
     """(H, W) ids of actors and links; 0 is background. Names in `TaskDescription.segmentation`."""
+    position: NDArray[np.float32] | None = None
+    """(H, W, 3) metres, in the camera's OpenGL frame (x right, y up, z backward), as ManiSkill observes it in whole
+    millimetres; 0 where the ray met nothing. The minimal shader's own numbers end at 32.767 m."""
+    normal: NDArray[np.float32] | None = None
+    """(H, W, 3) of unit length, in the same frame; 0 where the ray met nothing."""
+    albedo: NDArray[np.uint8] | None = None
+    """(H, W, 3) colour without light."""

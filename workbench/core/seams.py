@@ -12,7 +12,9 @@ upgrade fails loudly there and not in the middle of an author's task.
 
 from __future__ import annotations
 
-from functools import cached_property
+import sys
+from functools import cached_property, wraps
+from itertools import islice
 from types import FrameType
 from typing import Any
 
@@ -23,16 +25,20 @@ from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
 from mani_skill.agents.multi_agent import MultiAgent
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
+from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
+from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import common
 from mani_skill.utils.structs.actor import Actor
 from mani_skill.utils.structs.articulation import Articulation
 from mani_skill.utils.structs.articulation_joint import ArticulationJoint
 from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct
 from mani_skill.utils.structs.link import Link
+from mani_skill.utils.structs.pose import Pose
 from mani_skill.utils.structs.render_camera import RenderCamera
 from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 from numpy.typing import NDArray
 
+from workbench.core.camera_settings import CallSite, CameraKey
 from workbench.core.cpu_system import BatchedCpuSystem
 
 _installed = False
@@ -298,3 +304,68 @@ def camera_components(camera: Any) -> list[Any] | None:
     """
     inner = getattr(camera, "camera", None)
     return inner._render_cameras if isinstance(inner, RenderCamera) else None
+
+
+# --- what placing a camera writes ------------------------------------------------------------------
+
+
+def mark_camera_configs() -> None:
+    """Let every ``CameraConfig`` of this process keep where it was made, for `camera_site`. Safe to call again."""
+    stock = CameraConfig.__init__
+    if hasattr(stock, "_workbench_stock"):
+        return
+
+    @wraps(stock)
+    def init(self: Any, *args: Any, **kwargs: Any) -> None:
+        stock(self, *args, **kwargs)
+        self._workbench_site = _place_of_call(sys._getframe(1))
+
+    init._workbench_stock = stock  # type: ignore[attr-defined]
+    CameraConfig.__init__ = init  # type: ignore[method-assign]
+
+
+def _place_of_call(frame: FrameType) -> CallSite:
+    code = frame.f_code
+    line = frame.f_lineno
+    if sys.version_info >= (3, 11):
+        # Of a call over several lines `f_lineno` may be one within.
+        start = next(islice(code.co_positions(), frame.f_lasti // 2, None), (None,))[0]
+        line = line if start is None else start
+    return CallSite(code.co_filename, line, getattr(code, "co_qualname", code.co_name))
+
+
+def camera_site(config: Any) -> CallSite | None:
+    """Where a config was made; None where that was not kept."""
+    return getattr(config, "_workbench_site", None)
+
+
+def shader_packs() -> dict[str, Any]:
+    """ManiSkill's ``ShaderConfig`` objects by the name of their pack."""
+    return PREBUILT_SHADER_CONFIGS
+
+
+def use_shader(config: Any) -> None:
+    """What ``Camera.__init__`` does before its components are made: they get the process's present shader."""
+    set_shader_pack(config.shader_config)
+
+
+def as_pose(pose: Any) -> Pose:
+    """What ``CameraConfig.__post_init__`` makes of a pose."""
+    return Pose.create(pose)
+
+
+def set_up_camera(env: Any, key: CameraKey, camera: Any, config: Any, components: list[Any]) -> None:
+    """Make a ``Camera`` one of this config and these components, which are set up as the config says."""
+    kind, name = key
+    camera.config = config
+    (env._sensor_configs if kind == "sensor" else env._human_render_camera_configs)[name] = config
+    inner: RenderCamera = camera.camera
+    if inner._render_cameras is not components:
+        inner._render_cameras = components
+        # Made again, by name, when the scene is next drawn for all envs.
+        inner.camera_group = None  # type: ignore[assignment]
+        env.scene.camera_groups.pop(name, None)
+    inner._cached_model_matrix = None  # type: ignore[assignment]
+    inner._cached_extrinsic_matrix = None  # type: ignore[assignment]
+    inner._cached_intrinsic_matrix = None  # type: ignore[assignment]
+    inner._cached_local_pose = None  # type: ignore[assignment]

@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 
 from workbench.core import seams
 from workbench.core.body_table import BodyTable, build_body_table
+from workbench.core.camera_configs import rows_of_pose, settings_of
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 
 _MODALITIES = ("rgb", "depth", "segmentation", "position", "normal", "albedo")
-_TAKEN = ("rgb", "depth", "segmentation")
 _INT16_END = 32.767
 """Metres. The minimal shader writes positions as int16 millimetres."""
 
@@ -46,11 +46,12 @@ def list_cameras(env: Any, table: BodyTable | None = None) -> tuple[CameraInfo, 
     Args:
         table: the env's bodies, to name what a camera is mounted on; made anew if left out.
     """
-    cameras = _cameras(env)
+    cameras = cameras_of(env)
     table = table or (build_body_table(env) if cameras else None)
     infos = []
     for (kind, name), camera in cameras.items():
-        component = _components(camera)[0]
+        components = _components(camera)
+        component = components[0]
         gives = {m for modalities in camera.config.shader_config.texture_names.values() for m in modalities}
         mount = camera.camera.mount
         infos.append(
@@ -63,8 +64,11 @@ def list_cameras(env: Any, table: BodyTable | None = None) -> tuple[CameraInfo, 
                 near=float(component.near),
                 far=float(component.far),
                 intrinsic=np.array(component.get_intrinsic_matrix(), dtype=np.float32),
-                mount=None if mount is None or table is None else _body_name(mount, table),
+                mount=None if mount is None or table is None else body_name(mount, table),
                 modalities=tuple(m for m in _MODALITIES if m in gives),
+                settings=settings_of(camera.config),
+                varies=_varies(camera.config, components),
+                site=seams.camera_site(camera.config),
             )
         )
     return tuple(infos)
@@ -145,7 +149,7 @@ def begin_pictures(
     kinds = {kind for _, kind, _ in requests}
     if len(kinds) > 1:
         raise ValueError("pictures of sensors and of human cameras cannot be begun together")
-    cameras = _cameras(env)
+    cameras = cameras_of(env)
     for name, kind, modalities in requests:
         _check(name, kind, modalities, cameras)
     if not requests:
@@ -157,8 +161,8 @@ def begin_pictures(
     taken = []
     components = [_components(cameras[kind, name])[env_index] for name, kind, _ in requests]
     with (
-        _hidden_objects(env, env_index, shown=kinds == {"human"}),
-        _drawn_at(env, env_index, components, poses) as move_bodies,
+        hidden_objects(env, env_index, shown=kinds == {"human"}),
+        drawn_at(env, env_index, components, poses) as move_bodies,
     ):
         sub_scene.update_render()
         move_bodies()
@@ -171,7 +175,7 @@ def begin_pictures(
 
 
 @contextmanager
-def _drawn_at(
+def drawn_at(
     env: Any, env_index: int, components: Sequence[Any], poses: NDArray[np.float32] | None
 ) -> Iterator[Callable[[], None]]:
     """Draw the bodies of an env at `poses`, with the cameras on them, and leave the bodies where they are.
@@ -207,7 +211,7 @@ def _drawn_at(
             component.local_pose = local_pose
 
 
-def _cameras(env: Any) -> dict[tuple[CameraKind, str], Any]:
+def cameras_of(env: Any) -> dict[tuple[CameraKind, str], Any]:
     found: dict[tuple[CameraKind, str], Any] = {}
     for name, sensor in seams.sensors(env).items():
         if seams.camera_components(sensor) is not None:
@@ -220,11 +224,18 @@ def _cameras(env: Any) -> dict[tuple[CameraKind, str], Any]:
 
 def _components(camera: Any) -> list[Any]:
     components = seams.camera_components(camera)
-    assert components is not None, "only cameras that `_cameras` found come here"
+    assert components is not None, "only cameras that `cameras_of` found come here"
     return components
 
 
-def _body_name(mount: Any, table: BodyTable) -> str | None:
+def _varies(config: Any, components: Sequence[Any]) -> bool:
+    """Whether the poses differ between envs, or are not those of the config."""
+    said = rows_of_pose(config)
+    real = np.array([[*c.local_pose.p, *c.local_pose.q] for c in components])
+    return bool((said != said[:1]).any() or np.abs(real - said[:1]).max() > 1e-5)
+
+
+def body_name(mount: Any, table: BodyTable) -> str | None:
     thing = seams.objects_of(mount)[0]
     entity = thing if isinstance(thing, sapien.Entity) else thing.entity
     slot = table.slot_of.get(id(entity))
@@ -240,15 +251,15 @@ def _check(
         raise ValueError(f"there is no {kind} camera {name!r} to take a picture with; there are: {there}")
     gives = {m for ms in camera.config.shader_config.texture_names.values() for m in ms}
     for modality in modalities:
-        if modality not in _TAKEN:
-            raise ValueError(f"{modality!r} cannot be shown; ask for some of {', '.join(_TAKEN)}")
+        if modality not in _MODALITIES:
+            raise ValueError(f"{modality!r} cannot be shown; ask for some of {', '.join(_MODALITIES)}")
         if modality not in gives:
             pack = camera.config.shader_config.shader_pack
             raise ValueError(f"camera {name!r} gives no {modality} with the shader pack {pack!r}")
 
 
 @contextmanager
-def _hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]:
+def hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]:
     """Draw the task's hidden objects in this env, or do not, and put everything back afterwards."""
     was_visible: list[tuple[Any, float]] = []
     was_at: list[tuple[Any, sapien.Pose]] = []
@@ -295,8 +306,8 @@ def _read(
         transformed = config.texture_transforms[texture](torch.from_numpy(data)[None])
         made.update({m: image[0] for m, image in transformed.items() if m in modalities})
         if "depth" in gives and "depth" in modalities:
-            depth = _depth(texture, data, made["depth"].numpy()[..., 0], component)
-    segmentation = made.get("segmentation")
+            depth = depth_in_metres(texture, data, made["depth"].numpy()[..., 0], component)
+    segmentation, position, normal = (made.get(m) for m in ("segmentation", "position", "normal"))
     return Picture(
         camera=name,
         kind=kind,
@@ -305,10 +316,13 @@ def _read(
         rgb=np.ascontiguousarray(made["rgb"].numpy()) if "rgb" in made else None,
         depth=depth,
         segmentation=None if segmentation is None else segmentation.numpy()[..., 0].astype(np.int32),
+        position=None if position is None else position.numpy().astype(np.float32) / np.float32(1000.0),
+        normal=None if normal is None else np.ascontiguousarray(normal.numpy(), dtype=np.float32),
+        albedo=np.ascontiguousarray(made["albedo"].numpy()) if "albedo" in made else None,
     )
 
 
-def _depth(texture: str, data: NDArray, transformed: NDArray, component: Any) -> NDArray[np.float32]:
+def depth_in_metres(texture: str, data: NDArray, transformed: NDArray, component: Any) -> NDArray[np.float32]:
     """(H, W) metres, 0 for background, from the texture `data` and ManiSkill's own reading of it.
 
     ManiSkill's standard is int16 millimetres. Where the texture holds float positions in metres, as

@@ -62,6 +62,8 @@ class Moment:
     """Bytes, without parts and pictures."""
     pictures: dict[tuple[int, CameraKind, str], Picture] = field(default_factory=dict)
     """By env, kind and name of the camera."""
+    outdated: set[tuple[int, CameraKind, str]] = field(default_factory=set)
+    """Which of the pictures are of a camera that was moved since."""
     standing: Standing | None = None
     """What the table of envs said then."""
 
@@ -171,10 +173,18 @@ class History:
             if before is None:
                 self._pictured.append(moment.serial)
             moment.pictures[key] = picture
+            moment.outdated.discard(key)
             change = _picture_bytes(picture) - (0 if before is None else _picture_bytes(before))
             self._pictures_used += change
             self._used += change
         self._shrink()
+
+    def camera_moved(self, kind: CameraKind, name: str) -> None:
+        """Pictures that are kept of this camera do not show what it sees now."""
+        for serial in self._pictured:
+            moment = self.at(serial)
+            if moment is not None:
+                moment.outdated.update(key for key in moment.pictures if key[1:] == (kind, name))
 
     # --- what is there -----------------------------------------------------------------------------
 
@@ -393,5 +403,8 @@ def _step_bytes(step: StepResult) -> int:
 
 
 def _picture_bytes(picture: Picture) -> int:
-    arrays = (picture.rgb, picture.depth, picture.segmentation)
+    arrays = (
+        *(picture.rgb, picture.depth, picture.segmentation),
+        *(picture.position, picture.normal, picture.albedo),
+    )
     return 300 + sum(array.nbytes for array in arrays if array is not None)

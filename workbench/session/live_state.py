@@ -32,6 +32,7 @@ from workbench.session.messages import (
     LoadLevel,
     PastPictures,
     Pictures,
+    Placed,
     ReloadReport,
     Request,
     Restore,
@@ -219,6 +220,8 @@ class LiveState:
                 self.pictures = {k: p for k, p in {**self.pictures, **made}.items() if k in watched}
                 self.pictures_serial += 1
                 self.picture_milliseconds = event.milliseconds
+        elif isinstance(event, Placed):
+            self._placed(event)
         elif isinstance(event, Inspection):
             self.inspection = event
         elif isinstance(event, Status):
@@ -229,6 +232,16 @@ class LiveState:
             elif self.state in ("running", "paused", "loading"):
                 self.activity = ""
                 self._runs()
+
+    def _placed(self, event: Placed) -> None:
+        if event.info is None or self.task is None:
+            return
+        infos = tuple(event.info if c.key == event.key else c for c in self.task.cameras)
+        self.task = replace(self.task, cameras=infos)
+        if event.reshaped:
+            self.cameras_serial += 1  # what it can show may be something else
+        if self.timeline is not None:
+            self.timeline.camera_moved(*event.key)
 
     def died(self, death: Death, while_loading: bool, printed: str) -> Problem | None:
         """The worker is gone.

@@ -14,10 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.authoring.problem import Problem
+from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.geometry import SceneGeometry
 from workbench.core.inspection import Inspection, Section
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.core.step import StepResult
+from workbench.session.camera_messages import (
+    CameraAnswer,
+    CameraQuestion,
+    Searching,
+)
 
 Backend = Literal["auto", "cpu", "gpu"]
 ActionSource = Literal["hold", "zero", "random", "sliders", "policy"]
@@ -164,6 +170,18 @@ class WatchCameras:
 
 
 @dataclass(frozen=True)
+class PlaceCamera:
+    """Put a camera elsewhere in all envs, or give it another lens, size or shader; answered with `Placed`.
+
+    Of several for one camera that wait, only the last is made.
+    """
+
+    key: CameraKey
+    settings: CameraSettings | None
+    """None puts it back where the task had it."""
+
+
+@dataclass(frozen=True)
 class SetCapture:
     """While on, every step comes back with the pictures of all cameras of these envs, to be recorded."""
 
@@ -248,6 +266,8 @@ Request = (
     | SetActionSource
     | SetSliders
     | WatchCameras
+    | PlaceCamera
+    | CameraQuestion
     | SetCapture
     | Restore
     | DrawPast
@@ -348,6 +368,21 @@ class Pictures:
 
 
 @dataclass(frozen=True)
+class Placed:
+    """The answer to `PlaceCamera`. Pictures of that camera that come later show it as it was placed."""
+
+    key: CameraKey
+    settings: CameraSettings | None
+    """As asked."""
+    info: CameraInfo | None
+    """Of the camera as it is now, but for what the task's config says of it (`CameraInfo.settings`)."""
+    reshaped: bool = False
+    """Its pictures are of another size, or have other modalities."""
+    why_not: str = ""
+    """Why it was not placed; then nothing was changed."""
+
+
+@dataclass(frozen=True)
 class PastPictures:
     """The answer to `DrawPast`."""
 
@@ -386,5 +421,17 @@ class WarmedUp:
 
 
 Event = (
-    Loading | Loaded | Failed | Stepped | Pictures | PastPictures | Inspection | Judged | Status | WarmedUp
+    Loading
+    | Loaded
+    | Failed
+    | Stepped
+    | Pictures
+    | Placed
+    | CameraAnswer
+    | Searching
+    | PastPictures
+    | Inspection
+    | Judged
+    | Status
+    | WarmedUp
 )

@@ -6,6 +6,9 @@ begun, steps go on, and it is fetched when it should be ready, by what the last 
 before human cameras, since the two see different objects and cannot be drawn at once, and are handed over
 as soon as they are there. No more than 15 rounds a second are made, and after each there is a pause in
 proportion, so that the browser on the same machine gets its share.
+
+A camera that is being dragged is another matter: somebody follows it with the hand. Its picture is made next and
+alone (`hurry`), without a pause, and the others when it rests.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
+from workbench.core.camera_settings import CameraKey
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.take_pictures import KINDS, BegunPictures, Request, begin_pictures
 from workbench.core.task_env import TaskEnv
@@ -29,13 +33,16 @@ class PictureMaker:
         self._env_index = 0
         self._requests: tuple[Request, ...] = ()
         self._wanted = False
+        self._hurried: set[CameraKey] = set()
         self._next_round = 0.0
+        self._round: tuple[Request, ...] = ()
         self._begun: BegunPictures | None = None
         self._begun_at = 0.0
         self._ready_at = 0.0
         self._kinds_left: list[CameraKind] = []
         self._round_began = 0.0
-        self._expected: dict[CameraKind, float] = {"sensor": 0.0, "human": 0.0}
+        self._expected: dict[tuple[CameraKey, ...], float] = {}
+        self._drawn: tuple[CameraKey, ...] = ()
         self._moment = 0
         self._begun_of = 0
         self.moments: list[int] = []
@@ -45,11 +52,18 @@ class PictureMaker:
         """From now on these cameras of this env."""
         self._env_index, self._requests = env_index, tuple(requests)
         self._wanted = bool(requests)
+        self._hurried.clear()
+        self._expected.clear()
         self._next_round = 0.0  # somebody waits for these
 
     def scene_changed(self, moment: int) -> None:
         """What was drawn is old; the scene is now that of `moment`, a number of the caller's."""
         self._wanted, self._moment = bool(self._requests), moment
+
+    def hurry(self, key: CameraKey) -> None:
+        """Somebody moves this camera: if it is watched, its picture comes first."""
+        if any((kind, name) == key for name, kind, _ in self._requests):
+            self._hurried.add(key)
 
     @property
     def idle(self) -> bool:
@@ -60,15 +74,22 @@ class PictureMaker:
         """Seconds until `poll` has something to do; None while nobody looks."""
         if self._begun is not None:
             return max(0.0, self._ready_at - now)
+        if self._hurried:
+            return 0.0
         return max(0.0, self._next_round - now) if self._wanted else None
 
     def poll(self, env: TaskEnv, now: float) -> tuple[tuple[Picture, ...], float] | None:
         """Begin or fetch what is due; the pictures of a kind and their seconds when they are complete."""
         if self._begun is None:
-            if not self._wanted or now < self._next_round:
+            if not self._hurried and (not self._wanted or now < self._next_round):
                 return None
-            self._wanted, self._round_began = False, now
-            self._kinds_left = [kind for kind in KINDS if any(r[1] == kind for r in self._requests)]
+            if self._hurried:
+                self._round = tuple(r for r in self._requests if (r[1], r[0]) in self._hurried)
+                self._hurried.clear()
+            else:
+                self._round, self._wanted = self._requests, False
+            self._round_began = now
+            self._kinds_left = [kind for kind in KINDS if any(r[1] == kind for r in self._round)]
             self._begin_next(env)
             return None
         if now < self._ready_at:
@@ -91,12 +112,12 @@ class PictureMaker:
 
     def _begin_next(self, env: TaskEnv) -> None:
         kind = self._kinds_left.pop(0)
-        chosen = [request for request in self._requests if request[1] == kind]
+        chosen = [request for request in self._round if request[1] == kind]
         self._begun = begin_pictures(env.env, self._env_index, chosen)
-        self._kind: CameraKind = kind
+        self._drawn = tuple((kind, name) for name, kind, _ in chosen)
         self._begun_of = self._moment
         self._begun_at = time.monotonic()
-        self._ready_at = self._begun_at + self._expected[kind]
+        self._ready_at = self._begun_at + self._expected.get(self._drawn, 0.0)
 
     def _fetch(self) -> tuple[tuple[Picture, ...], float]:
         begun, self._begun = self._begun, None
@@ -108,5 +129,5 @@ class PictureMaker:
         waited = done - asked > 0.004
         # Fetched too early, the wait tells how long it takes; otherwise it may take less than expected.
         took = done - self._begun_at
-        self._expected[self._kind] = min(took, 1.0) if waited else 0.9 * self._expected[self._kind]
+        self._expected[self._drawn] = min(took, 1.0) if waited else 0.9 * self._expected.get(self._drawn, 0.0)
         return made, took

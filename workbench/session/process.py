@@ -31,6 +31,7 @@ from workbench.session.memory_limit import memory_with_children, resident_memory
 from workbench.session.messages import (
     Event,
     Load,
+    PlaceCamera,
     Quit,
     Request,
     SetActionSource,
@@ -117,7 +118,7 @@ class WorkerProcess:
     def send(self, request: Request) -> None:
         """Never waits. What is sent to a worker that is gone is lost; `receive` says so."""
         with self._wake:
-            if self._waiting and isinstance(request, _SETTINGS) and type(self._waiting[-1]) is type(request):
+            if self._waiting and _takes_the_place_of(request, self._waiting[-1]):
                 self._waiting.pop()
             if len(self._waiting) < _MOST_WAITING:
                 self._waiting.append(request)
@@ -245,6 +246,12 @@ class WorkerProcess:
                 if self._output(name, piece):
                     time.sleep(_FLOOD_PAUSE)
             self._output(name, b"")
+
+
+def _takes_the_place_of(request: Request, before: Request) -> bool:
+    if isinstance(request, PlaceCamera):
+        return isinstance(before, PlaceCamera) and before.key == request.key
+    return isinstance(request, _SETTINGS) and type(before) is type(request)
 
 
 def describe_exit(code: int | None) -> str:

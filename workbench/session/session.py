@@ -13,10 +13,15 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 from workbench.authoring.watch import SourceWatcher
 from workbench.core.inspection import Section
+from workbench.session.camera_judging import ShownMoment
+from workbench.session.camera_messages import CameraAnswer
+from workbench.session.camera_studio import CameraStudio
 from workbench.session.env_table import EnvRows
 from workbench.session.judge import FILE_SAVED, Judge, what_a_load_means
 from workbench.session.judgement import JudgedCurve, Judgement
@@ -30,8 +35,10 @@ from workbench.session.messages import (
     Event,
     Failed,
     Inspect,
+    Load,
     Loaded,
     LoadLevel,
+    Placed,
     Play,
     Request,
     Reset,
@@ -102,6 +109,8 @@ class Session:
         )
         self._recorder = LiveRecorder(recordings, self._note)
         self._judge = Judge(self._note)
+        self.studio = CameraStudio(self._send, self._note, self._shown_moment, self._same_version)
+        """Cameras placed by hand."""
         self._watcher = SourceWatcher(self._on_files_changed)
         self._follow((), {})
         self._worker.start()
@@ -113,9 +122,10 @@ class Session:
         recording = self._recorder.status()
         printed, vitals = self._printed.view(), self._worker.vitals
         with self._lock:
-            return self._state.view(
+            view = self._state.view(
                 recording=recording, printed=printed, vitals=vitals, judgement=self._judge.view
             )
+        return replace(view, studio=self.studio.view(view.step, view.selected_env))
 
     def env_rows(self) -> EnvRows | None:
         """The row of every env; None before a task is loaded. Copies some 100 kB for 256 envs: not for every frame."""
@@ -355,6 +365,7 @@ class Session:
         self._watcher.stop()
         self._worker.stop()
         self._judge.close()
+        self.studio.close()
         self._recorder.close()
 
     # --- what the worker says, on the session's thread -------------------------------------------
@@ -375,6 +386,7 @@ class Session:
 
     def _on_death(self, death: Death) -> None:
         self._recorder.stop()
+        self.studio.interrupted()
         with self._lock:
             s = self._state
             while_loading = self._recovery.loading
@@ -406,8 +418,14 @@ class Session:
         else:
             with self._lock:
                 self._state.take(event)
+            if isinstance(event, Placed):
+                self.studio.placed(event)
+            if isinstance(event, get_args(CameraAnswer)):
+                self.studio.answered(event)  # type: ignore[arg-type]
             if isinstance(event, Failed):
                 self._bring_back(event)
+                if not self._state.problem_at_run:
+                    self.studio.failed_to_load()
             if isinstance(event, Failed) and event.problem.file is not None:
                 # A module beside the task that broke before the task had ever imported it whole.
                 known = self._state.task.source_files if self._state.task is not None else ()
@@ -431,12 +449,17 @@ class Session:
                 judgement = Judgement(s.timeline.history)
             stale = restored and not is_on_disk(event.task.source)
             s.loaded(event, restored=restored, stale=stale)
+            placements = self.studio.loaded(event.task)
         if judgement is not None:
             self._judge.judge(self._state.load_request(Wanted(dict(event.task.source), None)), judgement)
         elif meaning == "forget":
             self._judge.forget()
         self._follow(event.task.source_files, {} if stale else event.task.source)
         self._watch()
+        for request in placements:
+            self._send(request)
+        if event.reload is None or event.reload.level not in ("same", "cameras"):
+            self.studio.outdated()
         if recording.active:
             self._record_on(event, recording.env_idx)
 
@@ -456,8 +479,22 @@ class Session:
             self._state.stepped(event)
         self._recorder.take(event)
 
+    def _shown_moment(self) -> ShownMoment:
+        with self._lock:
+            s = self._state
+            past = None if s.timeline is None else s.timeline.shown
+            count = 0 if s.task is None else s.task.num_envs
+            return ShownMoment(s.selected_env, count, None if past is None else past.step.poses)
+
+    def _same_version(self) -> Load | None:
+        """How another worker gets the version that runs."""
+        with self._lock:
+            task = self._state.task
+            return None if task is None else self._state.load_request(Wanted(dict(task.source), None))
+
     def _on_files_changed(self, paths: set[Path]) -> None:
         self._judge.stop(FILE_SAVED)
+        self.studio.interrupted()
         with self._lock:
             self._state.stale = True
         self._note()

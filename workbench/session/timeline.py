@@ -123,6 +123,11 @@ class Timeline:
             before = self.history.events(env, self.history.first, here - 1)
             self.seek(before[-1][0] if before else self.history.first)
 
+    def camera_moved(self, kind: CameraKind, name: str) -> None:
+        """See `History.camera_moved`; what is shown is drawn again when it is asked for."""
+        self.history.camera_moved(kind, name)
+        self._asked = None
+
     def pictures(self, env: int) -> dict[tuple[CameraKind, str], Picture]:
         """Those of the shown moment that were kept."""
         moment = self.shown
@@ -206,8 +211,13 @@ class Timeline:
         self, moment: Moment, env: int, cameras: tuple[CameraRequest, ...]
     ) -> tuple[CameraRequest, ...]:
         def lacks(camera: CameraRequest) -> bool:
-            picture = moment.pictures.get((env, camera.kind, camera.name))
-            return picture is None or any(getattr(picture, m) is None for m in camera.modalities)
+            key = (env, camera.kind, camera.name)
+            picture = moment.pictures.get(key)
+            return (
+                picture is None
+                or key in moment.outdated
+                or any(getattr(picture, m) is None for m in camera.modalities)
+            )
 
         return tuple(camera for camera in cameras if lacks(camera))
 

@@ -21,6 +21,7 @@ from workbench.session.kept_worker import Vitals
 from workbench.session.last_words import Busy
 from workbench.session.messages import ActionSource, EpisodeEnd, ReloadReport, TaskDescription
 from workbench.session.printed import Printed
+from workbench.session.studio_view import StudioView
 from workbench.session.timeline import TimelineView
 
 State = Literal["starting", "loading", "running", "paused", "error", "stopped"]
@@ -106,3 +107,5 @@ class SessionView:
     """The newest answer to `Session.inspect`, of whichever env was selected then."""
     judgement: JudgementView = JudgementView()
     """What the new code says of the episodes that were run with the old."""
+    studio: StudioView = StudioView()
+    """Cameras, as they are placed by hand."""

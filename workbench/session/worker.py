@@ -27,12 +27,24 @@ import numpy as np
 import torch
 
 from workbench.authoring.problem import Problem, TaskError, problem_from_exception
+from workbench.core.camera_configs import note_camera_sites
+from workbench.core.camera_settings import CameraKey
+from workbench.core.exchange import keep_observation_space
 from workbench.core.inspect_env import inspect_env
+from workbench.core.place_camera import PlacedCameras
 from workbench.core.snapshot import restore_snapshot
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import Request as PictureRequest
-from workbench.core.take_pictures import take_pictures
+from workbench.core.take_pictures import list_cameras, take_pictures
 from workbench.session.acting import Acting
+from workbench.session.camera_answers import answer
+from workbench.session.camera_messages import (
+    CameraQuestion,
+    CameraQuestionFailed,
+    DrawCamera,
+    JudgeCamera,
+    SuggestCameras,
+)
 from workbench.session.interrupts import Interrupted, Interrupts
 from workbench.session.judge_moments import judge_moments
 from workbench.session.messages import (
@@ -48,6 +60,8 @@ from workbench.session.messages import (
     Loading,
     PastPictures,
     Pictures,
+    PlaceCamera,
+    Placed,
     Play,
     Quit,
     ReloadReport,
@@ -66,7 +80,7 @@ from workbench.session.messages import (
     WarmUp,
     WatchCameras,
 )
-from workbench.session.open_task import OpenedTask, reset_checked, restore_checked, step_checked
+from workbench.session.open_task import OpenedTask, blamed, reset_checked, restore_checked, step_checked
 from workbench.session.pacing import Pacer, Rate
 from workbench.session.picture_maker import PictureMaker
 from workbench.session.pulse import Doing, PulseWriter
@@ -96,6 +110,8 @@ class Worker:
         self._rate = Rate()
         self._watch = WatchCameras(0, ())
         self._pictures = PictureMaker()
+        self._placed = PlacedCameras()
+        self._to_place: dict[CameraKey, PlaceCamera] = {}
         self._renderer_ready = False
         self._steps = StepEvents()
         self._status_sent = 0.0
@@ -110,6 +126,10 @@ class Worker:
             SetActionSource: self._set_action_source,
             SetSliders: self._set_sliders,
             WatchCameras: self._watch_cameras,
+            PlaceCamera: self._place_camera,
+            DrawCamera: self._answer_about_camera,
+            JudgeCamera: self._answer_about_camera,
+            SuggestCameras: self._answer_about_camera,
             SetCapture: self._set_capture,
             Restore: self._restore,
             DrawPast: self._draw_past,
@@ -130,6 +150,8 @@ class Worker:
             if self._playing and self._pacer.due(now):
                 self._pacer.spend()
                 self._at_work("stepping", self._control_step)
+            if self._to_place and self._pictures.idle:
+                self._at_work("stepping", self._place_cameras)
             self._make_pictures()
             self._send_status(time.monotonic())
 
@@ -189,7 +211,7 @@ class Worker:
             self._quit = True
 
     def _load(self, request: Load) -> None:
-        self._pictures.settle()
+        self._settle()
         running = None
         if self._opened is not None and self._loaded_by is not None and self._last is not None:
             running = Running(self._loaded_by, self._opened, self._last)
@@ -198,6 +220,8 @@ class Worker:
                 request, running, on_activity=lambda activity: self._send(Loading(activity))
             )
         except TaskError as error:
+            if self._opened is not None:
+                self._placed.put_back(self._opened.env.env)  # trying new cameras took the old ones away
             self._send(Failed(error.problem, kept=self._opened is not None))
             return
         # From here on it is one thing: an interrupt in the middle would leave the page with another task than ours.
@@ -207,6 +231,8 @@ class Worker:
     def _take_over(self, opened: OpenedTask, report: ReloadReport | None, request: Load) -> None:
         before, self._opened = self._opened, opened
         self._loaded_by, self._last = request, opened.first
+        if report is None or report.level not in ("same", "patched"):
+            self._placed.forget()
         if report is not None and report.level in SCENE_KEPT:
             self._look_through(self._watch)
             self._pictures.scene_changed(self._steps.number)
@@ -272,7 +298,7 @@ class Worker:
 
     def _look_through(self, request: WatchCameras) -> None:
         self._watch = request
-        self._pictures.settle()
+        self._settle()
         if self._opened is None:
             return
         known = {(camera.name, camera.kind) for camera in self._opened.description.cameras}
@@ -280,6 +306,62 @@ class Worker:
             (c.name, c.kind, c.modalities) for c in request.cameras if (c.name, c.kind) in known
         ]
         self._pictures.watch(min(request.env, self._opened.env.num_envs - 1), wanted)
+
+    def _answer_about_camera(self, question: CameraQuestion) -> None:
+        if self._opened is None:
+            self._send(CameraQuestionFailed(question.number, "no task is loaded"))
+            return
+        self._settle()
+        self._pulse.begin("drawing")
+        told = answer(
+            self._opened, self._placed, question, self._send, lambda: bool(self._connection.poll(0))
+        )
+        self._pulse.begin("idle")
+        self._send(told)
+
+    def _place_camera(self, request: PlaceCamera) -> None:
+        # Not at once: the picture under way is finished first, or a drag faster than the renderer would see none.
+        self._to_place.pop(request.key, None)
+        self._to_place[request.key] = request
+
+    def _place_cameras(self) -> None:
+        """Those that wait. No picture may be under way."""
+        wanted, self._to_place = self._to_place, {}
+        for request in wanted.values():
+            if self._opened is not None:
+                self._send(self._placed_as(self._opened, request))
+
+    def _placed_as(self, opened: OpenedTask, request: PlaceCamera) -> Placed:
+        key, env = request.key, opened.env.env
+        try:
+            with self._interrupts.shielded():
+                reshaped = self._placed.place(env, key, request.settings)
+        except (ValueError, RuntimeError) as error:
+            return Placed(key, request.settings, None, why_not=str(error))
+        said = {c.key: c for c in opened.description.cameras}
+        infos = tuple(
+            replace(info, settings=before.settings, varies=before.varies, site=before.site)
+            for info in list_cameras(env, opened.env.table)
+            if (before := said.get(info.key)) is not None
+        )
+        self._opened = replace(opened, description=replace(opened.description, cameras=infos))
+        self._pictures.scene_changed(self._steps.number)
+        self._pictures.hurry(key)
+        if reshaped and key[0] == "sensor" and opened.env.observes_pictures:
+            self._guarded(self._observe_again)
+        info = next((info for info in infos if info.key == key), None)
+        return Placed(key, request.settings, info, reshaped)
+
+    def _observe_again(self, opened: OpenedTask) -> None:
+        """A policy must not be given pictures of the size that was."""
+        with blamed("step", opened.loaded, opened.env):
+            opened.env.judge()
+        keep_observation_space(opened.env.env, opened.env.obs)
+
+    def _settle(self) -> None:
+        """The scene is about to be drawn or built otherwise: what is under way ends, and cameras stand as asked."""
+        self._pictures.settle()
+        self._place_cameras()
 
     def _set_capture(self, request: SetCapture) -> None:
         self._steps.captured_envs = request.env_idx
@@ -290,7 +372,7 @@ class Worker:
     def _draw_past(self, request: DrawPast) -> None:
         if self._opened is None:
             return
-        self._pictures.settle()  # its cameras and bodies are about to be drawn elsewhere
+        self._settle()  # its cameras and bodies are about to be drawn elsewhere
         wanted: list[PictureRequest] = [(c.name, c.kind, c.modalities) for c in request.cameras]
         try:
             pictures = take_pictures(self._opened.env.env, request.env, wanted, request.poses)
@@ -333,7 +415,7 @@ class Worker:
 
     def _step_once(self, opened: OpenedTask) -> None:
         if opened.env.observes_pictures:
-            self._pictures.settle()  # the observation is about to draw the same scene
+            self._settle()  # the observation is about to draw the same scene
         step = step_checked(opened.env, opened.loaded, self._acting.next_action(opened.env))
         self._rate.tick(time.monotonic())
         self._send_step(step, np.zeros(opened.env.num_envs, bool))
@@ -351,6 +433,7 @@ class Worker:
     ) -> None:
         self._pictures.settle()  # a reset may build the scene anew
         step = reset_checked(opened.env, opened.loaded, seed, env_idx)
+        self._placed.put_back(opened.env.env)
         mask = np.ones(opened.env.num_envs, bool)
         if env_idx is not None:
             mask[:] = False
@@ -376,7 +459,7 @@ class Worker:
         assert self._opened is not None
         self._last = step
         if self._steps.captured_envs:
-            self._pictures.settle()  # the same scene is about to be drawn
+            self._settle()  # the same scene is about to be drawn
         event = self._steps.event(self._opened, step, reset_mask, seeds, restored)
         self._pictures.scene_changed(event.number)
         self._send(event)
@@ -437,4 +520,5 @@ def work(connection: int, pulse: PulseWriter) -> None:
     # each time: 0.25 s, most of a reload of 16 envs.
     gc.collect()
     gc.freeze()
+    note_camera_sites()
     Worker(Connection(connection), pulse).run()

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
 import numpy as np
 import viser
 import viser.transforms
 from numpy.typing import NDArray
 
+from workbench.core.camera_frames import intrinsic_of, vertical_fov
+from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 
 CAMERA_TO_OPENCV = viser.transforms.SO3.from_matrix(
@@ -18,15 +23,34 @@ LARGEST_IMAGE = 128
 SMALL, LARGE = 0.07, 0.14
 """Depth of a frustum, metres: small beside one env, larger where the whole grid is looked at."""
 COLOURS: dict[CameraKind, tuple[int, int, int]] = {"sensor": (245, 159, 0), "human": (132, 94, 247)}
+THIN, THICK = 2.0, 4.0
+"""Pixels of a frustum's lines; the chosen one's are thick."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A camera that is being placed: it is drawn where it was put, which its newest picture may not know yet."""
+
+    pose: NDArray[np.float64]
+    """(7,) in the view."""
+    settings: CameraSettings
+    hidden: bool = False
+    """Somebody looks through it, and would see nothing but its picture."""
 
 
 class CameraFrustums:
-    """One frustum for each camera whose picture is at hand; a camera's pose travels with its picture."""
+    """One frustum for each camera whose picture is at hand; a camera's pose travels with its picture.
 
-    def __init__(self, server: viser.ViserServer) -> None:
-        self._server = server
+    Args:
+        pressed: called with the camera whose frustum was pressed.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, pressed: Callable[[CameraKey], None] = lambda key: None
+    ) -> None:
+        self._server, self._pressed = server, pressed
         self._drawn: dict[tuple[CameraKind, str], viser.CameraFrustumHandle] = {}
-        self._worn: dict[tuple[CameraKind, str], Picture] = {}
+        self._worn: dict[tuple[CameraKind, str], Picture | None] = {}
 
     def draw(
         self,
@@ -34,42 +58,66 @@ class CameraFrustums:
         pictures: dict[tuple[CameraKind, str], Picture],
         offset: NDArray[np.float32],
         size: float = LARGE,
+        placed: Mapping[CameraKey, Placed] | None = None,
     ) -> None:
-        """Draw these pictures' cameras and take away all others.
+        """Draw these pictures' cameras and those that are being placed, and take away all others.
 
         Args:
             cameras: The task's cameras.
             pictures: Those to show; empty shows none.
             offset: (3,) where the selected env stands in the view.
             size: Depth of a frustum in metres.
+            placed: Those that are being placed; with or without a picture.
         """
+        placed = placed or {}
         known = {(camera.kind, camera.name): camera for camera in cameras}
-        for key in [key for key in self._drawn if key not in pictures or key not in known]:
+        shown = {
+            key: pictures.get(key)
+            for key in (*pictures, *placed)
+            if key in known and not (key in placed and placed[key].hidden)
+        }
+        for key in [key for key in self._drawn if key not in shown]:
             self._drawn.pop(key).remove()
             del self._worn[key]
-        for key, picture in pictures.items():
-            if key in known:
-                self._draw_one(known[key], picture, offset, size)
+        for key, picture in shown.items():
+            self._draw_one(known[key], picture, placed.get(key), offset, size)
 
     def clear(self) -> None:
         self.draw((), {}, np.zeros(3, np.float32))
 
     def _draw_one(
-        self, camera: CameraInfo, picture: Picture, offset: NDArray[np.float32], size: float
+        self,
+        camera: CameraInfo,
+        picture: Picture | None,
+        placed: Placed | None,
+        offset: NDArray[np.float32],
+        size: float,
     ) -> None:
-        wxyz, position = frustum_pose(picture, offset)
+        fov, aspect = camera.fovy, camera.width / camera.height
+        if placed is not None:
+            wxyz, position = frustum_pose(placed.pose, np.zeros(3))
+            settings = placed.settings
+            fov, aspect = (
+                vertical_fov(intrinsic_of(settings), settings.height),
+                settings.width / settings.height,
+            )
+        elif picture is not None:
+            wxyz, position = frustum_pose(picture.pose, offset)
+        else:
+            return
+        thickness = THIN if placed is None else THICK
         key = (camera.kind, camera.name)
         handle = self._drawn.get(key)
         if handle is None:
-            self._drawn[key] = self._server.scene.add_camera_frustum(
+            handle = self._server.scene.add_camera_frustum(
                 f"/cameras/{camera.kind} {camera.name}",
-                fov=camera.fovy,
-                aspect=camera.width / camera.height,
+                fov=fov,
+                aspect=aspect,
                 scale=size,
-                thickness=2.0,
+                thickness=thickness,
                 thickness_units="screen",
                 color=COLOURS[camera.kind],
-                image=small_image(picture),
+                image=None if picture is None else small_image(picture),
                 format="jpeg",
                 jpeg_quality=75,
                 wxyz=wxyz,
@@ -77,11 +125,12 @@ class CameraFrustums:
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            self._worn[key] = picture
+            handle.on_click(lambda _: self._pressed(key))
+            self._drawn[key], self._worn[key] = handle, picture
             return
         handle.wxyz, handle.position, handle.scale = wxyz, position, size
-        handle.fov, handle.aspect = camera.fovy, camera.width / camera.height
-        if picture is not self._worn[key] and picture.rgb is not None:
+        handle.fov, handle.aspect, handle.thickness = fov, aspect, thickness
+        if picture is not None and picture is not self._worn[key] and picture.rgb is not None:
             # Assigning encodes and sends it, also when it is the picture that is there already.
             self._worn[key] = picture
             handle.image = small_image(picture)
@@ -99,10 +148,10 @@ def small_image(picture: Picture) -> NDArray[np.uint8] | None:
     return np.ascontiguousarray(picture.rgb[::stride, ::stride])
 
 
-def frustum_pose(picture: Picture, offset: NDArray[np.float32]) -> tuple[NDArray, NDArray]:
-    """wxyz and position of the camera in the view, in OpenCV's frame (z forward, y down)."""
-    turned = viser.transforms.SO3(picture.pose[3:].astype(np.float64)) @ CAMERA_TO_OPENCV
-    return turned.wxyz, (picture.pose[:3] + offset).astype(np.float64)
+def frustum_pose(pose: NDArray, offset: NDArray) -> tuple[NDArray, NDArray]:
+    """wxyz and position of a camera (7,) in the view, in OpenCV's frame (z forward, y down)."""
+    turned = viser.transforms.SO3(pose[3:].astype(np.float64)) @ CAMERA_TO_OPENCV
+    return turned.wxyz, (pose[:3] + offset).astype(np.float64)
 
 
 def without_the_viewpoint(

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import viser
 
+from workbench.core.camera_settings import CameraKey
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.session.messages import CameraRequest, TaskDescription
 from workbench.session.session import Session
@@ -21,6 +22,8 @@ from workbench.session.view import SessionView
 from workbench.ui.false_colour import (
     DepthRange,
     colour_depth,
+    colour_normal,
+    colour_position,
     colour_segmentation,
     depth_range,
     segments_seen,
@@ -29,7 +32,9 @@ from workbench.ui.fragments import render
 
 FASTEST = 1 / 15
 """Seconds between two pictures of one camera."""
-MODALITIES = ("rgb", "depth", "segmentation")
+MODALITIES = ("rgb", "depth", "segmentation", "position", "normal", "albedo")
+POSITION_CAPTION = "red, green, blue: right, up, towards the camera; each over its own range in this picture"
+NORMAL_CAPTION = "red, green, blue: right, up, towards the camera"
 KIND_NAMES: dict[CameraKind, str] = {"sensor": "sensor", "human": "for people"}
 
 
@@ -62,6 +67,8 @@ class CamerasPanel:
         self._env = -1
         self._drawn_at = 0.0
         self._asked: tuple[CameraRequest, ...] | None = None
+        self._studio: CameraKey | None = None
+        """The camera that is being placed, whose picture is wanted whether or not it has a tick here."""
         self._note = server.gui.add_html(render("note", text="Pictures appear when the task is loaded."))
         self._frustums = server.gui.add_checkbox(
             "In the view",
@@ -76,6 +83,7 @@ class CamerasPanel:
         return self._frustums.value is True
 
     def draw(self, view: SessionView) -> None:
+        self._studio = view.studio.selected
         if view.task is not None and view.cameras_serial != self._cameras_serial:
             self._cameras_serial = view.cameras_serial
             self._build(view.task)
@@ -101,7 +109,9 @@ class CamerasPanel:
         return {
             key: picture
             for key, picture in view.pictures.items()
-            if picture.env == view.selected_env and key in self._cameras and self._cameras[key].wanted()
+            if picture.env == view.selected_env
+            and key in self._cameras
+            and (key == view.studio.selected or self._cameras[key].wanted())
         }
 
     def _build(self, task: TaskDescription) -> None:
@@ -161,9 +171,9 @@ class CamerasPanel:
     def _ask(self) -> None:
         """Ask for exactly the pictures that have a tick."""
         wanted = tuple(
-            CameraRequest(camera.info.name, camera.info.kind, camera.wanted())
-            for camera in self._cameras.values()
-            if camera.wanted()
+            CameraRequest(camera.info.name, camera.info.kind, modalities)
+            for key, camera in self._cameras.items()
+            if (modalities := self._wanted_of(key, camera))
         )
         if wanted != self._asked:
             self._asked = wanted
@@ -174,6 +184,10 @@ class CamerasPanel:
                 camera.captions[modality].visible = shown
                 if modality in camera.images:
                     camera.images[modality].visible = shown
+
+    def _wanted_of(self, key: CameraKey, camera: _Camera) -> tuple[str, ...]:
+        wanted = camera.wanted()
+        return ("rgb", *wanted) if key == self._studio and "rgb" not in wanted else wanted
 
     def _mark_stale(self, view: SessionView) -> None:
         """Say of pictures that are on the page, and are not of the moment that is, that they are not."""
@@ -206,6 +220,14 @@ class CamerasPanel:
             self._draw_image(camera, "segmentation", colour_segmentation(picture.segmentation))
             legend, more = segments_seen(picture.segmentation, task.segmentation)
             camera.captions["segmentation"].content = render("segmentation_caption", legend=legend, more=more)
+        if "position" in wanted and picture.position is not None:
+            self._draw_image(camera, "position", colour_position(picture.position))
+            camera.captions["position"].content = render("note", text=POSITION_CAPTION)
+        if "normal" in wanted and picture.normal is not None:
+            self._draw_image(camera, "normal", colour_normal(picture.normal))
+            camera.captions["normal"].content = render("note", text=NORMAL_CAPTION)
+        if "albedo" in wanted and picture.albedo is not None:
+            self._draw_image(camera, "albedo", picture.albedo)
 
     def _draw_image(self, camera: _Camera, modality: str, pixels: np.ndarray) -> None:
         handle = camera.images.get(modality)

@@ -13,7 +13,17 @@ from dataclasses import dataclass
 import viser
 from viser._messages import HotkeyKey, KeyModifier  # the types of add_command's arguments (viser 1.1.1)
 
-_NAMES = {"space": "Space", "arrowleft": "←", "arrowright": "→", "home": "Home", "end": "End"}
+_NAMES = {
+    "space": "Space",
+    "arrowleft": "←",
+    "arrowright": "→",
+    "arrowup": "↑",
+    "arrowdown": "↓",
+    "pageup": "Page up",
+    "pagedown": "Page down",
+    "home": "Home",
+    "end": "End",
+}
 
 
 @dataclass(frozen=True)
@@ -30,7 +40,8 @@ class Command:
         if self.key is None:
             return ""
         name = _NAMES.get(self.key, self.key)
-        return f"{self.modifier.capitalize()} {name}" if self.modifier else name
+        held = [word.removeprefix("cmd/").capitalize() for word in (self.modifier or "").split("+") if word]
+        return " ".join([*held, name])
 
 
 def register(server: viser.ViserServer, commands: list[Command]) -> None:

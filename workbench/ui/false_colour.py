@@ -1,4 +1,4 @@
-"""Depth and segmentation as pictures that a person can read, with what their colours mean."""
+"""Depth, segmentation, positions and normals as pictures that a person can read, with what their colours mean."""
 
 from __future__ import annotations
 
@@ -53,6 +53,23 @@ def colour_depth(depth: NDArray[np.float32], span: DepthRange) -> NDArray[np.uin
     part = (place - below)[..., None]
     colours = VIRIDIS[below] * (1 - part) + VIRIDIS[below + 1] * part
     return np.where(met[..., None], colours.round().astype(np.uint8), NOTHING)
+
+
+def colour_position(position: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """(H, W, 3) metres of the camera's frame as RGB: x, y and z from the 1st to the 98th percentile of each."""
+    met = np.isfinite(position).all(axis=-1) & (position[..., 2] < 0)
+    if not met.any():
+        return np.broadcast_to(NOTHING, position.shape).copy()
+    low, high = np.percentile(position[met], (1, 98), axis=0)
+    place = np.clip((np.nan_to_num(position) - low) / np.maximum(high - low, 1e-3), 0, 1)
+    return np.where(met[..., None], (255 * place).round().astype(np.uint8), NOTHING)
+
+
+def colour_normal(normal: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """(H, W, 3) unit vectors as RGB, as normal maps are drawn: -1 is 0 and 1 is 255."""
+    met = np.isfinite(normal).all(axis=-1) & (np.abs(normal).max(axis=-1) > 0)
+    colours = np.clip((np.nan_to_num(normal) + 1) * 127.5, 0, 255).round().astype(np.uint8)
+    return np.where(met[..., None], colours, NOTHING)
 
 
 def segment_colour(identity: int) -> tuple[int, int, int]:

@@ -17,6 +17,7 @@ import time
 import numpy as np
 import viser
 
+from workbench.core.camera_settings import CameraKey
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.banner import Banner
@@ -39,6 +40,7 @@ from workbench.ui.run_panel import RunPanel
 from workbench.ui.scene_view import SceneView
 from workbench.ui.selection_mark import SelectionMark
 from workbench.ui.status_line import StatusLine
+from workbench.ui.studio_panel import StudioPanel
 from workbench.ui.terms_panel import TermsPanel
 from workbench.ui.timeline_panel import HEIGHT as TIMELINE_HEIGHT
 from workbench.ui.timeline_panel import TimelinePanel
@@ -98,6 +100,8 @@ class Page:
             self._version = VersionPanel(server, session)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
             self._cameras = CamerasPanel(server, session)
+        with tabs.add_tab("Studio", viser.Icon.CAMERA_PLUS):
+            self._studio = StudioPanel(server, session)
         with tabs.add_tab("Reward", viser.Icon.CHART_LINE):
             self._numbers = NumbersPanel(server)
             self._curves = CurvesPanel(server)
@@ -123,7 +127,7 @@ class Page:
 
         self._scene = SceneView(server)
         self._mark = SelectionMark(server)
-        self._frustums = CameraFrustums(server)
+        self._frustums = CameraFrustums(server, self._on_frustum)
         self._forces = ForceArrows(server)
         commands = self._commands()
         register(server, commands)
@@ -183,6 +187,7 @@ class Page:
         self._view_panel.draw(view)
         self._version.draw(view)
         self._cameras.draw(view)
+        self._studio.draw(view)
         self._numbers.draw(view)
         self._curves.draw(view)
         self._terms.draw(view)
@@ -244,7 +249,8 @@ class Page:
         if alone:
             pictures = without_the_viewpoint(pictures, view.pictures)
         offset = np.zeros(3, np.float32) if one else self._layout.offsets[env]
-        self._frustums.draw(task.cameras, pictures, offset, SMALL if alone else LARGE)
+        placed = self._studio.draw_in_view(view, offset)
+        self._frustums.draw(task.cameras, pictures, offset, SMALL if alone else LARGE, placed)
         self._forces.draw(self._inspect.forces(view), offset)
         # A scene of another size is framed anew; a reload that keeps the size never moves the view.
         size = np.round(np.concatenate([self._layout.low, self._layout.high]), 0).tobytes()
@@ -303,6 +309,9 @@ class Page:
             return frame_one(self._layout, human, aspect, TIMELINE_HEIGHT / height)
         return frame_all(self._layout, aspect, TIMELINE_HEIGHT / height)
 
+    def _on_frustum(self, key: CameraKey) -> None:
+        self._studio.select(key)
+
     def _on_scene_click(self, event: viser.SceneClickEvent) -> None:
         layout, view = self._layout, self._session.view()
         if layout is None or view.task is None or self._view_panel.only_selected:
@@ -350,6 +359,7 @@ class Page:
             Command("Interrupt what the task is doing", session.interrupt, "I"),
             Command("Restart the worker", session.restart_worker, "L", "shift"),
             Command("Dark or light", self._view_panel.toggle_dark, "D"),
+            *self._studio.commands(),
         ]
 
 

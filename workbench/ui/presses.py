@@ -6,6 +6,10 @@ pressable part of a table carries the id of a button that is in the page and not
 page.css), and two handlers on the table, fixed text of a template (``pressable.html``), press it. Nothing from the
 page becomes more than "this button was pressed", which the server knows how to take.
 
+Where in a picture somebody pressed is a number of the page, and takes another way: ``placeable.html`` writes it into
+a number input of viser's that is not seen either, as if it had been typed. One whole number says both coordinates, in
+ten-thousandths of the picture, and a running part, since an input that is given the value that it has says nothing.
+
 The mouse counts when it goes down: a table that is drawn anew a few times a second would lose the click of a
 person whose finger is still on the button. A touch counts as a click, or scrolling would press.
 """
@@ -19,6 +23,8 @@ import viser
 from workbench.ui.fragments import render
 from workbench.ui.viser_seam import element_id
 
+PARTS = 10_000
+"""Steps from one border of a picture to the other, as ``placeable.html`` counts them."""
 _LAST = 1e6
 """viser's order of elements: the hidden ones come after all others of their container."""
 
@@ -45,3 +51,33 @@ class Presses:
             button.on_click(lambda event: pressed(event.client))
             self._ids[key] = element_id(button)
         return self._ids[key]
+
+    def place_id(
+        self, key: Hashable, pressed: Callable[[float, float, viser.ClientHandle | None], None]
+    ) -> str:
+        """The id to put into ``data-place``; the same key is the same input for good.
+
+        Args:
+            pressed: called with the place in the picture, 0, 0 at its upper left corner and 1, 1 at its lower right
+                one, and the page that did it, on a thread of viser's.
+        """
+        if key not in self._ids:
+            with self._folder:
+                number = self._server.gui.add_number("·", 0)
+
+            def typed(event: viser.GuiEvent[viser.GuiNumberHandle[int]]) -> None:
+                place = place_of(event.target.value)
+                if event.client is not None and place is not None:
+                    pressed(*place, event.client)
+
+            number.on_update(typed)
+            self._ids[key] = element_id(number)
+        return self._ids[key]
+
+
+def place_of(number: object) -> tuple[float, float] | None:
+    """Column and row in 0..1 of what ``placeable.html`` sends; None for anything that it does not send."""
+    if isinstance(number, bool) or not isinstance(number, (int, float)) or not 0 <= number < 2**53:
+        return None
+    place = int(number) % PARTS**2
+    return (place // PARTS) / (PARTS - 1), (place % PARTS) / (PARTS - 1)

@@ -109,8 +109,8 @@ class MalformedMessage(ValueError):
     """A client sent what no page of ours sends."""
 
 
-def element_id(handle: viser.GuiButtonHandle) -> str:
-    """The ``id`` of this button's element in the page (viser's ``Button.tsx``), for HTML that presses it."""
+def element_id(handle: viser.GuiButtonHandle | viser.GuiNumberHandle) -> str:
+    """The ``id`` of its element in the page (viser's ``Button.tsx``, ``NumberInput.tsx``), for HTML that works it."""
     return handle._impl.uuid
 
 

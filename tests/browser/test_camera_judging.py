@@ -1,0 +1,128 @@
+"""A camera judged, compared, searched and exported in a real Chromium, over real envs."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Page, expect
+
+from tests.browser.opened import page_on, until
+
+pytestmark = pytest.mark.browser
+expect.set_options(timeout=60_000)
+ENVS = 3
+CAMERA = "base_camera"
+
+
+@pytest.fixture(scope="module")
+def page(task_file: Path, chromium_path: str) -> Iterator[Page]:
+    """The Studio tab on base_camera, with every folder that judges open."""
+    arguments = ("--num-envs", str(ENVS), "--no-spare")
+    with page_on(task_file, *arguments, chromium=chromium_path, height=900) as (page, errors, _):
+        page.get_by_role("tab", name="Studio").click()
+        page.locator("input[aria-haspopup=listbox]:visible").first.click()
+        page.get_by_role("option", name=f"{CAMERA} · sensor", exact=True).click()
+        for folder in ("Judge", "Compare", "Suggest a placement", "Matrices and files"):
+            page.get_by_text(folder, exact=True).click()
+        yield page
+        assert not errors
+
+
+def press(page: Page, name: str) -> None:
+    page.get_by_role("button", name=name, exact=True).click()
+
+
+def shown_matrix(page: Page) -> np.ndarray:
+    return np.array(
+        json.loads(page.locator(".wb-copy-head [data-copy]").first.get_attribute("data-copy") or "")
+    )
+
+
+def test_a_press_on_the_picture_tells_body_depth_and_point(page: Page) -> None:
+    pane = page.locator(".wb-pane")
+    box = pane.bounding_box()
+    assert box is not None
+    picture = page.locator("img[src^='blob:']:visible").first.bounding_box()
+    assert (
+        picture is not None
+        and abs(box["y"] - picture["y"]) < 1
+        and abs(box["height"] - picture["height"]) < 1
+    )
+    pane.click(position={"x": 4, "y": box["height"] - 4})
+    expect(page.locator(".wb-found b")).to_have_text("table-workspace")
+    text = page.locator(".wb-found").inner_text()
+    point = np.array(re.findall(r"-?\d\.\d{4}", text), float)[1:]
+    depth = float(re.findall(r"\d\.\d{4}", text)[0])
+    # The table's top is the env's z = 0, and this corner is at the lower left of what the camera sees.
+    assert abs(point[2]) < 0.005
+    x, y, z, one = shown_matrix(page) @ [*point, 1]
+    assert one == 1 and abs(z - depth) < 1e-3 and x < 0 and y > 0
+    assert abs(x + y) < 0.02  # a square picture: as far to the left as down
+
+
+def test_judged_over_the_envs_planes_that_fit_are_used_and_the_report_is_then_of_another(page: Page) -> None:
+    press(page, "Judge this camera")
+    expect(page.get_by_text(f"{ENVS} envs as they are")).to_be_visible()
+    row = page.locator(".wb-seen-table tbody tr").filter(has_text="cube")
+    expect(row.locator("td").nth(1)).to_have_text("100 %")
+    assert float(row.locator("td").nth(2).inner_text()) > 10
+    expect(page.get_by_text("judge it again")).to_have_count(0)
+    press(page, "Keep this placement as A")
+    page.locator(".wb-planes [data-press]").last.click()
+    expect(page.get_by_text("judge it again")).to_be_visible()
+    press(page, "Show side by side")
+    expect(page.locator(".wb-pair img")).to_have_count(2)
+    expect(page.get_by_text(re.compile(r"far 10 → \d"))).to_be_visible()
+    press(page, "Place it as A")
+    expect(page.get_by_text("judge it again")).to_have_count(0)
+
+
+def test_the_sheet_has_all_envs_and_a_press_selects_one(page: Page) -> None:
+    press(page, "Pictures of all envs")
+    cells = page.locator(".wb-sheet figure")
+    expect(cells).to_have_count(ENVS)
+    last = page.locator(f".wb-sheet [data-env='{ENVS - 1}']")
+    last.click()
+    expect(last).to_have_class("wb-selected")
+    expect(page.get_by_text(f"env {ENVS - 1}: step 0").first).to_be_visible()
+
+
+def test_a_download_is_the_camera_and_places_it_again(page: Page) -> None:
+    with page.expect_download() as event:
+        press(page, "Download")
+    assert event.value.suggested_filename == f"{CAMERA}.json"
+    text = Path(event.value.path()).read_text()
+    assert CAMERA in text
+    json.loads(text)
+    before = shown_matrix(page)
+    moved = before.copy()
+    moved[2, 3] += 0.1  # world to camera, OpenCV: what is seen goes a decimetre away
+    field = page.locator("textarea:visible")
+    field.fill("\n".join(" ".join(map(str, row)) for row in moved))
+    press(page, "Place the camera by it")
+    until(lambda: bool(np.allclose(shown_matrix(page), moved, atol=1e-6)), "the pasted pose")
+    mirrored = moved.copy()
+    mirrored[0] *= -1
+    field.fill(json.dumps(mirrored.tolist()))
+    press(page, "Place the camera by it")
+    expect(page.get_by_text("mirror image")).to_be_visible()
+    field.fill(text)
+    press(page, "Place the camera by it")
+    until(lambda: bool(np.allclose(shown_matrix(page), before, atol=1e-5)), "our own file's pose")
+
+
+def test_placements_are_suggested_with_pictures_and_taken(page: Page) -> None:
+    before = shown_matrix(page)
+    press(page, "Search")
+    take = page.locator(".wb-offer [data-press]")
+    expect(take.first).to_be_visible()
+    assert page.locator(".wb-offer img").count() == page.locator(".wb-offer").count() <= 5
+    expect(page.locator(".wb-offer").first).to_contain_text("cube: in 3 of 3 envs")
+    take.first.click()
+    expect(page.locator(".wb-offer").first).to_contain_text("taken")
+    assert not np.allclose(shown_matrix(page), before, atol=1e-3)

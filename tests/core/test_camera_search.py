@@ -1,0 +1,100 @@
+"""Placements that are suggested see what was asked for, wherever it was in the envs, and the same ones every time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from mani_skill.utils.registration import REGISTERED_ENVS
+
+from workbench.core.camera_frames import axes_of
+from workbench.core.camera_search import SearchProgress, SearchSpace, score_of, suggest_cameras
+from workbench.core.camera_settings import CameraSettings
+from workbench.core.task_env import EnvOptions, make_env
+from workbench.core.visibility import Placement, judge_placement
+
+N = 2
+LENS = CameraSettings((0, 0, 0), (1, 0, 0, 0), 0.9, None, 96, 64, 0.01, 100, "minimal")
+LOW, HIGH = (-0.8, -0.8, 0.1), (0.8, 0.8, 1.0)
+
+
+@pytest.fixture(scope="module")
+def env() -> Iterator[Any]:
+    made = make_env(REGISTERED_ENVS["PushCube-v1"].cls, EnvOptions(num_envs=N, backend="cpu"))
+    made.reset(seed=3)
+    yield made
+    made.close()
+
+
+def test_suggestions_see_the_objects_stand_apart_and_are_the_same_again(env: Any) -> None:
+    space = SearchSpace(("cube", "goal_region"), LOW, HIGH, LENS, candidates=12, best=2, apart=0.2)
+    told: list[SearchProgress] = []
+    before = [(s.physx_system.pack(), s.pack_poses()) for s in env.scene.sub_scenes]
+    found = suggest_cameras(env, space, range(N), progress=told.append)
+    assert [(s.physx_system.pack(), s.pack_poses()) for s in env.scene.sub_scenes] == before
+    assert 1 <= len(found) <= 2 and [s.score for s in found] == sorted((s.score for s in found), reverse=True)
+    for suggestion in found:
+        eye = np.array(suggestion.settings.position)
+        assert (eye >= LOW).all() and (eye <= HIGH).all()
+        away = np.subtract(suggestion.target, eye)
+        np.testing.assert_allclose(
+            axes_of(suggestion.settings.quaternion)[0], away / np.linalg.norm(away), atol=1e-9
+        )
+        # Judged again from nothing but its settings, it is as good as was said.
+        again = judge_placement(
+            env, Placement(suggestion.settings), range(N), size=suggestion.report.judged_size
+        )
+        assert score_of(again, space.objects) == pytest.approx(suggestion.score, abs=1e-6)
+        assert all(thing.summary().seen == 1 for thing in again.wanted_objects(space.objects))
+        assert suggestion.picture.rgb is not None and suggestion.picture.rgb.shape == (64, 96, 3)
+    assert found[0].score > 0.6
+    eyes = np.array([s.settings.position for s in found])
+    assert all(np.linalg.norm(a - b) >= 0.2 for i, a in enumerate(eyes) for b in eyes[:i])
+    done = [progress.done for progress in told]
+    assert done == sorted(done) and done[-1] == told[-1].total and told[-1].best == found[0].score
+
+    repeated = suggest_cameras(env, space, range(N))
+    assert [s.settings for s in repeated] == [s.settings for s in found]
+    assert not np.isclose(space_with_seed(env, space, 1).settings.position, found[0].settings.position).all()
+
+
+def space_with_seed(env: Any, space: SearchSpace, seed: int) -> Any:
+    quick = SearchSpace(space.objects, space.low, space.high, LENS, candidates=8, best=1, seed=seed)
+    return suggest_cameras(env, quick, [0])[0]
+
+
+def test_a_search_that_is_cancelled_ends_at_once_with_what_it_has(env: Any) -> None:
+    looks: list[int] = []
+    space = SearchSpace(("cube",), LOW, HIGH, LENS, candidates=1000)
+    assert (
+        suggest_cameras(env, space, [0], progress=lambda p: looks.append(1), cancelled=lambda: len(looks) > 4)
+        == ()
+    )
+    assert len(looks) == 6, "five looks, and the last word"
+
+
+def test_a_placement_that_sees_nothing_is_not_offered(env: Any) -> None:
+    under_the_table = SearchSpace(("cube",), (0, 0, -0.5), (0, 0, -0.5), LENS, candidates=4)
+    assert suggest_cameras(env, under_the_table, [0]) == ()
+
+
+@pytest.mark.parametrize(
+    ("objects", "says"),
+    [
+        (("dragon",), "no object 'dragon'.*cube"),
+        (("panda",), "is the robot"),
+        (("ground",), "no object 'ground'"),
+    ],
+)
+def test_what_cannot_be_searched_for_is_refused_by_name(env: Any, objects: Any, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        suggest_cameras(env, SearchSpace(objects, LOW, HIGH, LENS), [0])
+
+
+def test_a_space_that_says_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match="below its high"):
+        SearchSpace(("cube",), HIGH, LOW, LENS)
+    with pytest.raises(ValueError, match="at least one object"):
+        SearchSpace((), LOW, HIGH, LENS)

@@ -1,0 +1,261 @@
+"""The camera studio in a real session: cameras placed, undone, kept over reloads, written into the file, and judged."""
+
+# pyright: reportOptionalMemberAccess=false, reportOptionalIterable=false, reportArgumentType=false, reportOptionalSubscript=false
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.session.conftest import wait_until
+from workbench.core.camera_settings import CameraKey, CameraSettings, differences
+from workbench.session.messages import CameraRequest, TaskOptions
+from workbench.session.session import Session
+from workbench.session.studio_view import StudioCamera, StudioView
+from workbench.session.view import SessionView
+
+BASE: CameraKey = ("sensor", "base_camera")
+PEOPLE: CameraKey = ("human", "render_camera")
+
+
+@pytest.fixture(scope="module")
+def studio_session(task_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+    text = task_file.read_text()
+    # Small pictures: what is tested is where they are taken from.
+    task_file.write_text(text.replace("512", "64"))
+    options = TaskOptions(num_envs=2, env_kwargs={"obs_mode": "rgb"})
+    session = Session(str(task_file), options, recordings=tmp_path_factory.mktemp("recordings"))
+    session.set_clients(1)
+    wait_until(session, lambda view: view.task is not None, "the first load")
+    session.watch_cameras((CameraRequest("base_camera", "sensor"), CameraRequest("render_camera", "human")))
+    yield session
+    session.close()
+
+
+@pytest.fixture
+def session(studio_session: Session) -> Session:
+    """At rest, and every camera as the file has it."""
+    studio_session.pause()
+    studio_session.seek(None)
+    for camera in studio_session.view().studio.cameras:
+        studio_session.studio.back_to_file(camera.key)
+    wait_until(studio_session, lambda v: not v.playing and not moved(v), "rest")
+    return studio_session
+
+
+def moved(view: SessionView) -> set[CameraKey]:
+    return {camera.key for camera in view.studio.cameras if camera.moved}
+
+
+def camera(session: Session, key: CameraKey) -> StudioCamera:
+    found = session.view().studio.camera(key)
+    assert found is not None
+    return found
+
+
+def seen_from(key: CameraKey, settings: CameraSettings) -> Callable[[SessionView], bool]:
+    """Whether the newest picture was taken from there, with that size."""
+
+    def reached(view: SessionView) -> bool:
+        picture = view.pictures.get(key)
+        return (
+            picture is not None
+            and picture.rgb.shape == (settings.height, settings.width, 3)
+            and np.allclose(picture.pose, [*settings.position, *settings.quaternion], atol=1e-6)
+        )
+
+    return reached
+
+
+def said(what: Callable[[StudioView], bool]) -> Callable[[SessionView], bool]:
+    return lambda view: what(view.studio)
+
+
+def test_a_camera_that_is_dragged_is_seen_from_where_it_came_to_rest_and_is_one_step_of_undo(
+    session: Session,
+) -> None:
+    start = camera(session, BASE).now
+    for k in range(30):
+        session.studio.place(BASE, replace(start, position=(0.01 * k, 0.0, 0.8)), gesture=1)
+    rest = replace(start, position=(0.29, 0.0, 0.8))
+    view = wait_until(session, seen_from(BASE, rest), "the picture from there")
+    assert moved(view) == {BASE} and view.studio.undo == "moved base_camera"
+    session.studio.undo()
+    view = wait_until(session, seen_from(BASE, start), "the picture from before")
+    assert not moved(view) and view.studio.redo == "moved base_camera"
+    session.studio.redo()
+    wait_until(session, seen_from(BASE, rest), "the placement again")
+
+
+def test_size_and_lens_change_the_live_camera_and_the_observation(session: Session) -> None:
+    start = camera(session, BASE).now
+    other = replace(start, width=40, height=30, fov=0.8)
+    session.studio.place(BASE, other)
+    view = wait_until(session, seen_from(BASE, other), "the picture of that size")
+    info = view.studio.camera(BASE).info
+    assert (info.width, info.height, round(info.fovy, 6)) == (40, 30, 0.8)
+    assert info.settings == start, "what the file says is no longer told"
+    session.step()
+    view = wait_until(session, lambda v: v.step.elapsed_steps.any() or v.problem is not None, "a step")
+    assert view.problem is None
+    people = camera(session, PEOPLE).now
+    session.studio.place(PEOPLE, replace(people, position=(1.0, 0.0, 1.0)))
+    wait_until(session, seen_from(PEOPLE, replace(people, position=(1.0, 0.0, 1.0))), "the other camera")
+    session.reset()
+    view = wait_until(session, lambda v: not v.step.elapsed_steps.any(), "the reset")
+    serial = view.pictures_serial
+    wait_until(session, lambda v: v.pictures_serial > serial + 1 and seen_from(BASE, other)(v), "it stayed")
+
+
+def test_a_moment_of_the_past_is_drawn_again_when_the_camera_moves(session: Session) -> None:
+    start = camera(session, BASE).now
+    session.step()
+    wait_until(session, lambda v: v.step.elapsed_steps.any() and BASE in v.pictures, "a step")
+    session.seek_by(-1)
+    wait_until(session, lambda v: v.timeline.shown is not None, "the past")
+    there = replace(start, position=(0.4, 0.1, 0.7))
+    session.studio.place(BASE, there)
+    wait_until(session, lambda v: v.timeline.wants_pictures, "the old picture being outdated")
+    session.draw_past()
+    wait_until(session, seen_from(BASE, there), "the past seen from there")
+
+
+def test_what_cannot_be_is_refused_in_words_and_changes_nothing(session: Session) -> None:
+    start = camera(session, BASE).now
+    session.studio.place(BASE, replace(start, near=5.0, far=1.0))
+    view = wait_until(session, said(lambda s: "near must be" in s.problem), "the reason")
+    assert not moved(view)
+    session.studio.place(BASE, replace(start, shader_pack="nonsense"))
+    view = wait_until(session, said(lambda s: "there is no shader pack" in s.problem), "the worker's reason")
+    assert not moved(view)
+    session.studio.place(("sensor", "nobody"), start)
+    wait_until(session, said(lambda s: "there is no sensor camera nobody" in s.problem), "the reason")
+
+
+def test_a_placement_is_written_compared_and_taken_back(session: Session, task_file: Path) -> None:
+    studio, before = session.studio, task_file.read_text()
+    start = camera(session, BASE).now
+    studio.place(BASE, replace(start, position=(0.31, 0.02, 0.55), fov=1.2))
+    studio.plan_write(BASE)
+    view = wait_until(session, said(lambda s: s.writing.stage in ("planned", "refused")), "the plan")
+    assert view.studio.writing.stage == "planned", view.studio.writing.message
+    assert task_file.read_text() == before and "+" in view.studio.writing.edit.diff
+    studio.write()
+    view = wait_until(session, said(lambda s: s.writing.stage in ("checked", "mismatch")), "the check")
+    assert view.studio.writing.stage == "checked", view.studio.writing.message
+    assert view.reload.level == "cameras" and not moved(view)
+    now = camera(session, BASE)
+    assert now.now == now.info.settings and not differences(now.now, view.studio.writing.edit.settings)
+    assert task_file.read_text() == view.studio.writing.edit.new_text
+    studio.undo_write()
+    view = wait_until(session, said(lambda s: "as it was before." in s.writing.message), "the file of before")
+    assert task_file.read_text() == before
+    # The placement was not written any more, but it is not lost.
+    assert moved(view) == {BASE} and view.studio.camera(BASE).info.settings == start
+    wait_until(session, seen_from(BASE, view.studio.camera(BASE).now), "the camera where it was placed")
+
+
+def settled(session: Session, reached: Callable[[StudioView], bool], what: str) -> StudioView:
+    """The studio once its work in the background is done."""
+    view = wait_until(session, said(lambda s: s.progress is None and (reached(s) or bool(s.problem))), what)
+    assert not view.studio.problem, view.studio.problem
+    return view.studio
+
+
+def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved(session: Session) -> None:
+    session.studio.judge(BASE)
+    report = settled(session, lambda s: s.report_of == BASE, "the judgement").report
+    assert sorted(report.envs) == [0, 1] and not session.view().studio.report_stale
+    (cube,) = report.wanted_objects(("cube",))
+    assert cube.summary().seen == 1.0
+    session.studio.make_sheet(BASE)
+    sheet = settled(session, lambda s: len(s.sheet) == 2, "the pictures of all envs").sheet
+    assert [p.env for p in sheet] == [report.envs[i] for i in report.worst_first()]
+    # Turned to the sky.
+    start = camera(session, BASE).now
+    away = replace(start, quaternion=(0.7071067811865476, 0.0, -0.7071067811865476, 0.0))
+    session.studio.place(BASE, away)
+    assert session.view().studio.report_stale
+    session.studio.judge(BASE)
+    studio = settled(session, lambda s: s.report is not report, "the judgement of the placement")
+    assert studio.report.wanted_objects(("cube",))[0].summary().seen == 0.0 and not studio.report_stale
+    session.studio.compare(BASE, start)
+    here, there = settled(session, lambda s: s.compared is not None, "the comparison").compared
+    assert np.allclose(here.pose[3:], away.quaternion) and np.allclose(there.pose[3:], start.quaternion)
+    wait_until(session, seen_from(BASE, away), "the camera where it was placed, after the comparison")
+
+
+def test_a_picked_pixel_is_the_place_of_what_is_seen_there(session: Session) -> None:
+    view = session.view()
+    cube = view.step.poses[0, list(view.task.geometry.body_names).index("cube")]
+    looking_down = replace(
+        camera(session, BASE).now,
+        position=(float(cube[0]), float(cube[1]), 0.6),
+        quaternion=(0.7071067811865476, 0.0, 0.7071067811865476, 0.0),
+    )
+    session.studio.place(BASE, looking_down)
+    session.studio.pick(BASE, 0.5, 0.5)
+    picked = settled(session, lambda s: s.picked is not None and s.picked.body == "cube", "the pixel").picked
+    assert abs(picked.depth - (0.6 - cube[2] - 0.02)) < 2e-3
+    assert np.allclose(picked.point, [cube[0], cube[1], cube[2] + 0.02], atol=6e-3)
+
+
+def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session: Session) -> None:
+    studio = session.studio
+    studio.judge(BASE, 3)
+    assert session.view().studio.progress is not None
+    found = settled(session, lambda s: s.report_seeds == 3, "three seeds")
+    assert len(found.report.envs) == 3 and found.report_of == BASE
+    studio.suggest(BASE, ("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2)
+    offered = settled(session, lambda s: len(s.suggestions) > 0, "suggestions").suggestions
+    assert offered[0].score >= offered[-1].score > 0 and "cube: in 2 of 2 envs" in offered[0].words
+    studio.take_suggestion(0)
+    wait_until(session, lambda v: moved(v) == {BASE}, "the suggestion taken")
+    studio.judge(BASE, 500)
+    wait_until(
+        session, said(lambda s: s.progress is not None and s.progress.total == 500), "a long judgement"
+    )
+    studio.stop()
+    wait_until(session, said(lambda s: s.progress is None), "its end")
+    studio.suggest(BASE, ("nothing",), (0.0, 0.0, 0.3), (0.1, 0.1, 0.4), 1)
+    wait_until(session, said(lambda s: "no object 'nothing'" in s.problem), "why not")
+
+
+def test_cameras_go_out_and_poses_come_in(session: Session) -> None:
+    start = camera(session, BASE).now
+    text = session.studio.export([BASE, PEOPLE], "json")
+    session.studio.place(BASE, replace(start, position=(0.0, 0.0, 1.0)))
+    session.studio.import_pose(BASE, text, None, None)
+    assert not camera(session, BASE).moved
+    for form in ("opencv", "ros"):
+        assert session.studio.export([BASE, PEOPLE], form)
+    session.studio.import_pose(BASE, "1 0 0 5\n0 1 0 6\n0 0 1 7\n0 0 0 1", "camera_to_world", "maniskill")
+    assert camera(session, BASE).now.position == (5.0, 6.0, 7.0)
+    with pytest.raises(ValueError, match="no pose is in it"):
+        session.studio.import_pose(BASE, "{}", None, None)
+
+
+def test_placements_outlive_reloads_and_workers_until_the_file_says_otherwise(
+    session: Session, task_file: Path
+) -> None:
+    start, people = camera(session, BASE).now, camera(session, PEOPLE).now
+    there, aside = replace(start, position=(0.2, 0.2, 0.9)), replace(people, fov=0.5)
+    session.studio.place(BASE, there)
+    session.studio.place(PEOPLE, aside)
+    task_file.write_text(task_file.read_text().replace("width=128", "width=96", 1))
+    view = wait_until(
+        session, lambda v: v.studio.camera(BASE).info.settings.width == 96, "the version with another width"
+    )
+    assert moved(view) == {PEOPLE} and "base_camera was changed in the file" in view.studio.problem
+    assert view.studio.undo == "took base_camera from the file"
+    session.studio.undo()
+    wait_until(session, seen_from(BASE, there), "the placement, taken back from the file")
+    serial = view.task_serial
+    session.restart_worker()
+    wait_until(session, lambda v: v.task_serial > serial, "another worker")
+    wait_until(session, seen_from(BASE, there), "its camera where the last one's was")
+    assert moved(session.view()) == {BASE, PEOPLE}

@@ -1,0 +1,26 @@
+"""Where in a picture somebody pressed, as one number of a page that may send anything."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from workbench.ui.presses import PARTS, place_of
+
+parts = st.integers(0, PARTS - 1)
+
+
+@given(parts, parts, st.integers(0, 88))
+def test_a_place_comes_back_from_its_number_whatever_the_running_part(
+    column: int, row: int, running: int
+) -> None:
+    place = place_of(running * PARTS**2 + column * PARTS + row)
+    assert place == (column / (PARTS - 1), row / (PARTS - 1))
+
+
+@pytest.mark.parametrize("sent", [True, "12", None, -1, math.nan, math.inf, 2**60, 1e300, (1, 2)])
+def test_what_no_page_of_ours_sends_is_no_place(sent: object) -> None:
+    assert place_of(sent) is None

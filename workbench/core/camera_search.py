@@ -1,0 +1,322 @@
+"""Suggests where a camera could stand: placements that see what must be seen, in all of the envs.
+
+The space of placements is small (an eye in a box, looking towards the objects) and the measure has no gradient (an
+object is behind the arm or it is not), so it is sampled: eyes spread over the box, each looking at a point near the
+objects. What makes that quick enough to wait for is that nearly all of a picture's cost is the robot's meshes: on a
+software driver 2 ms without them, 30 ms with them. So every sample is looked at without the robot, in all envs, which
+settles size, cutting and what else is in the way; only the best of them are looked at with it. Around the best of
+those a second, smaller sample is drawn, twice.
+
+A placement's score is the mean of its mark in the average env and its mark in the worst one: a camera that loses
+the cube in one env of eight is not nearly as good as one that does not. The five best are given that stand apart,
+since five neighbours are one suggestion. For a seed the search is the same every time.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.core.body_table import BodyTable, build_body_table, read_poses
+from workbench.core.camera_frames import LookAt, intrinsic_of, pose_from_look_at, with_pose
+from workbench.core.camera_report import CameraReport
+from workbench.core.camera_settings import CameraSettings
+from workbench.core.pictures import CameraKind, Picture
+from workbench.core.temporary_camera import undrawn
+from workbench.core.visibility import (
+    Measured,
+    Placement,
+    SceneObject,
+    entities_of,
+    list_objects,
+    measure,
+    picture_of,
+    placed_camera,
+    report_of,
+    small_size,
+)
+
+WIDE_MARGIN = 0.1
+"""Share of the picture's shorter side that is enough between an object and the border."""
+ROOM = 0.1
+"""Metres of free sight before the lens: what is nearer stands where the camera's own body would be."""
+ROUNDS = 2
+"""Of drawing again around the best."""
+_Candidate = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Eye and target, each (3,)."""
+
+
+@dataclass(frozen=True)
+class SearchSpace:
+    """What is looked for, and where."""
+
+    objects: tuple[str, ...]
+    """Names of actors and articulations that must be seen."""
+    low: tuple[float, float, float]
+    """Of the box for the eye, metres in the env's frame."""
+    high: tuple[float, float, float]
+    lens: CameraSettings
+    """Everything of the camera but its pose."""
+    kind: CameraKind = "sensor"
+    candidates: int = 100
+    """Placements that the first round draws."""
+    best: int = 5
+    """Placements that are offered at most."""
+    apart: float | None = None
+    """Metres between the eyes of two that are offered; None for a seventh of the box's diagonal."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        box = np.array([self.low, self.high], np.float64)
+        if not np.isfinite(box).all() or (box[0] > box[1]).any():
+            raise ValueError(
+                f"the box for the eye goes from {self.low} to {self.high}: each low must be below its high"
+            )
+        if not self.objects:
+            raise ValueError("name at least one object that must be seen")
+        if self.candidates < 1 or self.best < 1:
+            raise ValueError("a search draws at least one placement and offers at least one")
+        intrinsic_of(self.lens)
+
+
+@dataclass(frozen=True)
+class SearchProgress:
+    """How far a search is."""
+
+    stage: str
+    """What is being done, in words."""
+    done: int
+    """Looks, of `total`."""
+    total: int
+    best: float
+    """Score of the best placement so far, 0..1; NaN before there is one."""
+
+
+@dataclass(frozen=True)
+class Suggestion:
+    """One placement that is offered."""
+
+    settings: CameraSettings
+    """In the env's frame."""
+    target: tuple[float, float, float]
+    """A point on its line of sight, for a look-at."""
+    score: float
+    """0..1; see `score_of`."""
+    report: CameraReport
+    picture: Picture
+    """Of the env where it does worst, with rgb, depth and segmentation."""
+
+
+def suggest_cameras(
+    env: Any,
+    space: SearchSpace,
+    envs: Sequence[int],
+    *,
+    poses: NDArray[np.float32] | None = None,
+    table: BodyTable | None = None,
+    progress: Callable[[SearchProgress], None] = lambda progress: None,
+    cancelled: Callable[[], bool] = lambda: False,
+) -> tuple[Suggestion, ...]:
+    """The best placements found for envs that are already reset, the best first; the envs are left as they are.
+
+    Fewer than `SearchSpace.best` are given where no more of them stand apart or see anything, and those found until
+    then where the search is cancelled.
+
+    Args:
+        poses: (N, B, 7) where to draw the bodies, as `read_poses` gives them; None for where they are.
+        progress: called after each look, so it should do little.
+        cancelled: asked before each look.
+
+    Raises:
+        ValueError: no env is named; an object is not there, never drawn for such a camera, or the robot itself.
+        IndexError: there is no such env.
+        RuntimeError: the renderer failed.
+    """
+    search = _Search(env, space, list(envs), poses, table or build_body_table(env), progress, cancelled)
+    return tuple(search.run())
+
+
+def score_of(report: CameraReport, objects: Sequence[str]) -> float:
+    """0 where some object is never seen, 1 where in every env all of them are whole, free, large and well inside.
+
+    The mean of the average env's mark and the worst env's. An env's mark is that of its worst object
+    (`ObjectSeen.marks`), up to a fifth less near the border, and less where something stands right before the lens.
+    """
+    marks = []
+    for thing in report.wanted_objects(objects):
+        inside = 0.8 + 0.2 * np.clip(thing.margin / WIDE_MARGIN, 0, 1)
+        marks.append(np.where(thing.present, thing.marks() * inside, np.nan))
+    worst = np.min(np.nan_to_num(marks, nan=np.inf), axis=0)
+    worst = worst * np.clip(np.nan_to_num(report.depth.nearest) / ROOM, 0, 1)
+    known = worst[np.isfinite(worst)]
+    return float((known.mean() + known.min()) / 2) if len(known) else 0.0
+
+
+class _Search:
+    """One run of `suggest_cameras`: what its stages share."""
+
+    def __init__(
+        self,
+        env: Any,
+        space: SearchSpace,
+        envs: list[int],
+        poses: NDArray[np.float32] | None,
+        table: BodyTable,
+        progress: Callable[[SearchProgress], None],
+        cancelled: Callable[[], bool],
+    ) -> None:
+        if not envs:
+            raise ValueError("no env is named to search in")
+        if any(not 0 <= e < env.num_envs for e in envs):
+            raise IndexError(f"envs {envs} are out of range for {env.num_envs} envs")
+        self.env, self.space, self.envs, self.poses, self.table = env, space, envs, poses, table
+        self.progress, self.cancelled = progress, cancelled
+        every = list_objects(env, table)
+        self.wanted = [_wanted(every, name, space.kind) for name in space.objects]
+        # Each is also looked at alone; the others are drawn, and hide what they hide.
+        self.objects = [thing for thing in every if thing.robot or thing in self.wanted]
+        self.size = small_size(space.lens.width, space.lens.height)
+        self.rng = np.random.default_rng(space.seed)
+        self.low, self.high = np.array(space.low, np.float64), np.array(space.high, np.float64)
+        diagonal = float(np.linalg.norm(self.high - self.low))
+        self.apart = diagonal / 7 if space.apart is None else space.apart
+        self.middle, self.spread = self._where_the_objects_are()
+        self.keep = max(12, 3 * space.best)
+        near = 8 * space.best
+        self.total = len(envs) * (space.candidates + self.keep + ROUNDS * (near + 2 * space.best))
+        self.done = 0
+        self.began = time.perf_counter()
+        self.best = float("nan")
+        self.found: list[tuple[float, _Candidate, CameraReport]] = []
+
+    def run(self) -> Iterator[Suggestion]:
+        drawn = [self._draw() for _ in range(self.space.candidates)]
+        self._look_at_best_of(drawn, self.keep, "looking for the objects")
+        for round_ in range(ROUNDS):
+            centres = [candidate for _, candidate, _ in self._chosen()]
+            reach = 0.12 / (round_ + 1)
+            near = [self._draw_near(centre, reach) for centre in centres for _ in range(8)]
+            self._look_at_best_of(near, 2 * len(centres), "trying beside the best")
+        self.progress(SearchProgress("taking pictures of the best", self.total, self.total, self.best))
+        for score, candidate, report in self._chosen():
+            yield self._suggestion(score, candidate, report)
+
+    def _look_at_best_of(self, candidates: list[_Candidate], keep: int, stage: str) -> None:
+        """Score all without the robot, and the best `keep` of them with it."""
+        bare = self._measure(candidates, stage)
+        scores = [score_of(self._report(row), self.space.objects) for row in bare]
+        order = [int(i) for i in np.argsort([-score for score in scores], kind="stable") if scores[i] > 0][
+            :keep
+        ]
+        kept = [candidates[i] for i in order]
+        whole = self._measure(kept, "looking past the robot", [bare[i] for i in order])
+        for candidate, row in zip(kept, whole, strict=False):
+            report = self._report(row)
+            score = score_of(report, self.space.objects)
+            self.found.append((score, candidate, report))
+            self.best = max(score, self.best) if np.isfinite(self.best) else score
+
+    def _measure(
+        self, candidates: list[_Candidate], stage: str, bare: list[list[Measured]] | None = None
+    ) -> list[list[Measured]]:
+        """Each candidate in each env: with the robot if `bare` is given, without it otherwise.
+
+        None at all where the search is cancelled on the way.
+        """
+        measured: list[list[Measured]] = [[] for _ in candidates]
+        placement = Placement(self.space.lens, self.space.kind)
+        poses = [pose_from_look_at(_look_at(candidate)) for candidate in candidates]
+        for position, e in enumerate(self.envs):
+            moment = None if self.poses is None else self.poses[e]
+            robots = [x for thing in self.objects if thing.robot for x in entities_of(thing, e, self.table)]
+            with (
+                placed_camera(self.env, e, placement, self.size, moment) as view,
+                undrawn(robots if bare is None else []),
+            ):
+                for i, pose in enumerate(poses):
+                    if self.cancelled():
+                        return []
+                    known = None if bare is None else bare[i][position]
+                    measured[i].append(
+                        measure(view, pose, e, self.objects, self.table, self.space.kind, known)
+                    )
+                    self.done += 1
+                    self.progress(SearchProgress(stage, self.done, self.total, self.best))
+        return measured
+
+    def _report(self, measured: list[Measured]) -> CameraReport:
+        milliseconds = 1000 * (time.perf_counter() - self.began)
+        key = (self.space.kind, "suggested")
+        return report_of(key, self.space.lens, self.size, self.envs, self.objects, measured, milliseconds)
+
+    def _chosen(self) -> list[tuple[float, _Candidate, CameraReport]]:
+        """The best that stand apart."""
+        chosen: list[tuple[float, _Candidate, CameraReport]] = []
+        for entry in sorted(self.found, key=lambda entry: -entry[0]):
+            eye = entry[1][0]
+            if entry[0] > 0 and all(np.linalg.norm(eye - c[1][0]) >= self.apart for c in chosen):
+                chosen.append(entry)
+            if len(chosen) == self.space.best:
+                break
+        return chosen
+
+    def _draw(self) -> _Candidate:
+        eye = self.rng.uniform(self.low, self.high)
+        return eye, self._apart_from(eye, self.middle + self.rng.uniform(-0.5, 0.5, 3) * self.spread)
+
+    def _draw_near(self, centre: _Candidate, reach: float) -> _Candidate:
+        eye = np.clip(centre[0] + self.rng.normal(0, reach, 3) * (self.high - self.low), self.low, self.high)
+        return eye, self._apart_from(eye, centre[1] + self.rng.normal(0, 0.5, 3) * reach * self.spread)
+
+    def _apart_from(self, eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
+        # An eye right on its target looks nowhere; a box for the eye may hold the objects.
+        return target if np.linalg.norm(target - eye) > 1e-3 else target - [0.0, 0.0, 0.01]
+
+    def _where_the_objects_are(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Middle and extent (3,) of where the wanted objects are in all envs."""
+        bodies = read_poses(self.env, self.table) if self.poses is None else self.poses
+        columns = [body for thing in self.wanted for body in thing.bodies]
+        places = bodies[self.envs][:, columns, :3].reshape(-1, 3).astype(np.float64)
+        places = places[np.isfinite(places).all(axis=1)]
+        if not len(places):
+            names = ", ".join(self.space.objects)
+            raise ValueError(f"none of the envs to search in has {names}")
+        low, high = places.min(axis=0), places.max(axis=0)
+        return (low + high) / 2, np.maximum(high - low, 0.05)
+
+    def _suggestion(self, score: float, candidate: _Candidate, report: CameraReport) -> Suggestion:
+        settings = with_pose(self.space.lens, pose_from_look_at(_look_at(candidate)))
+        worst = report.worst_first(self.space.objects)[0]
+        e = report.envs[worst]
+        placement = Placement(settings, self.space.kind)
+        moment = None if self.poses is None else self.poses[e]
+        target = candidate[1]
+        return Suggestion(
+            settings=settings,
+            target=(float(target[0]), float(target[1]), float(target[2])),
+            score=score,
+            report=report,
+            picture=picture_of(self.env, e, placement, self.table, moment),
+        )
+
+
+def _look_at(candidate: _Candidate) -> LookAt:
+    (ex, ey, ez), (tx, ty, tz) = candidate[0].tolist(), candidate[1].tolist()
+    return LookAt((ex, ey, ez), (tx, ty, tz))
+
+
+def _wanted(objects: Sequence[SceneObject], name: str, kind: CameraKind) -> SceneObject:
+    found = next((thing for thing in objects if thing.name == name), None)
+    there = ", ".join(thing.name for thing in objects if not (thing.robot or thing.name == "ground"))
+    if found is None or found.name == "ground":
+        raise ValueError(f"there is no object {name!r} to be seen; there are: {there}")
+    if found.robot:
+        raise ValueError(f"{name!r} is the robot; the search is for objects of the task: {there}")
+    if found.hidden and kind == "sensor":
+        raise ValueError(f"the task hides {name!r} from its sensors: no placement can see it")
+    return found

@@ -1,0 +1,125 @@
+"""In the worker: what is asked about a camera (`camera_messages`), answered with the env as it is, and no trace left."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from workbench.core.camera_search import SearchProgress, SearchSpace, suggest_cameras
+from workbench.core.camera_suggestion import OfferedPlacement, in_words
+from workbench.core.pictures import Picture
+from workbench.core.place_camera import PlacedCameras
+from workbench.core.take_pictures import take_pictures
+from workbench.core.visibility import judge_camera, small_size
+from workbench.session.camera_messages import (
+    CameraAnswer,
+    CameraJudged,
+    CameraPictures,
+    CameraQuestion,
+    CameraQuestionFailed,
+    DrawCamera,
+    JudgeCamera,
+    Searching,
+    SuggestCameras,
+    Suggested,
+)
+from workbench.session.open_task import OpenedTask
+
+JUDGED_SIDE = 128
+"""Pixels of the shorter side of what is judged, where the camera's own are more: an object that is lost in those is
+hardly to be called seen."""
+_TELL_EVERY = 0.2
+
+
+def answer(
+    opened: OpenedTask,
+    placed: PlacedCameras,
+    question: CameraQuestion,
+    tell: Callable[[Searching], None],
+    cancelled: Callable[[], bool],
+) -> CameraAnswer:
+    """No picture may be under way.
+
+    Args:
+        tell: of a long search.
+        cancelled: whether nobody waits for it any more.
+    """
+    try:
+        if isinstance(question, DrawCamera):
+            return CameraPictures(question.number, _drawn(opened, placed, question))
+        if isinstance(question, JudgeCamera):
+            return _judged(opened, question)
+        return _suggested(opened, question, tell, cancelled)
+    except (ValueError, IndexError, RuntimeError) as error:
+        return CameraQuestionFailed(question.number, str(error))
+
+
+def _drawn(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> tuple[Picture, ...]:
+    env, key = opened.env.env, question.key
+    before = placed.settings(key)
+    if question.settings is not None:
+        placed.place(env, key, question.settings)
+    try:
+        info = next((info for info in opened.description.cameras if info.key == key), None)
+        gives = question.modalities if info is None else info.modalities
+        wanted = tuple(m for m in question.modalities if m in gives)
+        return tuple(
+            take_pictures(
+                env,
+                e,
+                [(key[1], key[0], wanted)],
+                None if question.poses is None else question.poses[e],
+            )[0]
+            for e in question.envs
+        )
+    finally:
+        if question.settings is not None:
+            placed.place(env, key, before)
+
+
+def _judged(opened: OpenedTask, question: JudgeCamera) -> CameraJudged:
+    info = next((info for info in opened.description.cameras if info.key == question.key), None)
+    width, height = (128, 128) if info is None else (info.width, info.height)
+    if question.settings is not None:
+        width, height = question.settings.width, question.settings.height
+    report = judge_camera(
+        opened.env.env,
+        question.key,
+        question.envs,
+        settings=question.settings,
+        size=small_size(width, height, JUDGED_SIDE),
+        poses=question.poses,
+        table=opened.env.table,
+    )
+    return CameraJudged(question.number, report)
+
+
+def _suggested(
+    opened: OpenedTask,
+    question: SuggestCameras,
+    tell: Callable[[Searching], None],
+    cancelled: Callable[[], bool],
+) -> Suggested:
+    told = 0.0
+
+    def progress(at: SearchProgress) -> None:
+        nonlocal told
+        if time.monotonic() - told > _TELL_EVERY:
+            told = time.monotonic()
+            tell(Searching(question.number, at.done, at.total))
+
+    found = suggest_cameras(
+        opened.env.env,
+        SearchSpace(question.objects, question.low, question.high, question.settings, question.key[0]),
+        question.envs,
+        table=opened.env.table,
+        progress=progress,
+        cancelled=cancelled,
+    )
+    offered = tuple(
+        OfferedPlacement(
+            s.settings, s.target, s.score, in_words(s.report, question.objects), s.report, s.picture
+        )
+        for s in found
+    )
+    return Suggested(question.number, offered)

@@ -1,0 +1,271 @@
+"""Cameras looked at with more than one pair of eyes: over all envs, over many seeds, side by side, pixel by pixel.
+
+Every question here is a small job of several requests to a worker (see `camera_messages`). What concerns the moment
+on the screen is asked of the worker that plays, one env at a time, so that it goes on playing; what needs fresh
+episodes, of another in the background. There is one job of each kind at a time, and a new one takes its place.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.core.camera_frames import compose
+from workbench.core.camera_report import CameraReport, join_reports
+from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.core.camera_suggestion import OfferedPlacement
+from workbench.core.pictures import CameraInfo, Picture
+from workbench.session.camera_askers import BackgroundAsker, LiveAsker
+from workbench.session.camera_messages import (
+    CameraAnswer,
+    CameraJudged,
+    CameraPictures,
+    DrawCamera,
+    JudgeCamera,
+    SuggestCameras,
+    Suggested,
+)
+from workbench.session.lane import Job, Lane
+from workbench.session.messages import Load, Request
+from workbench.session.studio_view import Picked, Progress
+
+FIRST_SEED = 10_000
+"""The same seeds for every judgement, so that two can be compared; others than people begin with."""
+_IDLE_SECONDS = 300.0
+
+
+@dataclass(frozen=True)
+class ShownMoment:
+    """What the page shows."""
+
+    env: int
+    """The selected one."""
+    num_envs: int
+    poses: NDArray[np.float32] | None
+    """(N, B, 7) of a moment of the past; None for now."""
+
+
+@dataclass(frozen=True)
+class Looked:
+    """What is known by now."""
+
+    report: CameraReport | None = None
+    report_of: CameraKey | None = None
+    report_settings: CameraSettings | None = None
+    """How the camera stood when it was judged."""
+    report_seeds: int = 0
+    outdated: bool = False
+    """The report is of a version that was."""
+    suggestions: tuple[OfferedPlacement, ...] = ()
+    suggestions_of: CameraKey | None = None
+    compared: tuple[Picture, Picture] | None = None
+    picked: Picked | None = None
+    sheet: tuple[Picture, ...] = ()
+    problem: str = ""
+
+
+class CameraJudging:
+    """Thread-safe; every method returns at once."""
+
+    def __init__(self, send: Callable[[Request], None], on_change: Callable[[], None]) -> None:
+        """
+        Args:
+            send: to the worker that plays.
+            on_change: called, on any thread, when there is something new.
+        """
+        self._on_change = on_change
+        self._lock = threading.Lock()
+        self._looked = Looked()
+        self._live, self._background = LiveAsker(send), BackgroundAsker()
+        self._live_lane = Lane("studio-live", on_change, self._failed)
+        self._background_lane = Lane(
+            "studio-background", on_change, self._failed, _IDLE_SECONDS, self._background.end
+        )
+
+    # --- what is known -------------------------------------------------------------------------------
+
+    @property
+    def looked(self) -> Looked:
+        with self._lock:
+            return self._looked
+
+    @property
+    def progress(self) -> Progress | None:
+        return self._background_lane.progress or self._live_lane.progress
+
+    @property
+    def background_pid(self) -> int | None:
+        """Of the process in the background; None while there is none."""
+        return self._background.pid
+
+    def take(self, answer: CameraAnswer) -> None:
+        """The worker that plays answered."""
+        self._live.take(answer)
+
+    # --- jobs ------------------------------------------------------------------------------------------
+
+    def judge(self, key: CameraKey, now: CameraSettings | None, moment: ShownMoment) -> None:
+        """Judge a camera as it stands, in all envs, at the shown moment."""
+
+        def work(job: Job) -> None:
+            reports: list[CameraReport] = []
+            for env in range(moment.num_envs):
+                job.tell(env, moment.num_envs)
+                question = JudgeCamera(0, key, None, (env,), moment.poses)
+                reports.append(self._live.ask(question, job, CameraJudged).report)
+            self._know_report(key, now, join_reports(reports), 0)
+
+        self._live_lane.start(f"judging {key[1]} in all envs", work)
+
+    def judge_seeds(
+        self, key: CameraKey, now: CameraSettings | None, moved: bool, load: Load, seeds: int
+    ) -> None:
+        """Judge a camera over so many fresh episodes; what is known so far can be seen all the while."""
+
+        def work(job: Job) -> None:
+            self._background.load(load, job)
+            reports: list[CameraReport] = []
+            done = 0
+            while done < seeds:
+                self._background.reset(FIRST_SEED + done, job)
+                for env in range(min(self._background.num_envs, seeds - done)):
+                    job.tell(done, seeds)
+                    question = JudgeCamera(0, key, now if moved else None, (env,))
+                    reports.append(self._background.ask(question, job, CameraJudged).report)
+                    done += 1
+                self._know_report(key, now, join_reports(reports), done)
+
+        self._background_lane.start(f"judging {key[1]} over {seeds} seeds", work)
+
+    def suggest(
+        self,
+        key: CameraKey,
+        lens: CameraSettings,
+        objects: tuple[str, ...],
+        low: tuple[float, float, float],
+        high: tuple[float, float, float],
+        load: Load,
+        seeds: int,
+    ) -> None:
+        """Search placements over so many fresh episodes, or as many as there are envs."""
+
+        def work(job: Job) -> None:
+            self._know(suggestions=(), suggestions_of=key)
+            self._background.load(load, job)
+            self._background.reset(FIRST_SEED, job)
+            envs = tuple(range(min(max(1, seeds), self._background.num_envs)))
+            what = f"searching places for {key[1]}"
+            job.tell(0, 0, what)
+            question = SuggestCameras(0, key, lens, objects, low, high, envs)
+            found = self._background.ask(
+                question, job, Suggested, lambda at: job.tell(at.done, at.total, what)
+            )
+            problem = (
+                "" if found.offered else f"no place in that box sees {' and '.join(objects)} in any env."
+            )
+            self._know(suggestions=found.offered, problem=problem)
+
+        self._background_lane.start(f"searching places for {key[1]}", work)
+
+    def compare(self, key: CameraKey, other: CameraSettings, moment: ShownMoment) -> None:
+        """Two pictures of the shown moment."""
+
+        def work(job: Job) -> None:
+            pair = [self._draw(job, key, settings, moment.env, moment) for settings in (None, other)]
+            self._know(compared=(pair[0], pair[1]))
+
+        self._live_lane.start(f"comparing two placements of {key[1]}", work)
+
+    def make_sheet(self, key: CameraKey, moment: ShownMoment) -> None:
+        """A picture of every env, as they come."""
+        looked = self.looked
+        order: tuple[int, ...] = tuple(range(moment.num_envs))
+        if looked.report is not None and (looked.report_of, looked.report_seeds) == (key, 0):
+            judged = [looked.report.envs[i] for i in looked.report.worst_first()]
+            if sorted(judged) == list(order):
+                order = tuple(judged)
+
+        def work(job: Job) -> None:
+            self._know(sheet=())
+            for done, env in enumerate(order):
+                job.tell(done, len(order))
+                picture = self._draw(job, key, None, env, moment)
+                self._know(sheet=(*self.looked.sheet, picture))
+
+        self._live_lane.start(f"taking pictures by {key[1]} of all envs", work)
+
+    def pick(self, info: CameraInfo, u: float, v: float, moment: ShownMoment, names: dict[int, str]) -> None:
+        """What is at a place of the picture."""
+
+        def work(job: Job) -> None:
+            picture = self._draw(job, info.key, None, moment.env, moment, ("depth", "segmentation"))
+            self._know(picked=picked(info, picture, u, v, names))
+
+        self._live_lane.start("looking closely", work)
+
+    def stop(self) -> None:
+        """Stop all that is under way; what is known stays."""
+        self._live_lane.stop()
+        self._background_lane.stop()
+
+    def outdate(self) -> None:
+        """Another version runs: what was seen is of the one before."""
+        self.stop()
+        with self._lock:
+            self._looked = replace(self._looked, outdated=True, compared=None, picked=None, sheet=())
+
+    def close(self) -> None:
+        """End the process in the background."""
+        self._live_lane.close()
+        self._background_lane.close()
+
+    # --- small things ------------------------------------------------------------------------------------
+
+    def _draw(
+        self,
+        job: Job,
+        key: CameraKey,
+        settings: CameraSettings | None,
+        env: int,
+        moment: ShownMoment,
+        modalities: tuple[str, ...] = ("rgb",),
+    ) -> Picture:
+        question = DrawCamera(0, key, settings, (env,), modalities, moment.poses)
+        return self._live.ask(question, job, CameraPictures).pictures[0]
+
+    def _know_report(
+        self, key: CameraKey, now: CameraSettings | None, report: CameraReport, seeds: int
+    ) -> None:
+        self._know(report=report, report_of=key, report_settings=now, report_seeds=seeds, outdated=False)
+
+    def _know(self, **values: object) -> None:
+        with self._lock:
+            self._looked = replace(self._looked, **{"problem": "", **values})  # type: ignore[arg-type]
+        self._on_change()
+
+    def _failed(self, why: str) -> None:
+        self._know(problem=f"{why[:1].upper()}{why[1:]}" + ("" if why.endswith(".") else "."))
+
+
+def picked(info: CameraInfo, picture: Picture, u: float, v: float, names: dict[int, str]) -> Picked:
+    """What a place of a picture shows; `u` and `v` from 0 to 1, from its upper left corner."""
+    shape = next(a.shape for a in (picture.depth, picture.segmentation, picture.rgb) if a is not None)
+    height, width = shape[:2]
+    column = int(np.clip(np.floor(u * width), 0, width - 1))
+    row = int(np.clip(np.floor(v * height), 0, height - 1))
+    body, depth, point = None, None, None
+    if picture.segmentation is not None:
+        body = names.get(int(picture.segmentation[row, column]))
+    if picture.depth is not None and picture.depth[row, column] > 0:
+        depth = float(picture.depth[row, column])
+        k = info.intrinsic
+        # The middle of the pixel, in the camera's frame: x forward, y left, z up.
+        left = -(column + 0.5 - k[0, 2]) / k[0, 0] * depth
+        up = -(row + 0.5 - k[1, 2]) / k[1, 1] * depth
+        x, y, z = compose(picture.pose, [depth, left, up, 1, 0, 0, 0])[:3]
+        point = (float(x), float(y), float(z))
+    return Picked(info.key, picture.env, float(u), float(v), (column, row), body, depth, point)

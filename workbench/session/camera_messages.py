@@ -1,0 +1,108 @@
+"""What is asked of a worker about a camera, to be looked at once, and what it answers.
+
+Each request is small, so that a worker that plays answers it between two steps: who wants sixteen envs judged asks
+sixteen times. A search alone takes long, and is asked of a worker in the background. `number` is the asker's own and
+comes back with the answer; a request with another number, or any at all during a search, means that nobody waits for
+the one before.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.core.camera_report import CameraReport
+from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.core.camera_suggestion import OfferedPlacement
+from workbench.core.pictures import Picture
+
+
+@dataclass(frozen=True)
+class DrawCamera:
+    """The pictures of one camera in some envs; the answer is `CameraPictures`."""
+
+    number: int
+    key: CameraKey
+    settings: CameraSettings | None
+    """Drawn as if it were placed so, and left as it is; None for as it is placed."""
+    envs: tuple[int, ...]
+    modalities: tuple[str, ...] = ("rgb",)
+    """Those that its shader does not give are left out."""
+    poses: NDArray[np.float32] | None = None
+    """(N, B, 7) of the bodies at a moment of the past; None for now."""
+
+
+@dataclass(frozen=True)
+class JudgeCamera:
+    """Measure what one camera sees in some envs; the answer is `CameraJudged`."""
+
+    number: int
+    key: CameraKey
+    settings: CameraSettings | None
+    """None for each env's own."""
+    envs: tuple[int, ...]
+    poses: NDArray[np.float32] | None = None
+    """As in `DrawCamera`."""
+
+
+@dataclass(frozen=True)
+class SuggestCameras:
+    """Search placements of one camera that see these objects; answered with `Searching`, and at last `Suggested`."""
+
+    number: int
+    key: CameraKey
+    settings: CameraSettings
+    """Its lens; the pose does not matter."""
+    objects: tuple[str, ...]
+    low: tuple[float, float, float]
+    """Of the box for the eye, metres in the env's frame."""
+    high: tuple[float, float, float]
+    envs: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class CameraPictures:
+    """The answer to `DrawCamera`."""
+
+    number: int
+    pictures: tuple[Picture, ...]
+
+
+@dataclass(frozen=True)
+class CameraJudged:
+    """The answer to `JudgeCamera`."""
+
+    number: int
+    report: CameraReport
+
+
+@dataclass(frozen=True)
+class Searching:
+    """How far a search is."""
+
+    number: int
+    done: int
+    total: int
+
+
+@dataclass(frozen=True)
+class Suggested:
+    """The answer to `SuggestCameras`."""
+
+    number: int
+    offered: tuple[OfferedPlacement, ...]
+
+
+@dataclass(frozen=True)
+class CameraQuestionFailed:
+    """The answer to any of them that cannot be answered."""
+
+    number: int
+    why: str
+
+
+CameraQuestion = DrawCamera | JudgeCamera | SuggestCameras
+CameraAnswer = CameraPictures | CameraJudged | Suggested | CameraQuestionFailed
+"""What ends a request."""

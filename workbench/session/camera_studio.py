@@ -1,0 +1,504 @@
+"""The camera studio: cameras placed by hand, judged over the batch, and written into the author's file.
+
+The page calls the methods here, on any thread; each returns at once. What comes of them is in `StudioView`.
+
+A placement is known in three places: here (with its undo), in the worker's live cameras, and in the end in the
+author's file. What is here counts: after every version that comes in the worker is told again, so that neither a
+reload nor the end of a worker moves a camera. What is in the file counts more, when the author changed it there.
+What takes long (libcst, the disk) is done on a thread of its own, one thing after the other.
+"""
+
+from __future__ import annotations
+
+import threading
+import traceback
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.authoring import camera_files
+from workbench.core.camera_frames import Convention, Direction, relative_to, with_pose
+from workbench.core.camera_settings import (
+    CameraKey,
+    CameraKind,
+    CameraSettings,
+    differences,
+    why_no_camera,
+)
+from workbench.core.pictures import CameraInfo
+from workbench.core.step import StepResult
+from workbench.session.camera_judging import CameraJudging, ShownMoment
+from workbench.session.camera_messages import CameraAnswer
+from workbench.session.camera_writing import CameraWriting, Wish, plan
+from workbench.session.messages import Load, PlaceCamera, Placed, Request, TaskDescription
+from workbench.session.placements import Placements
+from workbench.session.studio_view import StudioCamera, StudioView
+
+MOST_SEEDS = 1000
+_ON_THE_GPU = "in GPU simulation cameras cannot be moved; open the task with --backend cpu to place them"
+
+
+class CameraStudio:
+    """See the module's text."""
+
+    def __init__(
+        self,
+        send: Callable[[Request], None],
+        on_change: Callable[[], None],
+        shown: Callable[[], ShownMoment],
+        load: Callable[[], Load | None],
+    ) -> None:
+        """
+        Args:
+            send: to the worker that plays.
+            on_change: called, on any thread, when `view` has something new.
+            shown: what the page shows now.
+            load: how another worker gets the version that runs; None before there is one.
+        """
+        self._send, self._on_change, self._shown, self._load = send, on_change, shown, load
+        self._lock = threading.Lock()
+        self._thread = ThreadPoolExecutor(1, "studio")
+        self._closing = False
+        self._serial = 0
+        self._task: TaskDescription | None = None
+        self._selected: CameraKey | None = None
+        self._problem = ""
+        self._placements = Placements()
+        self._writing = CameraWriting()
+        self._judging = CameraJudging(send, self._note)
+        self._drawn: tuple[StepResult | None, int] = (None, 0)
+        """What was shown last: the step and the selected env."""
+
+    # --- placing -------------------------------------------------------------------------------------
+
+    def select(self, key: CameraKey | None) -> None:
+        """Choose the camera that the page works on."""
+        with self._lock:
+            self._selected = key if key is None or self._info(key) is not None else self._selected
+        self._note()
+
+    def place(self, key: CameraKey, settings: CameraSettings, gesture: int | None = None) -> None:
+        """Place a camera, live. Of placements faster than the worker only the newest is made.
+
+        Args:
+            gesture: calls with the same number, one behind the other, are one step of undo (a drag).
+        """
+        with self._lock:
+            why_not = self._refusal(key) or why_no_camera(settings)
+            self._problem = f"{key[1]} is left where it is: {why_not}." if why_not else ""
+            request = None
+            if not why_not and self._placements.place(key, settings, gesture):
+                request = self._request(key)
+        self._send_all([request] if request else [])
+
+    def undo(self) -> None:
+        """Take the last step back."""
+        with self._lock:
+            step = self._placements.undo()
+            requests = [self._request(step.key)] if step is not None else []
+        self._send_all(requests)
+
+    def redo(self) -> None:
+        """Make the step again that was taken back last."""
+        with self._lock:
+            step = self._placements.redo()
+            requests = [self._request(step.key)] if step is not None else []
+        self._send_all(requests)
+
+    def back_to_file(self, key: CameraKey) -> None:
+        """Place a camera as the file says."""
+        with self._lock:
+            file = self._placements.file(key)
+            moved = file is not None and self._placements.place(
+                key, file, words=f"put {key[1]} back to the file"
+            )
+        self._send_all([PlaceCamera(key, None)] if moved else [])
+
+    # --- into the file -------------------------------------------------------------------------------
+
+    def plan_write(self, key: CameraKey) -> None:
+        """Find the edit that writes the placement of a camera; it becomes `StudioView.writing`."""
+        with self._lock:
+            wish = Wish("edit", key, self._placements.now(key))
+        self._plan(wish)
+
+    def plan_add(self, kind: CameraKind, name: str, settings: CameraSettings) -> None:
+        """Find the edit that adds a camera."""
+        self._plan(Wish("add", (kind, name), settings))
+
+    def plan_duplicate(self, key: CameraKey, name: str) -> None:
+        """Find the edit that adds a copy of a camera, placed as that one is now."""
+        with self._lock:
+            wish = Wish("duplicate", key, self._placements.now(key), name)
+        self._plan(wish)
+
+    def plan_rename(self, key: CameraKey, name: str) -> None:
+        """Find the edit that gives a camera another name."""
+        with self._lock:
+            wish = Wish("rename", key, self._placements.now(key), name)
+        self._plan(wish)
+
+    def plan_remove(self, key: CameraKey) -> None:
+        """Find the edit that removes a camera."""
+        self._plan(Wish("remove", key, None))
+
+    def _plan(self, wish: Wish) -> None:
+        def work() -> None:
+            with self._lock:
+                task, info = self._task, self._info(wish.key)
+            if task is None:
+                return
+            writing = plan(task, info, wish)
+            with self._lock:
+                self._writing.planned(wish, writing)
+            self._note()
+
+        self._later(work)
+
+    def write(self) -> None:
+        """Make the planned edit; the file is reloaded, and the new camera compared with what was written."""
+        self._later(self._write, self._writing.write)
+
+    def undo_write(self) -> None:
+        """Take the edit that was made last out of the file again."""
+        self._later(self._write, self._writing.undo)
+
+    def _write(self, do: Callable[[], bool]) -> None:
+        with self._lock:  # the version with it must not come in before it is known to be awaited
+            do()
+        self._note()
+
+    def drop_plan(self) -> None:
+        """Forget the plan (or the message about the last one)."""
+        with self._lock:
+            self._writing.drop()
+        self._note()
+
+    # --- judged ----------------------------------------------------------------------------------------
+
+    def judge(self, key: CameraKey, seeds: int = 0) -> None:
+        """Judge a camera as it is placed over all envs.
+
+        Args:
+            seeds: 0 for the envs at the shown moment; else over so many freshly reset ones, in the background.
+        """
+        with self._lock:
+            known, now, moved = self._known(key), self._placements.now(key), self._placements.moved(key)
+        if known and seeds <= 0:
+            self._judging.judge(key, now, self._shown())
+        elif known and (load := self._load()) is not None:
+            self._judging.judge_seeds(key, now, moved, load, min(seeds, MOST_SEEDS))
+
+    def suggest(
+        self,
+        key: CameraKey,
+        objects: Sequence[str],
+        low: tuple[float, float, float],
+        high: tuple[float, float, float],
+        seeds: int,
+    ) -> None:
+        """Search placements that see these objects over so many seeds, with the eye between two corners."""
+        with self._lock:
+            known, lens, info = self._known(key), self._placements.now(key), self._info(key)
+            if known and info is not None and info.mount is not None:
+                self._problem = (
+                    f"{key[1]} rides on {info.mount}: places are searched for cameras that stand still."
+                )
+                known = False
+            elif known and lens is None:
+                self._problem = f"{key[1]} cannot be placed: {self._refusal(key)}."
+        if known and lens is not None and (load := self._load()) is not None:
+            self._judging.suggest(key, lens, tuple(objects), low, high, load, seeds)
+        self._note()
+
+    def take_suggestion(self, index: int) -> None:
+        """Place the camera as suggested."""
+        looked = self._judging.looked
+        key = looked.suggestions_of
+        if key is None or not 0 <= index < len(looked.suggestions):
+            return
+        found = looked.suggestions[index].settings
+        with self._lock:
+            now = self._placements.now(key)
+        if now is not None:
+            self.place(key, replace(now, position=found.position, quaternion=found.quaternion))
+
+    def stop(self) -> None:
+        """Stop whatever runs in the background; what is known stays."""
+        self._judging.stop()
+
+    def compare(self, key: CameraKey, other: CameraSettings) -> None:
+        """Two pictures of the shown env: the camera as it is placed, and as it would be with other settings."""
+        with self._lock:
+            why_not = self._refusal(key) or why_no_camera(other)
+            if why_not:
+                self._problem = f"{key[1]} is not compared: {why_not}."
+        if not why_not:
+            self._judging.compare(key, other, self._shown())
+        self._note()
+
+    def make_sheet(self, key: CameraKey) -> None:
+        """The pictures of all envs by one camera, worst first if it was judged over them."""
+        with self._lock:
+            known = self._known(key)
+        if known:
+            self._judging.make_sheet(key, self._shown())
+
+    def pick(self, key: CameraKey, u: float, v: float) -> None:
+        """What is seen at a place of the picture: 0, 0 is its upper left corner, 1, 1 its lower right one."""
+        with self._lock:
+            info, task = self._info(key), self._task
+        if info is not None and task is not None:
+            self._judging.pick(info, u, v, self._shown(), task.segmentation)
+
+    def _known(self, key: CameraKey) -> bool:
+        if self._info(key) is None:
+            self._problem = f"There is no {key[0]} camera {key[1]}."
+            return False
+        return True
+
+    # --- in other words --------------------------------------------------------------------------------
+
+    def export(self, keys: Sequence[CameraKey], form: Literal["json", "opencv", "ros"]) -> str:
+        """The cameras as they are placed, at the shown moment of the selected env, as the text of a file.
+
+        ROS's form is one file a camera: of several, one document after the other.
+
+        Raises:
+            ValueError: one of them is not there, or cannot be said; a sentence for the reader.
+        """
+        with self._lock:
+            cameras = [self._to_export(key) for key in keys]
+        if form == "json":
+            return camera_files.cameras_as_json(cameras)
+        if form == "opencv":
+            return camera_files.cameras_as_opencv_yaml(cameras)
+        return "---\n".join(camera_files.camera_as_ros_yaml(camera) for camera in cameras)
+
+    def _to_export(self, key: CameraKey) -> camera_files.CameraToExport:
+        info, now = self._info(key), self._placements.now(key)
+        if info is None or now is None:
+            raise ValueError(f"there is no {key[0]} camera {key[1]} whose settings are known")
+        return camera_files.CameraToExport(key, now, info.mount, self._mount_pose(info, *self._drawn))
+
+    def import_pose(
+        self,
+        key: CameraKey,
+        text: str,
+        direction: Direction | None,
+        convention: Convention | None,
+        metres_per_unit: float = 1.0,
+    ) -> None:
+        """Place a camera as a calibration says: in the env's frame, or in its mount's if it is mounted.
+
+        Our own JSON says itself which pose is which; of anything else the person says it.
+
+        Raises:
+            ValueError: with a sentence for the reader.
+        """
+        found = camera_files.find_poses(text)
+        chosen = [pose for pose in found if key[1] in pose.label] or list(found)
+        if len(chosen) > 1:
+            labels = ", ".join(pose.label for pose in chosen)
+            raise ValueError(f"there are several poses in it ({labels}): paste the one that is meant")
+        pose = camera_files.camera_pose(chosen[0], convention, direction, metres_per_unit)
+        with self._lock:
+            info, now = self._info(key), self._placements.now(key)
+            mount = None if info is None else self._mount_pose(info, *self._drawn)
+        if now is None or info is None:
+            raise ValueError(f"there is no {key[0]} camera {key[1]} that can be placed")
+        if chosen[0].said is not None and info.mount is not None:
+            if mount is None:
+                raise ValueError(f"where {info.mount} is, on which {key[1]} rides, is not known yet")
+            pose = relative_to(mount, pose)  # ours is of the env's frame
+        self.place(key, with_pose(now, pose))
+
+    # --- what the page reads ---------------------------------------------------------------------------
+
+    def view(self, step: StepResult | None, env: int) -> StudioView:
+        """
+        Args:
+            step: of the shown moment.
+            env: the selected one.
+        """
+        looked, progress = self._judging.looked, self._judging.progress
+        with self._lock:
+            self._drawn = step, env
+            infos = () if self._task is None else self._task.cameras
+            judged = None if looked.report_of is None else self._placements.now(looked.report_of)
+            was = looked.report_settings
+            # Not what is rounded away when it is written.
+            moved = judged is None or was is None or bool(differences(judged, was, close=3e-4))
+            return StudioView(
+                cameras=tuple(self._camera(info, step, env) for info in infos),
+                report=looked.report,
+                report_of=looked.report_of,
+                report_seeds=looked.report_seeds,
+                report_stale=looked.report is not None and (moved or looked.outdated),
+                suggestions=looked.suggestions,
+                suggestions_of=looked.suggestions_of,
+                compared=looked.compared,
+                picked=looked.picked,
+                sheet=looked.sheet,
+                progress=progress,
+                selected=self._selected,
+                undo=self._placements.undo_words,
+                redo=self._placements.redo_words,
+                writing=self._writing.view,
+                problem=self._problem or looked.problem,
+                serial=self._serial,
+            )
+
+    def _camera(self, info: CameraInfo, step: StepResult | None, env: int) -> StudioCamera:
+        key = info.key
+        return StudioCamera(
+            key=key,
+            info=info,
+            now=self._placements.now(key),
+            moved=self._placements.moved(key),
+            mount_pose=self._mount_pose(info, step, env),
+            refused=self._refusal(key) or "",
+        )
+
+    def _mount_pose(self, info: CameraInfo, step: StepResult | None, env: int) -> NDArray[np.float32] | None:
+        if info.mount is None or self._task is None or step is None:
+            return None
+        names = self._task.geometry.body_names
+        if info.mount not in names or step.poses.shape[1] != len(names) or env >= len(step.poses):
+            return None  # another version is coming in
+        return step.poses[env, names.index(info.mount)]
+
+    def _info(self, key: CameraKey) -> CameraInfo | None:
+        infos = () if self._task is None else self._task.cameras
+        return next((info for info in infos if info.key == key), None)
+
+    def _refusal(self, key: CameraKey) -> str | None:
+        info = self._info(key)
+        if info is None:
+            return f"there is no {key[0]} camera {key[1]}"
+        if self._task is not None and self._task.backend == "gpu":
+            return _ON_THE_GPU
+        if info.settings is None:
+            return "its pose is no pose, or its lens differs between envs, so one placement cannot be its"
+        return None
+
+    # --- what the session tells ------------------------------------------------------------------------
+
+    def loaded(self, task: TaskDescription) -> list[PlaceCamera]:
+        """A version runs, and what was written is compared with it. To be told under the session's lock: calls nobody.
+
+        Returns:
+            what is to be asked of the worker, so that its cameras stand where they are placed.
+        """
+        with self._lock:
+            self._task = task
+            said = {c.key: c.settings for c in task.cameras if c.settings is not None}
+            own: frozenset[CameraKey] = frozenset()
+            wish = self._writing.wish
+            if wish is not None and self._writing.is_in(task):
+                own = frozenset({wish.key, wish.result})
+                self._follow_the_file(wish)
+                self._writing.compare(task)
+            dropped = self._placements.loaded(said, own)
+            self._problem = ""
+            if dropped:
+                names = " and ".join(key[1] for key in dropped)
+                one = len(dropped) == 1
+                self._problem = (
+                    f"{names} {'was' if one else 'were'} changed in the file, so {'it stands' if one else 'they stand'} "
+                    "where the file says; Undo brings your placement back."
+                )
+            if self._selected is not None and self._info(self._selected) is None:
+                self._selected = None
+            self._serial += 1
+            # The dropped ones too: their placement may have been on its way while the version came in.
+            return [self._request(key) for key in (*self._placements.all_moved, *dropped)]
+
+    def _follow_the_file(self, wish: Wish) -> None:
+        """What an edit, or its being taken back, means for the placements: none is to be lost by it."""
+        placements, undone = self._placements, self._writing.view.stage == "undone"
+        now = placements.now(wish.key)
+        if wish.what == "rename":
+            pair = (wish.result, wish.key) if undone else (wish.key, wish.result)
+            placements.rename(*pair)
+        elif wish.what == "duplicate" and not undone and placements.moved(wish.key) and now is not None:
+            placements.keep(wish.result, now)
+        elif wish.what == "edit" and wish.settings is not None:
+            if undone and not placements.moved(wish.key):
+                placements.keep(wish.key, wish.settings)
+            elif not undone and now is not None and not differences(now, wish.settings):
+                placements.written(wish.key)  # but for what was rounded
+        if not undone and wish.what in ("add", "duplicate", "rename"):
+            self._selected = wish.result
+
+    def answered(self, answer: CameraAnswer) -> None:
+        """The worker that plays answered a question about a camera."""
+        self._judging.take(answer)
+
+    def interrupted(self) -> None:
+        """The file was saved, or the worker is gone: what is under way is about what there was before."""
+        self._judging.stop()
+
+    def outdated(self) -> None:
+        """The version that runs is another in more than its cameras: what was seen is of the one before."""
+        self._judging.outdate()
+
+    def failed_to_load(self) -> None:
+        """A version does not load; the one before goes on."""
+        with self._lock:
+            self._writing.failed_to_load()
+        self._note()
+
+    def placed(self, event: Placed) -> None:
+        """The worker's answer to a placement."""
+        requests: list[PlaceCamera] = []
+        with self._lock:
+            task = self._task
+            if event.why_not:
+                self._problem = f"{event.key[1]} could not be placed: {event.why_not}."
+                self._placements.refused(event.key)
+                requests = [self._request(event.key)] if event.settings is not None else []
+            elif event.info is not None and task is not None:
+                infos = [event.info if c.key == event.key else c for c in task.cameras]
+                self._task = replace(task, cameras=tuple(infos))
+        self._send_all(requests)
+
+    def close(self) -> None:
+        """Wait for what is being written."""
+        with self._lock:
+            self._closing = True
+        self._judging.close()
+        self._thread.shutdown(wait=True, cancel_futures=True)
+
+    # --- small things ----------------------------------------------------------------------------------
+
+    def _request(self, key: CameraKey) -> PlaceCamera:
+        return PlaceCamera(key, self._placements.now(key) if self._placements.moved(key) else None)
+
+    def _send_all(self, requests: Sequence[Request]) -> None:
+        for request in requests:
+            self._send(request)
+        self._note()
+
+    def _later(self, work: Callable[..., None], *args: object) -> None:
+        with self._lock:
+            if not self._closing:
+                self._thread.submit(work, *args).add_done_callback(self._worked)
+
+    def _worked(self, future: Future[None]) -> None:
+        error = None if future.cancelled() else future.exception()
+        if error is None:
+            return
+        traceback.print_exception(error)
+        with self._lock:
+            self._problem = f"The workbench itself failed at this, and nothing was done: {error!r}"
+        self._note()
+
+    def _note(self) -> None:
+        with self._lock:
+            self._serial += 1
+        self._on_change()

@@ -1,0 +1,230 @@
+"""The way of a camera's change into the author's file: planned, shown, written, reloaded, compared, taken back.
+
+What was written is believed only when it was seen: the reload builds the camera anew, and the config that comes out
+is compared number by number with what the edit was to say. A difference is told as the error that it is.
+
+Plans are made of the files as they are on disk at that moment, since that is what is edited; if they say something
+else of the camera than the env has, the plan is refused. libcst takes a third of a second to import, so it is
+imported when the first plan is made. None of this runs on the page's thread, and nothing here is thread-safe.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from workbench.authoring.modules import decode
+from workbench.core.camera_settings import CameraKey, CameraSettings, differences
+from workbench.core.pictures import CameraInfo
+from workbench.session.messages import TaskDescription
+from workbench.session.studio_view import Writing
+
+if TYPE_CHECKING:
+    from workbench.authoring.camera_source import Refusal, SourceEdit
+
+    Plan = SourceEdit | Refusal
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What is to be written."""
+
+    what: str
+    """``edit``, ``add``, ``duplicate``, ``rename`` or ``remove``."""
+    key: CameraKey
+    """The camera that is changed, copied, renamed or removed, or the one that is added."""
+    settings: CameraSettings | None
+    """What it is to have."""
+    name: str = ""
+    """The new name."""
+
+    @property
+    def result(self) -> CameraKey:
+        """The camera that the file has when it is done."""
+        return (self.key[0], self.name) if self.name else self.key
+
+
+def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish) -> Writing:
+    """The edit that fulfils a wish, or why there is none.
+
+    Args:
+        info: of the live camera; None where one is added.
+    """
+    from workbench.authoring import camera_source
+
+    made: Plan
+    texts, unread = _texts(task)
+    if not task.source_files:
+        text = "" if wish.settings is None else camera_source.snippet(wish.result[1], wish.settings)
+        where = "" if task.file is None else f" ({task.file})"
+        made = camera_source.Refusal(
+            f"{task.class_name} is installed{where}, and an installed file is not to be edited: copy the task into a "
+            "file of your own and open that",
+            text,
+        )
+    elif unread:
+        made = camera_source.Refusal(unread)
+    else:
+        made = _made(task, texts, info, wish)
+    if isinstance(made, camera_source.SourceEdit):
+        blocked = camera_source.not_writable(made.file)
+        if blocked is not None:
+            text = "" if wish.settings is None else camera_source.snippet(wish.result[1], wish.settings)
+            made = camera_source.Refusal(blocked, text)
+    if isinstance(made, camera_source.Refusal):
+        copy = " You can copy the text below into the file yourself." if made.snippet else ""
+        return Writing("refused", wish.result, None, made, f"Not written: {made.reason}.{copy}")
+    message = f"This is what changes in {Path(made.file).name}. Nothing is written yet."
+    return Writing("planned", wish.result, made, None, message)
+
+
+def _made(task: TaskDescription, texts: dict[str, str], info: CameraInfo | None, wish: Wish) -> Plan:
+    from workbench.authoring import camera_source
+
+    kind, uid = wish.key
+    if wish.what == "add":
+        assert wish.settings is not None
+        file = task.file or task.source_files[0]
+        return camera_source.plan_add(texts, file, task.class_name, kind, uid, wish.settings)
+    if info is None or info.settings is None:
+        return camera_source.Refusal(f"there is no {kind} camera {uid!r} whose settings are known")
+    if wish.what == "remove":
+        return camera_source.plan_remove(texts, uid, info.site, kind)
+    if wish.what == "rename":
+        return camera_source.plan_rename(texts, uid, wish.name, info.settings, info.site, kind)
+    if wish.what == "duplicate":
+        return camera_source.plan_duplicate(texts, uid, wish.name, info.settings, info.site, kind)
+    assert wish.settings is not None
+    if info.varies:
+        snippet = camera_source.snippet(uid, wish.settings)
+        return camera_source.Refusal(
+            f"the task's own code moves {uid!r} (it is randomised, or moved after it was made), so one pose in the "
+            "file would not place it",
+            snippet,
+        )
+    return camera_source.plan_edit(texts, uid, info.settings, wish.settings, info.site, kind)
+
+
+def _texts(task: TaskDescription) -> tuple[dict[str, str], str]:
+    """The author's files as they are on disk; and why one cannot be read."""
+    texts: dict[str, str] = {}
+    for path in task.source_files:
+        try:
+            texts[path] = decode(path, Path(path).read_bytes())
+        except OSError as error:
+            return {}, f"{path} cannot be read: {error.strerror}"
+        except SyntaxError as error:
+            return {}, f"{path} cannot be read: {error.msg}"
+    return texts, ""
+
+
+class CameraWriting:
+    """One change at a time."""
+
+    def __init__(self) -> None:
+        self.view = Writing()
+        self.wish: Wish | None = None
+
+    def planned(self, wish: Wish, view: Writing) -> None:
+        self.wish, self.view = wish, view
+
+    def drop(self) -> None:
+        self.wish, self.view = None, Writing()
+
+    def write(self) -> bool:
+        """Make the planned edit. False if there is none, or it cannot be made."""
+        return self._apply("planned", "apply", "written", "Written to {file}; it is being loaded.")
+
+    def undo(self) -> bool:
+        """Take the edit that was made out of the file again."""
+        return self._apply(None, "revert", "undone", "{file} is as it was before; it is being loaded.")
+
+    def _apply(self, needs: str | None, how: str, stage: str, message: str) -> bool:
+        from workbench.authoring import camera_source
+
+        view = self.view
+        ready = view.stage == needs if needs else view.stage in ("written", "checked", "mismatch")
+        if view.edit is None or not ready:
+            return False
+        do: Callable[[SourceEdit], Refusal | None] = getattr(camera_source, how)
+        refusal = do(view.edit)
+        file = Path(view.edit.file).name
+        if refusal is not None:
+            kept = view.stage if needs is None else "refused"
+            self.view = replace(view, stage=kept, refusal=refusal, message=f"Not done: {refusal.reason}.")
+            return False
+        self.view = replace(view, stage=stage, refusal=None, message=message.format(file=file))  # type: ignore[arg-type]
+        return True
+
+    @property
+    def awaited(self) -> bool:
+        """The edit was made or taken back, and the version with it has not come in yet."""
+        return self.view.stage == "written" or (
+            self.view.stage == "undone" and self.view.message.endswith("loaded.")
+        )
+
+    def is_in(self, task: TaskDescription) -> bool:
+        """Whether this version is the one with the edit, or without it, that is awaited."""
+        edit = self.view.edit
+        if edit is None or not self.awaited:
+            return False
+        wanted = edit.new_text if self.view.stage == "written" else edit.old_text
+        return task.source.get(edit.file) == wanted
+
+    def compare(self, task: TaskDescription) -> None:
+        """The version that was awaited runs: does it have what was written?"""
+        view, wish = self.view, self.wish
+        assert view.edit is not None and wish is not None
+        infos = {c.key: c for c in task.cameras}
+        file = Path(view.edit.file).name
+        if view.stage == "undone":
+            self.view = replace(view, message=f"{file} is as it was before.")
+            return
+        wrong = _mismatch(wish, infos, view.edit.settings)
+        if wrong:
+            self.view = replace(
+                view,
+                stage="mismatch",
+                message=f"{wrong} Take the change back, or look at what else in the task places this camera.",
+            )
+            return
+        done = {
+            "add": f"{wish.key[1]} is in {file}, and the env has it.",
+            "remove": f"{wish.key[1]} is no longer in {file}.",
+            "rename": f"{wish.key[1]} is {wish.name} in {file} now.",
+            "duplicate": f"{wish.name} is in {file}, a copy of {wish.key[1]}.",
+        }.get(wish.what, f"{wish.key[1]} is written to {file}, and the new env has it.")
+        self.view = replace(view, stage="checked", message=done)
+
+    def failed_to_load(self) -> None:
+        if self.awaited and self.view.edit is not None:
+            file = Path(self.view.edit.file).name
+            told = "the change is in it; take it back if that is the reason"
+            if self.view.stage == "undone":
+                told = "the camera's change is out of it"
+            self.view = replace(self.view, message=f"{file} does not load: {told}.")
+
+
+def _mismatch(wish: Wish, infos: dict[CameraKey, CameraInfo], wanted: CameraSettings | None) -> str:
+    kind, name = wish.result
+    info = infos.get(wish.result)
+    if wish.what == "remove":
+        return f"The new env still has the {kind} camera {name}." if info is not None else ""
+    if info is None or info.settings is None:
+        return f"The new env has no {kind} camera {name}."
+    if wish.what == "rename" and wish.key in infos:
+        return f"The new env still has the {kind} camera {wish.key[1]}."
+    apart = () if wanted is None else differences(wanted, info.settings)
+    if not apart:
+        return ""
+    numbers = "; ".join(f"{what}: {_said(info.settings, what)}, not {_said(wanted, what)}" for what in apart)
+    return f"The new env's {name} is not what was written ({numbers})."
+
+
+def _said(settings: CameraSettings | None, what: str) -> str:
+    value = getattr(settings, {"orientation": "quaternion"}.get(what, what), None)
+    if isinstance(value, tuple):
+        return "(" + ", ".join(f"{v:.6g}" if isinstance(v, float) else str(v) for v in value) + ")"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,134 @@
+"""Jobs one at a time on a thread of their own: a new one takes the place of the one before, and any can be stopped.
+
+A job is a function that asks often whether it is to go on (`Job.check`); so it ends within what it does between two
+questions, and nobody ends a thread.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from workbench.session.studio_view import Progress
+
+
+class Stopped(Exception):
+    """The job is to go no further."""
+
+
+class JobFailed(Exception):
+    """The job cannot go on; its text is for the reader."""
+
+
+class Job:
+    """One piece of work."""
+
+    def __init__(self, lane: Lane, what: str, work: Callable[[Job], None]) -> None:
+        self._lane, self._what, self.work = lane, what, work
+        self.stopped = False
+        self.progress = Progress(what, 0, 0)
+
+    def check(self) -> None:
+        """Raises Stopped where it is to stop."""
+        if self.stopped:
+            raise Stopped
+
+    def tell(self, done: int, total: int, what: str = "") -> None:
+        """How far it is."""
+        self.progress = Progress(what or self._what, done, total)
+        self._lane.changed()
+
+
+class Lane:
+    """See the module's text."""
+
+    def __init__(
+        self,
+        name: str,
+        on_change: Callable[[], None],
+        on_failure: Callable[[str], None],
+        idle_seconds: float | None = None,
+        on_idle: Callable[[], None] = lambda: None,
+    ) -> None:
+        """
+        Args:
+            on_change: called when `progress` is new.
+            on_failure: called with the sentence that a job failed with.
+            on_idle: called on the lane's thread when there was no job for so long, and at its end.
+        """
+        self._name, self.changed, self._on_failure = name, on_change, on_failure
+        self._idle_seconds, self._on_idle = idle_seconds, on_idle
+        self._wake = threading.Condition()
+        self._waiting: Job | None = None
+        self._job: Job | None = None
+        self._closing = False
+        self._thread: threading.Thread | None = None
+
+    @property
+    def progress(self) -> Progress | None:
+        """Of the job that is done, or waits to be; None for neither."""
+        with self._wake:
+            job = self._waiting or self._job
+            return None if job is None or job.stopped else job.progress
+
+    def start(self, what: str, work: Callable[[Job], None]) -> None:
+        """Do this in place of whatever was done before."""
+        with self._wake:
+            if self._closing:
+                return
+            self._stop()
+            self._waiting = Job(self, what, work)
+            self._wake.notify_all()
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+                self._thread.start()
+        self.changed()
+
+    def stop(self) -> bool:
+        """Go no further with what is under way. False if there was nothing."""
+        with self._wake:
+            stopped = self._stop()
+        if stopped:
+            self.changed()
+        return stopped
+
+    def close(self) -> None:
+        """Stop, and wait for the thread's end."""
+        with self._wake:
+            self._closing = True
+            self._stop()
+            self._wake.notify_all()
+            thread = self._thread
+        if thread is not None:
+            thread.join()
+
+    def _stop(self) -> bool:
+        was = self._waiting is not None or (self._job is not None and not self._job.stopped)
+        self._waiting = None
+        if self._job is not None:
+            self._job.stopped = True
+        return was
+
+    def _run(self) -> None:
+        while (job := self._next()) is not None:
+            try:
+                job.work(job)
+            except Stopped:
+                pass
+            except JobFailed as failure:
+                self._on_failure(str(failure))
+            finally:
+                with self._wake:
+                    self._job = None
+                self.changed()
+        self._on_idle()
+
+    def _next(self) -> Job | None:
+        with self._wake:
+            while self._waiting is None and not self._closing:
+                if not self._wake.wait(self._idle_seconds):
+                    self._on_idle()
+            if self._closing:
+                return None
+            self._job, self._waiting = self._waiting, None
+            return self._job

@@ -1,0 +1,172 @@
+"""Where the cameras are placed, and the way back: undo and redo of what was done by hand.
+
+A step keeps the whole settings of one camera before and after, so it can be taken back whatever happened to the file
+meanwhile. What belongs to one gesture, the hundred positions of a drag, is one step. When a version comes in, what
+was placed and not written stays, except where the file says something new of that very camera: the author wrote
+that, so it counts, and the placement is one step of undo away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from workbench.core.camera_settings import CameraKey, CameraSettings, differences
+
+_MOST_STEPS = 500
+
+
+@dataclass(frozen=True)
+class Step:
+    """One change of one camera."""
+
+    key: CameraKey
+    before: CameraSettings
+    after: CameraSettings
+    words: str
+    gesture: int | None = None
+
+
+class Placements:
+    """Not thread-safe: `CameraStudio` locks."""
+
+    def __init__(self) -> None:
+        self._file: dict[CameraKey, CameraSettings] = {}
+        self._now: dict[CameraKey, CameraSettings] = {}
+        self._done: list[Step] = []
+        self._undone: list[Step] = []
+
+    def now(self, key: CameraKey) -> CameraSettings | None:
+        """None for a camera that there is not, or whose config cannot be said in settings."""
+        return self._now.get(key, self._file.get(key))
+
+    def file(self, key: CameraKey) -> CameraSettings | None:
+        """What the loaded version says."""
+        return self._file.get(key)
+
+    def moved(self, key: CameraKey) -> bool:
+        return key in self._now
+
+    @property
+    def all_moved(self) -> dict[CameraKey, CameraSettings]:
+        return dict(self._now)
+
+    @property
+    def undo_words(self) -> str | None:
+        return self._done[-1].words if self._done else None
+
+    @property
+    def redo_words(self) -> str | None:
+        return self._undone[-1].words if self._undone else None
+
+    def place(
+        self, key: CameraKey, settings: CameraSettings, gesture: int | None = None, words: str = ""
+    ) -> bool:
+        """False if there is no such camera, or it stands so already."""
+        before = self.now(key)
+        if before is None or not differences(before, settings):
+            return False
+        last = self._done[-1] if self._done else None
+        if gesture is not None and last is not None and (last.key, last.gesture) == (key, gesture):
+            before = last.before
+            self._done.pop()
+        words = words or _in_words(key, before, settings)
+        self._done = [*self._done[-_MOST_STEPS + 1 :], Step(key, before, settings, words, gesture)]
+        self._undone.clear()
+        self._put(key, settings)
+        return True
+
+    def undo(self) -> Step | None:
+        """The step that was taken back."""
+        if not self._done:
+            return None
+        step = self._done.pop()
+        self._undone.append(step)
+        self._put(step.key, step.before)
+        return step
+
+    def redo(self) -> Step | None:
+        if not self._undone:
+            return None
+        step = self._undone.pop()
+        self._done.append(replace(step, gesture=None))
+        self._put(step.key, step.after)
+        return step
+
+    def refused(self, key: CameraKey) -> None:
+        """It could not be placed so: it is as it was before that."""
+        last = self._done[-1] if self._done else None
+        if last is not None and last.key == key:
+            self._done.pop()
+            self._put(key, last.before)
+        else:
+            self._now.pop(key, None)
+
+    def written(self, key: CameraKey) -> None:
+        """The file says now what was placed, or says nothing of this camera any more."""
+        self._now.pop(key, None)
+
+    def keep(self, key: CameraKey, settings: CameraSettings) -> None:
+        """Place a camera that the next version may have, or have otherwise, without a step of undo."""
+        self._now[key] = settings
+
+    def rename(self, key: CameraKey, new: CameraKey) -> None:
+        """What is known of one camera is from now on of the other."""
+        if key in self._now:
+            self._now[new] = self._now.pop(key)
+        if key in self._file:
+            self._file[new] = self._file[key]
+        for steps in (self._done, self._undone):
+            steps[:] = [replace(s, key=new) if s.key == key else s for s in steps]
+
+    def loaded(
+        self, said: Mapping[CameraKey, CameraSettings], own: frozenset[CameraKey] = frozenset()
+    ) -> tuple[CameraKey, ...]:
+        """A version runs, whose cameras are these.
+
+        Args:
+            own: cameras that the studio itself changed in the file: nothing of theirs is dropped.
+
+        Returns:
+            cameras whose placement was dropped, since the file says something new of them.
+        """
+        before, self._file = self._file, dict(said)
+        dropped: list[CameraKey] = []
+        for key, placed in list(self._now.items()):
+            if key not in said:
+                del self._now[key]
+            elif not differences(placed, said[key]):
+                del self._now[key]
+            elif key not in own and key in before and differences(before[key], said[key]):
+                del self._now[key]
+                dropped.append(key)
+                words = f"took {key[1]} from the file"
+                self._done.append(Step(key, placed, said[key], words))
+        for steps in (self._done, self._undone):
+            steps[:] = [step for step in steps if step.key in said]
+        return tuple(dropped)
+
+    def _put(self, key: CameraKey, settings: CameraSettings) -> None:
+        file = self._file.get(key)
+        if file is not None and not differences(file, settings):
+            self._now.pop(key, None)
+        else:
+            self._now[key] = settings
+
+
+def _in_words(key: CameraKey, before: CameraSettings, after: CameraSettings) -> str:
+    changed = set(differences(before, after))
+    name = key[1]
+    if changed == {"position"}:
+        return f"moved {name}"
+    if changed == {"orientation"}:
+        return f"turned {name}"
+    if changed == {"position", "orientation"}:
+        return f"moved and turned {name}"
+    if changed <= {"fov", "intrinsic"}:
+        return f"changed the lens of {name}"
+    if changed <= {"near", "far"}:
+        return f"changed near and far of {name}"
+    if changed <= {"width", "height", "intrinsic"}:
+        return f"changed the size of {name}"
+    return f"changed the shader of {name}" if changed == {"shader_pack"} else f"changed {name}"

@@ -1,0 +1,125 @@
+"""What the page reads of the camera studio: immutable, a part of `SessionView`.
+
+Everything here is plain data and numpy. What can be done is in `camera_studio`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.core.camera_report import CameraReport
+from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.core.camera_suggestion import OfferedPlacement
+from workbench.core.pictures import CameraInfo, Picture
+
+if TYPE_CHECKING:
+    # libcst takes 0.2 s to import, and a page that writes no camera need not wait for it.
+    from workbench.authoring.camera_source import Refusal, SourceEdit
+
+WritingStage = Literal["none", "planned", "refused", "written", "checked", "mismatch", "undone"]
+"""``planned``: shown, not made. ``written``: in the file, the reload is awaited. ``checked``: the new env has what
+was written. ``mismatch``: it has something else. ``undone``: taken back out of the file."""
+
+
+@dataclass(frozen=True)
+class StudioCamera:
+    """One camera, as the file has it and as it is placed."""
+
+    key: CameraKey
+    info: CameraInfo
+    """Of the live camera; its `settings` are what the file says."""
+    now: CameraSettings | None
+    """As it is placed; equal to ``info.settings`` while it is untouched. None only where that is None."""
+    moved: bool
+    """It is placed otherwise than the file says."""
+    mount_pose: NDArray[np.float32] | None
+    """(7,) p and wxyz of its mount in the selected env's frame, at the shown moment. None: it stands still in the
+    env's frame."""
+    refused: str = ""
+    """Why it cannot be placed, as a sentence; empty where it can."""
+
+
+@dataclass(frozen=True)
+class Writing:
+    """How far a change is on its way into the file. One at a time."""
+
+    stage: WritingStage = "none"
+    key: CameraKey | None = None
+    """Whose: of a camera that is added, the new one's."""
+    edit: SourceEdit | None = None
+    refusal: Refusal | None = None
+    message: str = ""
+    """One sentence or two: what happened, and what to do next."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Of work in the background."""
+
+    what: str
+    done: int
+    total: int
+
+
+@dataclass(frozen=True)
+class Picked:
+    """What a pixel of a picture shows."""
+
+    key: CameraKey
+    env: int
+    u: float
+    """0 at the left border, 1 at the right."""
+    v: float
+    """0 at the top."""
+    pixel: tuple[int, int]
+    """Column and row."""
+    body: str | None
+    """Body name; None for the background."""
+    depth: float | None
+    """Metres along the optical axis; None for the background."""
+    point: tuple[float, float, float] | None
+    """Metres, in the env's frame; None for the background."""
+
+
+@dataclass(frozen=True)
+class StudioView:
+    cameras: tuple[StudioCamera, ...] = ()
+    selected: CameraKey | None = None
+    undo: str | None = None
+    """What `CameraStudio.undo` takes back, in words (``moved base_camera``); None if there is nothing."""
+    redo: str | None = None
+    writing: Writing = Writing()
+    report: CameraReport | None = None
+    """Of the last judgement."""
+    report_of: CameraKey | None = None
+    report_seeds: int = 0
+    """Fresh episodes that it is of; 0 for the envs at the moment that was shown."""
+    report_stale: bool = False
+    """The camera was moved since."""
+    suggestions: tuple[OfferedPlacement, ...] = ()
+    """Best first."""
+    suggestions_of: CameraKey | None = None
+    compared: tuple[Picture, Picture] | None = None
+    """The camera as it is placed, and as `CameraStudio.compare` was told."""
+    picked: Picked | None = None
+    sheet: tuple[Picture, ...] = ()
+    """The selected camera's picture in every env, worst first where it was judged."""
+    progress: Progress | None = None
+    """None while nothing runs in the background."""
+    problem: str = ""
+    """What went wrong last, or was decided over the author's head, as a sentence."""
+    serial: int = 0
+    """Grows with every change of anything but `StudioCamera.mount_pose`."""
+
+    def camera(self, key: CameraKey | None) -> StudioCamera | None:
+        """The camera of that key; None if there is none."""
+        return next((camera for camera in self.cameras if camera.key == key), None)
+
+    @property
+    def chosen(self) -> StudioCamera | None:
+        """The selected camera."""
+        return self.camera(self.selected)

@@ -1,0 +1,163 @@
+"""Two placements of one camera side by side: the one now, and the file's or one that was kept as A.
+
+Two pictures one after the other cannot be compared from memory. Both are of the same moment of the selected env, and
+what differs between the placements is said under them in numbers.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import viser
+
+from workbench.core import camera_frames as frames
+from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.session.session import Session
+from workbench.session.studio_view import StudioCamera
+from workbench.session.view import SessionView
+from workbench.ui.camera_work import WorkBar
+from workbench.ui.checked import checked_choice
+from workbench.ui.fragments import render
+from workbench.ui.inline_pictures import data_address
+
+FILE, KEPT = "as in the file", "as kept (A)"
+LARGEST = 256
+"""Pixels along the longer side of each picture."""
+
+
+class CameraCompare:
+    """The folder in the present container."""
+
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._session = session
+        self._kept: dict[CameraKey, CameraSettings] = {}
+        self._asked: tuple[CameraKey, CameraSettings, CameraSettings, str] | None = None
+        self._drawn: object = None
+        with server.gui.add_folder("Compare", expand_by_default=False) as self.folder:
+            self._other = server.gui.add_dropdown(
+                "Now, with",
+                (FILE, KEPT),
+                hint="The placement that stands beside the one that the camera has now.",
+            )
+            self._keep = server.gui.add_button(
+                "Keep this placement as A",
+                icon=viser.Icon.PIN,
+                color="gray",
+                hint="To compare it later, or return to it.",
+            )
+            self._compare = server.gui.add_button("Show side by side", icon=viser.Icon.COLUMNS_2)
+            self._bar = WorkBar(server, session)
+            self._html = server.gui.add_html("", visible=False)
+            self._take = server.gui.add_button(
+                "Place it as A", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
+            )
+        self._keep.on_click(lambda _: self._keep_now())
+        self._compare.on_click(self._ask)
+        self._take.on_click(lambda _: self._take_kept())
+
+    def _chosen(self) -> StudioCamera | None:
+        return self._session.view().studio.chosen
+
+    def _keep_now(self) -> None:
+        camera = self._chosen()
+        if camera is not None and camera.now is not None:
+            self._kept[camera.key] = camera.now
+            self._other.value = KEPT
+
+    def _take_kept(self) -> None:
+        camera = self._chosen()
+        if camera is not None and camera.key in self._kept:
+            self._session.studio.place(camera.key, self._kept[camera.key])
+
+    def _ask(self, event: viser.GuiEvent) -> None:
+        camera = self._chosen()
+        if camera is None or camera.now is None or camera.info.settings is None:
+            return
+        try:
+            choice = checked_choice(self._other.value, (FILE, KEPT), "choice")
+            if choice == KEPT and camera.key not in self._kept:
+                raise ValueError(
+                    "Nothing is kept of this camera yet: press Keep this placement as A, then move it."
+                )
+        except ValueError as error:
+            if event.client is not None:
+                event.client.add_notification(
+                    "Not possible", str(error), color="orange", auto_close_seconds=6.0
+                )
+            return
+        other = camera.info.settings if choice == FILE else self._kept[camera.key]
+        self._asked = (camera.key, camera.now, other, choice)
+        self._bar.asked()
+        self._session.studio.compare(camera.key, other)
+
+    def draw(self, view: SessionView) -> None:
+        studio = view.studio
+        camera = studio.chosen
+        usable = camera is not None and camera.now is not None
+        self._bar.draw(studio.progress)
+        for button in (self._keep, self._compare):
+            if button.disabled == usable:
+                button.disabled = not usable
+        kept = None if camera is None else self._kept.get(camera.key)
+        back = camera is not None and kept is not None and kept != camera.now
+        if self._take.visible != back:
+            self._take.visible = back
+        both = studio.compared
+        mine = (
+            both is not None
+            and camera is not None
+            and all((picture.kind, picture.camera) == camera.key for picture in both)
+        )
+        wanted = (id(both) if mine else None, None if camera is None else camera.now)
+        if wanted == self._drawn:
+            return
+        self._drawn = wanted
+        if self._html.visible != mine:
+            self._html.visible = mine
+        if not mine or both is None or camera is None or both[0].rgb is None or both[1].rgb is None:
+            return
+        asked = self._asked if self._asked is not None and self._asked[0] == camera.key else None
+        content = render(
+            "camera_pair",
+            pictures=[data_address(picture.rgb, LARGEST) for picture in both if picture.rgb is not None],
+            captions=(
+                "now" if asked is None or asked[1] == camera.now else "as it was then",
+                "the other" if asked is None else asked[3],
+            ),
+            env=both[0].env,
+            differences=[] if asked is None else what_differs(asked[2], asked[1]),
+        )
+        if self._html.content != content:
+            self._html.content = content
+
+
+def what_differs(old: CameraSettings, new: CameraSettings) -> list[str]:
+    """What `new` has otherwise than `old`, each in a few words; empty if nothing is."""
+    said = []
+    moved = float(np.linalg.norm(np.subtract(new.position, old.position)))
+    if moved > 1e-6:
+        said.append(f"moved {1000 * moved:.1f} mm" if moved < 0.1 else f"moved {moved:.3f} m")
+    turned = angle_between(old.quaternion, new.quaternion)
+    if turned > 1e-4:
+        said.append(f"turned {turned:.2f}°")
+    if old.fov is not None and new.fov is not None and abs(old.fov - new.fov) > 1e-9:
+        said.append(f"fov {math.degrees(old.fov):.1f}° → {math.degrees(new.fov):.1f}°")
+    elif old.fov != new.fov or old.intrinsic != new.intrinsic:
+        said.append("another lens")
+    if (old.width, old.height) != (new.width, new.height):
+        said.append(f"{old.width} × {old.height} → {new.width} × {new.height}")
+    for name in ("near", "far"):
+        if getattr(old, name) != getattr(new, name):
+            said.append(f"{name} {getattr(old, name):g} → {getattr(new, name):g} m")
+    if old.shader_pack != new.shader_pack:
+        said.append(f"shader {old.shader_pack} → {new.shader_pack}")
+    return said
+
+
+def angle_between(first: tuple[float, ...], second: tuple[float, ...]) -> float:
+    """Degrees between two orientations (4,) wxyz."""
+    turn = frames.rotation_matrix(first).T @ frames.rotation_matrix(second)
+    # Of the skew part too: the arc cosine alone knows no angle below some 1e-8 and is blunt below 1e-4.
+    skew = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    return math.degrees(math.atan2(float(np.linalg.norm(skew)), float(np.trace(turn)) - 1))

@@ -1,0 +1,182 @@
+"""A camera in other programs' words: its matrices in a convention of one's choice, files of it, and a calibration read in.
+
+A matrix of sixteen numbers does not say what it is. Which way it goes and what the camera's axes are called is
+therefore chosen here, stands beside the numbers that are shown, and holds for what is pasted too.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Literal
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.core import camera_frames as frames
+from workbench.core.camera_frames import Convention, Direction
+from workbench.session.session import Session
+from workbench.session.studio_view import StudioCamera
+from workbench.session.view import SessionView
+from workbench.ui.checked import checked_choice
+from workbench.ui.fragments import render
+
+Form = Literal["json", "opencv", "ros"]
+CONVENTIONS: dict[str, Convention] = {"OpenCV": "opencv", "OpenGL": "opengl", "ManiSkill": "maniskill"}
+AXES = {
+    "opencv": "x right, y down, z forward",
+    "opengl": "x right, y up, z backward",
+    "maniskill": "x forward, y left, z up",
+}
+DIRECTIONS: dict[str, Direction] = {
+    "world to camera": "world_to_camera",
+    "camera to world": "camera_to_world",
+}
+FORMS: dict[str, tuple[Form, str]] = {
+    "JSON": ("json", "json"),
+    "OpenCV YAML": ("opencv", "yaml"),
+    "ROS CameraInfo": ("ros", "yaml"),
+}
+THIS, ALL = "this camera", "all cameras"
+LONGEST = 20_000
+"""Characters of a calibration that is pasted."""
+
+
+class CameraExport:
+    """The folder in the present container."""
+
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._session = session
+        self._drawn: object = None
+        with server.gui.add_folder("Matrices and files", expand_by_default=False) as self.folder:
+            self._convention = server.gui.add_dropdown(
+                "Convention",
+                tuple(CONVENTIONS),
+                hint="What the camera's own axes are called: of what is shown, and of what is pasted.",
+            )
+            self._direction = server.gui.add_dropdown(
+                "Direction",
+                tuple(DIRECTIONS),
+                hint="OpenCV's extrinsic goes from world to camera; a pose goes from camera to world.",
+            )
+            self._html = server.gui.add_html("")
+            self._form = server.gui.add_dropdown("File", tuple(FORMS))
+            self._which = server.gui.add_dropdown("Of", (THIS, ALL))
+            self._download = server.gui.add_button("Download", icon=viser.Icon.DOWNLOAD)
+            self._text = server.gui.add_text(
+                "Calibration",
+                "",
+                multiline=True,
+                hint="Paste a matrix of 4 x 4 or 3 x 4 numbers, our JSON, or an OpenCV YAML. It is read in the "
+                "convention and direction chosen above.",
+            )
+            self._import = server.gui.add_button(
+                "Place the camera by it", icon=viser.Icon.FILE_IMPORT, color="gray"
+            )
+        self._download.on_click(self._on_download)
+        self._import.on_click(self._on_import)
+
+    def _choices(self) -> tuple[Convention, Direction]:
+        """Raises ValueError with a sentence."""
+        convention = checked_choice(self._convention.value, CONVENTIONS, "convention")
+        return CONVENTIONS[convention], DIRECTIONS[
+            checked_choice(self._direction.value, DIRECTIONS, "direction")
+        ]
+
+    def _on_download(self, event: viser.GuiEvent) -> None:
+        view = self._session.view()
+        camera = view.studio.chosen
+        if event.client is None or camera is None:
+            return
+        try:
+            form, suffix = FORMS[checked_choice(self._form.value, FORMS, "kind of file")]
+            every = checked_choice(self._which.value, (THIS, ALL), "choice") == ALL
+            keys = tuple(c.key for c in view.studio.cameras) if every else (camera.key,)
+            text = self._session.studio.export(keys, form)
+        except ValueError as error:
+            event.client.add_notification("Not possible", str(error), color="orange", auto_close_seconds=8.0)
+            return
+        name = "cameras" if every else camera.key[1]
+        event.client.send_file_download(
+            file_name(name, form, suffix), text.encode("utf-8"), save_immediately=True
+        )
+
+    def _on_import(self, event: viser.GuiEvent) -> None:
+        camera = self._session.view().studio.chosen
+        if event.client is None or camera is None:
+            return
+        try:
+            text = self._text.value
+            if not isinstance(text, str) or len(text) > LONGEST:
+                raise ValueError(f"The calibration is longer than {LONGEST} characters.")
+            if not text.strip():
+                raise ValueError(
+                    "Paste a calibration into the field first: a matrix, our JSON, or an OpenCV YAML."
+                )
+            convention, direction = self._choices()
+            self._session.studio.import_pose(camera.key, text, direction, convention)
+        except ValueError as error:
+            event.client.add_notification("Not placed", str(error), color="orange", auto_close_seconds=12.0)
+
+    def draw(self, view: SessionView) -> None:
+        camera = view.studio.chosen
+        idle = camera is None or camera.now is None
+        for button in (self._download, self._import):
+            if button.disabled != idle:
+                button.disabled = idle
+        try:
+            convention, direction = self._choices()
+        except ValueError:
+            return
+        mount = None if camera is None or camera.mount_pose is None else camera.mount_pose.tobytes()
+        wanted = (convention, direction, None if camera is None else (camera.key, camera.now), mount)
+        if wanted != self._drawn:
+            self._drawn = wanted
+            self._html.content = matrices_html(camera, convention, direction)
+
+
+def file_name(name: str, form: Form, suffix: str) -> str:
+    """A name for the download: what a camera may be called is no matter for a file system."""
+    plain = re.sub(r"[^A-Za-z0-9_-]+", "_", name).strip("_") or "camera"
+    return f"{plain[:60]}{'' if form == 'json' else f'_{form}'}.{suffix}"
+
+
+def matrices_html(camera: StudioCamera | None, convention: Convention, direction: Direction) -> str:
+    """Intrinsic and extrinsic of the camera as it is placed, in the env's frame."""
+    if camera is None or camera.now is None:
+        return render("note", text="Choose a camera first.")
+    pose = frames.pose_of(camera.now)
+    if camera.mount_pose is not None:
+        pose = frames.compose(camera.mount_pose, pose)
+    extrinsic = frames.matrix_of(pose, convention, direction)
+    intrinsic = frames.intrinsic_of(camera.now)
+    ways = {
+        "world_to_camera": "of the env's frame (metres, z up) into the camera's",
+        "camera_to_world": "of the camera's frame into the env's (metres, z up)",
+    }
+    return render(
+        "camera_matrices",
+        extrinsic=aligned(extrinsic),
+        extrinsic_copy=as_lists(extrinsic),
+        about=f"takes points {ways[direction]}; the camera's axes: {AXES[convention]}",
+        mount=""
+        if camera.info.mount is None
+        else f"It rides on {camera.info.mount}: as it is in this env at this moment.",
+        intrinsic=aligned(intrinsic),
+        intrinsic_copy=as_lists(intrinsic),
+        lens="OpenCV's pinhole, in pixels from the outer corner of the upper left one",
+        size=f"{camera.now.width} × {camera.now.height}",
+    )
+
+
+def aligned(matrix: NDArray[np.float64]) -> str:
+    """Rows of a matrix with their points under each other, to be read."""
+    cells = [[f"{number + 0.0:.4f}".replace("-0.0000", "0.0000") for number in row] for row in matrix]
+    width = max(len(cell) for row in cells for cell in row)
+    return "\n".join("  ".join(cell.rjust(width) for cell in row) for row in cells)
+
+
+def as_lists(matrix: NDArray[np.float64]) -> str:
+    """The matrix as Python and JSON write it, to be copied: nine digits, more than a calibration has."""
+    rows = (", ".join(f"{number + 0.0:.9g}" for number in row) for row in matrix)
+    return "[" + ", ".join(f"[{row}]" for row in rows) + "]"

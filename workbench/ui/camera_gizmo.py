@@ -1,0 +1,205 @@
+"""The handles on the chosen camera in the 3-D view: one to move and turn it, or an eye and a target.
+
+viser has one gizmo, which always lies along its own axes, and knows no steps. So turning about the world's axes is
+done here: that gizmo lies along the world's axes when it is taken, and what it was turned by since is put on the
+camera. Steps are made here too: the camera jumps in steps while the gizmo follows the hand, and is put where the
+camera is when it is let go.
+
+While somebody holds it, it belongs to them: a pose that the server writes then would pull it out of their hand.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import viser
+
+from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.session.studio_view import StudioCamera
+from workbench.ui.camera_moves import Floats, Frame, Snap, looking_at, snapped, turned_in_world
+from workbench.ui.placing import Placing
+
+LEFT_ALONE = 5.0
+"""Seconds without a movement after which a gizmo that was never let go (a page that went away) is free again."""
+PIXELS = 75.0
+TARGET_PIXELS = 45.0
+SIGHT_COLOUR = (34, 139, 230)
+UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+class CameraGizmo:
+    """There while a camera is chosen.
+
+    Args:
+        snap: the steps that are chosen.
+        own_axes: whether it lies along the camera's own axes.
+        look_at: whether there are an eye and a target in its place.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        placing: Placing,
+        snap: Callable[[], Snap],
+        own_axes: Callable[[], bool],
+        look_at: Callable[[], bool],
+    ) -> None:
+        self._server, self._placing = server, placing
+        self._snap, self._own_axes, self._look_at = snap, own_axes, look_at
+        scene = server.scene
+        # A fixed size on the screen: in a grid of sixteen envs one of 10 cm would be a dot.
+        self._camera = scene.add_transform_controls(
+            "/studio/camera", PIXELS, fixed=True, depth_test=False, visible=False
+        )
+        self._eye = scene.add_transform_controls(
+            "/studio/eye", PIXELS, fixed=True, depth_test=False, disable_rotations=True, visible=False
+        )
+        self._target = scene.add_transform_controls(
+            "/studio/target",
+            TARGET_PIXELS,
+            fixed=True,
+            depth_test=False,
+            disable_rotations=True,
+            visible=False,
+        )
+        self._line: viser.LineSegmentsHandle | None = None
+        self._drawn_line: object = None
+        self._held_at = -1e9
+        self._start: tuple[CameraKey, CameraSettings, Frame, Floats, Floats] | None = None
+        # Async: callbacks in viser's pool of threads would come in any order.
+        self._camera.on_update(self._on_camera)
+        self._eye.on_update(self._on_eye)
+        self._target.on_update(self._on_target)
+
+    @property
+    def held(self) -> bool:
+        return self._start is not None and time.monotonic() - self._held_at < LEFT_ALONE
+
+    def draw(self, camera: StudioCamera | None) -> None:
+        """Put the handles on this camera; None takes them away."""
+        if self.held:
+            if camera is not None:
+                self._draw_line(camera)
+            return
+        self._start = None
+        two = camera is not None and self._look_at()
+        for handle, shown in (
+            (self._camera, camera is not None and not two),
+            (self._eye, two),
+            (self._target, two),
+        ):
+            if handle.visible != shown:
+                handle.visible = shown
+        self._draw_line(camera)
+        if camera is None or camera.now is None:
+            return
+        pose = self._placing.frame(camera).to_view(camera.now)
+        _move(self._camera, pose[:3], pose[3:] if self._own_axes() else UNTURNED)
+        _move(self._eye, pose[:3], UNTURNED)
+        _move(self._target, self._placing.target_in_view(camera, camera.now), UNTURNED)
+
+    def _draw_line(self, camera: StudioCamera | None) -> None:
+        """From the eye to the target, which otherwise would be any three arrows in the air."""
+        wanted = None
+        if camera is not None and camera.now is not None and self._look_at():
+            eye = self._placing.frame(camera).to_view(camera.now)[:3]
+            wanted = np.stack([eye, self._placing.target_in_view(camera, camera.now)])[None].astype(
+                np.float32
+            )
+        shown = None if wanted is None else wanted.tobytes()
+        if shown == self._drawn_line:
+            return
+        self._drawn_line = shown
+        if wanted is None:
+            if self._line is not None:
+                self._line.visible = False
+        elif self._line is None:
+            self._line = self._server.scene.add_line_segments(
+                "/studio/line of sight", wanted, colors=SIGHT_COLOUR, thickness=2.0, thickness_units="screen"
+            )
+        else:
+            self._line.points, self._line.visible = wanted, True
+
+    # --- what the hand does ----------------------------------------------------------------------------
+
+    def _take(self) -> bool:
+        camera = self._placing.camera
+        if camera is None or camera.now is None:
+            return False
+        frame = self._placing.frame(camera)
+        pose = frame.to_view(camera.now)
+        self._start = (
+            camera.key,
+            camera.now,
+            frame,
+            pose,
+            self._placing.target_in_view(camera, camera.now),
+        )
+        self._placing.begin()
+        return True
+
+    def _went_on(self, phase: str) -> tuple[CameraKey, CameraSettings, Frame, Floats, Floats] | None:
+        """The camera as it was taken, while it is dragged."""
+        self._held_at = time.monotonic()
+        if (phase == "start" or self._start is None) and not self._take():
+            return None
+        start = self._start
+        if phase == "end":
+            self._start = None
+            self._placing.begin()
+        return start if phase == "update" else None
+
+    async def _on_camera(self, event: viser.TransformControlsEvent) -> None:
+        start = self._went_on(event.phase)
+        if start is None:
+            return
+        key, settings, frame, pose, target = start
+        position, wxyz = event.target.position, event.target.wxyz
+        try:
+            if self._own_axes():
+                moved = np.concatenate([position, wxyz])
+            else:
+                moved = turned_in_world(pose, position, wxyz)
+            moved = snapped(pose, moved, self._snap(), self._own_axes(), frame.offset)
+            self._placing.place(key, frame.from_view(settings, moved), "gizmo")
+        except ValueError as error:
+            self._refuse(event, error)
+            return
+        self._placing.set_distance(key, float(np.linalg.norm(target - pose[:3])))
+
+    async def _on_eye(self, event: viser.TransformControlsEvent) -> None:
+        self._look(event, moves_eye=True)
+
+    async def _on_target(self, event: viser.TransformControlsEvent) -> None:
+        self._look(event, moves_eye=False)
+
+    def _look(self, event: viser.TransformControlsEvent, moves_eye: bool) -> None:
+        start = self._went_on(event.phase)
+        if start is None:
+            return
+        key, settings, frame, pose, target = start
+        before = pose[:3] if moves_eye else target
+        at = np.concatenate([before, UNTURNED]), np.concatenate([event.target.position, UNTURNED])
+        there = snapped(*at, Snap(metres=self._snap().metres), False, frame.offset)[:3]
+        eye, target = (there, target) if moves_eye else (pose[:3], there)
+        try:
+            self._placing.place(key, frame.from_view(settings, looking_at(pose, eye, target)), "gizmo")
+        except ValueError as error:
+            self._refuse(event, error)
+            return
+        self._placing.set_distance(key, float(np.linalg.norm(target - eye)))
+
+    def _refuse(self, event: viser.TransformControlsEvent, error: ValueError) -> None:
+        """Let go, so that it is put back to where the camera is."""
+        self._start = None
+        if event.client is not None:
+            event.client.add_notification("Not possible", str(error), color="orange", auto_close_seconds=6.0)
+
+
+def _move(handle: viser.TransformControlsHandle, position: Floats, wxyz: Floats) -> None:
+    if not np.allclose(handle.position, position, atol=1e-7):
+        handle.position = position
+    if not np.allclose(handle.wxyz, wxyz, atol=1e-7):
+        handle.wxyz = wxyz

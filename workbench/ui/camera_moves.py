@@ -1,0 +1,224 @@
+"""What a hand's movement makes of a camera's settings: pure functions between the 3-D view and the config.
+
+A camera is moved in the view, where an env stands at its offset in the grid and a mounted camera goes with its link;
+it is written in the frame of its mount. `Frame` is the way between the two. All else here takes a pose in one of
+them and gives another: a turn about the world's axes, snapping, a step with a key, "here is the eye, there the
+target". So the gizmo, the keys and the number fields cannot disagree about what a movement means.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from workbench.core.camera_frames import (
+    LookAt,
+    axes_of,
+    compose,
+    intrinsic_of,
+    look_at_of,
+    make_pose,
+    pose_from_look_at,
+    pose_from_matrix,
+    pose_of,
+    quaternion_of,
+    relative_to,
+    rotation_matrix,
+    with_pose,
+)
+from workbench.core.camera_settings import CameraSettings
+
+Floats = NDArray[np.float64]
+
+NEAREST, FARTHEST, USUAL = 0.1, 3.0, 1.0
+"""Metres in front of the eye at which the target of a camera is put that has none yet."""
+SAME = 1e-7
+"""Metres, and parts of a unit quaternion: what viser's numbers of 32 bit may differ by."""
+
+
+@dataclass(frozen=True)
+class Snap:
+    """Steps of a gizmo; 0 for none."""
+
+    metres: float = 0.0
+    degrees: float = 0.0
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where the numbers of a camera's config are said, as seen in the 3-D view."""
+
+    mount: NDArray[np.float32] | None
+    """(7,) of the link that it rides on, in the env's frame; None for one that stands still."""
+    offset: NDArray[np.float32]
+    """(3,) where its env stands in the view."""
+
+    def to_view(self, settings: CameraSettings) -> Floats:
+        """(7,) where the camera is in the view."""
+        pose = self.to_env(settings)
+        pose[:3] += self.offset
+        return pose
+
+    def to_env(self, settings: CameraSettings) -> Floats:
+        """(7,) where the camera is in its env."""
+        pose = pose_of(settings)
+        return pose if self.mount is None else compose(self.mount, pose)
+
+    def from_view(self, settings: CameraSettings, pose: ArrayLike) -> CameraSettings:
+        """The same camera, at this pose (7,) of the view."""
+        there = np.array(pose, np.float64)
+        there[:3] -= self.offset
+        moved = with_pose(settings, there if self.mount is None else relative_to(self.mount, there))
+        # There and back costs last digits: what was not moved is not said anew.
+        if np.allclose(moved.position, settings.position, rtol=0, atol=SAME):
+            moved = replace(moved, position=settings.position)
+        if np.allclose(moved.quaternion, settings.quaternion, rtol=0, atol=SAME):
+            moved = replace(moved, quaternion=settings.quaternion)
+        return moved
+
+    def point_to_view(self, point: ArrayLike) -> Floats:
+        """(3,) of a point (3,) that is said as the camera's position is."""
+        there = np.asarray(point, np.float64)
+        if self.mount is not None:
+            there = compose(self.mount, make_pose(there, (1, 0, 0, 0)))[:3]
+        return there + self.offset
+
+    def point_from_view(self, point: ArrayLike) -> Floats:
+        there = np.asarray(point, np.float64) - self.offset
+        if self.mount is None:
+            return there
+        return relative_to(self.mount, make_pose(there, (1, 0, 0, 0)))[:3]
+
+
+def usual_distance(pose: ArrayLike) -> float:
+    """How far before a camera its target is put: where it looks at the height 0 of its env, if that is near."""
+    p = np.asarray(pose, np.float64)
+    forward = axes_of(p[3:])[0]
+    if abs(forward[2]) < 1e-6:
+        return USUAL
+    distance = -float(p[2] / forward[2])
+    return distance if NEAREST <= distance <= FARTHEST else USUAL
+
+
+def target_of(pose: ArrayLike, distance: float) -> Floats:
+    p = np.asarray(pose, np.float64)
+    return p[:3] + distance * axes_of(p[3:])[0]
+
+
+def looking_at(pose: ArrayLike, eye: ArrayLike, target: ArrayLike) -> Floats:
+    """(7,) the camera at `eye` that looks at `target`, turned about its line of sight as `pose` is.
+
+    Raises:
+        ValueError: eye and target are one point.
+    """
+    return pose_from_look_at(LookAt(_triple(eye), _triple(target), look_at_of(pose).roll))
+
+
+def turned_in_world(start: ArrayLike, position: ArrayLike, turn: ArrayLike) -> Floats:
+    """(7,) the pose `start`, turned by the quaternion `turn` about the axes of the world, at another position."""
+    s = np.asarray(start, np.float64)
+    turned = rotation_matrix(turn) @ rotation_matrix(s[3:])
+    return make_pose(position, quaternion_of(turned))
+
+
+def snapped(start: ArrayLike, pose: ArrayLike, snap: Snap, own_axes: bool, origin: ArrayLike) -> Floats:
+    """(7,) the pose that a gizmo was dragged to, in whole steps.
+
+    Along the world's axes the position falls on a grid, so that round numbers are written; along the camera's own it
+    goes in steps from where the drag began. It turns in steps from how it stood.
+
+    Args:
+        origin: (3,) of the grid.
+    """
+    s, p = np.asarray(start, np.float64), np.array(pose, np.float64)
+    was, is_now = rotation_matrix(s[3:]), rotation_matrix(p[3:])
+    moved = p[:3] - s[:3]
+    if snap.metres and own_axes:
+        p[:3] = s[:3] + was @ (np.round(was.T @ moved / snap.metres) * snap.metres)
+    elif snap.metres:
+        # An axis that is not dragged along stays as it is, also off the grid.
+        grid = np.asarray(origin, np.float64)
+        on_grid = np.round((p[:3] - grid) / snap.metres) * snap.metres + grid
+        p[:3] = np.where(np.abs(moved) > 1e-6, on_grid, p[:3])
+    if snap.degrees:
+        p[3:] = quaternion_of(_in_steps(is_now @ was.T, math.radians(snap.degrees)) @ was)
+    return p
+
+
+def nudged(pose: ArrayLike, step: Sequence[float]) -> Floats:
+    """(7,) moved by (forward, left, up) metres along the camera's own axes."""
+    p = np.array(pose, np.float64)
+    p[:3] += rotation_matrix(p[3:]) @ np.asarray(step, np.float64)
+    return p
+
+
+def panned(pose: ArrayLike, left: float, up: float) -> Floats:
+    """(7,) turned in place: to the left about the vertical, and up, both in degrees."""
+    p = np.asarray(pose, np.float64)
+    a, b = math.radians(left), -math.radians(up)
+    about_z = np.array([[math.cos(a), -math.sin(a), 0], [math.sin(a), math.cos(a), 0], [0, 0, 1]])
+    about_left = np.array([[math.cos(b), 0, math.sin(b)], [0, 1, 0], [-math.sin(b), 0, math.cos(b)]])
+    return make_pose(p[:3], quaternion_of(about_z @ rotation_matrix(p[3:]) @ about_left))
+
+
+def viewer_pose(position: ArrayLike, wxyz: ArrayLike) -> Floats:
+    """(7,) of viser's own camera, which says its rotation in OpenCV's frame."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation_matrix(wxyz), np.asarray(position, np.float64)
+    return pose_from_matrix(matrix, "opencv", "camera_to_world")
+
+
+def fov_that_shows_all(fov: float, aspect: float, view_aspect: float) -> float:
+    """Vertical field of view of a view of another shape (width over height) in which the whole picture fits."""
+    return 2 * math.atan(math.tan(fov / 2) * max(1.0, aspect / view_aspect))
+
+
+def picture_corners(settings: CameraSettings, pose: ArrayLike, depth: float) -> Floats:
+    """(4, 3) where the borders of the picture meet, `depth` metres in front of a camera at this pose (7,)."""
+    k, p = intrinsic_of(settings), np.asarray(pose, np.float64)
+    forward, left, up = axes_of(p[3:])
+    w, h = settings.width, settings.height
+    right = (np.array([0, w, w, 0]) - k[0, 2]) / k[0, 0]
+    down = (np.array([0, 0, h, h]) - k[1, 2]) / k[1, 1]
+    return p[:3] + depth * (forward - right[:, None] * left - down[:, None] * up)
+
+
+def kept_where_equal(
+    exact: Sequence[float] | Floats, typed: Sequence[float], digits: int
+) -> tuple[float, ...]:
+    """The typed numbers, but the exact one where the field shows just that one rounded.
+
+    A field of three sends all three: without this, typing x would cut y and z to the digits on the page.
+    """
+    return tuple(
+        float(e) if round(float(e), digits) == round(float(t), digits) else float(t)
+        for e, t in zip(exact, typed, strict=True)
+    )
+
+
+def rounded(numbers: ArrayLike, digits: int) -> tuple[float, ...]:
+    """For a field; without the minus of a zero."""
+    return tuple(round(float(n), digits) + 0.0 for n in np.asarray(numbers, np.float64))
+
+
+def _in_steps(rotation: Floats, step: float) -> Floats:
+    """(3, 3) about the same axis, by a whole number of steps."""
+    cosine = min(1.0, max(-1.0, (float(np.trace(rotation)) - 1) / 2))
+    angle = math.acos(cosine)
+    whole = round(angle / step) * step
+    if whole == 0 or angle < 1e-9:
+        return np.eye(3)
+    # Of the quaternion, since the antisymmetric part of the matrix vanishes at half a turn.
+    axis = quaternion_of(rotation)[1:]
+    axis = axis / np.linalg.norm(axis)
+    k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + math.sin(whole) * k + (1 - math.cos(whole)) * k @ k
+
+
+def _triple(v: ArrayLike) -> tuple[float, float, float]:
+    x, y, z = map(float, np.asarray(v, np.float64))
+    return x, y, z

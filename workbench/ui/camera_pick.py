@@ -1,0 +1,157 @@
+"""Press on the chosen camera's picture, and be told what is there, how far it is, and where.
+
+The question behind "is the cube in the picture" is often "what is this pixel": the depth that a policy gets of it, and
+the name that its segmentation id stands for. The answer has the point in the env's own frame, where it is also marked
+in the 3-D view, so that one sees whether the camera looks at what one thinks.
+
+viser's pictures do not say where they are pressed. So a pane of our own HTML lies over the picture that stands before
+it in its container (``.wb-pane`` in page.css), as wide and as tall, and passes on where it was pressed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.session.session import Session
+from workbench.session.studio_view import Picked, StudioCamera
+from workbench.session.view import SessionView
+from workbench.ui.fragments import render
+from workbench.ui.presses import Presses
+
+MARK_COLOUR = (230, 73, 128)
+MARK_SIZE = 0.05
+"""Metres from the point to each end of its cross."""
+
+
+class CameraPick:
+    """The pane over the picture before it, what was found, and the mark in the view.
+
+    Make it in the container of the picture, which must be the last before it.
+    """
+
+    def __init__(self, server: viser.ViserServer, session: Session, presses: Presses) -> None:
+        """
+        Args:
+            presses: of the tab or of a folder with a name around it (what has no name hides what comes after it).
+        """
+        self._session = session
+        self._drawn: object = None
+        # After a picture that is put into the container later.
+        self._pane = server.gui.add_html("", order=1e5, visible=False)
+        self._found = server.gui.add_html("", order=1e5 + 1, visible=False)
+        self._press = presses.place_id("picture", lambda u, v, client: self._pick(u, v))
+        self._mark = PointMark(server)
+
+    def _pick(self, u: float, v: float) -> None:
+        key = self._session.view().studio.selected
+        if key is not None:
+            self._session.studio.pick(key, u, v)
+
+    def draw(self, view: SessionView, shown: bool) -> None:
+        """Draw what is new.
+
+        Args:
+            shown: whether the picture of the chosen camera is.
+        """
+        camera, picked = view.studio.chosen, picked_here(view)
+        for handle, wanted in (
+            (self._pane, shown and camera is not None),
+            (self._found, shown and picked is not None),
+        ):
+            if handle.visible != wanted:
+                handle.visible = wanted
+        size = None if camera is None else _size(camera)
+        if camera is None or not shown or (size, picked) == self._drawn:
+            return
+        self._drawn = (size, picked)
+        self._pane.content = pane_html(camera, picked, self._press)
+        if picked is not None:
+            self._found.content = found_html(picked)
+
+    def draw_in_view(self, view: SessionView, offset: NDArray[np.float32]) -> None:
+        """Mark the point that was picked.
+
+        Args:
+            offset: (3,) where the selected env stands in the view.
+        """
+        self._mark.draw(picked_here(view), offset)
+
+
+def picked_here(view: SessionView) -> Picked | None:
+    """What was picked, if it is of the camera and the env that are selected."""
+    picked = view.studio.picked
+    if picked is None or picked.key != view.studio.selected or picked.env != view.selected_env:
+        return None
+    return picked
+
+
+def pane_html(camera: StudioCamera, picked: Picked | None, press: str) -> str:
+    width, height = _size(camera)
+    return render(
+        "camera_pane",
+        press=press,
+        aspect=f"{width / height:.6f}",
+        picked=picked is not None,
+        left="" if picked is None else f"{100 * picked.u:.2f}",
+        top="" if picked is None else f"{100 * picked.v:.2f}",
+    )
+
+
+def _size(camera: StudioCamera) -> tuple[int, int]:
+    said = camera.info if camera.now is None else camera.now
+    return said.width, said.height
+
+
+def found_html(picked: Picked) -> str:
+    numbers = "" if picked.point is None else ", ".join(f"{x:.4f}" for x in picked.point)
+    return render(
+        "camera_found",
+        body=picked.body or "background",
+        pixel=f"{picked.pixel[0]}, {picked.pixel[1]}",
+        depth="" if picked.depth is None else f"{picked.depth:.4f}",
+        point=numbers,
+        copy=f"[{numbers}]",
+    )
+
+
+class PointMark:
+    """A cross and the body's name in the view, at a point of the selected env."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._cross: viser.LineSegmentsHandle | None = None
+        self._label: viser.LabelHandle | None = None
+        self._drawn: object = None
+
+    def draw(self, picked: Picked | None, offset: NDArray[np.float32]) -> None:
+        point = None if picked is None else picked.point
+        wanted = None if point is None or picked is None else (point, offset.tobytes(), picked.body)
+        if wanted == self._drawn:
+            return
+        self._drawn = wanted
+        if point is None or picked is None:
+            for handle in (self._cross, self._label):
+                if handle is not None:
+                    handle.remove()
+            self._cross = self._label = None
+            return
+        place = np.asarray(point, np.float64) + offset
+        text = picked.body or ""
+        if self._cross is None or self._label is None:
+            ends = np.eye(3, dtype=np.float32) * MARK_SIZE
+            self._cross = self._server.scene.add_line_segments(
+                "/picked/cross",
+                np.stack([-ends, ends], axis=1),
+                MARK_COLOUR,
+                thickness=3.0,
+                thickness_units="screen",
+                position=place,
+            )
+            self._label = self._server.scene.add_label(
+                "/picked/label", text, position=place, anchor="bottom-left"
+            )
+        else:
+            self._cross.position = place
+            self._label.position, self._label.text = place, text

@@ -1,0 +1,263 @@
+"""Suggest placements: what must be seen, where the eye may be, and the best five with their pictures.
+
+The bounds are two corners of a box in the env's frame, and begin as a box round the eye. They follow the camera until
+somebody writes into them. The box is drawn in the view on demand. A camera that rides on a body has no such place to
+search for, and the folder says so.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.core.camera_settings import CameraKey
+from workbench.core.camera_suggestion import OfferedPlacement
+from workbench.session.messages import TaskDescription
+from workbench.session.session import Session
+from workbench.session.studio_view import StudioCamera, StudioView
+from workbench.session.view import SessionView
+from workbench.ui.camera_work import WorkBar
+from workbench.ui.checked import checked_int, checked_number
+from workbench.ui.fragments import render
+from workbench.ui.inline_pictures import data_address
+from workbench.ui.presses import Presses
+
+ROOM = 0.3
+"""Metres from the eye to each side of the box that is first offered."""
+FARTHEST = 1000.0
+"""Metres: bounds beyond are a slip of the finger."""
+MOST_RESETS = 256
+LARGEST = 160
+BOX_COLOUR = (230, 73, 128)
+
+Corner = tuple[float, float, float]
+
+
+class CameraSuggest:
+    """The folder in the present container, and the box in the view."""
+
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._session = session
+        self._chosen: set[str] | None = None
+        self._names: tuple[str, ...] = ()
+        self._of: CameraKey | None = None
+        self._touched = False
+        self._drawn: object = None
+        self._drawn_names: object = None
+        with server.gui.add_folder("Suggest a placement", expand_by_default=False) as self.folder:
+            self._mounted = server.gui.add_html("", visible=False)
+            self._objects = server.gui.add_html("")
+            self._low = server.gui.add_vector3(
+                "Eye from",
+                (0.0, 0.0, 0.0),
+                step=0.05,
+                hint="Lowest corner of the box in which the eye may be, metres.",
+            )
+            self._high = server.gui.add_vector3(
+                "Eye to", (0.0, 0.0, 0.0), step=0.05, hint="Highest corner of that box, metres."
+            )
+            self._show_box = server.gui.add_checkbox(
+                "Draw this box", False, hint="In the 3-D view, in the selected env."
+            )
+            self._resets = server.gui.add_number(
+                "Resets",
+                8,
+                min=1,
+                max=MOST_RESETS,
+                step=1,
+                hint="Freshly reset envs in which a placement is judged; as many as there are envs at most.",
+            )
+            self._search = server.gui.add_button("Search", icon=viser.Icon.SEARCH)
+            self._bar = WorkBar(server, session)
+            self._offers = server.gui.add_html("", visible=False)
+            self._presses = Presses(server)
+        self._search.on_click(self._ask)
+        for corner in (self._low, self._high):
+            corner.on_update(self._on_touch)
+        self._box = BoundsBox(server)
+
+    # --- asked ---------------------------------------------------------------------------------------
+
+    def _on_touch(self, event: viser.GuiEvent) -> None:
+        if event.client is not None:
+            self._touched = True
+            self._show_box.value = True
+
+    def _toggle(self, name: str) -> None:
+        chosen = set(self._names) if self._chosen is None else self._chosen
+        self._chosen = chosen ^ {name}
+
+    def _bounds(self) -> tuple[Corner, Corner]:
+        """Raises ValueError with a sentence."""
+        corners = []
+        for handle, name in ((self._low, "eye's first corner"), (self._high, "eye's second corner")):
+            if not isinstance(handle.value, tuple) or len(handle.value) != 3:
+                raise ValueError(f"The {name} is not three numbers.")
+            corners.append([checked_number(number, -FARTHEST, FARTHEST, name) for number in handle.value])
+        low, high = np.minimum(*corners), np.maximum(*corners)
+        return (float(low[0]), float(low[1]), float(low[2])), (float(high[0]), float(high[1]), float(high[2]))
+
+    def _ask(self, event: viser.GuiEvent) -> None:
+        key = self._session.view().studio.selected
+        if key is None:
+            return
+        try:
+            wanted = tuple(n for n in self._names if self._chosen is None or n in self._chosen)
+            if not wanted:
+                raise ValueError("Choose at least one object that must be seen.")
+            low, high = self._bounds()
+            resets = checked_int(self._resets.value, 1, MOST_RESETS, "number of resets")
+        except ValueError as error:
+            if event.client is not None:
+                event.client.add_notification(
+                    "Not possible", str(error), color="orange", auto_close_seconds=6.0
+                )
+            return
+        self._bar.asked()
+        self._session.studio.suggest(key, wanted, low, high, resets)
+
+    # --- drawn ---------------------------------------------------------------------------------------
+
+    def draw(self, view: SessionView) -> None:
+        studio, camera = view.studio, view.studio.chosen
+        able = camera is not None and camera.now is not None and not camera.refused
+        if self._search.disabled == able:
+            self._search.disabled = not able
+        self._bar.draw(studio.progress)
+        self._draw_controls(camera)
+        self._draw_bounds(camera)
+        self._draw_names(view, studio)
+        wanted = (id(studio.suggestions), studio.selected, None if camera is None else camera.now)
+        if wanted == self._drawn:
+            return
+        self._drawn = wanted
+        mine = bool(studio.suggestions) and studio.suggestions_of == studio.selected
+        if self._offers.visible != mine:
+            self._offers.visible = mine
+        if mine and camera is not None:
+            content = self._offers_html(studio.suggestions, camera)
+            if self._offers.content != content:
+                self._offers.content = content
+
+    def _draw_controls(self, camera: StudioCamera | None) -> None:
+        mount = None if camera is None else camera.info.mount
+        for handle in (self._objects, self._low, self._high, self._show_box, self._resets, self._search):
+            if handle.visible != (mount is None):
+                handle.visible = mount is None
+        if self._mounted.visible != (mount is not None):
+            self._mounted.visible = mount is not None
+        if mount is not None:
+            content = render(
+                "note", text=f"It rides on {mount}: places are searched for cameras that stand still."
+            )
+            if self._mounted.content != content:
+                self._mounted.content = content
+
+    def _draw_bounds(self, camera: StudioCamera | None) -> None:
+        if camera is None or camera.now is None:
+            return
+        if camera.key != self._of:
+            self._of, self._touched, self._chosen = camera.key, False, None
+        if self._touched:
+            return
+        for handle, sign in ((self._low, -1), (self._high, 1)):
+            x, y, z = (round(number + sign * ROOM, 2) for number in camera.now.position)
+            if handle.value != (x, y, z):
+                handle.value = (x, y, z)
+
+    def _draw_names(self, view: SessionView, studio: StudioView) -> None:
+        names = () if view.task is None else objects_of(view.task, studio)
+        chosen = frozenset(names) if self._chosen is None else frozenset(self._chosen)
+        if (names, chosen) == self._drawn_names:
+            return
+        self._names, self._drawn_names = names, (names, chosen)
+        self._objects.content = render(
+            "camera_objects",
+            objects=[
+                {
+                    "name": name,
+                    "on": name in chosen,
+                    "press": self._presses.id_of(("object", name), lambda _, name=name: self._toggle(name)),
+                }
+                for name in names
+            ],
+        )
+
+    def _offers_html(self, suggestions: tuple[OfferedPlacement, ...], camera: StudioCamera) -> str:
+        return render(
+            "camera_offers",
+            offers=[
+                {
+                    "picture": "" if offer.picture.rgb is None else data_address(offer.picture.rgb, LARGEST),
+                    "score": f"{offer.score:.2f}",
+                    "words": offer.words,
+                    "eye": ", ".join(f"{x:.2f}" for x in offer.settings.position),
+                    "taken": camera.now is not None
+                    and (offer.settings.position, offer.settings.quaternion)
+                    == (camera.now.position, camera.now.quaternion),
+                    "press": self._presses.id_of(
+                        ("take", i), lambda _, i=i: self._session.studio.take_suggestion(i)
+                    ),
+                }
+                for i, offer in enumerate(suggestions)
+            ],
+        )
+
+    def draw_in_view(self, view: SessionView, offset: NDArray[np.float32]) -> None:
+        """Draw the box of the bounds.
+
+        Args:
+            offset: (3,) where the selected env stands in the view.
+        """
+        camera = view.studio.chosen
+        if self._show_box.value is not True or camera is None or camera.info.mount is not None:
+            self._box.draw(None, offset)
+            return
+        try:
+            low, high = self._bounds()
+        except ValueError:
+            self._box.draw(None, offset)
+            return
+        self._box.draw(box_edges(low, high), offset)
+
+
+def objects_of(task: TaskDescription, studio: StudioView) -> tuple[str, ...]:
+    """Names of what may be asked to be seen: as the last report has them, or before it the actors that can move.
+
+    Only the worker knows which articulation is the robot, so other articulations are offered after a judgement.
+    """
+    if studio.report is not None:
+        return tuple(thing.name for thing in studio.report.wanted_objects())
+    names = zip(task.geometry.body_names, task.geometry.body_kinds, strict=True)
+    return tuple(name for name, kind in names if kind == "dynamic")
+
+
+def box_edges(low: Corner, high: Corner) -> NDArray[np.float32]:
+    """(12, 2, 3) the edges of a box."""
+    picks = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
+    corners = np.where(picks == 0, low, high)
+    pairs = [(i, j) for i in range(8) for j in range(i) if np.abs(picks[i] - picks[j]).sum() == 1]
+    return corners[np.array(pairs)].astype(np.float32)
+
+
+class BoundsBox:
+    """The edges of one box in the view."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._handle: viser.LineSegmentsHandle | None = None
+
+    def draw(self, edges: NDArray[np.float32] | None, offset: NDArray[np.float32]) -> None:
+        if edges is None:
+            if self._handle is not None:
+                self._handle.remove()
+                self._handle = None
+            return
+        points = edges + offset
+        if self._handle is None:
+            self._handle = self._server.scene.add_line_segments(
+                "/bounds of the eye", points, BOX_COLOUR, thickness=2.0, thickness_units="screen"
+            )
+        elif not np.array_equal(self._handle.points, points):
+            self._handle.points = points

@@ -1,0 +1,217 @@
+"""Judge a camera: over the envs as they stand or over fresh resets, as a table; and the pictures of all envs.
+
+The table says of each object in how many envs it is seen, how large, and what is in its way; the bars say how far
+away is what the camera sees, with planes that would fit it. The sheet has the selected camera's picture of every env,
+worst first once it was judged; pressing one selects that env.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import viser
+
+from workbench.core.camera_report import CameraReport
+from workbench.core.pictures import Picture
+from workbench.session.session import Session
+from workbench.session.studio_view import StudioCamera, StudioView
+from workbench.session.view import SessionView
+from workbench.ui import camera_report_words as words
+from workbench.ui.camera_work import WorkBar
+from workbench.ui.checked import checked_choice, checked_int
+from workbench.ui.fragments import render
+from workbench.ui.inline_pictures import data_address
+from workbench.ui.presses import Presses
+
+AS_THEY_ARE, FRESH = "the envs as they are", "fresh resets"
+MOST_RESETS = 1000
+MOST_PICTURES = 64
+"""On the sheet: the worst of them."""
+THUMBNAIL = 128
+"""Pixels along the longer side of a picture on the sheet."""
+
+
+class CameraVerdict:
+    """The folder in the present container."""
+
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._session = session
+        self._drawn: object = None
+        self._drawn_sheet: object = None
+        with server.gui.add_folder("Judge", expand_by_default=False) as self.folder:
+            self._over = server.gui.add_dropdown(
+                "Over",
+                (AS_THEY_ARE, FRESH),
+                hint="The envs at their present moment, or freshly reset ones with other seeds, in a process beside.",
+            )
+            self._resets = server.gui.add_number(
+                "Resets",
+                32,
+                min=1,
+                max=MOST_RESETS,
+                step=1,
+                visible=False,
+                hint="How many, each with a seed of its own.",
+            )
+            self._judge = server.gui.add_button("Judge this camera", icon=viser.Icon.CHECKLIST)
+            self._bar = WorkBar(server, session)
+            self._report = server.gui.add_html("", visible=False)
+            self._sheet = server.gui.add_button(
+                "Pictures of all envs", icon=viser.Icon.LAYOUT_GRID, color="gray"
+            )
+            self._sheet_bar = WorkBar(server, session)
+            self._pictures = server.gui.add_html("", visible=False)
+            self._presses = Presses(server)
+        self._judge.on_click(self._ask)
+        self._sheet.on_click(lambda _: self._ask_for_sheet())
+
+    # --- asked ---------------------------------------------------------------------------------------
+
+    def _ask(self, event: viser.GuiEvent) -> None:
+        key = self._session.view().studio.selected
+        if key is None:
+            return
+        try:
+            fresh = checked_choice(self._over.value, (AS_THEY_ARE, FRESH), "choice") == FRESH
+            seeds = checked_int(self._resets.value, 1, MOST_RESETS, "number of resets") if fresh else 0
+        except ValueError as error:
+            if event.client is not None:
+                event.client.add_notification(
+                    "Not possible", str(error), color="orange", auto_close_seconds=6.0
+                )
+            return
+        self._bar.asked()
+        self._session.studio.judge(key, seeds)
+
+    def _ask_for_sheet(self) -> None:
+        key = self._session.view().studio.selected
+        if key is not None:
+            self._sheet_bar.asked()
+            self._session.studio.make_sheet(key)
+
+    def _use(self, plane: str) -> None:
+        studio = self._session.view().studio
+        camera, report = studio.chosen, studio.report
+        if camera is None or camera.now is None or report is None or studio.report_of != camera.key:
+            return
+        value = report.depth.suggested_near if plane == "near" else report.depth.suggested_far
+        if value is None:
+            return
+        wanted = replace(camera.now, near=value) if plane == "near" else replace(camera.now, far=value)
+        if wanted.near < wanted.far:
+            self._session.studio.place(camera.key, wanted)
+
+    # --- drawn ---------------------------------------------------------------------------------------
+
+    def draw(self, view: SessionView) -> None:
+        studio = view.studio
+        camera = studio.chosen
+        fresh = self._over.value == FRESH
+        if self._resets.visible != fresh:
+            self._resets.visible = fresh
+        self._bar.draw(studio.progress)
+        self._sheet_bar.draw(studio.progress)
+        self._draw_report(studio, camera)
+        self._draw_sheet(view, camera)
+
+    def _draw_report(self, studio: StudioView, camera: StudioCamera | None) -> None:
+        report = studio.report if camera is not None and studio.report_of == camera.key else None
+        wanted = (id(report), studio.report_stale, None if camera is None else camera.now)
+        if wanted == self._drawn:
+            return
+        self._drawn = wanted
+        _show(self._report, report is not None)
+        if report is None or camera is None:
+            return
+        uses = {
+            plane: self._presses.id_of(plane, lambda _, p=plane: self._use(p)) for plane in ("near", "far")
+        }
+        _fill(self._report, report_html(report, camera, studio.report_stale, studio.report_seeds, uses))
+
+    def _draw_sheet(self, view: SessionView, camera: StudioCamera | None) -> None:
+        studio = view.studio
+        sheet = studio.sheet
+        mine = camera is not None and bool(sheet) and (sheet[0].kind, sheet[0].camera) == camera.key
+        wanted = (id(sheet) if mine else None, id(studio.report), view.selected_env)
+        if wanted == self._drawn_sheet:
+            return
+        self._drawn_sheet = wanted
+        _show(self._pictures, mine)
+        if not mine or camera is None:
+            return
+        judged = studio.report_of == camera.key and not studio.report_seeds
+        _fill(self._pictures, self._sheet_html(sheet, studio.report if judged else None, view.selected_env))
+
+    def _sheet_html(self, sheet: tuple[Picture, ...], report: CameraReport | None, selected: int) -> str:
+        places = {} if report is None else {env: i for i, env in enumerate(report.envs)}
+        cells = [
+            {
+                "env": picture.env,
+                "words": ""
+                if report is None or picture.env not in places
+                else words.env_words(report, places[picture.env]),
+                "picture": self._thumbnail(picture),
+                "selected": picture.env == selected,
+                "press": self._presses.id_of(("env", picture.env), lambda _, env=picture.env: self._go(env)),
+            }
+            for picture in sheet[:MOST_PICTURES]
+            if picture.rgb is not None
+        ]
+        note = ("worst first, " if report is not None else "") + "press one to select its env"
+        if len(sheet) > MOST_PICTURES:
+            note = f"{MOST_PICTURES} of {len(sheet)}; {note}"
+        return render("camera_sheet", cells=cells, note=note)
+
+    def _thumbnail(self, picture: Picture) -> str:
+        return "" if picture.rgb is None else data_address(picture.rgb, THUMBNAIL)
+
+    def _go(self, env: int) -> None:
+        task = self._session.view().task
+        if task is not None and env < task.num_envs:  # a version with fewer envs may have been loaded since
+            self._session.select_env(env)
+
+
+def report_html(
+    report: CameraReport, camera: StudioCamera, stale: bool, resets: int, uses: dict[str, str]
+) -> str:
+    """The table, the bars and the planes that would fit."""
+    depth, info = report.depth, camera.info
+    near = info.near if camera.now is None else camera.now.near
+    far = info.far if camera.now is None else camera.now.far
+    planes = []
+    for name, now, better in (("near", near, depth.suggested_near), ("far", far, depth.suggested_far)):
+        fits = better is None or abs(better / now - 1) < 0.02
+        planes.append(
+            {
+                "name": name,
+                "now": words.metres(now),
+                "better": "" if fits or better is None else words.metres(better),
+                "press": uses[name] if camera.now is not None and not camera.refused else "",
+            }
+        )
+    over = f"{len(report.envs)} fresh resets" if resets else f"{len(report.envs)} envs as they are"
+    width, height = report.judged_size
+    return render(
+        "camera_report",
+        stale=stale,
+        over=over,
+        how=f"{report.pictures} pictures of {width} × {height} in {report.milliseconds / 1000:.1f} s",
+        headline=words.headline(report),
+        rows=words.object_rows(report),
+        bars=words.histogram(depth, near, far),
+        metres=words.metres,
+        background=words.percent(float(depth.background.mean())),
+        beyond=words.percent(float(depth.beyond.mean())),
+        planes=planes,
+    )
+
+
+def _show(handle: viser.GuiHtmlHandle, shown: bool) -> None:
+    if handle.visible != shown:
+        handle.visible = shown
+
+
+def _fill(handle: viser.GuiHtmlHandle, content: str) -> None:
+    # Content that is sent again is made anew in the page, under the pointer of whoever is about to press it.
+    if handle.content != content:
+        handle.content = content

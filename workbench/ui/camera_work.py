@@ -1,0 +1,57 @@
+"""How far work in the background is, shown where it was asked for, with a button that stops it.
+
+A bar above all folders would push the button that was just pressed away from under the pointer, and one at the end of
+the tab is not seen. So each folder has a bar of its own under its button, and the one whose button was pressed last
+shows what runs. What is done in a moment shows none: it would only flash.
+"""
+
+from __future__ import annotations
+
+import time
+
+import viser
+
+from workbench.session.session import Session
+from workbench.session.studio_view import Progress
+from workbench.ui.fragments import render
+
+SHORT = 0.5
+"""Seconds that something may take without a bar."""
+
+
+class WorkBar:
+    """A bar and a button in the present container, hidden until something runs that was asked for here."""
+
+    _asked_last: WorkBar | None = None
+
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._bar = server.gui.add_html("", visible=False)
+        self._stop = server.gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
+        self._stop.on_click(lambda _: session.studio.stop())
+        self._drawn: Progress | None = None
+        self._began: float | None = None
+
+    def asked(self) -> None:
+        """What runs from now on was asked for here."""
+        WorkBar._asked_last = self
+
+    def draw(self, running: Progress | None) -> None:
+        """Draw what is new."""
+        if running is None or WorkBar._asked_last is not self:
+            self._began = None
+        elif self._began is None:
+            self._began = time.monotonic()
+        shown = self._began is not None and time.monotonic() - self._began >= SHORT
+        for handle in (self._bar, self._stop):
+            if handle.visible != shown:
+                handle.visible = shown
+        if not shown or running is None or running == self._drawn:
+            return
+        self._drawn = running
+        self._bar.content = render(
+            "camera_progress",
+            what=running.what,
+            done=running.done,
+            total=running.total,
+            percent=f"{100 * running.done / max(1, running.total):.0f}",
+        )

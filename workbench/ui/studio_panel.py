@@ -1,0 +1,414 @@
+"""The Studio tab: one camera is chosen, placed, and written into the file.
+
+Only one camera at a time has handles and numbers: with all of them the view would be full of arrows and nobody could
+tell whose numbers they read. It is chosen here or by a press on its frustum. Its picture stands above the controls,
+since it is what every movement is judged by; what one does all the time (look through it, undo) is under it, then
+where it is; the lens, which is set once, is folded.
+
+This module is the tab and who is told of what. What a movement means is in `camera_moves`; `placing` is the one way
+to the session; `camera_gizmo`, `camera_numbers`, `look_through` and `camera_writing` are the parts.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import PurePath
+from typing import Any
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+from viser._messages import HotkeyKey  # the type of add_command's argument (viser 1.1.1)
+
+from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.core.pictures import Picture
+from workbench.session.session import Session
+from workbench.session.studio_view import StudioCamera, StudioView
+from workbench.session.view import SessionView
+from workbench.ui.camera_frustums import Placed
+from workbench.ui.camera_gizmo import CameraGizmo
+from workbench.ui.camera_judging import CameraJudging
+from workbench.ui.camera_moves import Floats, Frame, Snap, nudged, panned
+from workbench.ui.camera_numbers import CameraNumbers
+from workbench.ui.camera_pick import CameraPick
+from workbench.ui.camera_writing import CameraWriting
+from workbench.ui.cameras_panel import FASTEST, KIND_NAMES
+from workbench.ui.checked import checked_choice
+from workbench.ui.commands import Command
+from workbench.ui.controls import Control
+from workbench.ui.fragments import render
+from workbench.ui.look_through import LookThrough
+from workbench.ui.placing import Placing
+from workbench.ui.presses import Presses
+
+NOBODY = "none"
+SNAPS = {"none": Snap(), "1 cm, 5°": Snap(0.01, 5.0), "5 cm, 15°": Snap(0.05, 15.0)}
+STEP = 0.01
+"""Metres by which a key moves the camera."""
+TURN = 1.0
+"""Degrees by which a key turns it."""
+VARIES = "Its pose differs between envs, or the task moves it: what is placed here holds for all of them until then."
+
+
+class StudioPanel:
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._server, self._session = server, session
+        self._placing = Placing(session)
+        self._keys: tuple[CameraKey, ...] = ()
+        self._names: dict[str, CameraKey | None] = {NOBODY: None}
+        self._picture: viser.GuiImageHandle | None = None
+        self._drawn: tuple[CameraKey, Picture] | None = None
+        self._drawn_at = 0.0
+        self._look_at, self._own_axes, self._snap = False, False, Snap()
+        gui = server.gui
+        choices: tuple[str, ...] = (NOBODY,)
+        self._choice: Control[Any, Any] = Control(
+            gui.add_dropdown("Camera", choices, initial_value=NOBODY, visible=False),
+            read=lambda value: self._names[checked_choice(value, self._names, "camera")],
+            send=self.select,
+            shown=self._name_of,
+        )
+        self._note = gui.add_html(render("note", text="Cameras appear when the task is loaded."))
+        self._picture_folder = gui.add_folder(None)
+        with self._picture_folder:
+            gui.add_html(render("studio_picture"))
+        self._facts = gui.add_html("", visible=False)
+        self._tools = gui.add_html("", visible=False)
+        self._look = LookThrough(server, self._placing)
+        self._writing = CameraWriting(server, session, self._placing, self._new_from_viewer)
+        self._handles = gui.add_html("", visible=False)
+        self._numbers = CameraNumbers(server, self._placing)
+        self._writing.add_members(server)
+        self._judging = CameraJudging(server, session)
+        self._presses = Presses(server)
+        with self._picture_folder:
+            self._pick = CameraPick(server, session, self._presses)
+        self._gizmo = CameraGizmo(
+            server,
+            self._placing,
+            snap=lambda: self._snap,
+            own_axes=lambda: self._own_axes,
+            look_at=lambda: self._look_at,
+        )
+
+    # --- chosen ------------------------------------------------------------------------------------------
+
+    def select(self, key: CameraKey | None) -> None:
+        self._session.studio.select(key)
+
+    def _name_of(self, key: CameraKey | None) -> str | None:
+        return next((name for name, known in self._names.items() if known == key), NOBODY)
+
+    # --- in the view -------------------------------------------------------------------------------------
+
+    def draw_in_view(self, view: SessionView, offset: NDArray[np.float32]) -> dict[CameraKey, Placed]:
+        """Put the handles where the chosen camera is; return where its frustum is to be drawn.
+
+        That is where it was placed and not where its newest picture was taken, or it would lag behind the hand.
+
+        Args:
+            offset: (3,) where the selected env stands in the view.
+        """
+        self._placing.offset = offset
+        self._judging.draw_in_view(view, offset)
+        self._pick.draw_in_view(view, offset)
+        chosen = self._shown(view.studio)
+        camera = chosen if view.timeline.shown is None else None
+        self._look.draw(chosen)
+        eye = None if chosen is None else self._placing.frame(chosen).to_view(_placed(chosen))
+        covered = self._look.any or (eye is not None and self._is_in_eye(eye))
+        self._gizmo.draw(None if covered else camera)
+        if chosen is None or eye is None:
+            return {}
+        return {chosen.key: Placed(eye, _placed(chosen), hidden=covered)}
+
+    def _shown(self, studio: StudioView) -> StudioCamera | None:
+        chosen = studio.chosen
+        return None if chosen is None or chosen.now is None or chosen.refused else chosen
+
+    def _is_in_eye(self, pose: Floats) -> bool:
+        """Whether a page looks from where the camera stands: its frustum, with its picture, would fill that view."""
+        near = (
+            float(np.linalg.norm(c.camera.position - pose[:3])) for c in self._server.get_clients().values()
+        )
+        return min(near, default=1.0) < 0.1
+
+    # --- the tab -----------------------------------------------------------------------------------------
+
+    def draw(self, view: SessionView) -> None:
+        studio = view.studio
+        self._draw_choice(view)
+        chosen, camera = studio.chosen, self._shown(studio)
+        _show(self._facts, chosen is not None)
+        _show(self._tools, camera is not None)
+        _show(self._handles, camera is not None)
+        self._numbers.draw(camera)
+        self._writing.draw(studio)
+        self._draw_picture(view)
+        self._pick.draw(view, shown=self._picture is not None and self._picture.visible)
+        self._judging.draw(view)
+        if chosen is not None:
+            _fill(self._facts, self._facts_of(chosen, view))
+        if camera is not None:
+            _fill(self._tools, self._tools_of(camera, studio))
+            _fill(self._handles, self._handles_of())
+
+    def _draw_choice(self, view: SessionView) -> None:
+        studio = view.studio
+        keys = tuple(camera.key for camera in studio.cameras)
+        if keys != self._keys:
+            self._keys = keys
+            self._names = {
+                NOBODY: None,
+                **{f"{name} · {KIND_NAMES[kind]}": (kind, name) for kind, name in keys},
+            }
+            self._choice.handle.options = tuple(self._names)
+        self._choice.show(studio.selected)
+        _show(self._choice.handle, bool(keys))
+        if not keys:
+            text = (
+                "This task has no camera."
+                if view.task is not None
+                else "Cameras appear when the task is loaded."
+            )
+        elif studio.selected is None:
+            text = "Choose a camera here, or press its frustum in the view, to place it."
+        else:
+            text = ""
+        _show(self._note, bool(text))
+        if text:
+            _fill(self._note, render("note", text=text))
+
+    def _draw_picture(self, view: SessionView) -> None:
+        key = view.studio.selected
+        picture = None if key is None else view.pictures.get(key)
+        if picture is not None and (picture.env != view.selected_env or picture.rgb is None):
+            picture = None
+        if self._picture is not None:
+            # The last one stays while the next is drawn; that of another camera does not.
+            _show(self._picture, self._drawn is not None and self._drawn[0] == key)
+        if key is None or picture is None or picture.rgb is None:
+            return
+        if self._drawn is not None and self._drawn[0] == key and self._drawn[1] is picture:
+            return
+        if time.monotonic() - self._drawn_at < FASTEST:
+            return
+        self._drawn, self._drawn_at = (key, picture), time.monotonic()
+        if self._picture is None:
+            with self._picture_folder:
+                self._picture = self._server.gui.add_image(picture.rgb, format="jpeg", jpeg_quality=80)
+        else:
+            self._picture.image = picture.rgb
+            _show(self._picture, True)
+
+    def _facts_of(self, camera: StudioCamera, view: SessionView) -> str:
+        info = camera.info
+        return render(
+            "studio_facts",
+            refused=camera.refused and f"{camera.refused[0].upper()}{camera.refused[1:].rstrip('.')}.",
+            moved=camera.moved,
+            file="" if info.site is None else PurePath(info.site.file).name,
+            line=None if info.site is None else info.site.line,
+            mount=info.mount,
+            varies=VARIES if info.varies else "",
+            problem=view.studio.problem,
+            took=f"{view.picture_milliseconds:.0f}" if view.picture_milliseconds else "",
+        )
+
+    def _tools_of(self, camera: StudioCamera, studio: StudioView) -> str:
+        actions = self._session.studio
+        looks = self._look.any
+        rows = [
+            [
+                self._tool(
+                    "Back to my view" if looks else "Look through it",
+                    "The view goes back to where it was."
+                    if looks
+                    else "The view goes to where the camera is.",
+                    "look",
+                    self._look.toggle,
+                    on=looks,
+                ),
+                self._tool(
+                    "Put it where I look",
+                    "The camera goes to where the view is; its lens stays.",
+                    "put",
+                    self._put,
+                ),
+            ],
+            [
+                self._tool(
+                    "Undo",
+                    f"Take back: {studio.undo} (Ctrl+Z)" if studio.undo else "There is nothing to take back.",
+                    "undo",
+                    lambda _: actions.undo(),
+                    off=studio.undo is None,
+                ),
+                self._tool(
+                    "Redo",
+                    f"Make again: {studio.redo} (Ctrl+Shift+Z)"
+                    if studio.redo
+                    else "There is nothing to make again.",
+                    "redo",
+                    lambda _: actions.redo(),
+                    off=studio.redo is None,
+                ),
+                self._tool(
+                    "Back to the file",
+                    "Place it as the file says." if camera.moved else "It is as the file says.",
+                    "back",
+                    lambda _: self._back_to_file(),
+                    off=not camera.moved,
+                ),
+            ],
+        ]
+        return render("studio_tools", rows=rows)
+
+    def _handles_of(self) -> str:
+        """What is dragged in the view, along which axes, in which steps."""
+        rows = [
+            [
+                {"label": "Drag"},
+                self._tool(
+                    "move, turn",
+                    "Move and turn the camera.",
+                    "move",
+                    self._sets(look_at=False),
+                    not self._look_at,
+                ),
+                self._tool(
+                    "eye, target",
+                    "Move the eye, or what it looks at.",
+                    "look at",
+                    self._sets(look_at=True),
+                    self._look_at,
+                ),
+            ],
+            [
+                {"label": "Along"},
+                self._tool(
+                    "world",
+                    "The world's axes.",
+                    "world",
+                    self._sets(own_axes=False),
+                    not self._own_axes,
+                    self._look_at,
+                ),
+                self._tool(
+                    "camera",
+                    "Its own: red is forward, green left, blue up.",
+                    "own",
+                    self._sets(own_axes=True),
+                    self._own_axes,
+                    self._look_at,
+                ),
+            ],
+            [
+                {"label": "Steps"},
+                *(
+                    self._tool(
+                        name, "Of what is dragged.", f"snap {name}", self._sets(snap=snap), self._snap == snap
+                    )
+                    for name, snap in SNAPS.items()
+                ),
+            ],
+        ]
+        return render("studio_tools", rows=rows)
+
+    def _sets(
+        self, look_at: bool | None = None, own_axes: bool | None = None, snap: Snap | None = None
+    ) -> Callable[[viser.ClientHandle | None], None]:
+        def pressed(_: viser.ClientHandle | None) -> None:
+            self._look_at = self._look_at if look_at is None else look_at
+            self._own_axes = self._own_axes if own_axes is None else own_axes
+            self._snap = self._snap if snap is None else snap
+
+        return pressed
+
+    def _tool(
+        self,
+        name: str,
+        hint: str,
+        key: str,
+        pressed: Callable[[viser.ClientHandle | None], None],
+        on: bool = False,
+        off: bool = False,
+    ) -> dict[str, object]:
+        press = self._presses.id_of(key, pressed)
+        return {"name": name, "hint": hint, "on": on, "press": "" if off else press}
+
+    # --- what is pressed ---------------------------------------------------------------------------------
+
+    def _back_to_file(self) -> None:
+        key = self._session.view().studio.selected
+        if key is not None:
+            self._session.studio.back_to_file(key)
+
+    def _put(self, client: viser.ClientHandle | None) -> None:
+        if client is None:
+            return
+        try:
+            camera, now, frame = self._placing.require()
+            self._placing.begin()
+            self._placing.place(camera.key, self._look.settings_from(client, now, frame), "viewer")
+        except ValueError as error:
+            client.add_notification("Not possible", str(error), color="orange", auto_close_seconds=6.0)
+
+    def _new_from_viewer(self, client: viser.ClientHandle, settings: CameraSettings) -> CameraSettings:
+        return self._look.settings_from(client, settings, Frame(None, self._placing.offset))
+
+    def commands(self) -> list[Command]:
+        """Of the page's keys. The arrows alone are the timeline's."""
+        return [
+            Command("Take back the last change of a camera", self._session.studio.undo, "Z", "cmd/ctrl"),
+            Command("Make it again", self._session.studio.redo, "Z", "cmd/ctrl+shift"),
+            self._moves("to its left", "arrowleft", (0, STEP, 0)),
+            self._moves("to its right", "arrowright", (0, -STEP, 0)),
+            self._moves("up", "arrowup", (0, 0, STEP)),
+            self._moves("down", "arrowdown", (0, 0, -STEP)),
+            self._moves("forward", "pageup", (STEP, 0, 0)),
+            self._moves("back", "pagedown", (-STEP, 0, 0)),
+            self._turns("to the left", "arrowleft", TURN, 0),
+            self._turns("to the right", "arrowright", -TURN, 0),
+            self._turns("up", "arrowup", 0, TURN),
+            self._turns("down", "arrowdown", 0, -TURN),
+        ]
+
+    def _moves(self, name: str, key: HotkeyKey, step: tuple[float, float, float]) -> Command:
+        def run() -> None:
+            self._by_key(lambda pose: nudged(pose, step), "key")
+
+        return Command(f"Move the chosen camera {name}", run, key, "alt")
+
+    def _turns(self, name: str, key: HotkeyKey, left: float, up: float) -> Command:
+        def run() -> None:
+            self._by_key(lambda pose: panned(pose, left, up), "turning key")
+
+        return Command(f"Turn the chosen camera {name}", run, key, "alt+shift")
+
+    def _by_key(self, move: Callable[[Floats], Floats], hand: str) -> None:
+        camera = self._placing.camera
+        if camera is not None and camera.now is not None:
+            frame = self._placing.frame(camera)
+            moved = frame.from_view(camera.now, move(frame.to_view(camera.now)))
+            self._placing.place(camera.key, moved, hand)
+
+
+def _placed(camera: StudioCamera) -> CameraSettings:
+    assert camera.now is not None
+    return camera.now
+
+
+def _show(
+    handle: viser.GuiFolderHandle | viser.GuiInputHandle | viser.GuiHtmlHandle | viser.GuiImageHandle,
+    shown: bool,
+) -> None:
+    if handle.visible != shown:
+        handle.visible = shown
+
+
+def _fill(handle: viser.GuiHtmlHandle, content: str) -> None:
+    # Content that is sent again is made anew in the page, under the pointer of whoever is about to press it.
+    if handle.content != content:
+        handle.content = content
