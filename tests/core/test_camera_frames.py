@@ -11,7 +11,7 @@ import pytest
 import sapien
 import sapien.render
 import transforms3d
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils import sapien_utils
@@ -21,7 +21,9 @@ from tests.core.single_env_judge import Bare, batch_of
 from workbench.core import camera_frames as frames
 from workbench.core.camera_frames import LookAt
 from workbench.core.camera_settings import CameraSettings
+from workbench.core.render_device import keep_render_device
 
+unhurried = settings(deadline=None, max_examples=50)  # a busy machine is no failure
 numbers = st.floats(-10, 10, allow_subnormal=False)
 positions = st.tuples(numbers, numbers, numbers)
 quaternions = st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: float(np.linalg.norm(q)) > 1e-3)
@@ -56,6 +58,7 @@ class Posed(Bare):
 
 
 def test_matrices_are_those_of_maniskills_cameras() -> None:
+    keep_render_device("cpu")
     env: Any = batch_of(Posed, 2, obs_mode="rgb", render_backend="cpu")
     for i, eye in enumerate(Posed.EYES):
         camera = env._sensors[f"c{i}"]
@@ -76,6 +79,7 @@ def test_matrices_are_those_of_maniskills_cameras() -> None:
     env.close()
 
 
+@unhurried
 @given(positions, positions)
 def test_look_at_is_maniskills_wherever_that_one_is_right(eye: Any, target: Any) -> None:
     away = np.subtract(target, eye)
@@ -100,6 +104,7 @@ def test_straight_down_and_up_are_right_where_upstream_is_not(forward: Any, top:
     assert_same_pose(pose, nearly, atol=2e-3)
 
 
+@unhurried
 @given(poses, st.floats(0.05, 20))
 def test_look_at_and_back(pose: Any, distance: float) -> None:
     looking = frames.look_at_of(pose, distance)
@@ -107,6 +112,7 @@ def test_look_at_and_back(pose: Any, distance: float) -> None:
     assert_same_pose(frames.pose_from_look_at(looking), pose, atol=1e-8)
 
 
+@unhurried
 @given(positions, st.sampled_from([DOWN, UP]), st.floats(-3.1, 3.1))
 def test_a_roll_straight_down_or_up_is_kept(eye: Any, forward: Any, roll: float) -> None:
     pose = frames.pose_from_look_at(LookAt(eye, tuple(np.add(eye, forward)), roll))
@@ -120,6 +126,7 @@ def test_a_positive_roll_turns_the_camera_clockwise_seen_from_behind() -> None:
     assert frames.rpy_of(rolled[3:])[0] == pytest.approx(math.degrees(0.3))
 
 
+@unhurried
 @given(quaternions)
 def test_quaternion_matrix_axes_and_rpy_are_one_rotation(quaternion: Any) -> None:
     q = frames.normalised(quaternion)
@@ -134,6 +141,7 @@ def test_quaternion_matrix_axes_and_rpy_are_one_rotation(quaternion: Any) -> Non
     assert_allclose(frames.rotation_matrix(frames.quaternion_from_rpy(*rpy)), r, atol=3e-6)
 
 
+@unhurried
 @given(st.floats(-180, 180), st.floats(-90, 90), st.floats(-180, 180))
 def test_rpy_is_that_of_urdf_and_ros(roll: float, pitch: float, yaw: float) -> None:
     theirs = transforms3d.euler.euler2mat(*np.radians([roll, pitch, yaw]), axes="sxyz")
@@ -148,6 +156,7 @@ def test_at_the_vertical_all_of_the_turn_is_said_as_yaw() -> None:
             )
 
 
+@unhurried
 @given(poses)
 @pytest.mark.parametrize("convention", ["maniskill", "opencv", "opengl"])
 @pytest.mark.parametrize("direction", ["camera_to_world", "world_to_camera"])
@@ -159,6 +168,7 @@ def test_matrices_and_back(convention: Any, direction: Any, pose: Any) -> None:
     assert_allclose(matrix @ frames.matrix_of(pose, convention, other), np.eye(4), atol=1e-8)
 
 
+@unhurried
 @given(poses, poses)
 def test_a_mounts_frame_and_back_as_sapien_has_it(mount: Any, local: Any) -> None:
     world = frames.compose(mount, local)
@@ -168,6 +178,7 @@ def test_a_mounts_frame_and_back_as_sapien_has_it(mount: Any, local: Any) -> Non
     assert_same_pose(frames.compose(mount, frames.inverse(mount)), (0, 0, 0, 1, 0, 0, 0), atol=1e-8)
 
 
+@unhurried
 @given(fovs, sizes, sizes)
 def test_fov_and_intrinsic_are_one_lens(fov: float, width: int, height: int) -> None:
     k = frames.intrinsic_from_fov(fov, width, height)
@@ -192,6 +203,7 @@ def test_a_lens_that_one_number_cannot_say_is_not_said_so() -> None:
     assert_allclose(frames.pose_of(moved), (1, 2, 3, 1, 0, 0, 0))
 
 
+@unhurried
 @given(poses, st.lists(positions, min_size=1, max_size=5), fovs)
 def test_points_fall_where_opencv_projects_them(pose: Any, points: Any, fov: float) -> None:
     k = frames.intrinsic_from_fov(fov, 64, 48)
@@ -203,7 +215,9 @@ def test_points_fall_where_opencv_projects_them(pose: Any, points: Any, fov: flo
     if ahead.any():
         rvec, _ = cv2.Rodrigues(extrinsic[:, :3])
         theirs, _ = cv2.projectPoints(np.array(points)[ahead], rvec, extrinsic[:, 3], k, None)
-        assert_allclose(pixels[ahead], theirs[:, 0], rtol=1e-4, atol=1e-2)
+        # In metres across the line of sight: just before the lens a millimetre is a thousand pixels.
+        metres = (pixels[ahead] - theirs[:, 0]) * depth[ahead, None] / k[0, 0]
+        assert_allclose(metres, 0, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -225,6 +239,7 @@ def test_a_matrix_that_is_no_pose_is_refused_in_words(matrix: Any, says: str) ->
         frames.pose_from_matrix(matrix, "opencv", "camera_to_world")
 
 
+@unhurried
 @given(quaternions)
 def test_a_rotation_printed_with_four_digits_is_taken(quaternion: Any) -> None:
     r = frames.rotation_matrix(quaternion)

@@ -43,6 +43,8 @@ Floats = NDArray[np.float64]
 
 FORMAT = "workbench-cameras"
 MOST_CHARACTERS = 100_000
+MOST_YAML = 20_000
+"""Characters; a calibration has two thousand, and Python's YAML reads a thousand in 20 ms."""
 PIXELS = "pixels from the outer edge of the top left pixel; OpenCV's own calibration gives half a pixel less"
 CONVENTIONS = {
     "length": "metres",
@@ -302,6 +304,8 @@ def _parsed(text: str) -> Any:
     bare = _WORDS.sub(" ", text)
     if not re.sub(r"[\s,;|()\[\]]", "", _NUMBER.sub("", bare)):
         return _pasted([float(number) for number in _NUMBER.findall(bare)])
+    if len(text) > MOST_YAML:
+        raise ValueError(f"as YAML {len(text)} characters are too many; a calibration has some two thousand")
     # OpenCV's first line has a colon where YAML has a space.
     try:
         tree = yaml.load(re.sub(r"\A%YAML.*\n", "", text), Loader=_Loader)

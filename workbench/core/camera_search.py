@@ -4,8 +4,8 @@ The space of placements is small (an eye in a box, looking towards the objects) 
 object is behind the arm or it is not), so it is sampled: eyes spread over the box, each looking at a point near the
 objects. What makes that quick enough to wait for is that nearly all of a picture's cost is the robot's meshes: on a
 software driver 2 ms without them, 30 ms with them. So every sample is looked at without the robot, in all envs, which
-settles size, cutting and what else is in the way; only the best of them are looked at with it. Around the best of
-those a second, smaller sample is drawn, twice.
+settles size, cutting and what else is in the way, and bounds the score from above; with the robot only those are
+looked at that may still beat what is found. Around the best a second, smaller sample is drawn, twice.
 
 A placement's score is the mean of its mark in the average env and its mark in the worst one: a camera that loses
 the cube in one env of eight is not nearly as good as one that does not. The five best are given that stand apart,
@@ -45,8 +45,14 @@ WIDE_MARGIN = 0.1
 """Share of the picture's shorter side that is enough between an object and the border."""
 ROOM = 0.1
 """Metres of free sight before the lens: what is nearer stands where the camera's own body would be."""
+FROM_THE_ROBOT = 0.2
+"""Metres that an eye keeps from the origin of every link of a robot, as it stands in the envs that are searched."""
+GOOD_ENOUGH = 0.995
+"""Score from which nothing is gained by drawing again."""
 ROUNDS = 2
 """Of drawing again around the best."""
+TRIES = 50
+"""To find an eye clear of the robot; a box that lies within it is searched all the same."""
 _Candidate = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Eye and target, each (3,)."""
 
@@ -91,8 +97,9 @@ class SearchProgress:
     stage: str
     """What is being done, in words."""
     done: int
-    """Looks, of `total`."""
+    """Poses looked from, of `total`."""
     total: int
+    """At most: what cannot be better than what is found is left out."""
     best: float
     """Score of the best placement so far, 0..1; NaN before there is one."""
 
@@ -152,8 +159,9 @@ def score_of(report: CameraReport, objects: Sequence[str]) -> float:
         inside = 0.8 + 0.2 * np.clip(thing.margin / WIDE_MARGIN, 0, 1)
         marks.append(np.where(thing.present, thing.marks() * inside, np.nan))
     worst = np.min(np.nan_to_num(marks, nan=np.inf), axis=0)
-    worst = worst * np.clip(np.nan_to_num(report.depth.nearest) / ROOM, 0, 1)
-    known = worst[np.isfinite(worst)]
+    room = np.clip(np.nan_to_num(report.depth.nearest) / ROOM, 0, 1)
+    there = np.isfinite(worst)
+    known = worst[there] * room[there]
     return float((known.mean() + known.min()) / 2) if len(known) else 0.0
 
 
@@ -184,8 +192,9 @@ class _Search:
         self.rng = np.random.default_rng(space.seed)
         self.low, self.high = np.array(space.low, np.float64), np.array(space.high, np.float64)
         diagonal = float(np.linalg.norm(self.high - self.low))
-        self.apart = diagonal / 7 if space.apart is None else space.apart
+        self.apart = max(diagonal / 7, 0.01) if space.apart is None else space.apart
         self.middle, self.spread = self._where_the_objects_are()
+        self.links = self._places([thing for thing in every if thing.robot])
         self.keep = max(12, 3 * space.best)
         near = 8 * space.best
         self.total = len(envs) * (space.candidates + self.keep + ROUNDS * (near + 2 * space.best))
@@ -198,7 +207,10 @@ class _Search:
         drawn = [self._draw() for _ in range(self.space.candidates)]
         self._look_at_best_of(drawn, self.keep, "looking for the objects")
         for round_ in range(ROUNDS):
-            centres = [candidate for _, candidate, _ in self._chosen()]
+            chosen = self._chosen()
+            if len(chosen) == self.space.best and chosen[-1][0] >= GOOD_ENOUGH:
+                break
+            centres = [candidate for _, candidate, _ in chosen]
             reach = 0.12 / (round_ + 1)
             near = [self._draw_near(centre, reach) for centre in centres for _ in range(8)]
             self._look_at_best_of(near, 2 * len(centres), "trying beside the best")
@@ -207,19 +219,45 @@ class _Search:
             yield self._suggestion(score, candidate, report)
 
     def _look_at_best_of(self, candidates: list[_Candidate], keep: int, stage: str) -> None:
-        """Score all without the robot, and the best `keep` of them with it."""
+        """Score all without the robot, and with it those of the best `keep` that may still be offered.
+
+        A robot only hides, so the score without it is a bound: who cannot beat what is found is not looked at again.
+        """
         bare = self._measure(candidates, stage)
         scores = [score_of(self._report(row), self.space.objects) for row in bare]
-        order = [int(i) for i in np.argsort([-score for score in scores], kind="stable") if scores[i] > 0][
-            :keep
-        ]
-        kept = [candidates[i] for i in order]
-        whole = self._measure(kept, "looking past the robot", [bare[i] for i in order])
-        for candidate, row in zip(kept, whole, strict=False):
-            report = self._report(row)
-            score = score_of(report, self.space.objects)
-            self.found.append((score, candidate, report))
-            self.best = max(score, self.best) if np.isfinite(self.best) else score
+        order = np.argsort([-score for score in scores], kind="stable").tolist()
+        waiting = [i for i in order if scores[i] > 0][:keep]
+        while waiting and not self.cancelled():
+            chosen = self._chosen()
+            least = chosen[-1][0] if len(chosen) == self.space.best else 0.0
+            beaten = [(score, candidate) for score, candidate, _ in chosen]
+            waiting = [
+                i
+                for i in waiting
+                if scores[i] > least
+                and not any(score >= scores[i] and self._near(c, candidates[i]) for score, c in beaten)
+            ]
+            # Neighbours wait for what the better of them turns out to be.
+            now: list[int] = []
+            for i in waiting:
+                if len(now) < self.space.best and not any(
+                    self._near(candidates[i], candidates[j]) for j in now
+                ):
+                    now.append(i)
+            if not now:
+                break
+            waiting = [i for i in waiting if i not in now]
+            whole = self._measure(
+                [candidates[i] for i in now], "looking past the robot", [bare[i] for i in now]
+            )
+            for i, row in zip(now, whole, strict=False):
+                report = self._report(row)
+                score = score_of(report, self.space.objects)
+                self.found.append((score, candidates[i], report))
+                self.best = max(score, self.best) if np.isfinite(self.best) else score
+
+    def _near(self, a: _Candidate, b: _Candidate) -> bool:
+        return bool(np.linalg.norm(a[0] - b[0]) < self.apart)
 
     def _measure(
         self, candidates: list[_Candidate], stage: str, bare: list[list[Measured]] | None = None
@@ -258,8 +296,7 @@ class _Search:
         """The best that stand apart."""
         chosen: list[tuple[float, _Candidate, CameraReport]] = []
         for entry in sorted(self.found, key=lambda entry: -entry[0]):
-            eye = entry[1][0]
-            if entry[0] > 0 and all(np.linalg.norm(eye - c[1][0]) >= self.apart for c in chosen):
+            if entry[0] > 0 and not any(self._near(entry[1], other[1]) for other in chosen):
                 chosen.append(entry)
             if len(chosen) == self.space.best:
                 break
@@ -267,11 +304,19 @@ class _Search:
 
     def _draw(self) -> _Candidate:
         eye = self.rng.uniform(self.low, self.high)
+        for _ in range(TRIES):
+            if self._is_clear(eye):
+                break
+            eye = self.rng.uniform(self.low, self.high)
         return eye, self._apart_from(eye, self.middle + self.rng.uniform(-0.5, 0.5, 3) * self.spread)
 
     def _draw_near(self, centre: _Candidate, reach: float) -> _Candidate:
         eye = np.clip(centre[0] + self.rng.normal(0, reach, 3) * (self.high - self.low), self.low, self.high)
+        eye = eye if self._is_clear(eye) else centre[0]
         return eye, self._apart_from(eye, centre[1] + self.rng.normal(0, 0.5, 3) * reach * self.spread)
+
+    def _is_clear(self, eye: NDArray[np.float64]) -> bool:
+        return not len(self.links) or np.linalg.norm(self.links - eye, axis=1).min() >= FROM_THE_ROBOT
 
     def _apart_from(self, eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
         # An eye right on its target looks nowhere; a box for the eye may hold the objects.
@@ -279,15 +324,19 @@ class _Search:
 
     def _where_the_objects_are(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Middle and extent (3,) of where the wanted objects are in all envs."""
-        bodies = read_poses(self.env, self.table) if self.poses is None else self.poses
-        columns = [body for thing in self.wanted for body in thing.bodies]
-        places = bodies[self.envs][:, columns, :3].reshape(-1, 3).astype(np.float64)
-        places = places[np.isfinite(places).all(axis=1)]
+        places = self._places(self.wanted)
         if not len(places):
             names = ", ".join(self.space.objects)
             raise ValueError(f"none of the envs to search in has {names}")
         low, high = places.min(axis=0), places.max(axis=0)
         return (low + high) / 2, np.maximum(high - low, 0.05)
+
+    def _places(self, things: Sequence[SceneObject]) -> NDArray[np.float64]:
+        """(K, 3) where the bodies of some objects are, in all envs that have them."""
+        bodies = read_poses(self.env, self.table) if self.poses is None else self.poses
+        columns = [body for thing in things for body in thing.bodies]
+        places = bodies[self.envs][:, columns, :3].reshape(-1, 3).astype(np.float64)
+        return places[np.isfinite(places).all(axis=1)]
 
     def _suggestion(self, score: float, candidate: _Candidate, report: CameraReport) -> Suggestion:
         settings = with_pose(self.space.lens, pose_from_look_at(_look_at(candidate)))
