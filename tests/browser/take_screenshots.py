@@ -150,6 +150,22 @@ def shoot_studio(page: Page) -> None:
     page.get_by_role("option", name="none", exact=True).click()
 
 
+def shoot_camera_judged(page: Page) -> None:
+    """What a camera sees of all envs: the table, the depths, and the pictures."""
+    tab(page, "Studio")
+    page.locator("input[aria-haspopup=listbox]:visible").first.click()
+    page.get_by_role("option", name="base_camera · sensor", exact=True).click()
+    page.get_by_text("Judge", exact=True).click()
+    page.get_by_role("button", name="Judge this camera").click()
+    expect(page.locator(".wb-planes")).to_be_visible()
+    page.get_by_role("button", name="Pictures of all envs").click()
+    envs = page.locator(".wb-sheet figure")
+    expect(envs).to_have_count(16)
+    envs.first.click()
+    page.get_by_role("button", name="Judge this camera").evaluate("e => e.scrollIntoView({block: 'start'})")
+    shoot(page, "judge_camera")
+
+
 def close_notice(page: Page) -> None:
     notice = page.locator(".mantine-Notification-closeButton")
     if notice.count():
@@ -209,6 +225,7 @@ def main() -> None:
             time.sleep(4)
             shoot(page, "cameras")
             shoot_studio(page)
+            shoot_camera_judged(page)
             shoot_reloads(page, file)
             lines = TASK.read_text().splitlines()
             place = next(i for i, line in enumerate(lines) if '"cube_to_goal": distance' in line)

@@ -79,11 +79,15 @@ def object_rows(report: CameraReport) -> list[ObjectRow]:
             bad.append("cut")
         if found.wholly_hidden > 0 or found.hidden > MOSTLY_HIDDEN:
             bad.append("hidden")
-        missing = len(report.envs) - found.present
+        notes = []
+        if found.present < len(report.envs):
+            notes.append(f"in {found.present} of {len(report.envs)} envs")
+        if found.covered > MOSTLY_HIDDEN:
+            notes.append(f"{percent(found.covered)} behind other things")
         rows.append(
             ObjectRow(
                 thing.name,
-                f"in {found.present} of {len(report.envs)} envs" if missing else "",
+                ", ".join(notes),
                 percent(found.seen),
                 f"{found.median_pixels:.0f}",
                 percent(found.cut),
@@ -123,9 +127,12 @@ def env_words(report: CameraReport, position: int) -> str:
     _, thing = min(found, key=lambda pair: pair[0])
     hidden = float(thing.hidden_share[position])
     if thing.pixels[position] == 0:
-        return f"{thing.name} hidden" if hidden > 0 else f"no {thing.name}"
+        return f"{thing.name} hidden" if thing.alone[position] > 0 else f"no {thing.name}"
     if hidden > MOSTLY_HIDDEN:
         return f"{thing.name} {percent(hidden)} hidden"
+    covered = float(thing.covered_share[position])
+    if covered > MOSTLY_HIDDEN:
+        return f"{thing.name} {percent(covered)} behind things"
     if thing.cut[position]:
         return f"{thing.name} cut"
     pixels = f"{thing.name} {thing.pixels[position]:.0f} px"
