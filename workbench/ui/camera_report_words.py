@@ -152,9 +152,9 @@ def histogram(depth: DepthReport, near: float, far: float) -> Histogram | None:
     first, last = max(0, int(filled[0]) - 1), min(len(counts), int(filled[-1]) + 2)
     ends = depth.farthest_object[np.isfinite(depth.farthest_object)]
     end = float(ends.max()) if len(ends) else math.inf
-    part = counts[first:last]
+    part, middles = counts[first:last], np.sqrt(DEPTH_EDGES[:-1] * DEPTH_EDGES[1:])
     bars = tuple(
-        (float(count) / float(part.max()), bool(DEPTH_EDGES[first + i] >= end))
+        (float(count) / float(part.max()), bool(middles[first + i] >= end))
         for i, count in enumerate(part)
     )
 
