@@ -154,8 +154,7 @@ def histogram(depth: DepthReport, near: float, far: float) -> Histogram | None:
     end = float(ends.max()) if len(ends) else math.inf
     part, middles = counts[first:last], np.sqrt(DEPTH_EDGES[:-1] * DEPTH_EDGES[1:])
     bars = tuple(
-        (float(count) / float(part.max()), bool(middles[first + i] >= end))
-        for i, count in enumerate(part)
+        (float(count) / float(part.max()), bool(middles[first + i] >= end)) for i, count in enumerate(part)
     )
 
     def place(plane: float) -> float | None:

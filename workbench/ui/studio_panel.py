@@ -49,6 +49,7 @@ STEP = 0.01
 TURN = 1.0
 """Degrees by which a key turns it."""
 VARIES = "Its pose differs between envs, or the task moves it: what is placed here holds for all of them until then."
+IN_ITS_EYE = "You look from where it stands. Move the view, and its handles appear."
 
 
 class StudioPanel:
@@ -60,6 +61,7 @@ class StudioPanel:
         self._picture: viser.GuiImageHandle | None = None
         self._drawn: tuple[CameraKey, Picture] | None = None
         self._drawn_at = 0.0
+        self._in_its_eye = False
         self._look_at, self._own_axes, self._snap = False, False, Snap()
         gui = server.gui
         choices: tuple[str, ...] = (NOBODY,)
@@ -118,6 +120,7 @@ class StudioPanel:
         self._look.draw(chosen)
         eye = None if chosen is None else self._placing.frame(chosen).to_view(_placed(chosen))
         covered = self._look.any or (eye is not None and self._is_in_eye(eye))
+        self._in_its_eye = covered and not self._look.any
         self._gizmo.draw(None if covered else camera)
         if chosen is None or eye is None:
             return {}
@@ -212,6 +215,7 @@ class StudioPanel:
             line=None if info.site is None else info.site.line,
             mount=info.mount,
             varies=VARIES if info.varies else "",
+            hint=IN_ITS_EYE if self._in_its_eye else "",
             problem=view.studio.problem,
             took=f"{view.picture_milliseconds:.0f}" if view.picture_milliseconds else "",
         )
