@@ -128,24 +128,47 @@ def shoot_envs(chromium: str) -> None:
             shoot(page, "envs")
 
 
-def shoot_studio(page: Page) -> None:
+def shoot_studio(chromium: str) -> None:
     """A camera is chosen, moved with keys, and the change is shown."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(shutil.copy(TASK, Path(folder) / "push_cube.py"))
+        with (
+            open_workbench(str(file), "--num-envs", "4", cwd=file.parent) as opened,
+            sync_playwright() as playwright,
+        ):
+            page, _ = new_page(launch(playwright, chromium))
+            page.goto(opened.url)
+            expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
+            close_notice(page)
+            tab(page, "Studio")
+            page.locator("input[aria-haspopup=listbox]:visible").first.click()
+            page.get_by_role("option", name="base_camera · sensor", exact=True).click()
+            expect(page.get_by_role("button", name="Show the change")).to_be_visible()
+            page.evaluate("document.activeElement.blur()")
+            for key in 12 * ["Alt+ArrowLeft"] + 12 * ["Alt+Shift+ArrowRight"]:
+                page.keyboard.press(key)
+                time.sleep(0.1)
+            page.get_by_role("button", name="Show the change").click()
+            leave = page.get_by_role("button", name="Leave the file as it is")
+            expect(leave).to_be_visible()
+            leave.scroll_into_view_if_needed()
+            shoot(page, "studio")
+
+
+def shoot_camera_judged(page: Page) -> None:
+    """What a camera sees of all envs: the table, the depths, and the pictures."""
     tab(page, "Studio")
     page.locator("input[aria-haspopup=listbox]:visible").first.click()
     page.get_by_role("option", name="base_camera · sensor", exact=True).click()
-    expect(page.get_by_role("button", name="Show the change")).to_be_visible()
-    page.evaluate("document.activeElement.blur()")
-    for key in 12 * ["Alt+ArrowLeft"] + 8 * ["Alt+Shift+ArrowRight"]:
-        page.keyboard.press(key)
-        time.sleep(0.1)
-    page.get_by_role("button", name="Show the change").click()
-    write = page.get_by_role("button", name=re.compile("^Write it to"))
-    expect(write).to_be_visible()
-    write.scroll_into_view_if_needed()
-    shoot(page, "studio")
-    page.get_by_role("button", name="Leave the file as it is").click()
-    page.keyboard.press("Control+z")
-    page.keyboard.press("Control+z")
+    page.get_by_text("Judge", exact=True).click()
+    page.get_by_role("button", name="Judge this camera").click()
+    expect(page.locator(".wb-planes")).to_be_visible()
+    page.get_by_role("button", name="Pictures of all envs").click()
+    envs = page.locator(".wb-sheet figure")
+    expect(envs).to_have_count(16)
+    envs.first.click()
+    page.get_by_role("button", name="Judge this camera").evaluate("e => e.scrollIntoView({block: 'start'})")
+    shoot(page, "judge_camera")
     page.locator("input[aria-haspopup=listbox]:visible").first.click()
     page.get_by_role("option", name="none", exact=True).click()
 
@@ -181,6 +204,7 @@ def main() -> None:
         sys.exit(how_to_get_chromium())
     OUT.mkdir(exist_ok=True)
     shoot_envs(chromium)
+    shoot_studio(chromium)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(shutil.copy(TASK, Path(folder) / "push_cube.py"))
         with (
@@ -208,7 +232,7 @@ def main() -> None:
                 tick.check(force=True)
             time.sleep(4)
             shoot(page, "cameras")
-            shoot_studio(page)
+            shoot_camera_judged(page)
             shoot_reloads(page, file)
             lines = TASK.read_text().splitlines()
             place = next(i for i, line in enumerate(lines) if '"cube_to_goal": distance' in line)

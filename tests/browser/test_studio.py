@@ -150,6 +150,12 @@ def test_dragged_with_the_mouse_written_checked_and_taken_back(page: Page, task_
     until(lambda: numbers(page, "Position")[1] > 0.05, "the number")
     page.mouse.up()
     assert numbers(page, "Position")[::2] == [0.45, 0.6] and numbers(page, "Degrees")[:2] == [0, 58.34]
+    # All of it is one step of undo, which brings back what it looked at too.
+    page.keyboard.press("Control+z")
+    until(lambda: numbers(page, "Position") == [0.45, 0, 0.6], "the drag undone")
+    assert numbers(page, "Looks at") == [0.08, 0, 0]
+    page.keyboard.press("Control+Shift+z")
+    until(lambda: numbers(page, "Position")[1] > 0.05, "the drag again")
     assert task_file.read_text() == text
     page.get_by_role("button", name="Show the change").click()
     expect(page.locator(".wb-diff-add")).to_contain_text("look_at(eye=[0.45,")

@@ -17,19 +17,23 @@ def seen(
     name: str,
     pixels: list[float],
     unhindered: list[float] | None = None,
+    alone: list[float] | None = None,
     cut: tuple[int, ...] = (),
     present: list[bool] | None = None,
     scenery: bool = False,
     never_drawn: bool = False,
 ) -> ObjectSeen:
     count = len(pixels)
+    unhindered = pixels if unhindered is None else unhindered
     return ObjectSeen(
         name=name,
         never_drawn=never_drawn,
         scenery=scenery,
         present=np.array([True] * count if present is None else present),
         pixels=np.array(pixels, np.float32),
-        unhindered=np.array(pixels if unhindered is None else unhindered, np.float32),
+        unhindered=np.array(unhindered, np.float32),
+        alone=np.array(unhindered if alone is None else alone, np.float32),
+        margin=np.zeros(count, np.float32),
         cut=np.isin(np.arange(count), cut),
     )
 
@@ -93,15 +97,18 @@ def test_the_headline_says_the_worst(thing: ObjectSeen, said: str) -> None:
 
 
 def test_an_env_is_called_by_what_is_worst_in_it() -> None:
-    cube = seen("cube", [0, 0, 40, 90, 90, 20], unhindered=[0, 30, 80, 90, 90, 20], cut=(3,))
-    report = report_of(cube, seen("bowl", [200] * 6))
-    assert [env_words(report, env) for env in range(6)] == [
+    free = [0.0, 30.0, 80.0, 90.0, 90.0, 20.0, 0.0, 45.0]
+    cube = seen("cube", [0, 0, 40, 90, 90, 20, 0, 45], free, alone=[*free[:6], 50, 90], cut=(3,))
+    report = report_of(cube, seen("bowl", [200] * 8))
+    assert [env_words(report, env) for env in range(8)] == [
         "no cube",
         "cube hidden",
         "cube 50 % hidden",
         "cube cut",
         "cube 90 px",
         "cube 20 px, small",
+        "cube hidden",
+        "cube 50 % behind things",
     ]
 
 

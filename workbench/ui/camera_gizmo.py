@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import viser
@@ -21,12 +22,26 @@ from workbench.session.studio_view import StudioCamera
 from workbench.ui.camera_moves import Floats, Frame, Snap, looking_at, snapped, turned_in_world
 from workbench.ui.placing import Placing
 
-LEFT_ALONE = 5.0
+LEFT_ALONE = 60.0
 """Seconds without a movement after which a gizmo that was never let go (a page that went away) is free again."""
 PIXELS = 75.0
 TARGET_PIXELS = 45.0
 SIGHT_COLOUR = (34, 139, 230)
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """A camera as it was when a handle was taken."""
+
+    key: CameraKey
+    settings: CameraSettings
+    frame: Frame
+    pose: Floats
+    """(7,) in the view."""
+    target: Floats
+    """(3,) in the view."""
+    gesture: int
 
 
 class CameraGizmo:
@@ -67,7 +82,7 @@ class CameraGizmo:
         self._line: viser.LineSegmentsHandle | None = None
         self._drawn_line: object = None
         self._held_at = -1e9
-        self._start: tuple[CameraKey, CameraSettings, Frame, Floats, Floats] | None = None
+        self._start: _Taken | None = None
         # Async: callbacks in viser's pool of threads would come in any order.
         self._camera.on_update(self._on_camera)
         self._eye.on_update(self._on_eye)
@@ -130,17 +145,11 @@ class CameraGizmo:
             return False
         frame = self._placing.frame(camera)
         pose = frame.to_view(camera.now)
-        self._start = (
-            camera.key,
-            camera.now,
-            frame,
-            pose,
-            self._placing.target_in_view(camera, camera.now),
-        )
-        self._placing.begin()
+        target = self._placing.target_in_view(camera, camera.now)
+        self._start = _Taken(camera.key, camera.now, frame, pose, target, self._placing.begin())
         return True
 
-    def _went_on(self, phase: str) -> tuple[CameraKey, CameraSettings, Frame, Floats, Floats] | None:
+    def _went_on(self, phase: str) -> _Taken | None:
         """The camera as it was taken, while it is dragged."""
         self._held_at = time.monotonic()
         if (phase == "start" or self._start is None) and not self._take():
@@ -155,7 +164,7 @@ class CameraGizmo:
         start = self._went_on(event.phase)
         if start is None:
             return
-        key, settings, frame, pose, target = start
+        pose, frame = start.pose, start.frame
         position, wxyz = event.target.position, event.target.wxyz
         try:
             if self._own_axes():
@@ -163,11 +172,9 @@ class CameraGizmo:
             else:
                 moved = turned_in_world(pose, position, wxyz)
             moved = snapped(pose, moved, self._snap(), self._own_axes(), frame.offset)
-            self._placing.place(key, frame.from_view(settings, moved), "gizmo")
+            self._place(start, moved, float(np.linalg.norm(start.target - pose[:3])))
         except ValueError as error:
             self._refuse(event, error)
-            return
-        self._placing.set_distance(key, float(np.linalg.norm(target - pose[:3])))
 
     async def _on_eye(self, event: viser.TransformControlsEvent) -> None:
         self._look(event, moves_eye=True)
@@ -179,17 +186,20 @@ class CameraGizmo:
         start = self._went_on(event.phase)
         if start is None:
             return
-        key, settings, frame, pose, target = start
+        pose, target = start.pose, start.target
         before = pose[:3] if moves_eye else target
         at = np.concatenate([before, UNTURNED]), np.concatenate([event.target.position, UNTURNED])
-        there = snapped(*at, Snap(metres=self._snap().metres), False, frame.offset)[:3]
+        there = snapped(*at, Snap(metres=self._snap().metres), False, start.frame.offset)[:3]
         eye, target = (there, target) if moves_eye else (pose[:3], there)
         try:
-            self._placing.place(key, frame.from_view(settings, looking_at(pose, eye, target)), "gizmo")
+            self._place(start, looking_at(pose, eye, target), float(np.linalg.norm(target - eye)))
         except ValueError as error:
             self._refuse(event, error)
-            return
-        self._placing.set_distance(key, float(np.linalg.norm(target - eye)))
+
+    def _place(self, start: _Taken, pose: Floats, distance: float) -> None:
+        moved = start.frame.from_view(start.settings, pose)
+        self._placing.set_distance(start.key, moved, distance)
+        self._placing.place(start.key, moved, "gizmo", start.gesture)
 
     def _refuse(self, event: viser.TransformControlsEvent, error: ValueError) -> None:
         """Let go, so that it is put back to where the camera is."""

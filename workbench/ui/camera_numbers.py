@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import viser
 
 from workbench.core.camera_frames import (
@@ -233,8 +234,8 @@ class CameraNumbers:
         target = frame.point_to_view(kept_where_equal(self._target_of(camera, now), typed, METRES))
         pose = frame.to_view(now)
         turned = frame.from_view(now, looking_at(pose, pose[:3], target))
+        self._placing.set_distance(camera.key, turned, float(np.linalg.norm(target - pose[:3])))
         self._placing.place(camera.key, turned, "target")
-        self._placing.set_distance(camera.key, float(((target - pose[:3]) ** 2).sum() ** 0.5))
 
     def _set_rpy(self, typed: tuple[float, ...]) -> None:
         self._change(

@@ -79,11 +79,15 @@ def object_rows(report: CameraReport) -> list[ObjectRow]:
             bad.append("cut")
         if found.wholly_hidden > 0 or found.hidden > MOSTLY_HIDDEN:
             bad.append("hidden")
-        missing = len(report.envs) - found.present
+        notes = []
+        if found.present < len(report.envs):
+            notes.append(f"in {found.present} of {len(report.envs)} envs")
+        if found.covered > MOSTLY_HIDDEN:
+            notes.append(f"{percent(found.covered)} behind other things")
         rows.append(
             ObjectRow(
                 thing.name,
-                f"in {found.present} of {len(report.envs)} envs" if missing else "",
+                ", ".join(notes),
                 percent(found.seen),
                 f"{found.median_pixels:.0f}",
                 percent(found.cut),
@@ -123,9 +127,12 @@ def env_words(report: CameraReport, position: int) -> str:
     _, thing = min(found, key=lambda pair: pair[0])
     hidden = float(thing.hidden_share[position])
     if thing.pixels[position] == 0:
-        return f"{thing.name} hidden" if hidden > 0 else f"no {thing.name}"
+        return f"{thing.name} hidden" if thing.alone[position] > 0 else f"no {thing.name}"
     if hidden > MOSTLY_HIDDEN:
         return f"{thing.name} {percent(hidden)} hidden"
+    covered = float(thing.covered_share[position])
+    if covered > MOSTLY_HIDDEN:
+        return f"{thing.name} {percent(covered)} behind things"
     if thing.cut[position]:
         return f"{thing.name} cut"
     pixels = f"{thing.name} {thing.pixels[position]:.0f} px"
@@ -145,10 +152,9 @@ def histogram(depth: DepthReport, near: float, far: float) -> Histogram | None:
     first, last = max(0, int(filled[0]) - 1), min(len(counts), int(filled[-1]) + 2)
     ends = depth.farthest_object[np.isfinite(depth.farthest_object)]
     end = float(ends.max()) if len(ends) else math.inf
-    part = counts[first:last]
+    part, middles = counts[first:last], np.sqrt(DEPTH_EDGES[:-1] * DEPTH_EDGES[1:])
     bars = tuple(
-        (float(count) / float(part.max()), bool(DEPTH_EDGES[first + i] >= end))
-        for i, count in enumerate(part)
+        (float(count) / float(part.max()), bool(middles[first + i] >= end)) for i, count in enumerate(part)
     )
 
     def place(plane: float) -> float | None:

@@ -18,10 +18,12 @@ from numpy.typing import NDArray
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera
-from workbench.ui.camera_moves import Floats, Frame, target_of, usual_distance
+from workbench.ui.camera_moves import USUAL, Floats, Frame, target_of, usual_distance
 
 PAUSE = 1.2
 """Seconds. What one hand does after a shorter pause belongs to the same step of undo."""
+REMEMBERED = 2000
+"""Places of cameras, for which it is known how far they looked from there."""
 FARTHEST = 1000.0
 """Metres from the origin that a page may ask for."""
 
@@ -32,7 +34,8 @@ class Placing:
         self._lock = threading.Lock()
         self._gestures = itertools.count(1)
         self._gesture, self._hand, self._moved_at = 0, "", -1e9
-        self._distances: dict[CameraKey, float] = {}
+        self._distances: dict[tuple[object, ...], float] = {}
+        self._distance: dict[CameraKey, float] = {}
         self.offset: NDArray[np.float32] = np.zeros(3, np.float32)
         """Where the selected env stands in the view."""
 
@@ -56,16 +59,18 @@ class Placing:
     def frame(self, camera: StudioCamera) -> Frame:
         return Frame(camera.mount_pose, self.offset)
 
-    def begin(self) -> None:
-        """What comes next is a step of undo of its own."""
+    def begin(self) -> int:
+        """A movement that is one step of undo however long it takes; and what comes after it is another."""
         with self._lock:
             self._hand = ""
+            return next(self._gestures)
 
-    def place(self, key: CameraKey, settings: CameraSettings, hand: str) -> None:
+    def place(self, key: CameraKey, settings: CameraSettings, hand: str, gesture: int | None = None) -> None:
         """Place it live.
 
         Args:
             hand: what moves it. The same hand goes on with its movement unless it paused.
+            gesture: of `begin`, for a hand that says when it begins and ends.
 
         Raises:
             ValueError: it is too far away for any task.
@@ -77,20 +82,35 @@ class Placing:
             if hand != self._hand or now - self._moved_at > PAUSE:
                 self._gesture = next(self._gestures)
             self._hand, self._moved_at = hand, now
-            gesture = self._gesture
+            gesture = self._gesture if gesture is None else gesture
         self._session.studio.place(key, settings, gesture)
 
     # --- the target: a camera has a direction; how far it looks is the page's own knowledge -----------
 
     def distance(self, camera: StudioCamera) -> float:
-        """Metres from the eye to the target."""
-        if camera.key not in self._distances and camera.now is not None:
-            self._distances[camera.key] = usual_distance(self.frame(camera).to_env(camera.now))
-        return self._distances.get(camera.key, 1.0)
+        """Metres from the eye to the target: as it was when the camera stood so, or as it was last."""
+        now = camera.now
+        if now is None:
+            return USUAL
+        distance = self._distances.get(_stand(camera.key, now), self._distance.get(camera.key))
+        if distance is None:
+            distance = usual_distance(self.frame(camera).to_env(now))
+        self.set_distance(camera.key, now, distance)
+        return distance
 
-    def set_distance(self, key: CameraKey, distance: float) -> None:
-        self._distances[key] = max(float(distance), 1e-3)
+    def set_distance(self, key: CameraKey, settings: CameraSettings, distance: float) -> None:
+        """Remember how far it looks from there, so that an undo brings back the target too."""
+        distance = max(float(distance), 1e-3)
+        with self._lock:
+            self._distance[key] = distance
+            self._distances[_stand(key, settings)] = distance
+            if len(self._distances) > REMEMBERED:
+                del self._distances[next(iter(self._distances))]
 
     def target_in_view(self, camera: StudioCamera, settings: CameraSettings) -> Floats:
         """(3,)"""
         return target_of(self.frame(camera).to_view(settings), self.distance(camera))
+
+
+def _stand(key: CameraKey, settings: CameraSettings) -> tuple[object, ...]:
+    return key, settings.position, settings.quaternion
