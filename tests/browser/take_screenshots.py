@@ -149,9 +149,7 @@ def shoot_studio(chromium: str) -> None:
                 page.keyboard.press(key)
                 time.sleep(0.1)
             page.get_by_role("button", name="Show the change").click()
-            leave = page.get_by_role("button", name="Leave the file as it is")
-            expect(leave).to_be_visible()
-            leave.scroll_into_view_if_needed()
+            page.get_by_role("button", name="Write it to push_cube.py").scroll_into_view_if_needed()
             shoot(page, "studio")
 
 
