@@ -136,7 +136,7 @@ def shoot_studio(chromium: str) -> None:
             open_workbench(str(file), "--num-envs", "4", cwd=file.parent) as opened,
             sync_playwright() as playwright,
         ):
-            page, _ = new_page(launch(playwright, chromium))
+            page, _ = new_page(launch(playwright, chromium), height=900)
             page.goto(opened.url)
             expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
             close_notice(page)
