@@ -166,8 +166,8 @@ def test_what_was_before_the_oldest_moment_cannot_be_returned_to() -> None:
 def test_a_reset_of_others_is_no_reward_of_zero() -> None:
     history = filled(3)
     history.add(stepped(0, jumped=(1,)), 3)
-    assert history.rewards(0, 0, 99).tolist() == [0, 1, 2, 2]
-    assert history.rewards(1, 0, 99).tolist()[1:3] == [1, 2] and np.isnan(history.rewards(1, 3, 3)).all()
+    assert history.rewards(0, 1, 99).tolist() == [1, 2, 2]
+    assert history.rewards(1, 1, 2).tolist() == [1, 2] and np.isnan(history.rewards(1, 3, 3)).all()
 
 
 def test_what_a_newer_version_says_of_a_moment_is_not_its_record() -> None:
