@@ -184,7 +184,7 @@ def test_undo_leaves_alone_what_has_jumped_on_since(session: Session) -> None:
     assert view.step.elapsed_steps.tolist() == [3, 1, 6]
     assert view.timeline.undo == "reset of env 0"
     view = after(session, session.undo)
-    assert view.step.elapsed_steps.tolist() == [3, 1, 6] and view.timeline.undo == "reset of all"
+    assert view.step.elapsed_steps.tolist() == [3, 1, 6] and view.timeline.undo == "reset of 2 envs"
     session.select_env(1)
     assert session.view().timeline.undo == "reset of env 1"
     assert after(session, session.undo).step.elapsed_steps.tolist() == [3, 2, 6]
