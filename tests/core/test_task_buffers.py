@@ -173,12 +173,15 @@ def test_what_was_not_written_yet_goes_back_to_how_it_was_built() -> None:
     env.close()
 
 
-def test_what_holds_for_the_batch_goes_back_with_the_whole_batch_only(env: Any) -> None:
+def test_what_holds_for_the_batch_goes_back_when_all_envs_do(env: Any) -> None:
     snapshot, count = take_snapshot(env), env.total_resets
     env.total_resets += 5
     report = restore_snapshot(env, snapshot, [0, 1])
     assert env.total_resets == count + 5
     assert "whole batch" in report.not_carried["total_resets"]
+    report = restore_snapshot(env, snapshot, range(N), source=2)
+    assert env.total_resets == count and not report.not_carried
+    env.total_resets += 5
     restore_snapshot(env, snapshot)
     assert env.total_resets == count
 

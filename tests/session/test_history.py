@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from workbench.core.pictures import Picture
 from workbench.core.step import StepResult
-from workbench.session.history import FAIL, RESET, SUCCESS, TRUNCATED, WENT_BACK, History
+from workbench.session.history import FAIL, NOT_A_NUMBER, RESET, SUCCESS, TRUNCATED, WENT_BACK, History
+from workbench.session.judgement import Judgement
 from workbench.session.messages import PastPictures, Pictures, Restored, Stepped
 
 N, BODIES = 3, 4
@@ -150,7 +153,9 @@ def test_undo_goes_back_through_the_jumps_one_by_one() -> None:
     before = history.last_jump(1)
     assert before is not None and before.serial == 3
     other = history.last_jump(0)
-    assert other is not None and other.serial == 3
+    assert other is not None and other.serial == 3 and history.moved_last_by(other) == (0, 1, 2)
+    history.add(stepped(0, jumped=(0, 1, 2), restored=Restored((0, 1, 2), (0, 1, 2), 2, 3, {})), 3)
+    assert history.last_jump(1) is None, "what it did in the future that was left is none of what it lives"
 
 
 def test_what_was_before_the_oldest_moment_cannot_be_returned_to() -> None:
@@ -161,12 +166,36 @@ def test_what_was_before_the_oldest_moment_cannot_be_returned_to() -> None:
 def test_a_reset_of_others_is_no_reward_of_zero() -> None:
     history = filled(3)
     history.add(stepped(0, jumped=(1,)), 3)
-    assert history.rewards(0, 0, 99).tolist() == [0, 1, 2, 2]
-    assert history.rewards(1, 0, 99).tolist() == [0, 1, 2, 0]
+    assert history.rewards(0, 1, 99).tolist() == [1, 2, 2]
+    assert history.rewards(1, 1, 2).tolist() == [1, 2] and np.isnan(history.rewards(1, 3, 3)).all()
+
+
+def test_what_a_newer_version_says_of_a_moment_is_not_its_record() -> None:
+    history = filled(3)
+    first = history.at(2).step  # type: ignore[union-attr]
+    for reward in (7.0, 8.0):
+        history.renew_last(replace(first, reward=np.full(N, reward, np.float32)))
+    moment = history.at(2)
+    assert moment is not None and moment.as_recorded is first and moment.step.reward[0] == 8.0
+    assert history.rewards(0, 2, 2).tolist() == [8.0]
+    judged = Judgement(history).curve("reward", 0)
+    assert judged is not None and judged.old.tolist() == [1.0, 2.0]
+
+
+def test_the_first_reward_of_an_episode_that_is_no_number_is_an_event() -> None:
+    history = filled(2)
+    for number in (2, 3):
+        step = stepped(number)
+        step.step.reward[1] = np.nan
+        history.add(step, number)
+    history.add(stepped(0, jumped=(0, 1, 2)), 3)
+    history.add(stepped(1), 4)
+    assert history.events(1, 1, 99) == [(2, NOT_A_NUMBER), (4, RESET)]
+    assert history.events(0, 1, 99) == [(4, RESET)]
 
 
 @pytest.mark.parametrize("count", [1, 1023, 1024, 1025, 5000])
 def test_rows_stay_with_their_moments_however_many_there_are(count: int) -> None:
     history = filled(count, 3_000_000)
     expected = [float(m.step.reward[0]) for m in history.between(0, count)]
-    assert history.rewards(0, 0, count).tolist() == expected
+    assert np.array_equal(history.rewards(0, 0, count), expected, equal_nan=True)

@@ -6,6 +6,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -115,7 +117,7 @@ def test_a_policy_from_a_file_is_called_with_the_observation(session: Session, t
     ("text", "reference", "says"),
     [
         ("def act(obs):\n    return 1 / 0\n", "act", "ZeroDivisionError"),
-        ("def act(obs):\n    return obs[:, :3]\n", "act", "expected \\(2, 8\\)"),
+        ("def act(obs):\n    return obs[:, :3]\n", "act", "expected (2, 8)"),
         ("def act(obs):\n    return obs[:, :8] * float('nan')\n", "act", "NaN"),
         ("def act(obs):\n    return None\n", "missing", "no function missing"),
     ],
@@ -130,11 +132,44 @@ def test_a_policy_that_fails_says_so_and_the_session_goes_on(
     if reference == "act":
         session.step()
     view = wait_until(session, lambda v: v.problem is not None, "a problem")
-    assert view.problem.stage == "policy"
-    assert np.any([word in view.problem.message for word in [says.replace("\\", "")]])
+    assert view.problem.stage == "policy" and says in view.problem.message
+    # No other action takes its place: whoever plays or steps hears the same.
+    for again in (session.play, session.step):
+        said = session.view().problem_serial
+        again()
+        view = wait_until(
+            session, lambda v, n=said: v.problem_serial > n and not v.playing, "the problem again"
+        )
+        assert says in view.problem.message and not view.step.elapsed_steps.any()
     session.set_action_source("random")
     session.step()
     wait_until(session, lambda v: v.problem is None, "the problem's end")
+
+
+def test_a_policy_that_is_not_named_does_not_step(session: Session) -> None:
+    settle(session)
+    session.set_action_source("policy")
+    session.step()
+    view = wait_until(session, lambda v: v.problem is not None, "a problem")
+    assert "name a policy: module:function or file.py:function" in view.problem.message
+    assert not view.step.elapsed_steps.any()
+    session.set_action_source("random")
+    session.step()
+    wait_until(session, lambda v: v.problem is None, "the problem's end")
+
+
+def test_a_policy_is_looked_for_beside_the_task_too_and_taken_when_it_is_mended(
+    session: Session, task_file
+) -> None:
+    settle(session)
+    session.set_action_source("policy", "pol.py:act")
+    view = wait_until(session, lambda v: v.problem is not None, "a problem")
+    for folder in (Path.cwd(), task_file.parent):
+        assert str(folder) in view.problem.message
+    (task_file.parent / "pol.py").write_text("def act(obs):\n    return obs[:, :8] * 0 + 0.25\n")
+    session.step()
+    view = wait_until(session, lambda v: v.step.elapsed_steps.any(), "a step")
+    assert np.allclose(view.step.action, 0.25) and view.problem is None
 
 
 def test_pictures_come_of_the_selected_env_and_only_while_somebody_looks(session: Session) -> None:

@@ -16,6 +16,7 @@ import pytest
 from tests.session.conftest import TASKS, wait_until
 from tests.ui.scenes import description, step_of, table_scene
 from workbench.session.env_table import EnvTable, Outcome
+from workbench.session.history import NOT_A_NUMBER
 from workbench.session.messages import Stepped, TaskOptions
 from workbench.session.outliers import FASTEST, Kind, OutlierWatch, lowest_still_point
 from workbench.session.session import Session
@@ -73,6 +74,7 @@ class OneOfEachEnv(BaseEnv):
 
     def compute_dense_reward(self, obs, action, info):
         reward = torch.zeros(self.num_envs)
+        reward[6] = torch.nan
         reward[5] = 1.5 * (self.elapsed_steps[5] >= 3)
         return reward
 
@@ -85,7 +87,7 @@ def one_of_each(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
     folder: Path = tmp_path_factory.mktemp("author")
     (folder / "one_of_each.py").write_text(BROKEN)
     session = Session(
-        str(folder / "one_of_each.py"), TaskOptions(num_envs=6, env_kwargs={"render_backend": "none"}),
+        str(folder / "one_of_each.py"), TaskOptions(num_envs=7, env_kwargs={"render_backend": "none"}),
         recordings=folder / "kept",
     )  # fmt: skip
     session.set_action_source("hold")
@@ -111,6 +113,7 @@ def test_each_kind_is_found_in_the_env_that_does_it_and_nowhere_else(one_of_each
         3: {Kind.UNDER_FLOOR, Kind.DROPPED},
         4: {Kind.DROPPED},
         5: {Kind.REWARD},
+        6: {Kind.NOT_A_NUMBER},
     }
 
 
@@ -121,6 +124,10 @@ def test_the_reason_says_what_and_when(one_of_each: Session) -> None:
     assert any(o.reason == "ghost is under the floor" for o in outliers[3])
     assert outliers[4][0].reason.startswith("cube dropped 0.")
     assert outliers[5][0].reason == "the reward is 1.5, above 1"
+    assert (outliers[6][0].reason, outliers[6][0].step) == ("the reward is not a number", 1)
+    one_of_each.select_env(6)
+    [odd] = [what for what in one_of_each.strip(0, 10**6).events if what[1] & NOT_A_NUMBER]
+    assert odd[0] == one_of_each.view().timeline.first + 1
 
 
 def test_outliers_of_an_episode_are_those_of_the_last_one_after_a_reset(one_of_each: Session) -> None:

@@ -153,7 +153,7 @@ def test_the_future_that_was_left_can_be_returned_to(session: Session) -> None:
     session.seek(start + 2)
     after(session, lambda: session.go_on("all"))
     run(session, 2)
-    assert session.view().timeline.undo == "going back (all envs)"
+    assert session.view().timeline.undo == "going back of all"
     view = after(session, session.undo)
     assert is_close(view.step.poses, left.poses)
     assert view.step.elapsed_steps.tolist() == [6] * N
@@ -172,6 +172,45 @@ def test_a_reset_can_be_taken_back_and_the_one_before_it_too(session: Session) -
     view = after(session, session.undo)
     assert is_close(view.step.poses[:2], first.poses[:2])
     assert view.step.elapsed_steps.tolist() == [3, 3, 5]
+
+
+def test_undo_leaves_alone_what_has_jumped_on_since(session: Session) -> None:
+    fresh(session)
+    run(session, 3)
+    after(session, lambda: session.reset((0, 1)))
+    run(session, 2)
+    after(session, lambda: session.reset((1,)))
+    view = run(session, 1)
+    assert view.step.elapsed_steps.tolist() == [3, 1, 6]
+    assert view.timeline.undo == "reset of env 0"
+    view = after(session, session.undo)
+    assert view.step.elapsed_steps.tolist() == [3, 1, 6] and view.timeline.undo == "reset of 2 envs"
+    session.select_env(1)
+    assert session.view().timeline.undo == "reset of env 1"
+    assert after(session, session.undo).step.elapsed_steps.tolist() == [3, 2, 6]
+    assert session.view().timeline.undo == "reset of env 1", (
+        "of the two that were moved by it the other is back"
+    )
+    view = after(session, session.undo)
+    assert view.step.elapsed_steps.tolist() == [3, 3, 6] and view.timeline.undo == "reset of all"
+    session.select_env(0)
+
+
+def test_a_moment_without_an_action_has_the_reward_of_its_record_or_none(session: Session) -> None:
+    start = fresh(session)
+    assert np.isnan(session.view().step.reward).all()
+    rewards = [run(session, 1).step.reward for _ in range(4)]
+    view = after(session, lambda: session.reset((1,)))
+    assert np.isnan(view.step.reward[1]) and np.array_equal(view.step.reward[[0, 2]], rewards[3][[0, 2]])
+    session.seek(start + 2)
+    view = after(session, lambda: session.go_on("all"))
+    assert np.array_equal(view.step.reward, rewards[1])
+    assert not view.timeline.not_carried
+    strip = session.strip(start, view.timeline.last)
+    kept = [np.nan, *(reward[0] for reward in rewards), rewards[3][0], rewards[1][0]]
+    assert np.array_equal(strip.reward, kept, equal_nan=True)
+    session.seek(start + 2)
+    assert not after(session, lambda: session.go_on("into all")).timeline.not_carried
 
 
 def test_a_recording_ends_where_one_goes_back(session: Session) -> None:

@@ -85,6 +85,9 @@ def test_a_loop_in_a_step_is_told_and_can_be_left_with_its_traceback(
     busy = wait_until(session, lambda v: v.busy is not None, "busy").busy
     assert busy.doing == f"in {place}" and busy.seconds >= 2.0 and not busy.deaf
     assert busy.file == str(risky_file) and busy.code in ("while True:", "pass")
+    session.step()
+    session.step()
+    session.play()
     session.interrupt()
     view = wait_until(session, lambda v: v.problem is not None and v.busy is None, "the interrupt")
     assert view.problem.stage == place and "Interrupted: stopped by hand after" in view.problem.message

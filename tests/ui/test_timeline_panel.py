@@ -51,7 +51,7 @@ def test_it_is_there_from_the_first_moment_and_offers_only_what_can_be_done(page
     drawn(page)
     assert (panel._slider.handle.min, panel._slider.handle.max, panel._slider.handle.value) == (-4, 0, 0)
     assert not panel._travel.visible, "nobody is in the past"
-    assert panels.UNDO_RESET not in panel._walk.options, "nothing was before the first reset"
+    assert panel._walk.options == panels.WALK, "nothing was before the first reset"
     assert "live" in panel._strip.content
 
 
@@ -83,9 +83,11 @@ def test_zoom_to_episode_takes_the_slider_to_where_the_episode_began(page: Page)
     page._timeline._on_walk(panels.EPISODE)
     panel = drawn(page)
     assert panel._slider.handle.min == -3
-    assert panels.EVERYTHING in panel._walk.options and panels.UNDO_RESET in panel._walk.options
+    assert panel._walk.options[-2:] == (panels.EVERYTHING, "undo reset of all")
     page._timeline._on_walk(panels.EVERYTHING)
     assert drawn(page)._slider.handle.min < -3
+    page._timeline._on_walk("undo reset of all")
+    wait_until(page._session, lambda view: view.step.elapsed_steps[0] > 3, "the episode before")
 
 
 def test_an_arrow_that_a_slider_took_is_not_taken_twice(page: Page) -> None:

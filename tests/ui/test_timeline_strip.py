@@ -7,7 +7,7 @@ from tests.ui.scenes import running
 from workbench.session.history import FAIL, RESET, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.session.timeline import Strip, TimelineView
 from workbench.ui.fragments import render
-from workbench.ui.timeline_strip import HEIGHT, POINTS, line_points, strip_values
+from workbench.ui.timeline_strip import HEIGHT, POINTS, reward_lines, strip_values
 
 
 def strip(**changes: object) -> Strip:
@@ -66,17 +66,25 @@ def test_one_moment_alone_can_be_drawn() -> None:
 def test_a_spike_of_one_step_stays_in_the_line(count: int) -> None:
     reward = np.zeros(count, np.float32)
     reward[count // 3] = 5.0
-    points = [tuple(map(float, point.split(","))) for point in line_points(reward).split()]
+    (line,) = reward_lines(reward)
+    points = [tuple(map(float, point.split(","))) for point in line.split()]
     assert len(points) <= POINTS
     assert min(y for _, y in points) == 0.0 and max(y for _, y in points) == HEIGHT
     assert all(0 <= x <= 100 for x, _ in points)
 
 
-def test_a_reward_without_a_number_or_without_a_change_has_no_line() -> None:
-    assert line_points(np.full(10, np.nan, np.float32)) == ""
-    assert line_points(np.ones(10, np.float32)) == ""
-    points = line_points(np.array([0, np.nan, 1], np.float32))
-    assert "nan" not in points and len(points.split()) == 3
+def test_where_there_is_no_reward_is_a_gap_and_without_a_change_no_line() -> None:
+    assert reward_lines(np.full(10, np.nan, np.float32)) == []
+    assert reward_lines(np.ones(10, np.float32)) == []
+    lines = reward_lines(np.array([np.nan, 1, 2, np.nan, 0], np.float32))
+    assert [[point.split(",")[0] for point in line.split()] for line in lines] == [
+        ["25.00", "50.00"],
+        ["100.00", "100.00"],
+    ]
+    many = np.tile(np.array([np.nan, 1, 2], np.float32), 1000)
+    assert len(reward_lines(many)) == 1, "narrower than a pixel"
+    html = render("timeline", **strip_values(strip(reward=many[:101]), running(4, timeline=past())))
+    assert "nan" not in html and html.count("<polyline") > 1
 
 
 def test_what_could_not_be_put_back_is_said_and_escaped() -> None:

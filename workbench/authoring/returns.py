@@ -4,8 +4,9 @@ ManiSkill 3.0.1 checks none of it. Some mistakes raise far from their cause (``s
 Python bool: "'bool' object has no attribute 'clone'", inside `BaseEnv.step`). The others are
 silent: ``success`` of shape ``()`` gives a ``terminated`` of shape ``()``; a reward of shape
 ``(N, 1)``, of shape ``()``, or a Python float is handed on, and then broadcasts against ``(N,)``
-into an ``(N, N)`` in somebody's trainer; a NaN is handed on too. With one env all of them look
-right. So they are checked here, and told at the ``def`` of the hook that returned them.
+into an ``(N, N)`` in somebody's trainer. With one env all of them look right. So they are checked
+here, and told at the ``def`` of the hook that returned them. (A NaN has the right shape: it is a value,
+and flagged in the env that has it, see `workbench.session.outliers`.)
 
 The rules are those of ManiSkill's guide to custom tasks ("ensure the data returned ... is all
 batched"), and the checks are pure: nothing is stepped, changed or moved from its device. Their words
@@ -36,7 +37,7 @@ def check_step_returns(
 
     `evaluate` is what ``evaluate()`` returned: a dict of tensors with leading dimension N, in which
     ``success`` and ``fail`` are bool of shape (N,); dicts in it are looked into, and strings left
-    alone. `reward` is (N,), floating and finite; None where no reward was computed. Tensors may be
+    alone. `reward` is (N,) and floating; None where no reward was computed. Tensors may be
     on any device. A problem's stage is ``returns``; its place is in `source_files`, or None where
     the hook is inherited.
     """

@@ -121,8 +121,9 @@ def restore_snapshot(
 
     The env may be another: made anew, or of an edited task. Then actors and articulations are matched by
     name, articulations also by the names of their joints, and attributes of the task by name and shape.
-    What holds for a whole batch (counters, the process's random generators) is put back when all envs
-    of the env go back where they were in a snapshot of as many.
+    What the task keeps for a whole batch (counters, a controller's step) belongs to the moment, and is put back
+    when all envs of the env are. The process's random generators are put back when all go back where they were,
+    in a snapshot of as many.
 
     Afterwards the tensors, poses and contact queries are those of the restored moment. ``env._last_obs`` is not:
     ask ``env.get_obs(env.get_info())``, or use `TaskEnv.restore`, which does.
@@ -183,7 +184,7 @@ def restore_memory(
     """Put entry ``positions[k]`` of `memory` into env ``env_idx[k]``; returns what was carried, and not.
 
     Args:
-        whole: all envs go back where they were, so what holds for the batch does too.
+        whole: all envs go back where they were, so the process's random generators do too.
     """
     steps = env.elapsed_steps
     steps[env_idx] = steps.new_tensor(memory.elapsed_steps[positions])
@@ -194,7 +195,7 @@ def restore_memory(
         reader.write(name, generators[name], env_idx, _chosen(states, positions))
     if whole:
         write_shared_rng(memory.shared_rng, env.device)
-    return write_task_state(env, memory.task, env_idx, positions, whole)
+    return write_task_state(env, memory.task, env_idx, positions)
 
 
 _plans: WeakKeyDictionary[Any, CpuStatePlan] = WeakKeyDictionary()

@@ -6,7 +6,7 @@ Nobody declares them either, so they are looked for (`task_members`).
 
 *Rows.* A tensor, an array or a list of plain values whose first dimension is the number of envs has one row
 an env, and the rows of chosen envs are copied. Anything else (a counter, a threshold) holds for the whole
-batch, so it is put back only when the whole batch is.
+batch, so it is put back only when all envs are.
 
 *State or scene?* ``self.peg_half_sizes`` has a row an env too, but it describes pegs that were built, and
 copying env 3's row to env 7 would not change env 7's peg. The difference is when it was written: what has not
@@ -145,12 +145,12 @@ def read_task_state(env: BaseEnv, env_idx: list[int]) -> TaskState:
 
 
 def write_task_state(
-    env: BaseEnv, state: TaskState, env_idx: list[int], positions: list[int], whole: bool
+    env: BaseEnv, state: TaskState, env_idx: list[int], positions: list[int]
 ) -> tuple[dict[str, None], dict[str, str]]:
     """Put row ``positions[k]`` of every buffer into env ``env_idx[k]``.
 
-    Args:
-        whole: all envs are put back where they were: what holds for the whole batch is put back too.
+    What holds for the whole batch is put back too if all envs are, each to its own or all to one of them: they
+    then stand at the one moment that it belongs to.
 
     Returns:
         Paths that were carried, and paths that were not with the reason.
@@ -180,7 +180,7 @@ def write_task_state(
             carried[leaf.path] = None
             continue
         if not kept.per_env:
-            if whole:
+            if all_envs:
                 leaf.put(_as_found(kept, env))
                 carried[leaf.path] = None
             elif not _equal(kept.values, value):

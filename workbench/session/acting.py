@@ -6,6 +6,7 @@ repeats everything that follows it.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,8 @@ class Acting:
     def __init__(self) -> None:
         self._source: ActionSource = "random"
         self._policy: Policy | None = None
+        self._policy_name = ""
+        self._beside: Path | None = None
         self._rng = np.random.default_rng(0)
         self.sliders: tuple[float, ...] = ()
         """(A,) what every env is given while the source is ``sliders``; another length is no action."""
@@ -37,33 +40,42 @@ class Acting:
         # Each episode has a seed of its own, or a recording of it could not say how to start it again.
         return [int(seed) for seed in self._rng.integers(2**31, size=count)]
 
-    def use(self, source: ActionSource, policy: str | None) -> None:
+    def use(self, source: ActionSource, policy: str | None, beside: Path | None = None) -> None:
         """Take the actions from there.
 
+        Args:
+            policy: as for `load_policy`; with none named yet, nothing is wrong until an action is asked for.
+            beside: as for `load_policy`.
+
         Raises:
-            TaskError: the policy cannot be imported; the envs then hold still.
+            TaskError: the policy cannot be imported; so will `next_action`, which tries again.
         """
-        self._source = source
-        if source != "policy" or policy is None:
+        self._source, self._policy_name, self._beside = source, policy or "", beside
+        self._policy = None
+        if source != "policy" or not self._policy_name:
             return
         try:
-            self._policy = load_policy(policy)
+            self._policy = load_policy(self._policy_name, beside)
         except (Exception, SystemExit, Interrupted) as error:
-            self._policy = None
             raise TaskError(problem_from_exception(error, "policy", ())) from error
 
     def next_action(self, task: TaskEnv) -> NDArray[np.float32]:
         """(N, A), within the bounds but for a policy's.
 
         Raises:
-            TaskError: the policy raised, or gave no action.
+            TaskError: the policy raised, gave no action, or cannot be imported. Its file is read anew the next
+                time: it may be mended by then.
         """
         if self._source == "random":
             return actions.random_action(task.parts, task.num_envs, self._rng)
-        if self._source == "policy" and self._policy is not None:
+        if self._source == "policy":
+            # Never another action in its place: the page says that the policy acts.
             try:
+                if self._policy is None:
+                    self._policy = load_policy(self._policy_name, self._beside)
                 return actions.to_flat_action(task.env, task.parts, self._policy(task.obs))
             except (Exception, SystemExit, Interrupted) as error:
+                self._policy = None
                 raise TaskError(problem_from_exception(error, "policy", ())) from error
         low, high = actions.bounds(task.parts)
         if self._source == "zero":

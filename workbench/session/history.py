@@ -17,7 +17,7 @@ from __future__ import annotations
 import pickle
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 
 import numpy as np
@@ -29,8 +29,8 @@ from workbench.core.step import StepResult
 from workbench.session.messages import PastPictures, Pictures, Restored, Stepped
 from workbench.session.standing import Standing
 
-RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED = 1, 2, 4, 8, 16
-"""What may happen to an env at a moment. Success and failure: the first moment of it in an episode."""
+RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, NOT_A_NUMBER = 1, 2, 4, 8, 16, 32
+"""What may happen to an env at a moment. Success, failure and a reward that is none: the first in an episode."""
 _OVERHEAD = 2500
 """Bytes of the objects around a moment's arrays; with it the count is within 2 % of what tracemalloc measures."""
 _PICTURES_SHARE = 0.5
@@ -46,6 +46,7 @@ class Moment:
     serial: int
     """Counts up over the session."""
     step: StepResult
+    """Its reward is NaN in an env that was reset, and the recorded one in an env that was put back here."""
     jumped: NDArray[np.bool_]
     """(N,) as `Stepped.reset_mask`."""
     seeds: NDArray[np.int64] | None
@@ -66,6 +67,13 @@ class Moment:
     """Which of the pictures are of a camera that was moved since."""
     standing: Standing | None = None
     """What the table of envs said then."""
+    first_said: StepResult | None = None
+    """`step` as it was when this happened, if a newer version has said otherwise since."""
+
+    @property
+    def as_recorded(self) -> StepResult:
+        """What was said when it happened, whichever version said it."""
+        return self.step if self.first_said is None else self.first_said
 
 
 @dataclass(frozen=True)
@@ -108,8 +116,7 @@ class History:
         self._used = 0
         self._pictures_used = 0
         self._pictured: deque[int] = deque()
-        self._ever = {flag: np.zeros(num_envs, bool) for flag in (SUCCESS, FAIL)}
-        self._undone: set[int] = set()
+        self._ever = {flag: np.zeros(num_envs, bool) for flag in (SUCCESS, FAIL, NOT_A_NUMBER)}
         self._jumps: deque[Moment] = deque()
         self._base = first_serial
         self._happened = np.zeros((_FIRST_ROWS, num_envs), np.uint8)
@@ -118,8 +125,13 @@ class History:
     # --- what comes --------------------------------------------------------------------------------
 
     def add(self, stepped: Stepped, tick: int) -> Moment:
-        """The next moment."""
+        """The next moment.
+
+        A reward is for an action: where there was none (a reset, a going back) the worker says zero, and what is
+        kept is NaN, or what was said of the moment that was gone back to, or in the other envs what stood before.
+        """
         parts = self._take_parts(stepped)
+        stepped = replace(stepped, step=self._with_rewards(stepped))
         size = _OVERHEAD + len(stepped.snapshot) + _step_bytes(stepped.step)
         size += Standing.bytes_a_step(self._num_envs)
         moment = Moment(
@@ -135,8 +147,6 @@ class History:
             parts=parts,
             size=size,
         )
-        if stepped.restored is not None and stepped.restored.undoes is not None:
-            self._undone.add(stepped.restored.undoes)
         self._write_row(moment)
         self._next_serial += 1
         self._moments.append(moment)
@@ -146,11 +156,22 @@ class History:
         self._shrink()
         return moment
 
-    def renew_last(self, step: StepResult) -> None:
-        """The newest moment was judged anew, by a version that was put on the env that is there."""
-        if self._moments:
-            self._moments[-1].step = step
-            self._write_row(self._moments[-1])
+    def renew_last(self, step: StepResult) -> StepResult:
+        """The newest moment was judged anew, by a version that was put on the env that is there.
+
+        Returns:
+            what it says from now on: no other reward where there was no action.
+        """
+        if not self._moments:
+            return step
+        moment = self._moments[-1]
+        if moment.first_said is None:
+            moment.first_said = moment.step
+            moment.size += _step_bytes(step)
+            self._used += _step_bytes(step)
+        moment.step = step if step.action is not None else replace(step, reward=moment.step.reward)
+        self._write_row(moment)
+        return moment.step
 
     def add_pictures(self, event: Pictures | PastPictures) -> None:
         """Pictures are kept with the moment that they show, if it still is."""
@@ -238,7 +259,7 @@ class History:
         return [(low + int(k), int(happened[k])) for k in np.flatnonzero(happened)]
 
     def rewards(self, env: int, low: int, high: int) -> NDArray[np.float32]:
-        """(K,) of this env at the moments between two, both included; zero where it jumped."""
+        """(K,) of this env at the moments between two, both included; NaN where it was reset."""
         return self._reward[self._rows(low, high)[1], env].copy()
 
     def jumps_back(self, env: int) -> list[tuple[int, int]]:
@@ -298,13 +319,26 @@ class History:
         return np.array(list(islice(rewards, most))[::-1], np.float32)
 
     def last_jump(self, env: int) -> Moment | None:
-        """The newest jump of this env that can be taken back: one that was not, and takes none back itself."""
+        """The jump that brought this env where it is, if it can be taken back.
+
+        Where one was taken back the env stands as it stood before it, so the next is the last one before that:
+        what it did in the future that was left thereby is none of this one's.
+        """
+        until = self.last
         for moment in reversed(self._jumps):
-            takes_back = moment.restored is not None and moment.restored.undoes is not None
-            if moment.jumped[env] and not takes_back and moment.serial not in self._undone:
-                before = self.at(moment.serial - 1)
-                return moment if before is not None and before.snapshot else None
+            if moment.serial > until or not moment.jumped[env]:
+                continue
+            if moment.restored is not None and moment.restored.undoes is not None:
+                until = moment.restored.origin
+                continue
+            before = self.at(moment.serial - 1)
+            return moment if before is not None and before.snapshot else None
         return None
+
+    def moved_last_by(self, jump: Moment) -> tuple[int, ...]:
+        """The envs that this jump brought where they are; others that it moved have jumped on since."""
+        moved = (int(env) for env in np.flatnonzero(jump.jumped))
+        return tuple(env for env in moved if self.last_jump(env) is jump)
 
     # --- the inside --------------------------------------------------------------------------------
 
@@ -355,10 +389,6 @@ class History:
             row = moment.serial - self._base
         self._happened[row] = moment.happened
         self._reward[row] = moment.step.reward
-        if moment.step.action is None and self._moments:
-            # Others were reset: to those that were not, nothing happened, and their reward is no zero.
-            stays = ~moment.jumped
-            self._reward[row, stays] = self._reward[row - 1, stays]
 
     def _shrink(self) -> None:
         while self._pictures_used > self.limit * _PICTURES_SHARE and self._pictured:
@@ -370,7 +400,6 @@ class History:
             self._used -= oldest.size
             self._drop_pictures(oldest)
             self._release(oldest.parts)
-            self._undone.discard(oldest.serial)
             if self._jumps and self._jumps[0] is oldest:
                 self._jumps.popleft()
 
@@ -379,6 +408,23 @@ class History:
         moment.pictures = {}
         self._pictures_used -= size
         self._used -= size
+
+    def _with_rewards(self, stepped: Stepped) -> StepResult:
+        step, jumped, restored = stepped.step, stepped.reset_mask, stepped.restored
+        if step.action is not None or not jumped.any():
+            return step
+        reward, gone = np.full(self._num_envs, np.nan, np.float32), jumped
+        if self._moments:
+            before = self._moments[-1].step
+            reward[:] = before.reward
+            if restored is None:
+                # A worker that came back with the very moment at which the one before it died.
+                gone = jumped & ((step.elapsed_steps != before.elapsed_steps) | (step.elapsed_steps == 0))
+        reward[gone] = np.nan
+        origin = None if restored is None else self.at(restored.origin)
+        if restored is not None and origin is not None:
+            reward[list(restored.env_idx)] = origin.step.reward[list(restored.source)]
+        return replace(step, reward=reward)
 
     def _events(self, stepped: Stepped) -> NDArray[np.uint8]:
         step, jumped = stepped.step, stepped.reset_mask
@@ -393,6 +439,12 @@ class History:
             happened[is_so & ~self._ever[flag] & ~jumped] |= flag
             self._ever[flag] = np.where(jumped, is_so, self._ever[flag] | is_so)
         happened[step.truncated & ~jumped] |= TRUNCATED
+        ever, none = self._ever[NOT_A_NUMBER], ~np.isfinite(step.reward)
+        if not jumped.any():
+            happened[none & ~ever] |= NOT_A_NUMBER
+            ever |= none
+        else:
+            ever[jumped] = none[jumped] & (stepped.restored is not None)
         return happened
 
 

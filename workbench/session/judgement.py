@@ -120,7 +120,7 @@ class Judgement:
         self._old: dict[str, NDArray[np.float32]] = {}
         self._new: dict[str, NDArray[np.float32]] = {}
         for row, moment in enumerate(self._moments):
-            self._write(self._old, row, moment.step)
+            self._write(self._old, row, moment.as_recorded)
         self._metres = np.zeros((count, envs), np.float32)
         self._radians = np.zeros((count, envs), np.float32)
         # Episodes by number over the batch: which one each env is in at each row.

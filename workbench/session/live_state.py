@@ -69,11 +69,13 @@ class Chronicle:
         self._past = Past(task.num_envs)
         self._curves: Curves | None = None
 
-    def add(self, event: Stepped) -> None:
+    def add(self, event: Stepped) -> StepResult:
+        """Take an event; returns its result as it is kept (see `History.add`)."""
         self._past.add(event)
-        self.timeline.add(event, max(0, self._past.count - 1))
+        moment = self.timeline.add(event, max(0, self._past.count - 1))
         self.table.add(event, self.timeline.history)
         self.terms.add(event)
+        return moment.step
 
     def curves(self) -> Curves:
         """Copied once for every control step, however often they are asked for."""
@@ -164,7 +166,7 @@ class LiveState:
             same = restored and before is not None and before.source_hash == task.source_hash
             self._new_scene(task, event.first, its_past_stays=same)
         elif self.timeline is not None:
-            self.timeline.history.renew_last(event.first)
+            self.step = self.timeline.history.renew_last(event.first)
         if report is None or report.level not in ("same", "patched"):
             self.cameras_serial += 1
             self.pictures_serial += 1
@@ -188,7 +190,7 @@ class LiveState:
     def stepped(self, event: Stepped) -> None:
         self.step = event.step
         if self.chronicle is not None:
-            self.chronicle.add(event)
+            self.step = self.chronicle.add(event)
             self.step_serial = self.chronicle.timeline.history.last
         first, self.first_due = self.first_due, False
         if self.problem is not None and self.problem_at_run and not first:
@@ -327,8 +329,13 @@ class LiveState:
         return [
             SetSpeed(self.speed),
             SetEpisodeEnd(self.episode_end),
-            SetActionSource(self.action_source, self.policy),
+            self.action_request(),
         ]
+
+    def action_request(self) -> SetActionSource:
+        """Where the actions come from; a policy's file may also lie beside the task's."""
+        beside = None if self.own_file is None else str(self.own_file.parent)
+        return SetActionSource(self.action_source, self.policy, beside)
 
     def watch_request(self) -> WatchCameras:
         """The pictures that somebody looks at; none while no page is open."""

@@ -144,7 +144,9 @@ class SetEpisodeEnd:
 class SetActionSource:
     source: ActionSource
     policy: str | None = None
-    """``module:function`` or ``file.py:function`` when `source` is ``policy``."""
+    """``module:function`` or ``file.py:function`` when `source` is ``policy``; None while none is named."""
+    beside: str | None = None
+    """The folder in which a policy's file is looked for when it is not in the current one."""
 
 
 @dataclass(frozen=True)
@@ -276,6 +278,11 @@ Request = (
     | JudgeMoments
     | Quit
 )
+
+
+def is_a_step(request: Request) -> bool:
+    """Whether it asks for control steps: an interrupt drops those that wait."""
+    return isinstance(request, SingleStep) or (isinstance(request, Play) and request.playing)
 
 
 # --- events: worker to server --------------------------------------------------------------------

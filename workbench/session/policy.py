@@ -17,20 +17,23 @@ from typing import Any
 Policy = Callable[[Any], Any]
 
 
-def load_policy(reference: str) -> Policy:
+def load_policy(reference: str, beside: Path | None = None) -> Policy:
     """Import the function that `reference` names.
+
+    Args:
+        beside: a folder in which a relative file is looked for when it is not in the current one.
 
     Raises:
         ValueError: the reference is not of that form, or names nothing callable.
         Exception: whatever the policy's module raises while it is imported.
     """
+    if not reference.strip():
+        raise ValueError("name a policy: module:function or file.py:function")
     name, separator, attribute = reference.rpartition(":")
     if not separator or not name or not attribute:
         raise ValueError(f"'{reference}' is not of the form module:function or file.py:function")
     if name.endswith(".py"):
-        path = Path(name).expanduser().resolve()
-        if not path.is_file():
-            raise ValueError(f"there is no file {path}")
+        path = _find(name, beside)
         spec = importlib.util.spec_from_file_location(f"workbench_policy_{path.stem}", path)
         if spec is None or spec.loader is None:
             raise ValueError(f"{path} cannot be imported")
@@ -46,3 +49,19 @@ def load_policy(reference: str) -> Policy:
     if not callable(function):
         raise ValueError(f"{name} has no function {attribute}")
     return function
+
+
+def _find(name: str, beside: Path | None) -> Path:
+    """Where the file is: in the folder where the command was started, or else beside the task."""
+    path = Path(name).expanduser()
+    here = path.resolve()
+    if here.is_file():
+        return here
+    if path.is_absolute() or beside is None or (beside / path).resolve() == here:
+        raise ValueError(f"there is no file {here}")
+    there = (beside / path).resolve()
+    if not there.is_file():
+        raise ValueError(
+            f"there is no {name} in {Path.cwd()}, where the command was started, nor beside the task in {beside}"
+        )
+    return there

@@ -39,6 +39,7 @@ from workbench.session.messages import (
     SetSliders,
     SetSpeed,
     WatchCameras,
+    is_a_step,
 )
 from workbench.session.pulse import Beat, PulseReader, make_pulse
 
@@ -178,7 +179,9 @@ class WorkerProcess:
         return os.pread(self._stacks, 100_000, 0).decode(errors="replace")
 
     def interrupt(self) -> None:
-        """Leave the author's code if Python runs it; see `interrupts`."""
+        """Leave the author's code if Python runs it (see `interrupts`); control steps that wait are not taken."""
+        with self._wake:
+            self._waiting = deque(request for request in self._waiting if not is_a_step(request))
         if self.beat().number > 0 and self._process.poll() is None:
             _signal_main_thread(self.pid, INTERRUPT_SIGNAL)
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from workbench.authoring.reference import named_file
 from workbench.core.pictures import Picture
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import take_pictures
@@ -143,5 +144,6 @@ def _acting(what: RecordOptions) -> Acting:
     if what.actions in ("hold", "zero", "random"):
         acting.use(what.actions, None)
     else:
-        acting.use("policy", what.actions)
+        file = named_file(what.task)
+        acting.use("policy", what.actions, None if file is None else file.parent)
     return acting

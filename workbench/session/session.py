@@ -43,7 +43,6 @@ from workbench.session.messages import (
     Request,
     Reset,
     Restore,
-    SetActionSource,
     SetCapture,
     SetEpisodeEnd,
     SetSliders,
@@ -222,7 +221,7 @@ class Session:
 
     def set_action_source(self, source: ActionSource, policy: str | None = None) -> None:
         self._set(action_source=source, policy=policy)
-        self._send(SetActionSource(source, policy))
+        self._send(self._state.action_request())
 
     def set_sliders(self, action: tuple[float, ...]) -> None:
         """The action (A,) that every env gets while the action source is ``sliders``."""

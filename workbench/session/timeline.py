@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.pictures import CameraKind, Picture
-from workbench.session.history import RESET, History, Moment
+from workbench.session.history import History, Moment
 from workbench.session.messages import CameraRequest, DrawPast, PastPictures, Pictures, Restore, Stepped
 
 Scope = Literal["this", "all", "into all"]
@@ -77,13 +77,14 @@ class Timeline:
 
     # --- what comes ----------------------------------------------------------------------------------
 
-    def add(self, stepped: Stepped, tick: int) -> None:
-        self.history.add(stepped, tick)
+    def add(self, stepped: Stepped, tick: int) -> Moment:
+        moment = self.history.add(stepped, tick)
         if stepped.reset_mask.any():
             missed = {} if stepped.restored is None else stepped.restored.not_carried
             self._not_carried = tuple(f"{what}: {why}" for what, why in missed.items())
         if self._shown is not None and self._shown < self.history.first:
             self._shown = self.history.first  # what was looked at had to go
+        return moment
 
     def add_pictures(self, event: Pictures | PastPictures) -> None:
         self.history.add_pictures(event)
@@ -148,7 +149,7 @@ class Timeline:
             limit=history.limit,
             moments=len(history),
             can_go_on=moment is not None and bool(moment.snapshot),
-            undo=None if jump is None else _in_words(jump, self._num_envs),
+            undo=None if jump is None else _in_words(jump, history.moved_last_by(jump), self._num_envs),
             not_carried=self._not_carried,
             wants_pictures=moment is not None and bool(self._lacking(moment, env, cameras)),
         )
@@ -184,14 +185,14 @@ class Timeline:
         return Restore(snapshot, envs, source, moment.serial)
 
     def undo(self, env: int) -> Restore | None:
-        """Ask to take back this env's last jump, in all envs that jumped; None where there is none."""
+        """Ask to take back this env's last jump, in all envs that it brought where they are; None if there is none."""
         jump = self.history.last_jump(env)
         if jump is None:
             return None
         snapshot = self.history.snapshot_at(jump.serial - 1)
         if snapshot is None:
             return None
-        envs = tuple(int(i) for i in np.flatnonzero(jump.jumped))
+        envs = self.history.moved_last_by(jump)
         self._shown = None
         return Restore(snapshot, envs, envs, jump.serial - 1, undoes=jump.serial)
 
@@ -222,12 +223,10 @@ class Timeline:
         return tuple(camera for camera in cameras if lacks(camera))
 
 
-def _in_words(jump: Moment, num_envs: int) -> str:
-    envs = np.flatnonzero(jump.jumped)
+def _in_words(jump: Moment, envs: tuple[int, ...], num_envs: int) -> str:
+    what = "reset" if jump.restored is None else "going back"
+    if num_envs == 1:
+        return what
     if len(envs) == num_envs:
-        who = "the env" if num_envs == 1 else "all envs"
-    elif len(envs) > 3:
-        who = f"{len(envs)} envs"
-    else:
-        who = ("env " if len(envs) == 1 else "envs ") + ", ".join(str(i) for i in envs)
-    return f"reset of {who}" if jump.happened[envs[0]] & RESET else f"going back ({who})"
+        return f"{what} of all"
+    return f"{what} of env {envs[0]}" if len(envs) == 1 else f"{what} of {len(envs)} envs"

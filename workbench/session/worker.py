@@ -17,10 +17,12 @@ from __future__ import annotations
 import gc
 import pickle
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -79,6 +81,7 @@ from workbench.session.messages import (
     WarmedUp,
     WarmUp,
     WatchCameras,
+    is_a_step,
 )
 from workbench.session.open_task import OpenedTask, blamed, reset_checked, restore_checked, step_checked
 from workbench.session.pacing import Pacer, Rate
@@ -116,6 +119,8 @@ class Worker:
         self._steps = StepEvents()
         self._status_sent = 0.0
         self._quit = False
+        self._queue: deque[Request] = deque()
+        """What has come and was not carried out."""
         self._handlers: dict[type, Callable[[Any], None]] = {
             Load: self._load,
             Play: self._play,
@@ -144,7 +149,9 @@ class Worker:
         self._interrupts.install()
         while not self._quit:
             self._pulse.begin("idle")
-            for request in self._requests(self._sleep()):
+            self._queue.extend(self._requests(self._sleep()))
+            while self._queue:
+                request = self._queue.popleft()
                 self._at_work(_DOING.get(type(request)), partial(self._handlers[type(request)], request))
             now = time.monotonic()
             if self._playing and self._pacer.due(now):
@@ -165,6 +172,7 @@ class Worker:
             self._interrupts.run(work)
         except Interrupted as error:
             # Outside of what knows its task: between two hooks, or in the workbench's own code.
+            self._drop_steps()
             known = () if self._opened is None else self._opened.loaded.source_files
             self._fail(problem_from_exception(error, _STAGE.get(doing, "step"), known))
             self._back_to_the_moment()
@@ -203,6 +211,13 @@ class Worker:
         loads = [request for request in requests if isinstance(request, Load)]
         return [request for request in requests if not isinstance(request, Load) or request is loads[-1]]
 
+    def _drop_steps(self) -> None:
+        """What was pressed while a hook hung is not to make it hang again. Before the page is told of the
+        interrupt: what is pressed after that is meant."""
+        with self._interrupts.shielded():
+            waiting = [*self._queue, *self._requests(0.0)]
+            self._queue = deque(request for request in waiting if not is_a_step(request))
+
     def _send(self, event: Event) -> None:
         try:
             with self._interrupts.shielded():
@@ -222,6 +237,8 @@ class Worker:
         except TaskError as error:
             if self._opened is not None:
                 self._placed.put_back(self._opened.env.env)  # trying new cameras took the old ones away
+            if isinstance(error.__cause__, Interrupted):
+                self._drop_steps()
             self._send(Failed(error.problem, kept=self._opened is not None))
             return
         # From here on it is one thing: an interrupt in the middle would leave the page with another task than ours.
@@ -284,9 +301,14 @@ class Worker:
 
     def _set_action_source(self, request: SetActionSource) -> None:
         try:
-            self._acting.use(request.source, request.policy)
+            beside = None if request.beside is None else Path(request.beside)
+            self._acting.use(request.source, request.policy, beside)
         except TaskError as error:
-            self._fail(error.problem)
+            if isinstance(error.__cause__, Interrupted):
+                self._drop_steps()
+            # Before a task is loaded it would pass for a failure of the load; the first step says it.
+            if self._opened is not None:
+                self._fail(error.problem)
 
     def _set_sliders(self, request: SetSliders) -> None:
         self._acting.sliders = request.action
@@ -404,8 +426,11 @@ class Worker:
         try:
             do(self._opened)
         except TaskError as error:
+            left = isinstance(error.__cause__, Interrupted)
+            if left:
+                self._drop_steps()
             self._fail(error.problem)
-            if isinstance(error.__cause__, Interrupted):
+            if left:
                 self._back_to_the_moment()
 
     def _fail(self, problem: Problem) -> None:

@@ -67,9 +67,10 @@ class CurvesPanel:
             return
         data, labels = curve_data(curves.tick, values, env)
         series = chart_series(labels)
-        if shown is not None:
+        if shown is not None or not all(np.isfinite(line).all() for line in data[1:]):
             # uPlot finds no range for data with NaN in it.
             span = span or value_span(data[1:])
+        if shown is not None:
             data, series = (*data, cursor_data(data, shown)), (*series, CURSOR)
         scales = {"x": uplot.Scale(time=False)} | ({} if span is None else {"y": uplot.Scale(range=span)})
         if chart is None:
@@ -104,7 +105,15 @@ def curve_data(
     one = values[recent, min(env, values.shape[1] - 1)].astype(np.float64)
     if values.shape[1] == 1:
         return (x, one), ("env 0",)
-    return (x, values[recent].mean(axis=1, dtype=np.float64), one), ("mean of the batch", f"env {env}")
+    return (x, mean_of_numbers(values[recent]), one), ("mean of the batch", f"env {env}")
+
+
+def mean_of_numbers(values: NDArray[np.float32]) -> NDArray[np.float64]:
+    """(T,) over the envs whose value is a number; NaN where none is. One env's NaN is not to take the mean away."""
+    there = np.isfinite(values)
+    total = np.where(there, values, 0.0).sum(axis=1, dtype=np.float64)
+    count = there.sum(axis=1)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def cursor_data(data: tuple[NDArray[np.float64], ...], shown: int) -> NDArray[np.float64]:

@@ -32,7 +32,7 @@ def number_rows(step: StepResult, selected_env: int, max_episode_steps: int | No
     of = f" / {max_episode_steps}" if max_episode_steps else ""
     rows = [
         NumberRow("elapsed steps", f"{_item(step.elapsed_steps, env)}{of}", _batch(step.elapsed_steps)),
-        NumberRow("reward", _item(step.reward, env), _batch(step.reward)),
+        _reward_row(step, env),
     ]
     first = [key for key in ("success", "fail") if key in step.evaluate]
     rest = sorted(key for key in step.evaluate if key not in first)
@@ -43,6 +43,17 @@ def number_rows(step: StepResult, selected_env: int, max_episode_steps: int | No
             mood = "good" if key == "success" else "bad"
         rows.append(NumberRow(str(key), _item(values, env), _batch(values), mood))
     return rows
+
+
+def _reward_row(step: StepResult, env: int) -> NumberRow:
+    """A reward is for an action: right after a reset there is none, which is not zero and not a NaN of the task's."""
+    there = np.isfinite(step.reward) | ((step.elapsed_steps > 0) & (step.action is not None))
+    there &= step.elapsed_steps > 0
+    return NumberRow(
+        "reward",
+        _item(step.reward, env) if env < len(there) and there[env] else "—",
+        _batch(step.reward[there]) if there.any() else "—",
+    )
 
 
 def _item(values: NDArray, env: int) -> str:

@@ -96,14 +96,14 @@ class RunPanel:
                 gui.add_dropdown("Source", tuple(SOURCES), initial_value="hold still"),
                 read=lambda value: SOURCES[checked_choice(value, SOURCES, "source of actions")],
                 send=self._choose_source,
-                shown=self._source_shown,
+                shown=lambda source: _name_of(SOURCES, source),
             )
             self._policy = Control(
                 gui.add_text(
                     "Policy", "", hint="module:function or file.py:function, given obs, returns the action."
                 ),
                 read=self._read_policy,
-                send=lambda policy: session.set_action_source("policy", policy),
+                send=lambda policy: session.set_action_source("policy", policy or None),
                 settle=0.8,
             )
             self._policy_hint = gui.add_html(
@@ -111,7 +111,6 @@ class RunPanel:
                 "It is called with the observation and returns the action.</div>"
             )
             self._sliders = ActionSliders(server, session)
-        self._choosing_policy = False
 
     # --- what keys and buttons do ----------------------------------------------------------------
 
@@ -161,9 +160,7 @@ class RunPanel:
         self._end.show(view.episode_end)
         self._source.show(view.action_source)
         self._policy.show(view.policy or "")
-        if view.action_source == "policy" or self._source.handle.value != "policy":
-            self._choosing_policy = False
-        policy_wanted = view.action_source == "policy" or self._choosing_policy
+        policy_wanted = view.action_source == "policy"
         self._policy.handle.visible = policy_wanted
         self._policy_hint.visible = policy_wanted and not view.policy
         self._sliders.draw(view.action_source == "sliders", view.sliders)
@@ -192,24 +189,14 @@ class RunPanel:
             self._speed.handle.options = tuple(SPEEDS)
         return name
 
-    def _source_shown(self, source: ActionSource) -> str | None:
-        return "policy" if self._choosing_policy else _name_of(SOURCES, source)
-
     def _choose_source(self, source: ActionSource) -> None:
-        if source != "policy":
-            self._choosing_policy = False
-            self._session.set_action_source(source)
-            return
-        policy = self._policy.handle.value
-        if ":" in policy:
-            self._session.set_action_source("policy", policy)
-        else:
-            # Nothing to run yet: the field for its name appears, the actions stay as they are.
-            self._choosing_policy = True
+        # A policy that is not named yet is a source all the same: a step says what is missing.
+        policy = self._policy.handle.value.strip() if source == "policy" else ""
+        self._session.set_action_source(source, policy or None)
 
     def _read_policy(self, value: object) -> str:
         text = checked_text(value, 500, "policy").strip()
-        if ":" not in text:
+        if text and ":" not in text:
             raise ValueError("A policy is written module:function or file.py:function.")
         return text
 

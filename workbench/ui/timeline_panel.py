@@ -39,7 +39,8 @@ LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, NOW = "‹ event", "‹ step", "st
 EPISODE, EVERYTHING = "zoom to episode", "zoom out"
 SCOPES: tuple[Scope, ...] = ("this", "all", "into all")
 GO_ON = "Go on from here"
-UNDO_RESET, UNDO_BACK = "undo reset", "undo going back"
+UNDO = "undo"
+"""How the button begins that takes back a jump; what and of how many envs follows."""
 WALK = (LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, NOW, EPISODE)
 
 
@@ -117,7 +118,7 @@ class TimelinePanel:
         elif name in (EPISODE, EVERYTHING):
             self._episode_only = name == EPISODE
             self._range_at = 0.0
-        elif name in (UNDO_RESET, UNDO_BACK):
+        elif isinstance(name, str) and name.startswith(UNDO):
             self._session.undo()
 
     def _on_travel(self, name: object) -> None:
@@ -161,7 +162,7 @@ class TimelinePanel:
     def _draw_buttons(self, view: SessionView) -> None:
         past = view.timeline
         # A group of buttons cannot be greyed, so what would do nothing is left out.
-        undo = () if past.undo is None else (UNDO_RESET if past.undo.startswith("reset") else UNDO_BACK,)
+        undo = () if past.undo is None else (f"{UNDO} {past.undo}",)
         walk = (*WALK[:-1], EVERYTHING if self._episode_only else EPISODE, *undo)
         if self._walk.options != walk:
             self._walk.options = walk

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import groupby
+
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.session.history import FAIL, RESET, SUCCESS, TRUNCATED, WENT_BACK
+from workbench.session.history import FAIL, NOT_A_NUMBER, RESET, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.session.timeline import Strip
 from workbench.session.view import SessionView
 
@@ -14,6 +16,7 @@ POINTS = 240
 HEIGHT = 30.0
 """Units of the picture's height that the line has; the marks are above."""
 MARKS: tuple[tuple[int, str, str], ...] = (
+    (NOT_A_NUMBER, "odd", "reward is not a number"),
     (FAIL, "fail", "fail"),
     (SUCCESS, "success", "success"),
     (TRUNCATED, "limit", "time limit"),
@@ -56,7 +59,7 @@ def strip_values(strip: Strip, view: SessionView) -> dict[str, object]:
         "marks": marks,
         "arcs": arcs,
         "bands": bands,
-        "line": line_points(strip.reward),
+        "lines": reward_lines(strip.reward),
         "cursor": place(min(max(shown, strip.low), strip.high)),
         "live": past.shown is None,
         "ago": past.last - shown,
@@ -80,24 +83,26 @@ def where(view: SessionView) -> str:
     return f"{env}step {elapsed}{limit}, {elapsed * task.control_dt:.2f} s"
 
 
-def line_points(reward: NDArray[np.float32]) -> str:
-    """An SVG polyline of the finite rewards over x 0..100 and y 0..`HEIGHT`, greatest on top; empty if there are none."""
+def reward_lines(reward: NDArray[np.float32]) -> list[str]:
+    """SVG polylines of the finite rewards over x 0..100 and y 0..`HEIGHT`, greatest on top, with a gap where there
+    is none; no line without two different ones."""
     finite = reward[np.isfinite(reward)]
-    if len(reward) < 2 or not len(finite) or finite.min() == finite.max():
-        return ""
+    if not len(finite) or finite.min() == finite.max():
+        return []
     low, high = float(finite.min()), float(finite.max())
-    filled = np.where(np.isfinite(reward), reward, low)
-    if len(filled) <= POINTS:
-        places, values = np.arange(len(filled)), filled
+    known = np.where(np.isfinite(reward), reward, np.nan)
+    if len(known) <= POINTS:
+        places, values = np.arange(len(known)), known
     else:
-        edges = np.linspace(0, len(filled), POINTS // 2 + 1).astype(int)[:-1]
-        values = np.stack(
-            [np.minimum.reduceat(filled, edges), np.maximum.reduceat(filled, edges)], 1
-        ).reshape(-1)
+        edges = np.linspace(0, len(known), POINTS // 2 + 1).astype(int)[:-1]
+        values = np.stack([np.fmin.reduceat(known, edges), np.fmax.reduceat(known, edges)], 1).reshape(-1)
         places = np.repeat(edges, 2)
-    x = 100 * places / (len(filled) - 1)
+    x = 100 * places / (len(known) - 1)
     y = HEIGHT * (1 - (values - low) / (high - low))
-    return " ".join(f"{a:.2f},{b:.1f}" for a, b in zip(x, y, strict=True))
+    points = [None if np.isnan(b) else f"{a:.2f},{b:.1f}" for a, b in zip(x, y, strict=True)]
+    runs = [list(run) for there, run in groupby(points, key=lambda point: point is not None) if there]
+    # A line of one point is not drawn; one of length zero with round ends is a dot.
+    return [" ".join(str(point) for point in (run if len(run) > 1 else run * 2)) for run in runs]
 
 
 def megabytes(size: int) -> str:
