@@ -9,6 +9,7 @@ reply; here is how each is made.
 from __future__ import annotations
 
 import asyncio
+import functools
 import gzip
 import html
 import logging
@@ -130,6 +131,12 @@ async def admitted_reply(
         response = viser_hook(connection, request)
         if response is None:  # viser took for a handshake what was not judged as one
             return reply(400, "text/plain; charset=utf-8", b"Bad request.", page)
+        if response.headers.get("Content-Type", "").startswith("text/html"):
+            zipped = response.headers.get("Content-Encoding") == "gzip"
+            # In a thread: packing viser's page anew takes a while, at the first time.
+            response.body = await asyncio.to_thread(with_our_script, response.body, zipped)
+            del response.headers["Content-Length"]
+            response.headers["Content-Length"] = str(len(response.body))
         for name, value in {**_EVERY_REPLY, **page}.items():
             response.headers[name] = value
         return response
@@ -149,6 +156,21 @@ async def admitted_reply(
 
     # In a thread: reading and compressing a recording would hold up every page's websocket.
     return await asyncio.to_thread(work)
+
+
+@functools.lru_cache(maxsize=4)
+def with_our_script(page: bytes, zipped: bool) -> bytes:
+    """viser's page with ``web_assets/keys.js`` in its head; viser itself offers no way to add a script.
+
+    Raises:
+        ValueError: it has no head; viser is not the one that this was written for.
+    """
+    plain = gzip.decompress(page) if zipped else page
+    before, head_end, after = plain.partition(b"</head>")
+    if not head_end:
+        raise ValueError(f"viser {viser_seam.WRITTEN_FOR} serves a page with a </head>; this one has none.")
+    plain = before + b'<script src="/workbench/keys.js"></script>' + head_end + after
+    return gzip.compress(plain, 6) if zipped else plain
 
 
 def _compresses(kind: str) -> bool:
