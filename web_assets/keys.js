@@ -15,15 +15,22 @@
   }
 
   function giveBack(event) {
-    // Later: the control itself takes the focus, or opens its list, in handlers that come after this one.
-    setTimeout(() => {
-      const focused = document.activeElement;
-      if (!focused || focused === document.body) return;
-      // The view keeps the browser from moving the focus when it is clicked, also out of a field.
-      if (!isTypedInto(focused) || event.target instanceof HTMLCanvasElement) focused.blur();
-    }, 50);
+    const focused = document.activeElement;
+    if (!focused || focused === document.body) return;
+    // The view keeps the browser from moving the focus when it is clicked, also out of a field.
+    if (!isTypedInto(focused) || event.target instanceof HTMLCanvasElement) focused.blur();
   }
 
   // On the window and first: what is pressed may keep the event from going further.
-  for (const kind of ["pointerup", "click"]) window.addEventListener(kind, giveBack, true);
+  for (const kind of ["pointerup", "click"]) {
+    window.addEventListener(
+      kind,
+      (event) => {
+        giveBack(event);
+        // Again: some controls take the focus, or close their list, in handlers that come after this one.
+        setTimeout(() => giveBack(event), 50);
+      },
+      true,
+    );
+  }
 }

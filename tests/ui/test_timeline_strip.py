@@ -81,7 +81,7 @@ def test_a_reward_without_a_number_or_without_a_change_has_no_line() -> None:
 
 def test_what_could_not_be_put_back_is_said_and_escaped() -> None:
     view = running(2, timeline=TimelineView(100, 200, not_carried=("actor <b>peg</b>: gone",)))
-    html = render("timeline", **strip_values(strip(), view))
+    html = render("timeline_hint", live=True, not_carried="; ".join(view.timeline.not_carried))
     assert "not put back: actor &lt;b&gt;peg&lt;/b&gt;: gone" in html
 
 

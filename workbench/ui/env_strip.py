@@ -18,7 +18,12 @@ from workbench.session.env_table import EnvRows, Outcome
 
 Filter = Literal["all", "failed", "running", "flagged"]
 FILTERS: tuple[Filter, ...] = ("all", "failed", "running", "flagged")
-SHOWN_AS: dict[Filter, str] = {"all": "all", "failed": "last failed", "running": "running", "flagged": "flagged"}
+SHOWN_AS: dict[Filter, str] = {
+    "all": "all",
+    "failed": "last failed",
+    "running": "running",
+    "flagged": "flagged",
+}
 """What a pill says. An env that runs may have failed before, so "failed 16" beside "running 16" puzzles."""
 MEANS: dict[Filter, str] = {
     "all": "Every env",
@@ -28,7 +33,7 @@ MEANS: dict[Filter, str] = {
 }
 NONE_SO: dict[Filter, str] = {
     "all": "There is no env.",
-    "failed": "No env's last episode failed.",
+    "failed": "In no env did the last episode fail.",
     "running": "No env is running.",
     "flagged": "No env is flagged.",
 }

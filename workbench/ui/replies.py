@@ -30,6 +30,9 @@ Handler = Callable[[str], tuple[int, str, bytes]]
 """Gets the path behind its prefix (decoded, no query, no ``..``, no backslash, no NUL); returns the
 status, the content type and the body. Runs in a thread of its own, so it may read files."""
 
+SCRIPTS = ("keys.js", "view_width.js")
+"""Of ``web_assets/``, run by the page; each says what it is for."""
+
 _log = logging.getLogger("workbench.door")
 
 _EVERY_REPLY = {
@@ -134,7 +137,7 @@ async def admitted_reply(
         if response.headers.get("Content-Type", "").startswith("text/html"):
             zipped = response.headers.get("Content-Encoding") == "gzip"
             # In a thread: packing viser's page anew takes a while, at the first time.
-            response.body = await asyncio.to_thread(with_our_script, response.body, zipped)
+            response.body = await asyncio.to_thread(with_our_scripts, response.body, zipped)
             del response.headers["Content-Length"]
             response.headers["Content-Length"] = str(len(response.body))
         for name, value in {**_EVERY_REPLY, **page}.items():
@@ -159,8 +162,8 @@ async def admitted_reply(
 
 
 @functools.lru_cache(maxsize=4)
-def with_our_script(page: bytes, zipped: bool) -> bytes:
-    """viser's page with ``web_assets/keys.js`` in its head; viser itself offers no way to add a script.
+def with_our_scripts(page: bytes, zipped: bool) -> bytes:
+    """viser's page with `SCRIPTS` in its head; viser itself offers no way to add one.
 
     Raises:
         ValueError: it has no head; viser is not the one that this was written for.
@@ -169,7 +172,8 @@ def with_our_script(page: bytes, zipped: bool) -> bytes:
     before, head_end, after = plain.partition(b"</head>")
     if not head_end:
         raise ValueError(f"viser {viser_seam.WRITTEN_FOR} serves a page with a </head>; this one has none.")
-    plain = before + b'<script src="/workbench/keys.js"></script>' + head_end + after
+    tags = "".join(f'<script src="/workbench/{name}"></script>' for name in SCRIPTS)
+    plain = before + tags.encode() + head_end + after
     return gzip.compress(plain, 6) if zipped else plain
 
 

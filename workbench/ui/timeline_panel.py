@@ -26,7 +26,7 @@ from workbench.ui.timeline_strip import strip_values
 WIDEST, NARROWEST = 760, 280
 GAP = 12
 """Pixels, as of the banner."""
-HEIGHT = 190
+HEIGHT = 205
 """Pixels of the view that it lies over, for whoever frames a scene."""
 REDRAW_EVERY = 0.2
 RANGE_EVERY = 0.5
