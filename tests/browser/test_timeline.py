@@ -110,6 +110,49 @@ def test_the_slider_goes_where_it_is_clicked_and_takes_an_arrow_once(desk: Desk)
     desk.page.get_by_role("button", name="zoom out").click()
 
 
+def test_keys_work_after_a_click_on_a_tab_a_checkbox_or_a_dropdown_but_not_in_a_field(desk: Desk) -> None:
+    page = desk.page
+    page.get_by_role("tab", name="Inspect").click()
+    page.keyboard.press("Space")
+    page.get_by_role("tab", name="Run").click()
+    expect(page.get_by_role("button", name="Pause", exact=True)).to_be_visible()
+    page.keyboard.press("Space")
+    expect(page.get_by_role("button", name="Play", exact=True)).to_be_visible()
+    reward = page.get_by_role("tab", name="Reward")
+    reward.click()
+    page.keyboard.press("r")
+    desk.comes_to(0)
+    page.keyboard.press("s")
+    desk.comes_to(1)
+    desk.press("ArrowLeft")
+    desk.comes_to(0)
+    desk.press("ArrowRight")
+    desk.comes_to(1)
+    expect(reward).to_have_attribute("aria-selected", "true")
+    page.get_by_role("tab", name="Inspect").click()
+    page.locator("input[aria-haspopup=listbox]:visible").first.click()
+    page.get_by_role("option", name="contacts", exact=True).click()
+    page.get_by_role("checkbox").locator("visible=true").first.click()
+    page.keyboard.press("r")
+    expect(page.get_by_text("not known before the next step")).to_be_visible()
+    field = page.locator("input[inputmode]:visible").last
+    field.click()
+    page.keyboard.press("s")
+    desk.leave_inputs()
+    page.keyboard.press("s")
+    expect(page.get_by_text("env 0 at step 1 of its episode")).to_be_visible()
+    reward.click()
+
+
+def test_the_timeline_keeps_its_height_when_it_offers_to_go_on(desk: Desk) -> None:
+    panel = ".mantine-Paper-root:has(.wb-timeline)"
+    live = desk.box(panel)
+    desk.press("ArrowLeft")
+    expect(desk.page.get_by_role("button", name="Go on from here: env 0")).to_be_visible()
+    past = desk.box(panel)
+    assert abs(past["height"] - live["height"]) < 1
+
+
 def test_going_on_from_a_moment_leaves_the_old_future_in_reach(desk: Desk) -> None:
     desk.press("ArrowLeft", "ArrowLeft", "ArrowLeft", "ArrowLeft")
     desk.comes_to(STEPS - 4)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import viser
 
 from tests.ui.scenes import EMPTY, problem, running
-from workbench.session.last_words import Busy
+from workbench.session.last_words import Busy, busy_at
 from workbench.ui.banner import Banner, banner_html
 from workbench.ui.busy_banner import SHOWN_AFTER, BusyBanner, busy_html
 from workbench.ui.fragments import render
@@ -57,6 +57,21 @@ def test_stands_instead_of_the_banner_of_a_problem(server: viser.ViserServer) ->
     assert not banner._panel.visible
     banner.draw(view)
     assert banner._panel.visible and "KeyError" in banner._html.content
+
+
+def test_a_worker_that_gets_ready_is_not_the_author_s_and_leaves_the_reason_in_sight(
+    server: viser.ViserServer,
+) -> None:
+    ready = busy_at(21.0, "warming up", "", (), deaf=False)
+    view = running(2, busy=ready, problem=problem(), problem_serial=1, state="starting", playing=False)
+    busy, _ = a_banner(server)
+    died = Banner(server, lambda: None, lambda: None)
+    busy.draw(view)
+    died.draw(view)
+    assert not busy._panel.visible and died._panel.visible
+    text = render("status_line", **status_values(view))
+    assert "a new worker is getting ready" in text and "busy" not in text
+    assert not busy_at(21.0, "stepping", "", (), deaf=False).getting_ready
 
 
 def test_an_interrupt_is_not_called_a_failure() -> None:

@@ -21,7 +21,7 @@ from workbench.ui import door as door_module
 from workbench.ui import viser_seam
 from workbench.ui.door import DEFAULT_PORT, Door, DoorError, DoorOptions, open_door
 from workbench.ui.gate import cookie_name
-from workbench.ui.replies import folder_handler
+from workbench.ui.replies import SCRIPTS, folder_handler
 from workbench.web_assets import web_assets_folder
 
 
@@ -268,6 +268,17 @@ def test_our_files_are_served_small_where_the_browser_can(door):
     status, headers, body = get(door, "/workbench/refused.html?v=1", Accept_Encoding="br, gzip")
     assert (status, headers["Content-Encoding"], gzip.decompress(body)) == (200, "gzip", page)
     assert len(body) < len(page)
+
+
+@pytest.mark.parametrize("encoding", ["identity", "gzip"])
+def test_the_page_runs_our_scripts_and_they_are_served(door, encoding):
+    status, headers, body = get(door, "/", Accept_Encoding=encoding)
+    page = gzip.decompress(body) if headers["Content-Encoding"] == "gzip" else body
+    assert status == 200 and int(headers["Content-Length"]) == len(body)
+    for name in SCRIPTS:
+        assert f'<script src="/workbench/{name}"></script>'.encode() in page
+        status, headers, _ = get(door, f"/workbench/{name}")
+        assert status == 200 and headers["Content-Type"].startswith("text/javascript")
 
 
 def test_a_route_gets_the_rest_of_its_path(door):

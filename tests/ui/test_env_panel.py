@@ -58,7 +58,7 @@ def test_pages_filters_and_rows_are_pressed(server: viser.ViserServer, session: 
     press(panel, server, "on")
     assert shown(panel, session) == list(range(MOST_ROWS, MOST_ROWS + 6))
     press(panel, server, ("filter", "failed"))
-    assert shown(panel, session) == [] and "No env is failed" in panel._handle.content
+    assert shown(panel, session) == [] and "In no env did the last episode fail" in panel._handle.content
     press(panel, server, ("filter", "all"))
     press(panel, server, ("sort", "env"))
     assert shown(panel, session) == list(range(MOST_ROWS + 5, 5, -1))

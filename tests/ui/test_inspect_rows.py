@@ -130,6 +130,15 @@ def test_the_tab_never_shows_another_envs_reading_and_escapes_names(choice: str)
         assert choice == "poses" or expected[choice] not in other
 
 
+def test_contacts_are_said_to_be_unknown_before_a_step_and_none_to_be_none_after_one() -> None:
+    now = Inspection(0, 5, contacts=(PRESSED,))
+    html = inspect_html("contacts", running(1), now, None, no_step_yet=True)
+    assert "not known before the next step" in html and "5 N" not in html
+    assert "nothing touches anything" in inspect_html(
+        "contacts", running(1), Inspection(0, 5, contacts=()), None
+    )
+
+
 def test_a_section_that_was_refused_says_why() -> None:
     now = Inspection(0, 5, refused=(("contacts", "PhysX on the GPU keeps no list"),))
     assert "PhysX on the GPU keeps no list" in inspect_html("contacts", running(1), now, None)

@@ -45,6 +45,8 @@ class Busy:
     traceback: str = ""
     drawing: bool = False
     """The renderer is at work, which may take long the first time."""
+    getting_ready: bool = False
+    """A new worker imports and compiles; no line of the author's is at work."""
     deaf: bool = False
     """It was interrupted and went on all the same."""
 
@@ -122,6 +124,7 @@ def busy_at(seconds: float, doing: str, dump: str, own_files: Iterable[str], dea
         code=None if place is None else code_of(place.file, place.line),
         traceback=as_traceback(frames),
         drawing=doing == "drawing" and hook is None,
+        getting_ready=doing in ("starting", "warming up") and hook is None,
         deaf=deaf,
     )
 

@@ -23,8 +23,12 @@ WIDTH = 460
 
 
 def is_shown(view: SessionView) -> bool:
-    """Whether the banner stands over the view; it goes before that of a problem."""
-    return view.busy is not None and view.busy.seconds >= SHOWN_AFTER
+    """Whether the banner stands over the view; it goes before that of a problem.
+
+    Not for a worker that gets ready: nothing of the author's is at work then, and why the one before is gone
+    must stay in sight.
+    """
+    return view.busy is not None and view.busy.seconds >= SHOWN_AFTER and not view.busy.getting_ready
 
 
 class BusyBanner:

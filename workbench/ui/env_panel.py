@@ -16,7 +16,19 @@ import viser
 from workbench.session.env_table import EnvRows
 from workbench.session.session import Session
 from workbench.session.view import SessionView
-from workbench.ui.env_strip import FILTERS, Filter, columns, entry_names, make_rows, mask, moment_of, order
+from workbench.ui.env_strip import (
+    FILTERS,
+    MEANS,
+    NONE_SO,
+    SHOWN_AS,
+    Filter,
+    columns,
+    entry_names,
+    make_rows,
+    mask,
+    moment_of,
+    order,
+)
 from workbench.ui.fragments import render
 from workbench.ui.presses import Presses
 
@@ -68,10 +80,11 @@ class EnvPanel:
         shown = envs[self._first : self._first + MOST_ROWS]
         return render(
             "envs",
-            filter=self._filter,
+            none_so=NONE_SO[self._filter],
             pills=[
                 {
-                    "name": name,
+                    "name": SHOWN_AS[name],
+                    "hint": MEANS[name],
                     "count": int(np.count_nonzero(mask(rows, name))),
                     "on": name == self._filter,
                     "press": self._press(("filter", name), lambda name=name: self._choose_filter(name)),

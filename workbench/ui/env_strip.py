@@ -18,6 +18,25 @@ from workbench.session.env_table import EnvRows, Outcome
 
 Filter = Literal["all", "failed", "running", "flagged"]
 FILTERS: tuple[Filter, ...] = ("all", "failed", "running", "flagged")
+SHOWN_AS: dict[Filter, str] = {
+    "all": "all",
+    "failed": "last failed",
+    "running": "running",
+    "flagged": "flagged",
+}
+"""What a pill says. An env that runs may have failed before, so "failed 16" beside "running 16" puzzles."""
+MEANS: dict[Filter, str] = {
+    "all": "Every env",
+    "failed": "The last episode that came to an end ended without success: by fail, or at the time limit",
+    "running": "The episode under way has not come to its first end",
+    "flagged": "Something odd in the episode under way, or in the one before",
+}
+NONE_SO: dict[Filter, str] = {
+    "all": "There is no env.",
+    "failed": "In no env did the last episode fail.",
+    "running": "No env is running.",
+    "flagged": "No env is flagged.",
+}
 MOST_ENTRIES = 6
 """Columns of bool entries; a row of more is wider than the view."""
 POINTS = 40

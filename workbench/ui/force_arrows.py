@@ -13,9 +13,12 @@ from numpy.typing import NDArray
 
 from workbench.core.inspection import Inspection
 
-COLOUR = (255, 70, 20)
-METRES_AT_ONE_NEWTON = 0.06
-LONGEST = 0.25
+COLOUR = (255, 0, 200)
+"""Magenta: wood, steel, goals and cubes are not."""
+METRES_AT_ONE_NEWTON = 0.07
+LONGEST = 0.3
+SHAFT, HEAD, HEAD_LENGTH = 0.005, 0.012, 0.028
+"""Metres; an arrow shorter than its head would be drawn as something else."""
 WEAKEST = 1e-3
 """Newtons; weaker is drawn by nobody's wish."""
 
@@ -43,7 +46,7 @@ class ForceArrows:
                 self._handle = None
         elif self._handle is None:
             self._handle = self._server.scene.add_arrows(
-                "/forces", arrows, COLOUR, shaft_radius=0.0025, head_radius=0.006, head_length=0.014
+                "/forces", arrows, COLOUR, shaft_radius=SHAFT, head_radius=HEAD, head_length=HEAD_LENGTH
             )
         else:
             self._handle.points = arrows

@@ -59,20 +59,30 @@ class InspectPanel:
         choice = self._show.value if self._show.value in CHOICES else NOTHING
         self._ask(view, choice)
         self._take(view)
-        wanted = (choice, view.task_serial, view.selected_env, id(self._now))
+        no_step = self._no_step_yet(view)
+        wanted = (choice, view.task_serial, view.selected_env, id(self._now), no_step)
         if choice == POSES:
             wanted = (*wanted, view.step_serial)
         chosen = self._drawn is None or wanted[0] != self._drawn[0]
         if wanted == self._drawn or not (chosen or time.monotonic() - self._drawn_at >= READ_EVERY):
             return
         self._drawn, self._drawn_at = wanted, time.monotonic()
-        self._handle.content = inspect_html(choice, view, self._now, self._before)
+        self._handle.content = inspect_html(choice, view, self._now, self._before, no_step)
 
     def forces(self, view: SessionView) -> Inspection | None:
         """The reading whose contacts are to be drawn in the view; None draws none: they are of what is live."""
         here = self._now is not None and self._now.env == view.selected_env
-        shown = self._forces.value is True and here and view.timeline.shown is None
+        known = view.timeline.shown is None and not self._no_step_yet(view)
+        shown = self._forces.value is True and here and known
         return self._now if shown else None
+
+    def _no_step_yet(self, view: SessionView) -> bool:
+        """Whether the selected env was built, reset or put back and has made no step since. PhysX finds contacts
+        while it steps: until then its list is empty, or that of the state before."""
+        if self._now is not None and self._now.env == view.selected_env and self._now.elapsed_steps == 0:
+            return True
+        lived = self._session.stretch() if view.timeline.shown is None else None
+        return lived is not None and lived[0] == lived[1]
 
     def _ask(self, view: SessionView, choice: str) -> None:
         chosen: tuple[Section | None, ...] = (
@@ -101,8 +111,14 @@ class InspectPanel:
         self._now = new
 
 
-def inspect_html(choice: str, view: SessionView, now: Inspection | None, before: Inspection | None) -> str:
-    """What the tab shows under its controls."""
+def inspect_html(
+    choice: str,
+    view: SessionView,
+    now: Inspection | None,
+    before: Inspection | None,
+    no_step_yet: bool = False,
+) -> str:
+    """What the tab shows under its controls; no contacts of an env that made no step since it was set."""
     leaves, articulations, contacts, poses = [], [], [], []
     note = ""
     env, section = view.selected_env, CHOICES[choice]
@@ -127,8 +143,11 @@ def inspect_html(choice: str, view: SessionView, now: Inspection | None, before:
             articulations = [{"name": a.articulation, "joints": joint_rows(a)} for a in now.joints or ()]
             note += "; bars show the position between the limits, and the target in orange"
         elif section == "contacts":
-            contacts = contact_rows(now.contacts or ())
-            note += "" if contacts else ": nothing touches anything"
+            contacts = [] if no_step_yet else contact_rows(now.contacts or ())
+            if no_step_yet:
+                note += ": what touches what is not known before the next step"
+            elif not contacts:
+                note += ": nothing touches anything"
         elif section == "observation":
             leaves = leaf_rows(now.observation or (), before.observation if before else None)
         elif section == "state":

@@ -350,7 +350,7 @@ class Page:
             Command("Next env", lambda: run.select_neighbour(1), "N"),
             Command("Previous env", lambda: run.select_neighbour(-1), "P"),
             Command("Open or close the table of envs", self._toggle_envs, "B"),
-            Command("Next env that failed", lambda: self._envs.select_next("failed"), "E"),
+            Command("Next env whose last episode failed", lambda: self._envs.select_next("failed"), "E"),
             Command("Next env with something odd", lambda: self._envs.select_next("flagged"), "E", "shift"),
             Command("Show all envs or the selected one", self._view_panel.toggle_only_selected, "O"),
             Command("Frame what is shown", lambda: self.frame(session.view()), "F"),

@@ -9,6 +9,7 @@ reply; here is how each is made.
 from __future__ import annotations
 
 import asyncio
+import functools
 import gzip
 import html
 import logging
@@ -28,6 +29,9 @@ from workbench.web_assets import web_assets_folder
 Handler = Callable[[str], tuple[int, str, bytes]]
 """Gets the path behind its prefix (decoded, no query, no ``..``, no backslash, no NUL); returns the
 status, the content type and the body. Runs in a thread of its own, so it may read files."""
+
+SCRIPTS = ("keys.js", "view_width.js")
+"""Of ``web_assets/``, run by the page; each says what it is for."""
 
 _log = logging.getLogger("workbench.door")
 
@@ -130,6 +134,12 @@ async def admitted_reply(
         response = viser_hook(connection, request)
         if response is None:  # viser took for a handshake what was not judged as one
             return reply(400, "text/plain; charset=utf-8", b"Bad request.", page)
+        if response.headers.get("Content-Type", "").startswith("text/html"):
+            zipped = response.headers.get("Content-Encoding") == "gzip"
+            # In a thread: packing viser's page anew takes a while, at the first time.
+            response.body = await asyncio.to_thread(with_our_scripts, response.body, zipped)
+            del response.headers["Content-Length"]
+            response.headers["Content-Length"] = str(len(response.body))
         for name, value in {**_EVERY_REPLY, **page}.items():
             response.headers[name] = value
         return response
@@ -149,6 +159,22 @@ async def admitted_reply(
 
     # In a thread: reading and compressing a recording would hold up every page's websocket.
     return await asyncio.to_thread(work)
+
+
+@functools.lru_cache(maxsize=4)
+def with_our_scripts(page: bytes, zipped: bool) -> bytes:
+    """viser's page with `SCRIPTS` in its head; viser itself offers no way to add one.
+
+    Raises:
+        ValueError: it has no head; viser is not the one that this was written for.
+    """
+    plain = gzip.decompress(page) if zipped else page
+    before, head_end, after = plain.partition(b"</head>")
+    if not head_end:
+        raise ValueError(f"viser {viser_seam.WRITTEN_FOR} serves a page with a </head>; this one has none.")
+    tags = "".join(f'<script src="/workbench/{name}"></script>' for name in SCRIPTS)
+    plain = before + tags.encode() + head_end + after
+    return gzip.compress(plain, 6) if zipped else plain
 
 
 def _compresses(kind: str) -> bool:

@@ -6,6 +6,7 @@ import time
 
 import viser
 
+from workbench.session.last_words import Busy
 from workbench.session.view import SessionView
 from workbench.ui.fragments import render
 from workbench.ui.version_panel import took
@@ -59,11 +60,11 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
     moving = view.playing and view.state in ("running", "error") and task is not None and busy is None
     return {
         "state": view.state if busy is None else "loading",
-        "word": WORDS[view.state if busy is None else "busy"],
+        "word": WORDS[view.state if busy is None or busy.getting_ready else "busy"],
         "problem": view.problem is not None,
         "stale": view.stale and task is not None and view.state not in ("starting", "loading"),
         "ago": None if view.timeline.shown is None else view.timeline.last - view.timeline.shown,
-        "activity": view.activity if busy is None else f"{busy.doing} for {busy.seconds:.0f} s",
+        "activity": view.activity if busy is None else _doing(busy),
         "news": _news(view) if fresh else "",
         "task": None if task is None else task.env_id,
         "backend": "" if task is None else task.backend,
@@ -79,6 +80,12 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
         "behind": moving and view.speed != float("inf") and view.real_time_factor < 0.85 * view.speed,
         "speed": f"{view.speed:g}",
     }
+
+
+def _doing(busy: Busy) -> str:
+    if busy.getting_ready:
+        return f"a new worker is getting ready (shaders are compiled once a process), {busy.seconds:.0f} s"
+    return f"{busy.doing} for {busy.seconds:.0f} s"
 
 
 def _news(view: SessionView) -> str:

@@ -26,7 +26,7 @@ from workbench.ui.timeline_strip import strip_values
 WIDEST, NARROWEST = 760, 280
 GAP = 12
 """Pixels, as of the banner."""
-HEIGHT = 190
+HEIGHT = 205
 """Pixels of the view that it lies over, for whoever frames a scene."""
 REDRAW_EVERY = 0.2
 RANGE_EVERY = 0.5
@@ -56,8 +56,9 @@ class TimelinePanel:
                 send=self._seek,
             )
             self._strip = gui.add_html("")
-            # It comes and goes, and the panel grows upwards: under the row below, a second press on "step" would
-            # meet another button.
+            # One of these two rows is there, and they are equally high: a panel that grows is moved up only a moment
+            # later, its last row is cut off until then, and a second press on "step" would meet another button.
+            self._hint = gui.add_html("")
             self._travel = gui.add_button_group("", (GO_ON,), visible=False)
             self._walk = gui.add_button_group("", WALK)
         self._walk.on_click(lambda event: self._on_walk(event.target.value))
@@ -169,8 +170,12 @@ class TimelinePanel:
         travel = go_on_labels(view) if past.can_go_on else ()
         if travel and self._travel.options != travel:
             self._travel.options = travel
+        hint = render("timeline_hint", live=past.shown is None, not_carried="; ".join(past.not_carried))
+        if self._hint.content != hint:
+            self._hint.content = hint
         if self._travel.visible != bool(travel):
-            self._travel.visible = bool(travel)
+            with self._server.atomic():
+                self._travel.visible, self._hint.visible = bool(travel), not travel
 
     def _draw_strip(self, view: SessionView) -> None:
         past, now = view.timeline, time.monotonic()

@@ -67,7 +67,6 @@ def strip_values(strip: Strip, view: SessionView) -> dict[str, object]:
         "used": megabytes(past.used),
         "limit": megabytes(past.limit),
         "moments": past.moments,
-        "not_carried": past.not_carried,
         "kinds": [(style, name) for _, style, name in MARKS if any(m["style"] == style for m in marks)],
     }
 

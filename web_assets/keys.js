@@ -1,0 +1,36 @@
+// A control that was clicked gives the focus back, so that the page's keys go on working.
+//
+// viser's keys are heard on the document, but never while the focus is in an <input>, which a ticked checkbox and a
+// dropdown are too; and a tab or a button that was clicked takes the arrows and the space for itself. So once the
+// pointer is up, the focus stays only where somebody types: in a text or number field, or in a dropdown that is open.
+// Whoever walks through the controls with the Tab key presses no pointer, and keeps the focus.
+"use strict";
+{
+  const NOT_TYPED_INTO = ["checkbox", "radio", "range", "button", "submit", "reset", "color", "file"];
+
+  function isTypedInto(element) {
+    if (element.isContentEditable || element instanceof HTMLTextAreaElement) return true;
+    if (!(element instanceof HTMLInputElement) || NOT_TYPED_INTO.includes(element.type)) return false;
+    return element.getAttribute("aria-haspopup") !== "listbox" || element.getAttribute("aria-expanded") === "true";
+  }
+
+  function giveBack(event) {
+    const focused = document.activeElement;
+    if (!focused || focused === document.body) return;
+    // The view keeps the browser from moving the focus when it is clicked, also out of a field.
+    if (!isTypedInto(focused) || event.target instanceof HTMLCanvasElement) focused.blur();
+  }
+
+  // On the window and first: what is pressed may keep the event from going further.
+  for (const kind of ["pointerup", "click"]) {
+    window.addEventListener(
+      kind,
+      (event) => {
+        giveBack(event);
+        // Again: some controls take the focus, or close their list, in handlers that come after this one.
+        setTimeout(() => giveBack(event), 50);
+      },
+      true,
+    );
+  }
+}
