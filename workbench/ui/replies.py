@@ -137,7 +137,7 @@ async def admitted_reply(
         if response.headers.get("Content-Type", "").startswith("text/html"):
             zipped = response.headers.get("Content-Encoding") == "gzip"
             # In a thread: packing viser's page anew takes a while, at the first time.
-            response.body = await asyncio.to_thread(with_our_scripts, response.body, zipped)
+            response.body = await asyncio.to_thread(with_our_scripts, bytes(response.body), zipped)
             del response.headers["Content-Length"]
             response.headers["Content-Length"] = str(len(response.body))
         for name, value in {**_EVERY_REPLY, **page}.items():
