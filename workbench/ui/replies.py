@@ -30,7 +30,7 @@ Handler = Callable[[str], tuple[int, str, bytes]]
 """Gets the path behind its prefix (decoded, no query, no ``..``, no backslash, no NUL); returns the
 status, the content type and the body. Runs in a thread of its own, so it may read files."""
 
-SCRIPTS = ("keys.js", "view_width.js")
+SCRIPTS = ("keys.js", "timeline_width.js")
 """Of ``web_assets/``, run by the page; each says what it is for."""
 
 _log = logging.getLogger("workbench.door")
