@@ -30,7 +30,7 @@ Handler = Callable[[str], tuple[int, str, bytes]]
 """Gets the path behind its prefix (decoded, no query, no ``..``, no backslash, no NUL); returns the
 status, the content type and the body. Runs in a thread of its own, so it may read files."""
 
-SCRIPTS = ("keys.js", "view_width.js")
+SCRIPTS = ("keys.js", "timeline_width.js")
 """Of ``web_assets/``, run by the page; each says what it is for."""
 
 _log = logging.getLogger("workbench.door")
@@ -137,7 +137,7 @@ async def admitted_reply(
         if response.headers.get("Content-Type", "").startswith("text/html"):
             zipped = response.headers.get("Content-Encoding") == "gzip"
             # In a thread: packing viser's page anew takes a while, at the first time.
-            response.body = await asyncio.to_thread(with_our_scripts, response.body, zipped)
+            response.body = await asyncio.to_thread(with_our_scripts, bytes(response.body), zipped)
             del response.headers["Content-Length"]
             response.headers["Content-Length"] = str(len(response.body))
         for name, value in {**_EVERY_REPLY, **page}.items():

@@ -1,0 +1,23 @@
+// How wide the timeline may be, for the style sheet: --wb-timeline-most, in pixels.
+//
+// What lies over the view must not lie over the controls beside it. The server fits the timeline when a page has said
+// how wide its view has become; while a docked panel opens that is some frames too late, and the controls are covered.
+"use strict";
+{
+  const GAP = 12; // as timeline_panel.py has it
+  const resized = new ResizeObserver(([view]) => {
+    const panel = document.querySelector(".wb-timeline")?.closest(".mantine-Paper-root");
+    if (!panel) return;
+    // From its left edge: that is where it will be at once, while the view takes some frames to get there.
+    const most = view.target.getBoundingClientRect().right - panel.getBoundingClientRect().left - GAP;
+    document.documentElement.style.setProperty("--wb-timeline-most", `${most}px`);
+  });
+  const looked = new MutationObserver(() => {
+    const view = document.querySelector("canvas[data-engine]");
+    if (!view) return;
+    looked.disconnect();
+    // Not the canvas itself: it takes its new size some frames after the box that it fills.
+    resized.observe(view.parentElement);
+  });
+  looked.observe(document, { childList: true, subtree: true });
+}
