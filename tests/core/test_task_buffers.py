@@ -180,7 +180,7 @@ def test_what_holds_for_the_batch_goes_back_when_all_envs_do(env: Any) -> None:
     assert env.total_resets == count + 5
     assert "whole batch" in report.not_carried["total_resets"]
     report = restore_snapshot(env, snapshot, range(N), source=2)
-    assert env.total_resets == count and not report.not_carried
+    assert env.total_resets == count and "total_resets" not in report.not_carried
     env.total_resets += 5
     restore_snapshot(env, snapshot)
     assert env.total_resets == count
