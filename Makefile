@@ -13,6 +13,9 @@ SHELL := /bin/bash
 
 TASK ?= tasks/push_cube.py
 ARGS ?=
+# Processes that run the tests, a file of tests each: half of the time goes into waiting for a browser or a worker.
+# More would not help two cores, and each compiles the renderer's shaders for itself.
+WORKERS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
 
@@ -42,11 +45,11 @@ open: set-up
 
 test: lint
 	@env_lines=$$($(BIN)/python -m workbench.machine.software_vulkan --export); eval "$$env_lines"; \
-	$(BIN)/python -m pytest -m "not slow" $(ARGS)
+	$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile $(ARGS)
 
 test-all: lint
 	@env_lines=$$($(BIN)/python -m workbench.machine.software_vulkan --export); eval "$$env_lines"; \
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
 
 lint: set-up-test
 	$(BIN)/ruff check .
