@@ -136,7 +136,7 @@ def shoot_studio(chromium: str) -> None:
             open_workbench(str(file), "--num-envs", "4", cwd=file.parent) as opened,
             sync_playwright() as playwright,
         ):
-            page, _ = new_page(launch(playwright, chromium))
+            page, _ = new_page(launch(playwright, chromium), height=900)
             page.goto(opened.url)
             expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
             close_notice(page)
@@ -149,9 +149,7 @@ def shoot_studio(chromium: str) -> None:
                 page.keyboard.press(key)
                 time.sleep(0.1)
             page.get_by_role("button", name="Show the change").click()
-            leave = page.get_by_role("button", name="Leave the file as it is")
-            expect(leave).to_be_visible()
-            leave.scroll_into_view_if_needed()
+            page.get_by_role("button", name="Write it to push_cube.py").scroll_into_view_if_needed()
             shoot(page, "studio")
 
 

@@ -1,3 +1,4 @@
+# pyright: reportArgumentType=false
 """Every private name of ManiSkill that drawing and pictures rely upon: an upgrade fails here first."""
 
 from __future__ import annotations

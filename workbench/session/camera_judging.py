@@ -211,10 +211,12 @@ class CameraJudging:
         """Stop all that is under way; what is known stays."""
         self._live_lane.stop()
         self._background_lane.stop()
+        self._on_change()
 
     def outdate(self) -> None:
-        """Another version runs: what was seen is of the one before."""
-        self.stop()
+        """Another version runs: what was seen is of the one before. Calls nobody."""
+        self._live_lane.stop()
+        self._background_lane.stop()
         with self._lock:
             self._looked = replace(self._looked, outdated=True, compared=None, picked=None, sheet=())
 

@@ -34,7 +34,7 @@ from workbench.core.step import StepResult
 from workbench.session.camera_judging import CameraJudging, ShownMoment
 from workbench.session.camera_messages import CameraAnswer
 from workbench.session.camera_writing import CameraWriting, Wish, plan
-from workbench.session.messages import Load, PlaceCamera, Placed, Request, TaskDescription
+from workbench.session.messages import Load, PlaceCamera, Placed, ReloadLevel, Request, TaskDescription
 from workbench.session.placements import Placements
 from workbench.session.studio_view import StudioCamera, StudioView
 
@@ -388,8 +388,11 @@ class CameraStudio:
 
     # --- what the session tells ------------------------------------------------------------------------
 
-    def loaded(self, task: TaskDescription) -> list[PlaceCamera]:
+    def loaded(self, task: TaskDescription, level: ReloadLevel | None) -> list[PlaceCamera]:
         """A version runs, and what was written is compared with it. To be told under the session's lock: calls nobody.
+
+        Args:
+            level: how it came in; None for the first.
 
         Returns:
             what is to be asked of the worker, so that its cameras stand where they are placed.
@@ -415,6 +418,8 @@ class CameraStudio:
             if self._selected is not None and self._info(self._selected) is None:
                 self._selected = None
             self._serial += 1
+            if level not in ("same", "cameras"):
+                self._judging.outdate()
             # The dropped ones too: their placement may have been on its way while the version came in.
             return [self._request(key) for key in (*self._placements.all_moved, *dropped)]
 
@@ -442,10 +447,6 @@ class CameraStudio:
     def interrupted(self) -> None:
         """The file was saved, or the worker is gone: what is under way is about what there was before."""
         self._judging.stop()
-
-    def outdated(self) -> None:
-        """The version that runs is another in more than its cameras: what was seen is of the one before."""
-        self._judging.outdate()
 
     def failed_to_load(self) -> None:
         """A version does not load; the one before goes on."""

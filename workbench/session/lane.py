@@ -84,13 +84,10 @@ class Lane:
                 self._thread.start()
         self.changed()
 
-    def stop(self) -> bool:
-        """Go no further with what is under way. False if there was nothing."""
+    def stop(self) -> None:
+        """Go no further with what is under way. Calls nobody."""
         with self._wake:
-            stopped = self._stop()
-        if stopped:
-            self.changed()
-        return stopped
+            self._stop()
 
     def close(self) -> None:
         """Stop, and wait for the thread's end."""
@@ -102,12 +99,10 @@ class Lane:
         if thread is not None:
             thread.join()
 
-    def _stop(self) -> bool:
-        was = self._waiting is not None or (self._job is not None and not self._job.stopped)
+    def _stop(self) -> None:
         self._waiting = None
         if self._job is not None:
             self._job.stopped = True
-        return was
 
     def _run(self) -> None:
         while (job := self._next()) is not None:

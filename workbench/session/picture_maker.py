@@ -43,6 +43,8 @@ class PictureMaker:
         self._round_began = 0.0
         self._expected: dict[tuple[CameraKey, ...], float] = {}
         self._drawn: tuple[CameraKey, ...] = ()
+        self.nothing_else_to_do = False
+        """No step is due: a picture is waited for where it is not ready, since guessing when it will be takes longer."""
         self._moment = 0
         self._begun_of = 0
         self.moments: list[int] = []
@@ -73,7 +75,7 @@ class PictureMaker:
     def wait(self, now: float) -> float | None:
         """Seconds until `poll` has something to do; None while nobody looks."""
         if self._begun is not None:
-            return max(0.0, self._ready_at - now)
+            return 0.0 if self.nothing_else_to_do else max(0.0, self._ready_at - now)
         if self._hurried:
             return 0.0
         return max(0.0, self._next_round - now) if self._wanted else None
@@ -92,7 +94,7 @@ class PictureMaker:
             self._kinds_left = [kind for kind in KINDS if any(r[1] == kind for r in self._round)]
             self._begin_next(env)
             return None
-        if now < self._ready_at:
+        if now < self._ready_at and not self.nothing_else_to_do:
             return None
         made, seconds = self._fetch()
         if self._kinds_left:

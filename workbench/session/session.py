@@ -449,7 +449,8 @@ class Session:
                 judgement = Judgement(s.timeline.history)
             stale = restored and not is_on_disk(event.task.source)
             s.loaded(event, restored=restored, stale=stale)
-            placements = self.studio.loaded(event.task)
+            level = None if event.reload is None else event.reload.level
+            placements = self.studio.loaded(event.task, level)
         if judgement is not None:
             self._judge.judge(self._state.load_request(Wanted(dict(event.task.source), None)), judgement)
         elif meaning == "forget":
@@ -458,8 +459,6 @@ class Session:
         self._watch()
         for request in placements:
             self._send(request)
-        if event.reload is None or event.reload.level not in ("same", "cameras"):
-            self.studio.outdated()
         if recording.active:
             self._record_on(event, recording.env_idx)
 

@@ -473,6 +473,7 @@ class Worker:
             # The first picture of a process compiles the shaders: 5 to 19 s on a software renderer.
             self._send_status(None, "compiling the renderer's shaders, once")
         self._pulse.begin("drawing")
+        self._pictures.nothing_else_to_do = not self._playing
         try:
             made = self._pictures.poll(self._opened.env, time.monotonic())
         except RuntimeError as error:

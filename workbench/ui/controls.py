@@ -79,7 +79,9 @@ class Control(Generic[Handle, T]):
         if self.handle.disabled == enabled:
             self.handle.disabled = not enabled
 
-    def _on_update(self, event: viser.GuiEvent) -> None:
+    async def _on_update(self, event: viser.GuiEvent) -> None:
+        # Async, so that it runs with the message itself: in viser's pool of threads it may come so late that `show`
+        # has put the session's value over the new one, which is then what would be sent.
         if event.client is None:
             return  # `show` wrote it; sending it back would make an endless exchange.
         self._touched = Control._last_touch = time.monotonic()

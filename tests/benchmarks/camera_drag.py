@@ -1,0 +1,109 @@
+"""From a drag of a camera to its new picture, against editing the number and running the stock script again.
+
+    python tests/benchmarks/camera_drag.py [--num-envs 16] [--placements 30] [--restarts 3]
+
+A real session on the example task, its 128 x 128 sensor camera looked through. Three clocks:
+
+    one placement    `CameraStudio.place` while paused, until a picture taken from there is in the session's view
+    a drag           20 placements a second for three seconds: how many pictures came, and how long after the last
+    stock            python started anew on the file: stock ``gym.make`` of one env, reset, first picture
+
+The bar is 200 ms for one placement (median).
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from tests.benchmarks.reload import cold_restart
+from tests.browser.opened import TASK
+from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.session.messages import CameraRequest, TaskOptions
+from workbench.session.session import Session
+
+BASE: CameraKey = ("sensor", "base_camera")
+BAR = 0.2
+RATE = 20.0
+DRAG_SECONDS = 3.0
+
+
+@dataclass(frozen=True)
+class Options:
+    num_envs: int = 16
+    placements: int = 30
+    restarts: int = 3
+
+
+def wait(session: Session, settings: CameraSettings, patience: float = 120.0) -> None:
+    """Until a picture taken from there is in the view."""
+    deadline, seen = time.monotonic() + patience, -1
+    while time.monotonic() < deadline:
+        picture = session.view().pictures.get(BASE)
+        if picture is not None and np.allclose(picture.pose[:3], settings.position, atol=1e-6):
+            return
+        seen = session.wait(seen, 0.2)
+    raise SystemExit(f"no picture from {settings.position} came within {patience:.0f} s")
+
+
+def at(start: CameraSettings, k: int) -> CameraSettings:
+    return replace(start, position=(0.4 + 0.002 * k, 0.001 * k, 0.6))
+
+
+def main(options: Options) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        session = Session(
+            str(TASK), TaskOptions(num_envs=options.num_envs), recordings=Path(folder) / "recordings"
+        )
+        try:
+            seen = -1
+            while (camera := session.view().studio.camera(BASE)) is None:
+                seen = session.wait(seen, 1.0)
+            start = camera.info.settings
+            assert start is not None
+            session.set_clients(1)
+            session.watch_cameras((CameraRequest("base_camera", "sensor"),))
+            wait(session, start)
+            single = []
+            for k in range(options.placements):
+                time.sleep(0.1)
+                began = time.perf_counter()
+                session.studio.place(BASE, at(start, k))
+                wait(session, at(start, k))
+                single.append(time.perf_counter() - began)
+            first = session.view().pictures_serial
+            count = int(RATE * DRAG_SECONDS)
+            began = time.perf_counter()
+            for k in range(count):
+                time.sleep(max(0.0, began + k / RATE - time.perf_counter()))
+                session.studio.place(BASE, at(start, 100 + k), gesture=1)
+            last = time.perf_counter()
+            wait(session, at(start, 100 + count - 1))
+            lag = time.perf_counter() - last
+            pictures = (session.view().pictures_serial - first) / (time.perf_counter() - began)
+        finally:
+            session.close()
+    stock = [cold_restart(TASK) for _ in range(options.restarts)]
+    median = statistics.median(single)
+    print(
+        f"one placement   median {1000 * median:.0f} ms, worst {1000 * max(single):.0f} ms of {len(single)}"
+    )
+    print(
+        f"a drag at {RATE:.0f}/s   {pictures:.1f} pictures a second, the last {1000 * lag:.0f} ms after it ended"
+    )
+    print(f"stock script    median {statistics.median(stock):.1f} s of {len(stock)}")
+    print(f"{statistics.median(stock) / median:.0f} times sooner")
+    if median > BAR:
+        raise SystemExit(f"one placement took {1000 * median:.0f} ms, more than {1000 * BAR:.0f} ms")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
