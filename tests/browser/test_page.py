@@ -79,7 +79,7 @@ def test_the_page_opens_with_the_task_and_without_an_error(desk: Desk) -> None:
 def test_tabs_that_have_nothing_to_show_are_not_there(desk: Desk) -> None:
     tabs = desk.page.get_by_role("tab").all_inner_texts()
     assert [tab for tab in tabs if tab not in ("Envs", "Timeline")] == [
-        *("Run", "Cameras", "Reward", "Inspect", "Episodes", "Log")
+        *("Run", "Cameras", "Studio", "Reward", "Inspect", "Episodes", "Log")
     ]
 
 

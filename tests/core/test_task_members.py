@@ -38,7 +38,7 @@ def env() -> Iterator[Any]:
 
 def fill(env: Any) -> None:
     env.best = torch.zeros(2)
-    env.count = 3
+    env.count, env.limit = 3, 5
     env.stages = {"reach": torch.zeros(2), "names": ["a", "b"], "deep": {"n": 1}}
     env.trail = [torch.zeros(2), torch.ones(2)]
     env.marks = [0, 0]
@@ -50,14 +50,14 @@ def fill(env: Any) -> None:
 
 
 EDITS: dict[str, Callable[[Any], None]] = {
-    "a tensor written to": lambda env: env.best.add_(1),
+    "a tensor written to": lambda env: env.trail[0].add_(1),
     "another tensor": lambda env: setattr(env, "best", torch.rand(2)),
     "a tensor of another shape": lambda env: setattr(env, "best", torch.rand(2, 3)),
     "a tensor becomes a number": lambda env: setattr(env, "best", 1.0),
     "a tensor becomes a view of the simulation": lambda env: setattr(env, "best", env.view),
     "a view of the simulation becomes memory": lambda env: setattr(env, "view", torch.zeros(2)),
     "a counter": lambda env: setattr(env, "count", env.count + 1),
-    "a counter becomes a list": lambda env: setattr(env, "count", [torch.zeros(2)]),
+    "a number becomes a list": lambda env: setattr(env, "limit", [torch.zeros(2)]),
     "a new attribute": lambda env: setattr(env, "more", torch.zeros(2)),
     "an attribute goes": lambda env: vars(env).pop("array", None),
     "an entry of a dict": lambda env: env.stages.update(reach=torch.rand(2)),

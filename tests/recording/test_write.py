@@ -36,8 +36,9 @@ def unprivileged(tmp_path: Path) -> Iterator[None]:
     if os.geteuid() != 0:
         yield
         return
-    for folder in (tmp_path, *tmp_path.parents[:2]):
-        folder.chmod(0o755)
+    for folder in (tmp_path, *tmp_path.parents):
+        if folder.stat().st_mode & 0o077 == 0:  # pytest's own, as many as there are processes of tests
+            folder.chmod(0o755)
     os.chown(tmp_path, 65534, 65534)
     os.seteuid(65534)
     try:
