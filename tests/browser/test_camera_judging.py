@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Locator, Page, expect
 
 from tests.browser.opened import page_on, until
 
@@ -17,6 +17,7 @@ pytestmark = pytest.mark.browser
 expect.set_options(timeout=60_000)
 ENVS = 3
 CAMERA = "base_camera"
+PICTURE = "img[src^='blob:']:visible"
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +38,11 @@ def press(page: Page, name: str) -> None:
     page.get_by_role("button", name=name, exact=True).click()
 
 
+def lies_over(one: Locator, other: Locator) -> bool:
+    a, b = one.bounding_box(), other.bounding_box()
+    return a is not None and b is not None and abs(a["y"] - b["y"]) < 1 and abs(a["height"] - b["height"]) < 1
+
+
 def shown_matrix(page: Page) -> np.ndarray:
     return np.array(
         json.loads(page.locator(".wb-copy-head [data-copy]").first.get_attribute("data-copy") or "")
@@ -45,14 +51,10 @@ def shown_matrix(page: Page) -> np.ndarray:
 
 def test_a_press_on_the_picture_tells_body_depth_and_point(page: Page) -> None:
     pane = page.locator(".wb-pane")
+    expect(page.locator(PICTURE).first).to_be_visible(timeout=180_000)
+    until(lambda: lies_over(pane, page.locator(PICTURE).first), "a pane as large as the picture")
     box = pane.bounding_box()
     assert box is not None
-    picture = page.locator("img[src^='blob:']:visible").first.bounding_box()
-    assert (
-        picture is not None
-        and abs(box["y"] - picture["y"]) < 1
-        and abs(box["height"] - picture["height"]) < 1
-    )
     pane.click(position={"x": 4, "y": box["height"] - 4})
     expect(page.locator(".wb-found b")).to_have_text("table-workspace")
     text = page.locator(".wb-found").inner_text()
@@ -126,4 +128,4 @@ def test_placements_are_suggested_with_pictures_and_taken(page: Page) -> None:
     expect(page.locator(".wb-offer").first).to_contain_text(re.compile(r"cube: in (\d) of \1 envs"))
     take.first.click()
     expect(page.locator(".wb-offer").first).to_contain_text("taken")
-    assert not np.allclose(shown_matrix(page), before, atol=1e-3)
+    until(lambda: not np.allclose(shown_matrix(page), before, atol=1e-3), "the camera where it was suggested")

@@ -186,7 +186,7 @@ def test_typed_and_nudged_and_undone(page: Page) -> None:
         page.keyboard.press("Control+z")
         until(lambda undone=undone: numbers(page, "Degrees")[1] == undone, "the turn undone")
     until(lambda: numbers(page, "Radians") == [1], "all undone")
-    assert numbers(page, "Position") == [0.45, 0, 0.6]
+    until(lambda: numbers(page, "Position") == [0.45, 0, 0.6], "where it was")
     page.keyboard.press("Control+Shift+z")
     until(lambda: numbers(page, "Radians") == [1.5708], "the lens again")
     page.get_by_text("Lens and picture", exact=True).click()
