@@ -14,6 +14,7 @@ import viser
 from workbench.authoring.problem import Problem
 from workbench.session.view import SessionView
 from workbench.ui.busy_banner import is_shown as busy_is_shown
+from workbench.ui.changed import show
 from workbench.ui.fragments import render
 
 WIDEST, NARROWEST = 520, 240
@@ -75,8 +76,7 @@ class Banner:
             return
         self._fit_views()
         stopped = view.state == "stopped"
-        if self._restart.visible != stopped:
-            self._restart.visible = stopped
+        show(self._restart, stopped)
         # Written once a problem: a new text would close the traceback that someone has open.
         drawn = view.problem_serial, _kept(view) if problem.stage == "worker" else ""
         if drawn != self._drawn:

@@ -14,6 +14,7 @@ import viser
 
 from workbench.session.last_words import Busy
 from workbench.session.view import SessionView
+from workbench.ui.changed import show
 from workbench.ui.fragments import render
 
 SHOWN_AFTER = 4.0
@@ -70,8 +71,7 @@ class BusyBanner:
             self._traceback.content = trace
             self._traceback.visible = bool(trace)
         can_interrupt = not busy.deaf and not busy.drawing
-        if self._interrupt.visible != can_interrupt:
-            self._interrupt.visible = can_interrupt
+        show(self._interrupt, can_interrupt)
         if not self._panel.visible:
             self._panel.visible = True
             self._panel.expand()

@@ -17,6 +17,7 @@ from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera
 from workbench.session.view import SessionView
 from workbench.ui.camera_work import WorkBar
+from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_choice
 from workbench.ui.fragments import render
 from workbench.ui.inline_pictures import data_address
@@ -101,8 +102,7 @@ class CameraCompare:
                 button.disabled = not usable
         kept = None if camera is None else self._kept.get(camera.key)
         back = camera is not None and kept is not None and kept != camera.now
-        if self._take.visible != back:
-            self._take.visible = back
+        show(self._take, back)
         both = studio.compared
         mine = (
             both is not None
@@ -113,8 +113,7 @@ class CameraCompare:
         if wanted == self._drawn:
             return
         self._drawn = wanted
-        if self._html.visible != mine:
-            self._html.visible = mine
+        show(self._html, mine)
         if not mine or both is None or camera is None or both[0].rgb is None or both[1].rgb is None:
             return
         asked = self._asked if self._asked is not None and self._asked[0] == camera.key else None
@@ -128,8 +127,7 @@ class CameraCompare:
             env=both[0].env,
             differences=[] if asked is None else what_differs(asked[2], asked[1]),
         )
-        if self._html.content != content:
-            self._html.content = content
+        fill(self._html, content)
 
 
 def what_differs(old: CameraSettings, new: CameraSettings) -> list[str]:

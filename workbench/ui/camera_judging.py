@@ -15,6 +15,7 @@ from workbench.ui.camera_compare import CameraCompare
 from workbench.ui.camera_export import CameraExport
 from workbench.ui.camera_suggest import CameraSuggest
 from workbench.ui.camera_verdict import CameraVerdict
+from workbench.ui.changed import show
 
 
 class CameraJudging:
@@ -35,8 +36,7 @@ class CameraJudging:
         # Folders without a subject would be dead controls.
         there = view.studio.chosen is not None
         for part in self._parts:
-            if part.folder.visible != there:
-                part.folder.visible = there
+            show(part.folder, there)
             part.draw(view)
 
     def draw_in_view(self, view: SessionView, offset: NDArray) -> None:

@@ -35,6 +35,7 @@ from workbench.core.camera_frames import (
 from workbench.core.camera_settings import CameraSettings
 from workbench.session.studio_view import StudioCamera
 from workbench.ui.camera_moves import Floats, kept_where_equal, looking_at, rounded
+from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_choice, checked_int, checked_number, checked_text
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
@@ -152,8 +153,7 @@ class CameraNumbers:
     def draw(self, camera: StudioCamera | None) -> None:
         """Show this camera; None hides all."""
         for folder in (self._place_folder, self._lens_folder):
-            if folder.visible != (camera is not None):
-                folder.visible = camera is not None
+            show(folder, camera is not None)
         if camera is None or camera.now is None:
             return
         now = camera.now
@@ -170,8 +170,8 @@ class CameraNumbers:
             (self._forward, AXES),
             (self._up, AXES),
         ):
-            _show(control.handle, said == name)
-        _show(self._left, said == AXES)
+            show(control.handle, said == name)
+        show(self._left, said == AXES)
         if said == RPY:
             # Half a turn is the same both ways round; it would flicker between the two.
             self._rpy.show([180.0 if round(a, DEGREES) == -180 else a for a in rpy_of(now.quaternion)])
@@ -182,8 +182,7 @@ class CameraNumbers:
             self._forward.show(forward)
             self._up.show(up)
             text = render("note", text=f"Left: {', '.join(f'{n:.{UNIT}f}' for n in rounded(left, UNIT))}")
-            if self._left.content != text:
-                self._left.content = text
+            fill(self._left, text)
 
     def _draw_lens(self, now: CameraSettings) -> None:
         by_matrix = now.intrinsic is not None
@@ -194,7 +193,7 @@ class CameraNumbers:
             (self._focal, by_matrix),
             (self._centre, by_matrix),
         ):
-            _show(control.handle, shown)
+            show(control.handle, shown)
         k = intrinsic_of(now)
         if by_matrix:
             self._focal.show((k[0, 0], k[1, 1]))
@@ -389,8 +388,3 @@ def _turned(settings: CameraSettings, quaternion: Floats) -> CameraSettings:
     pose = pose_of(settings)
     pose[3:] = quaternion
     return with_pose(settings, pose)
-
-
-def _show(handle: Any, shown: bool) -> None:
-    if handle.visible != shown:
-        handle.visible = shown

@@ -18,6 +18,7 @@ from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera, StudioView
 from workbench.session.view import SessionView
 from workbench.ui.camera_work import WorkBar
+from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_int, checked_number
 from workbench.ui.fragments import render
 from workbench.ui.inline_pictures import data_address
@@ -133,26 +134,21 @@ class CameraSuggest:
             return
         self._drawn = wanted
         mine = bool(studio.suggestions) and studio.suggestions_of == studio.selected
-        if self._offers.visible != mine:
-            self._offers.visible = mine
+        show(self._offers, mine)
         if mine and camera is not None:
             content = self._offers_html(studio.suggestions, camera)
-            if self._offers.content != content:
-                self._offers.content = content
+            fill(self._offers, content)
 
     def _draw_controls(self, camera: StudioCamera | None) -> None:
         mount = None if camera is None else camera.info.mount
         for handle in (self._objects, self._low, self._high, self._show_box, self._resets, self._search):
-            if handle.visible != (mount is None):
-                handle.visible = mount is None
-        if self._mounted.visible != (mount is not None):
-            self._mounted.visible = mount is not None
+            show(handle, mount is None)
+        show(self._mounted, mount is not None)
         if mount is not None:
             content = render(
                 "note", text=f"It rides on {mount}: places are searched for cameras that stand still."
             )
-            if self._mounted.content != content:
-                self._mounted.content = content
+            fill(self._mounted, content)
 
     def _draw_bounds(self, camera: StudioCamera | None) -> None:
         if camera is None or camera.now is None:

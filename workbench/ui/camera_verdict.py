@@ -18,6 +18,7 @@ from workbench.session.studio_view import StudioCamera, StudioView
 from workbench.session.view import SessionView
 from workbench.ui import camera_report_words as words
 from workbench.ui.camera_work import WorkBar
+from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_choice, checked_int
 from workbench.ui.fragments import render
 from workbench.ui.inline_pictures import data_address
@@ -107,8 +108,7 @@ class CameraVerdict:
         studio = view.studio
         camera = studio.chosen
         fresh = self._over.value == FRESH
-        if self._resets.visible != fresh:
-            self._resets.visible = fresh
+        show(self._resets, fresh)
         self._bar.draw(studio.progress)
         self._sheet_bar.draw(studio.progress)
         self._draw_report(studio, camera)
@@ -120,13 +120,13 @@ class CameraVerdict:
         if wanted == self._drawn:
             return
         self._drawn = wanted
-        _show(self._report, report is not None)
+        show(self._report, report is not None)
         if report is None or camera is None:
             return
         uses = {
             plane: self._presses.id_of(plane, lambda _, p=plane: self._use(p)) for plane in ("near", "far")
         }
-        _fill(self._report, report_html(report, camera, studio.report_stale, studio.report_seeds, uses))
+        fill(self._report, report_html(report, camera, studio.report_stale, studio.report_seeds, uses))
 
     def _draw_sheet(self, view: SessionView, camera: StudioCamera | None) -> None:
         studio = view.studio
@@ -136,11 +136,11 @@ class CameraVerdict:
         if wanted == self._drawn_sheet:
             return
         self._drawn_sheet = wanted
-        _show(self._pictures, mine)
+        show(self._pictures, mine)
         if not mine or camera is None:
             return
         judged = studio.report_of == camera.key and not studio.report_seeds
-        _fill(self._pictures, self._sheet_html(sheet, studio.report if judged else None, view.selected_env))
+        fill(self._pictures, self._sheet_html(sheet, studio.report if judged else None, view.selected_env))
 
     def _sheet_html(self, sheet: tuple[Picture, ...], report: CameraReport | None, selected: int) -> str:
         places = {} if report is None else {env: i for i, env in enumerate(report.envs)}
@@ -204,14 +204,3 @@ def report_html(
         beyond=words.percent(float(depth.beyond.mean())),
         planes=planes,
     )
-
-
-def _show(handle: viser.GuiHtmlHandle, shown: bool) -> None:
-    if handle.visible != shown:
-        handle.visible = shown
-
-
-def _fill(handle: viser.GuiHtmlHandle, content: str) -> None:
-    # Content that is sent again is made anew in the page, under the pointer of whoever is about to press it.
-    if handle.content != content:
-        handle.content = content

@@ -18,6 +18,7 @@ import viser
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera, StudioView, Writing
+from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_text
 from workbench.ui.fragments import render
 from workbench.ui.placing import Placing
@@ -151,13 +152,13 @@ class CameraWriting:
             and (writing.stage not in ("planned", "written") or stale)
         )
         # Not at the place of the button that writes: a second press must not write what was not read.
-        _show(self._plan, can_place and (writing.stage != "planned" or stale))
+        show(self._plan, can_place and (writing.stage != "planned" or stale))
         if self._plan.disabled == wants_plan:
             self._plan.disabled = not wants_plan
-        _show(self._text, writing.stage != "none")
-        _show(self._write, writing.stage == "planned" and not stale)
-        _show(self._drop, writing.stage in ("planned", "refused", "undone"))
-        _show(self._undo, writing.stage in DONE)
+        show(self._text, writing.stage != "none")
+        show(self._write, writing.stage == "planned" and not stale)
+        show(self._drop, writing.stage in ("planned", "refused", "undone"))
+        show(self._undo, writing.stage in DONE)
         leave = LEAVE if writing.stage == "planned" else CLOSE
         if self._drop.label != leave:
             self._drop.label = leave
@@ -166,10 +167,9 @@ class CameraWriting:
         if self._write.label != label:
             self._write.label = label
         text = writing_html(writing, chosen, stale)
-        if self._text.content != text:
-            self._text.content = text
+        fill(self._text, text)
         if self._with_chosen is not None:
-            _show(self._with_chosen, chosen is not None)
+            show(self._with_chosen, chosen is not None)
 
     def _is_stale(self, studio: StudioView) -> bool:
         """The camera was moved since the plan for it was made."""
@@ -208,10 +208,3 @@ def diff_lines(diff: str) -> list[tuple[str, str]]:
     code = [line[1:] for kind, line in lines if kind != "at" and line[1:].strip()]
     indent = min((len(line) - len(line.lstrip()) for line in code), default=0)
     return [(kind, line if kind == "at" else line[:1] + " " + line[1 + indent :]) for kind, line in lines]
-
-
-def _show(
-    handle: viser.GuiHtmlHandle | viser.GuiButtonHandle | viser.GuiButtonGroupHandle, shown: bool
-) -> None:
-    if handle.visible != shown:
-        handle.visible = shown

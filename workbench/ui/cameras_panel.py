@@ -19,6 +19,7 @@ from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.session.messages import CameraRequest, TaskDescription
 from workbench.session.session import Session
 from workbench.session.view import SessionView
+from workbench.ui.changed import fill
 from workbench.ui.false_colour import (
     DepthRange,
     colour_depth,
@@ -148,8 +149,7 @@ class CamerasPanel:
                     camera = self._build_camera(info, first_of_kind[info.kind] == info.name)
                 else:
                     camera.info, camera.depth_span = info, None
-                    if camera.facts.content != facts(camera):
-                        camera.facts.content = facts(camera)
+                    fill(camera.facts, facts(camera))
                 if camera.folder.order != order:
                     camera.folder.order = order
                 self._cameras[key] = camera

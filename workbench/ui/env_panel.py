@@ -16,6 +16,7 @@ import viser
 from workbench.session.env_table import EnvRows
 from workbench.session.session import Session
 from workbench.session.view import SessionView
+from workbench.ui.changed import fill
 from workbench.ui.env_strip import (
     FILTERS,
     MEANS,
@@ -69,8 +70,7 @@ class EnvPanel:
         self._changed, self._drawn, self._drawn_at = False, wanted, time.monotonic()
         rows = self._session.env_rows()
         content = render("envs", head=()) if rows is None else self._html(rows, view.selected_env)
-        if self._handle.content != content:
-            self._handle.content = content
+        fill(self._handle, content)
 
     def _html(self, rows: EnvRows, selected: int) -> str:
         if self._column not in columns(rows):

@@ -20,6 +20,7 @@ from workbench.session.judgement import EpisodeDifference, JudgedCurve
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui import judged_in_words as words
+from workbench.ui.changed import fill, show
 from workbench.ui.curves_panel import CURSOR, LONGEST, SELECTED_COLOUR, value_span
 from workbench.ui.fragments import render
 from workbench.ui.presses import Presses
@@ -59,12 +60,12 @@ class JudgementPanel:
         if wanted == self._drawn or time.monotonic() - self._drawn_at < REDRAW_EVERY:
             return
         self._drawn, self._drawn_at = wanted, time.monotonic()
-        _show(self._status, judged.state != "none")
-        _show(self._stop, judged.state in ("loading", "judging"))
+        show(self._status, judged.state != "none")
+        show(self._stop, judged.state in ("loading", "judging"))
         if judged.state == "none":
             self._first = 0
         else:
-            _fill(self._status, status_html(judged))
+            fill(self._status, status_html(judged))
         self._draw_list(judged, view)
         self._draw_chart(judged, view)
 
@@ -81,10 +82,10 @@ class JudgementPanel:
         # What a page sends as its choice may be anything.
         name = self._name.value if self._name.value in names else "reward"
         curve = self._session.judged_curve(name, view.selected_env) if differs else None
-        _show(self._name, curve is not None)
+        show(self._name, curve is not None)
         if curve is None or len(curve.tick) < 2:
             if self._chart is not None:
-                _show(self._chart, False)
+                show(self._chart, False)
             return
         data = chart_data(curve, view.timeline.shown)
         series = SERIES if len(data) == 3 else (*SERIES, CURSOR)
@@ -107,13 +108,13 @@ class JudgementPanel:
         with self._server.atomic():
             self._chart.series, self._chart.scales, self._chart.title = series, scales, title
             self._chart.data = data
-        _show(self._chart, True)
+        show(self._chart, True)
 
     # --- the list ------------------------------------------------------------------------------------
 
     def _draw_list(self, judged: JudgementView, view: SessionView) -> None:
         self._listed = () if judged.summary is None else judged.summary.differences
-        _show(self._list, bool(self._listed))
+        show(self._list, bool(self._listed))
         if not self._listed:
             return
         count = len(self._listed)
@@ -132,7 +133,7 @@ class JudgementPanel:
                 "on": self._presses.id_of("on", lambda _: self._turn(MOST_ROWS)),
             },
         )
-        _fill(self._list, content)
+        fill(self._list, content)
 
     def _row(self, place: int, view: SessionView) -> dict[str, object]:
         episode = self._listed[place]
@@ -224,17 +225,3 @@ def status_html(judged: JudgementView) -> str:
         drifted=summary is not None and words.is_far(summary),
         not_carried=judged.not_carried,
     )
-
-
-def _show(
-    handle: viser.GuiHtmlHandle | viser.GuiButtonHandle | viser.GuiDropdownHandle | viser.GuiUplotHandle,
-    shown: bool,
-) -> None:
-    if handle.visible != shown:
-        handle.visible = shown
-
-
-def _fill(handle: viser.GuiHtmlHandle, content: str) -> None:
-    # Content that is sent again is made anew in the page, under the pointer of whoever is about to press it.
-    if handle.content != content:
-        handle.content = content

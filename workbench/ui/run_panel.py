@@ -14,6 +14,7 @@ from workbench.session.messages import ActionSource, EpisodeEnd
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.action_sliders import ActionSliders
+from workbench.ui.changed import show
 from workbench.ui.checked import checked_choice, checked_int, checked_text
 from workbench.ui.controls import Control
 
@@ -150,8 +151,7 @@ class RunPanel:
             self._sliders.build(view.task.actions, view.sliders)
         self._draw_play(view.playing, can_act)
         # viser cannot grey out a group of buttons; one that does nothing must not be there.
-        if self._transport.visible != can_act:
-            self._transport.visible = can_act
+        show(self._transport, can_act)
         for control in (self._env, self._speed, self._seed, self._end, self._source, self._policy):
             control.enable(can_act)
         self._env.show(view.selected_env)

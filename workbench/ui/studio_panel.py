@@ -34,6 +34,7 @@ from workbench.ui.camera_numbers import CameraNumbers
 from workbench.ui.camera_pick import CameraPick
 from workbench.ui.camera_writing import CameraWriting
 from workbench.ui.cameras_panel import FASTEST, KIND_NAMES
+from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_choice
 from workbench.ui.commands import Command
 from workbench.ui.controls import Control
@@ -143,19 +144,19 @@ class StudioPanel:
         studio = view.studio
         self._draw_choice(view)
         chosen, camera = studio.chosen, self._shown(studio)
-        _show(self._facts, chosen is not None)
-        _show(self._tools, camera is not None)
-        _show(self._handles, camera is not None)
+        show(self._facts, chosen is not None)
+        show(self._tools, camera is not None)
+        show(self._handles, camera is not None)
         self._numbers.draw(camera)
         self._writing.draw(studio)
         self._draw_picture(view)
         self._pick.draw(view, shown=self._picture is not None and self._picture.visible)
         self._judging.draw(view)
         if chosen is not None:
-            _fill(self._facts, self._facts_of(chosen, view))
+            fill(self._facts, self._facts_of(chosen, view))
         if camera is not None:
-            _fill(self._tools, self._tools_of(camera, studio))
-            _fill(self._handles, self._handles_of())
+            fill(self._tools, self._tools_of(camera, studio))
+            fill(self._handles, self._handles_of())
 
     def _draw_choice(self, view: SessionView) -> None:
         studio = view.studio
@@ -168,7 +169,7 @@ class StudioPanel:
             }
             self._choice.handle.options = tuple(self._names)
         self._choice.show(studio.selected)
-        _show(self._choice.handle, bool(keys))
+        show(self._choice.handle, bool(keys))
         if not keys:
             text = (
                 "This task has no camera."
@@ -179,9 +180,9 @@ class StudioPanel:
             text = "Choose a camera here, or press its frustum in the view, to place it."
         else:
             text = ""
-        _show(self._note, bool(text))
+        show(self._note, bool(text))
         if text:
-            _fill(self._note, render("note", text=text))
+            fill(self._note, render("note", text=text))
 
     def _draw_picture(self, view: SessionView) -> None:
         key = view.studio.selected
@@ -190,7 +191,7 @@ class StudioPanel:
             picture = None
         if self._picture is not None:
             # The last one stays while the next is drawn; that of another camera does not.
-            _show(self._picture, self._drawn is not None and self._drawn[0] == key)
+            show(self._picture, self._drawn is not None and self._drawn[0] == key)
         if key is None or picture is None or picture.rgb is None:
             return
         if self._drawn is not None and self._drawn[0] == key and self._drawn[1] is picture:
@@ -203,7 +204,7 @@ class StudioPanel:
                 self._picture = self._server.gui.add_image(picture.rgb, format="jpeg", jpeg_quality=80)
         else:
             self._picture.image = picture.rgb
-            _show(self._picture, True)
+            show(self._picture, True)
 
     def _facts_of(self, camera: StudioCamera, view: SessionView) -> str:
         info = camera.info
@@ -402,17 +403,3 @@ class StudioPanel:
 def _placed(camera: StudioCamera) -> CameraSettings:
     assert camera.now is not None
     return camera.now
-
-
-def _show(
-    handle: viser.GuiFolderHandle | viser.GuiInputHandle | viser.GuiHtmlHandle | viser.GuiImageHandle,
-    shown: bool,
-) -> None:
-    if handle.visible != shown:
-        handle.visible = shown
-
-
-def _fill(handle: viser.GuiHtmlHandle, content: str) -> None:
-    # Content that is sent again is made anew in the page, under the pointer of whoever is about to press it.
-    if handle.content != content:
-        handle.content = content

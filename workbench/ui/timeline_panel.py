@@ -18,6 +18,7 @@ import viser
 from workbench.session.session import Session
 from workbench.session.timeline import Scope
 from workbench.session.view import SessionView
+from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_int
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
@@ -132,8 +133,7 @@ class TimelinePanel:
     def draw(self, view: SessionView) -> None:
         past = view.timeline
         there = view.task is not None and past.moments > 0
-        if self._panel.visible != there:
-            self._panel.visible = there
+        show(self._panel, there)
         if not there or view.task is None:
             return
         self._shown = past.shown
@@ -171,8 +171,7 @@ class TimelinePanel:
         if travel and self._travel.options != travel:
             self._travel.options = travel
         hint = render("timeline_hint", live=past.shown is None, not_carried="; ".join(past.not_carried))
-        if self._hint.content != hint:
-            self._hint.content = hint
+        fill(self._hint, hint)
         if self._travel.visible != bool(travel):
             with self._server.atomic():
                 self._travel.visible, self._hint.visible = bool(travel), not travel

@@ -15,6 +15,7 @@ import viser
 from workbench.session.messages import LoadLevel, ReloadReport
 from workbench.session.session import Session
 from workbench.session.view import SessionView
+from workbench.ui.changed import show
 from workbench.ui.checked import checked_choice
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
@@ -56,8 +57,7 @@ class VersionPanel:
     def draw(self, view: SessionView) -> None:
         task = view.task
         can_load = view.state != "stopped"
-        if self._again.visible != can_load:
-            self._again.visible = can_load
+        show(self._again, can_load)
         names = () if task is None else (task.class_name, *task.others)
         if len(names) > 1:
             # In one order, whichever of them is shown.
@@ -65,8 +65,7 @@ class VersionPanel:
                 self._names = tuple(sorted(names))
                 self._task.handle.options = self._names
             self._task.show(names[0])
-        if self._task.handle.visible != (len(names) > 1):
-            self._task.handle.visible = len(names) > 1
+        show(self._task.handle, len(names) > 1)
         wanted = (view.reload, view.stale, task is None)
         if wanted != self._drawn:
             self._drawn = wanted
