@@ -24,7 +24,7 @@ from workbench.recording.verify import verify_rrd
 from workbench.session.interrupts import INTERRUPT_SIGNAL
 from workbench.session.kept_worker import WorkerOptions
 from workbench.session.messages import TaskOptions
-from workbench.session.process import _signal_main_thread
+from workbench.session.process import signal_main_thread
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 
@@ -283,7 +283,7 @@ def test_an_interrupt_is_for_the_thread_that_python_handles_signals_in() -> None
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     child.send_signal(signal.SIGSTOP)
     try:
-        _signal_main_thread(child.pid, INTERRUPT_SIGNAL)
+        signal_main_thread(child.pid, INTERRUPT_SIGNAL)
         status = Path(f"/proc/{child.pid}/status").read_text()
         pending = {
             line.split(":")[0]: int(line.split()[1], 16) for line in status.splitlines() if "Pnd" in line
@@ -293,4 +293,4 @@ def test_an_interrupt_is_for_the_thread_that_python_handles_signals_in() -> None
     finally:
         child.kill()
         child.wait()
-    _signal_main_thread(child.pid, INTERRUPT_SIGNAL)  # gone: nothing to interrupt
+    signal_main_thread(child.pid, INTERRUPT_SIGNAL)  # gone: nothing to interrupt

@@ -7,8 +7,6 @@ wants it; its envs are reset as often as one likes, which is how a camera is jud
 
 from __future__ import annotations
 
-import contextlib
-import os
 import threading
 import time
 from collections.abc import Callable
@@ -29,10 +27,9 @@ from workbench.session.messages import (
     Status,
     Stepped,
 )
-from workbench.session.process import WorkerProcess, describe_exit
+from workbench.session.process import WorkerProcess, describe_exit, start_in_background
 
 _LOOK = 0.05
-_NICENESS = 10
 _PATIENCE = 3.0
 """Seconds in which a process that was told to stop must answer again, or is ended."""
 MOST_ENVS = 16
@@ -100,7 +97,10 @@ class BackgroundAsker:
             return
         if self._process is None:
             job.tell(0, 0, "starting a process to look with")
-            self._process = _start_process()
+            try:
+                self._process = start_in_background()
+            except OSError as error:
+                raise JobFailed(f"no process could be started to look with: {error}") from error
         job.tell(0, 0, "building envs to look at")
         self._loaded = None
         event = self._request(load, job, Loaded)
@@ -176,19 +176,3 @@ def _for_judging(load: Load) -> Load:
     return replace(
         load, options=replace(options, num_envs=envs, env_kwargs=kwargs), level="auto", snapshot=None
     )
-
-
-def _start_process() -> WorkerProcess:
-    try:
-        process = WorkerProcess(_unheard)
-    except OSError as error:
-        raise JobFailed(f"no process could be started to look with: {error}") from error
-    with contextlib.suppress(ProcessLookupError, PermissionError):
-        # The worker that plays comes first where there are fewer cores than work.
-        os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
-    return process
-
-
-def _unheard(stream: str, text: object) -> bool:
-    """What the author's code prints is heard from the worker that plays."""
-    return False

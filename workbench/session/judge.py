@@ -12,8 +12,6 @@ stops it by not sending more, and a process that does not answer (the new code m
 
 from __future__ import annotations
 
-import contextlib
-import os
 import pickle
 import threading
 import time
@@ -33,7 +31,7 @@ from workbench.session.messages import (
     MomentToJudge,
     TaskDescription,
 )
-from workbench.session.process import WorkerProcess, describe_exit
+from workbench.session.process import WorkerProcess, describe_exit, start_in_background
 
 IDLE_SECONDS = 300.0
 """How long the process is kept without a judgement."""
@@ -48,7 +46,6 @@ _LOOK = 0.05
 _MOMENT_PATIENCE = 2.0
 _LOAD_PATIENCE = 10.0
 """Seconds after which a process that was told to stop, and is still at a chunk or a load, is ended."""
-_NICENESS = 10
 
 JudgeState = Literal["none", "loading", "judging", "done", "stopped", "failed"]
 
@@ -232,7 +229,10 @@ class Judge:
     def _load(self, job: _Job) -> None:
         self._tell(job, "loading")
         if self._process is None:
-            self._process = _start_process()
+            try:
+                self._process = start_in_background()
+            except OSError as error:
+                raise _Failure(f"no process could be started to judge with: {error}") from error
         else:
             # A version is tried at the moment at which the env stands, which is where the judgement before
             # ended: there the new code may raise or loop though it runs from the beginnings in the record.
@@ -349,19 +349,3 @@ class Judge:
                 summary=summary,
             )
         self._on_change()
-
-
-def _start_process() -> WorkerProcess:
-    try:
-        process = WorkerProcess(_unheard)
-    except OSError as error:
-        raise _Failure(f"no process could be started to judge with: {error}") from error
-    with contextlib.suppress(ProcessLookupError, PermissionError):
-        # The worker that plays comes first where there are fewer cores than work.
-        os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
-    return process
-
-
-def _unheard(stream: str, text: object) -> bool:
-    """What the author's code prints was printed when it happened; it is not said again."""
-    return False

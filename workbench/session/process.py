@@ -12,6 +12,7 @@ it is, it says from a signal handler into a file in memory, whatever its interpr
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import errno
 import fcntl
@@ -51,6 +52,7 @@ _PIECE = 1 << 20
 _FLOOD_PAUSE = 0.005
 """Seconds between two reads of a flood: with pieces of a megabyte that drains 200 MB a second."""
 _F_SETPIPE_SZ = 1031
+_NICENESS = 10
 
 Output = Callable[[str, bytes], bool]
 """Gets ``stdout`` or ``stderr`` and the bytes that came (none at its end); True asks for a little rest."""
@@ -183,7 +185,7 @@ class WorkerProcess:
         with self._wake:
             self._waiting = deque(request for request in self._waiting if not is_a_step(request))
         if self.beat().number > 0 and self._process.poll() is None:
-            _signal_main_thread(self.pid, INTERRUPT_SIGNAL)
+            signal_main_thread(self.pid, INTERRUPT_SIGNAL)
 
     # --- its end -----------------------------------------------------------------------------------
 
@@ -266,7 +268,21 @@ def describe_exit(code: int | None) -> str:
     return f"ended with exit code {code}"
 
 
-def _signal_main_thread(pid: int, number: signal.Signals) -> None:
+def start_in_background() -> WorkerProcess:
+    """A worker that works beside the one that plays, and after it where there are fewer cores than work.
+
+    What the author's code prints in it is heard of the other one, and not said twice.
+
+    Raises:
+        OSError: no process could be started.
+    """
+    process = WorkerProcess(lambda stream, piece: False)
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
+    return process
+
+
+def signal_main_thread(pid: int, number: signal.Signals) -> None:
     """Send a signal to the thread of a process that Python's handlers run in.
 
     The kernel hands a signal for the whole process to any of its threads, on a busy machine also to one of torch's
