@@ -92,6 +92,11 @@ class _Scene:
 _scenes: WeakKeyDictionary[Any, _Scene] = WeakKeyDictionary()
 
 
+def _scene_of(env: BaseEnv) -> _Scene:
+    # Kept, also where nothing was noted: `look_over` knows its last look by the object.
+    return _scenes.setdefault(env.scene, _Scene())
+
+
 def note_scene(env: BaseEnv) -> None:
     """Remember what the task holds now, right after its scene was built, as belonging to the scene."""
     _scenes[env.scene] = scene = _Scene()
@@ -104,7 +109,7 @@ def note_constructed(env: BaseEnv) -> None:
 
     An env made of the edited file would otherwise be given the old file's ``self.threshold = 0.02``.
     """
-    scene = _scenes.setdefault(env.scene, _Scene())
+    scene = _scene_of(env)
     scene.add([leaf for leaf in _look_over(env).leaves if isinstance(leaf.value, (*PLAIN, tuple))])
     forget_look(env)
 
@@ -112,7 +117,7 @@ def note_constructed(env: BaseEnv) -> None:
 def read_task_state(env: BaseEnv, env_idx: list[int]) -> TaskState:
     """Copies of what the task remembers about the envs in `env_idx`, and of what holds for the batch."""
     walk = _look_over(env)
-    scene = _scenes.get(env.scene, _Scene())
+    scene = _scene_of(env)
     chosen = np.array(env_idx, dtype=np.int64)
     rows: Any = slice(None) if env_idx == list(range(env.num_envs)) else torch.from_numpy(chosen)
     buffers: dict[str, Buffer] = {}
@@ -156,7 +161,7 @@ def write_task_state(
         Paths that were carried, and paths that were not with the reason.
     """
     walk = _look_over(env, state.buffers)
-    scene = _scenes.get(env.scene, _Scene())
+    scene = _scene_of(env)
     carried: dict[str, None] = {}
     missed = dict(state.omitted)
     all_envs = sorted(env_idx) == list(range(env.num_envs))
@@ -270,7 +275,7 @@ def _as_built(mark: _Mark, num_envs: int) -> Buffer:
 
 def _look_over(env: BaseEnv, wanted: Collection[str] = ()) -> Walk:
     """Everything that may have changed since the scene was built, and what is at the paths in `wanted`."""
-    scene = _scenes.get(env.scene, _Scene())
+    scene = _scene_of(env)
     built = scene.plain
     for path in scene.paths.intersection(wanted):
         owner, _, name = path.rpartition(".")
