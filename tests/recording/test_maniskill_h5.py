@@ -44,8 +44,9 @@ def stacked(rows: list[dict[str, NDArray]]) -> dict[str, NDArray]:
 
 def record_both(task: str, folder: Path, **kwargs: Any) -> tuple[Path, Path]:
     """The .h5 of one episode from ManiSkill's wrapper, and from ours."""
+    stock: Any = gym.make(task, num_envs=1, **kwargs)
     env: Any = RecordEpisode(
-        gym.make(task, num_envs=1, **kwargs),
+        stock,
         str(folder / "theirs"),
         trajectory_name="theirs",
         save_video=False,
