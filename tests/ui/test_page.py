@@ -82,6 +82,8 @@ def test_what_a_press_changes_on_the_panels_comes_apart_from_the_view(
     # A browser applies a batch with anything of the view in it at its next frame of the view, which may take long.
     wait_until(page._session, lambda view: view.task is not None, "the load")
     monkeypatch.setattr("workbench.ui.page.SENT_WITHIN", 10.0)
+    page._session.select_env(0)
+    page.redraw()
     address, options = handshake(f"http://127.0.0.1:{page._server.get_port()}")
     with websockets.sync.client.connect(address, **options) as connection:
 
@@ -93,8 +95,6 @@ def test_what_a_press_changes_on_the_panels_comes_apart_from_the_view(
                 batches.append({message["type"] for message in messages_in(frame)})
             return batches
 
-        page._session.select_env(0)
-        page.redraw()
         kinds_until("ReplayDoneMessage")
         page._session.select_env(1)
         page.redraw()
