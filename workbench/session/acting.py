@@ -57,7 +57,7 @@ class Acting:
         try:
             self._policy = load_policy(self._policy_name, beside)
         except (Exception, SystemExit, Interrupted) as error:
-            raise TaskError(problem_of(error, policy, beside)) from error
+            raise TaskError(problem_of(error, self._policy_name, beside)) from error
 
     def next_action(self, task: TaskEnv) -> NDArray[np.float32]:
         """(N, A), within the bounds but for a policy's.
