@@ -4,7 +4,7 @@ A recording is read by people in the viewer and by programs, so where a thing li
 
 - ``/world`` right-handed, z up; ``/world/<body>`` its pose, ``/world/<body>/<n>`` its static meshes;
 - ``/world/cameras/<name>`` pose and pinhole, with children ``rgb``, ``depth`` and ``segmentation``;
-- ``/action``, ``/reward`` and ``/reward/<term>``, ``/evaluate/<entry>``, ``/observation/state/<entry>``,
+- ``/action``, ``/reward`` and ``/reward/<term>``, ``/evaluate/<entry>``, ``/observation/state``,
   ``/episode/{success,fail,terminated,truncated}`` as numbers, ``/logs/events`` as text.
 
 Two timelines index all of it: ``step``, the state's number, and ``sim_time``. Row k is what
@@ -18,6 +18,7 @@ z forward); ManiSkill has wxyz and x forward, y left, z up.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -38,6 +39,8 @@ SIM_TIME = "sim_time"
 WORLD = "/world"
 CAMERAS = "/world/cameras"
 EVENTS = "/logs/events"
+OBSERVATION = "/observation/state"
+"""All observations but pictures as one batch, as LeRobot has them: an entity each would be 5 kB a file and 40 B a step."""
 REWARD_TERMS = "reward_terms/"
 """What an entry of ``evaluate()`` begins with that is a part of the reward."""
 
@@ -179,6 +182,11 @@ class EpisodeLog:
                 log.scalars(entity, states, piece.columns[name])
         for name, values in survey.flags.items():
             log.scalars(f"/episode/{name}", states, values[states])
+        if observed := [piece.columns[OBS + name] for name in survey.named(OBS)]:
+            flat = [
+                np.asarray(v, dtype=np.float64).reshape(len(states), math.prod(v.shape[1:])) for v in observed
+            ]
+            log.scalars(OBSERVATION, states, np.concatenate(flat, axis=1))
 
 
 # --- names ----------------------------------------------------------------------------------------
@@ -221,10 +229,6 @@ def evaluate_entity(name: str) -> str:
     if name.startswith(REWARD_TERMS):
         return rr.new_entity_path(["reward", name[len(REWARD_TERMS) :] or "unnamed"])
     return rr.new_entity_path(["evaluate", name or "unnamed"])
-
-
-def observation_entity(name: str) -> str:
-    return rr.new_entity_path(["observation", "state", *(part for part in name.split("/") if part)])
 
 
 # --- scene ----------------------------------------------------------------------------------------
@@ -340,10 +344,9 @@ def _numbers(survey: Survey) -> list[tuple[str, str, list[str]]]:
         ("terminated", "/episode/terminated", ["terminated"]),
         ("truncated", "/episode/truncated", ["truncated"]),
     ]
-    for prefix, entity in ((EVALUATE, evaluate_entity), (OBS, observation_entity)):
-        for name, column in survey.named(prefix).items():
-            said = name.removeprefix(REWARD_TERMS) if prefix == EVALUATE else name or "obs"
-            found.append((prefix + name, entity(name), series_names(said, column)))
+    for name, column in survey.evaluate().items():
+        series = series_names(name.removeprefix(REWARD_TERMS), column)
+        found.append((EVALUATE + name, evaluate_entity(name), series))
     return found
 
 
@@ -355,8 +358,6 @@ def series_names(name: str, column: Column) -> list[str]:
 
 
 def _log_series(log: Log, survey: Survey) -> None:
-    if survey.length == 0:
-        return
     drawn: Counter[str] = Counter()
     for _, entity, series in _numbers(survey):
         folder = entity.split("/")[1]  # one view shows all entities of a folder
@@ -365,6 +366,8 @@ def _log_series(log: Log, survey: Survey) -> None:
         drawn[folder] += len(series)
     for name in survey.flags:
         log.series(f"/episode/{name}", [name])
+    observed = survey.named(OBS).items()
+    log.series(OBSERVATION, [one for name, column in observed for one in series_names(name or "obs", column)])
 
 
 def events(survey: Survey) -> list[tuple[int, str, str]]:
