@@ -294,7 +294,9 @@ class TaskEnv:
         elapsed = to_numpy(self.env.elapsed_steps).astype(np.int32)
         limit = self.max_episode_steps
         truncated = np.zeros(self.num_envs, bool) if limit is None else elapsed >= limit
-        evaluate = {k: _batch(to_numpy(v), self.num_envs) for k, v in _flat(info) if k != "elapsed_steps"}
+        evaluate = {
+            k: _batch(to_numpy(v), self.num_envs) for k, v in flat_entries(info) if k != "elapsed_steps"
+        }
         return StepResult(
             elapsed_steps=elapsed,
             reward=reward,
@@ -315,10 +317,11 @@ def _seed_list(seed: int | Sequence[int] | None, count: int) -> list[int] | None
     return seeds
 
 
-def _flat(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flat_entries(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The leaves of a nested dict, named by the keys that lead to them, joined by ``/``."""
     for key, value in info.items():
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}/")
+            yield from flat_entries(value, f"{prefix}{key}/")
         else:
             yield f"{prefix}{key}", value
 
