@@ -243,6 +243,17 @@ def data_rows_of(struct: Any) -> torch.Tensor:
     return struct._body_data_index
 
 
+def robots(env: Any) -> list[Articulation]:
+    """Those of ``env.agent``, which must be there."""
+    agent = env.agent
+    return [one.robot for one in (agent.agents if isinstance(agent, MultiAgent) else [agent])]
+
+
+def data_rows_of_articulation(articulation: Any) -> torch.Tensor:
+    """Its row of each env in the tensors of joints, ``px.cuda_articulation_qpos`` and its kin: ``_data_index``."""
+    return articulation._data_index
+
+
 def hidden_objects(env: Any) -> list[Any]:
     """What the task hides from its sensors: ``_hidden_objects``, Actors (merged ones too)."""
     return env._hidden_objects
