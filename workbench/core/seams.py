@@ -13,6 +13,8 @@ upgrade fails loudly there and not in the middle of an author's task.
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property, wraps
 from itertools import islice
 from types import FrameType
@@ -193,6 +195,20 @@ def set_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: list[int]) -> Non
     env._episode_seed = every
     env._batched_episode_rng[env_idx] = BatchedRNG.from_seeds(seeds, backend=env._batched_rng_backend)
     env._episode_rng = env._batched_episode_rng[0]
+
+
+@contextmanager
+def drawing_from(env: BaseEnv, index: int) -> Iterator[None]:
+    """Within this ``_episode_rng``, from which the robot's first joints are drawn, is the generator of that env.
+
+    ManiSkill keeps it for code that was written for one env, and it is env 0's for good: a partial reset of env 3
+    would draw on from wherever env 0's episode got to, whatever its own seed.
+    """
+    env._episode_rng = env._batched_episode_rng[index]
+    try:
+        yield
+    finally:
+        env._episode_rng = env._batched_episode_rng[0]
 
 
 def keep_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: NDArray[np.int64]) -> None:

@@ -24,7 +24,13 @@ from workbench.core.body_table import BodyTable, build_body_table, read_poses
 from workbench.core.contact_list import Contact, list_contacts
 from workbench.core.cpu_scene import batched_class
 from workbench.core.render_device import keep_render_device
-from workbench.core.seams import episode_seeds, flatten_observation, keep_observation, set_episode_seeds
+from workbench.core.seams import (
+    drawing_from,
+    episode_seeds,
+    flatten_observation,
+    keep_observation,
+    set_episode_seeds,
+)
 from workbench.core.snapshot import (
     RestoreReport,
     Snapshot,
@@ -205,7 +211,7 @@ class TaskEnv:
             return self.env.reset(options=options)
         set_episode_seeds(self.env, chosen, seeds)
         devices = [self.env.device] if self.env.device.type == "cuda" else []
-        with torch.random.fork_rng(devices=devices):
+        with torch.random.fork_rng(devices=devices), drawing_from(self.env, chosen[0]):
             torch.manual_seed(seeds[0])
             return self.env.reset(options=options)
 
