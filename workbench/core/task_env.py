@@ -8,7 +8,7 @@ GPU simulation, and the caller need not know which.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -29,6 +29,7 @@ from workbench.core.seams import (
     episode_seeds,
     flatten_observation,
     keep_observation,
+    last_observation,
     set_episode_seeds,
 )
 from workbench.core.snapshot import (
@@ -268,6 +269,26 @@ class TaskEnv:
         if self._check is not None:
             self._check(info, given)
         return self._result(info, reward, self._terminated(info), action)
+
+    def result_of(
+        self,
+        info: Mapping[str, Any],
+        reward: Any,
+        terminated: Any,
+        truncated: Any,
+        action: NDArray[np.float32] | None,
+    ) -> StepResult:
+        """What somebody else's ``env.step`` (or ``env.reset``: no action) gave, who went past this object."""
+        self._refresh_if_rebuilt()
+        self.obs = last_observation(self.env)
+        info = {key: value for key, value in info.items() if key != "reconfigure"}
+        result = self._result(
+            info,
+            _batch(to_numpy(reward).astype(np.float32), self.num_envs),
+            _batch(to_numpy(terminated).astype(bool), self.num_envs),
+            action,
+        )
+        return replace(result, truncated=_batch(to_numpy(truncated).astype(bool), self.num_envs))
 
     @property
     def observes_pictures(self) -> bool:

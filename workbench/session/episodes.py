@@ -120,6 +120,13 @@ class EpisodeGatherer:
             del self._episodes[env]
         self._on_episode(episode)
 
+    def drop(self, env: int) -> None:
+        """Forget the episode of `env`, if it has one."""
+        episode = self._episodes.get(env)
+        if episode is not None:
+            self._episodes[env] = None
+            episode.writer.discard()
+
     def _begin(self, env: int, stepped: Stepped) -> None:
         task = self._task
         seed = int(stepped.seeds[env]) if stepped.seeds is not None else -1

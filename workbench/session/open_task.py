@@ -98,7 +98,7 @@ def build_task(
         clock.lap("reset")
         on_activity("reading the shapes")
         loaded = with_late_imports(loaded)
-        description = describe(loaded, task, options.env_kwargs)
+        description = describe(loaded, task, options.env_kwargs, loaded.max_episode_steps)
         clock.lap("geometry")
     except BaseException:
         env.close()
@@ -140,7 +140,9 @@ def restore_checked(
         return task.restore(snapshot, env_idx, source)
 
 
-def describe(loaded: LoadedTask, task: TaskEnv, given: Mapping[str, Any]) -> TaskDescription:
+def describe(
+    loaded: LoadedTask, task: TaskEnv, given: Mapping[str, Any], max_episode_steps: int | None
+) -> TaskDescription:
     """What the page must know of the task, as plain data; `given` are the keywords that it was made with."""
     env = task.env
     dimensions = [
@@ -162,7 +164,7 @@ def describe(loaded: LoadedTask, task: TaskEnv, given: Mapping[str, Any]) -> Tas
         backend=simulation,
         device=f"{env.device}" + (f", pictures on {renderer.name}" if renderer else ", no pictures"),
         num_envs=task.num_envs,
-        max_episode_steps=loaded.max_episode_steps,
+        max_episode_steps=max_episode_steps,
         obs_mode=env.obs_mode,
         reward_mode=env.reward_mode,
         control_mode=control_mode,

@@ -65,7 +65,9 @@ class Arrival:
     """Entries that ``evaluate`` says otherwise of the same state."""
 
 
-def begin_again(opened: OpenedTask, runs: Mapping[int, RecordedRun]) -> tuple[dict[int, bool], dict[str, str]]:
+def begin_again(
+    opened: OpenedTask, runs: Mapping[int, RecordedRun]
+) -> tuple[dict[int, bool], dict[str, str]]:
     """Let these envs stand at the first state of their runs.
 
     Returns:
@@ -227,5 +229,3 @@ def _distance(
     now = read_states(env)
     found = [apart(_of(now, i), wanted) for i in chosen]
     return max(metres for metres, _ in found), max(radians for _, radians in found)
-
-
