@@ -35,7 +35,7 @@ from workbench.core.pictures import Picture
 from workbench.core.seams import task_class
 from workbench.core.state_columns import read_state_columns
 from workbench.core.step import StepResult
-from workbench.core.take_pictures import take_pictures
+from workbench.core.step_pictures import step_pictures
 from workbench.core.task_env import TaskEnv
 from workbench.recording.recover import recover
 from workbench.recording.rrd import RecordingError
@@ -55,14 +55,15 @@ class Recorder(gym.Wrapper):
         folder: str | Path,
         *,
         env_idx: Sequence[int] | None = None,
-        pictures: bool = False,
+        pictures: bool | Sequence[str] = False,
     ) -> None:
         """
         Args:
             env: as `workbench.make` gives it.
             folder: made if it is missing. What an earlier recording left half written there is mended.
             env_idx: which envs; None for all.
-            pictures: record what every camera sees at every step: some 25 to 50 ms a picture without a GPU.
+            pictures: record what every camera sees at every step, or those of these names. Sensors that the env
+                observes are there already; any other picture takes 25 to 50 ms without a GPU.
 
         Raises:
             TypeError: `env` is no ManiSkill env, or wrapped for vectors already.
@@ -152,9 +153,12 @@ class Recorder(gym.Wrapper):
             return
         pictures: tuple[Picture, ...] = ()
         if self._pictures:
-            wanted = recorded_pictures(self._description.cameras)
+            cameras = self._description.cameras
+            if self._pictures is not True:
+                cameras = [camera for camera in cameras if camera.name in self._pictures]
+            wanted = recorded_pictures(cameras)
             for env in self._envs:
-                pictures += take_pictures(task.env, env, wanted)
+                pictures += step_pictures(task, env, wanted)
         columns = read_state_columns(task)
         try:
             gatherer.take(Stepped(step, reset_mask, pictures, task.episode_seeds, columns=columns))
