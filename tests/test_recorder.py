@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from workbench.recording.episode import Episode
 from workbench.recording.read_episode import read_episode, read_maniskill, trajectories
 
 TASKS = Path(__file__).parents[1] / "tasks"
-OPTIONS = {"backend": "cpu", "render_backend": "none"}
+OPTIONS: Any = {"backend": "cpu", "render_backend": "none"}
 
 
 def episodes_in(folder: Path) -> list[Episode]:
@@ -42,7 +43,8 @@ def test_it_keeps_what_maniskills_own_recorder_keeps(tmp_path: Path) -> None:
     """The same run through both, RecordEpisode around ours: states, actions, rewards and flags are equal."""
     env = workbench.make(str(TASKS / "push_cube.py"), 2, **OPTIONS)
     ours = workbench.Recorder(env, tmp_path / "ours")
-    both = RecordEpisode(ours, str(tmp_path / "theirs"), save_video=False, trajectory_name="run")
+    theirs_in = str(tmp_path / "theirs")
+    both = RecordEpisode(ours, theirs_in, save_video=False, trajectory_name="run")  # type: ignore[arg-type]
     both.reset(seed=3)
     for step in range(5):
         both.step(torch.from_numpy(both.action_space.sample()))
