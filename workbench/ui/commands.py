@@ -44,8 +44,9 @@ class Command:
         return " ".join([*held, name])
 
 
-def register(server: viser.ViserServer, commands: list[Command]) -> None:
+def register(server: viser.ViserServer, commands: list[Command]) -> list[viser.CommandHandle]:
     """Put the commands into the palette of every page."""
+    handles = []
     for command in commands:
         handle = server.gui.add_command(
             command.label,
@@ -54,6 +55,8 @@ def register(server: viser.ViserServer, commands: list[Command]) -> None:
             modifier=command.modifier,
         )
         handle.on_trigger(_without_event(command.run))
+        handles.append(handle)
+    return handles
 
 
 def _without_event(run: Callable[[], None]) -> Callable[[object], None]:

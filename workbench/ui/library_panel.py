@@ -24,7 +24,7 @@ import viser
 from workbench.recording.library import Library, LibraryError, LibraryView
 from workbench.recording.library_row import LONGEST_NOTE, LibraryRow, clean_tags
 from workbench.ui.changed import fill, show
-from workbench.ui.commands import Command
+from workbench.ui.commands import Command, register
 from workbench.ui.fragments import render
 from workbench.ui.library_forms import Question, ask_text, ask_whether
 from workbench.ui.library_rows import (
@@ -129,6 +129,12 @@ class LibraryPanel:
         self._told: tuple[str, ...] = ()
         self._question: Question | None = None
 
+        commands = self._commands()
+        self._keys = register(server, commands)
+        self._escape = register(server, [Command("Cancel", self.close, "escape")])[0]
+        self._escape.disabled = True
+        with server.gui.add_folder("Keys of the library", expand_by_default=False):
+            server.gui.add_html(render("keys", commands=commands))
         self._find.on_update(lambda _: self._on_typed())
         self._tasks.on_update(lambda _: self._on_task())
 
@@ -158,8 +164,7 @@ class LibraryPanel:
         with self._lock:
             self._actions.append(Action(label, hint, run, most))
 
-    def commands(self) -> list[Command]:
-        """Keys of the table, for the page to register."""
+    def _commands(self) -> list[Command]:
         actions = {action.label: action for action in self._actions}
         return [
             Command("The next recording of the table", lambda: self._move(1), "arrowdown"),
@@ -184,8 +189,12 @@ class LibraryPanel:
 
     # --- drawing ---------------------------------------------------------------------------------------
 
-    def draw(self) -> None:
-        """Draw what has changed. To be called often; costs nothing while nothing has."""
+    def draw(self, _view: object = None) -> None:
+        """Draw what has changed. To be called often; costs nothing while nothing has.
+
+        Args:
+            _view: of the page that hosts it; not looked at.
+        """
         view = self._library.view()
         with self._lock:
             if self._typed_at is not None and time.monotonic() - self._typed_at > TYPING:
@@ -496,7 +505,17 @@ class LibraryPanel:
         with self._lock:
             if self._question is not None:
                 self._question.close()
+            # viser's keys come before a focused button's: Enter on Cancel would open a recording.
+            self._hear_keys(False)
             self._question = make()
+
+    def _closed(self) -> None:
+        self._hear_keys(True)
+
+    def _hear_keys(self, heard: bool) -> None:
+        for key in self._keys:
+            key.disabled = not heard
+        self._escape.disabled = heard
 
     def _ask_tags(self, ids: tuple[str, ...]) -> None:
         rows = self._rows_of(ids)
@@ -516,7 +535,11 @@ class LibraryPanel:
         if known:
             explained += f" In use: {', '.join(known[:12])}."
         names = [row.name for row in rows]
-        self._ask(lambda: ask_text(self._server, "Tags", explained, names, ", ".join(shared), answered))
+        self._ask(
+            lambda: ask_text(
+                self._server, "Tags", explained, names, ", ".join(shared), answered, self._closed
+            )
+        )
 
     def _ask_note(self, ids: tuple[str, ...]) -> None:
         rows = self._rows_of(ids)
@@ -530,7 +553,7 @@ class LibraryPanel:
         def answered(typed: str) -> None:
             self._do(lambda: self._library.set_note(ids, typed[:LONGEST_NOTE]))
 
-        self._ask(lambda: ask_text(self._server, "Note", explained, names, value, answered))
+        self._ask(lambda: ask_text(self._server, "Note", explained, names, value, answered, self._closed))
 
     def _ask_delete(self, ids: tuple[str, ...]) -> None:
         rows = self._rows_of(ids)
@@ -545,6 +568,7 @@ class LibraryPanel:
                 "All their files go to the folder .trash in the library, and can be taken back from there.",
                 "Delete",
                 lambda: self._do(lambda: self._library.delete(ids)),
+                self._closed,
             )
         )
 
@@ -559,6 +583,7 @@ class LibraryPanel:
                 "This cannot be undone.",
                 "Delete for good",
                 lambda: self._do(self._library.empty_trash),
+                self._closed,
             )
         )
 
