@@ -172,7 +172,7 @@ _KEYS = (
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.fixed_dictionaries({}, optional={key: _anything for key in _KEYS.split()}))
+@given(st.fixed_dictionaries({}, optional=dict.fromkeys(_KEYS.split(), _anything)))
 def test_whatever_a_description_says_there_is_one_row_that_the_index_can_hold(fields: dict) -> None:
     with tempfile.TemporaryDirectory() as name:
         describe(Path(name), "a", **fields)

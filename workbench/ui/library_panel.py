@@ -283,7 +283,7 @@ class LibraryPanel:
             page,
             here,
             bool(view.rows),
-            view.reading is None,
+            self._none_so(view),
             self._column,
             self._descending,
             now.date(),
