@@ -161,6 +161,20 @@ def test_what_is_no_recording_is_no_row(tmp_path: Path) -> None:
     assert read(tmp_path) == []
 
 
+def test_names_of_files_that_are_no_text_can_be_shown_and_deleted(tmp_path: Path, library: Library) -> None:
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9"))
+    describe(folder, os.fsdecode(b"a\xff\n"), id="aaaa")
+    for _ in range(2):
+        library.refresh()
+        (row,) = library.rows()
+        row.name.encode()
+    library.set_note(["aaaa"], "x")
+    library.delete(["aaaa"])
+    assert library.rows() == ()
+    library.undo_delete()
+    assert [row.note for row in library.rows()] == ["x"]
+
+
 _anything = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
@@ -392,10 +406,12 @@ def test_files_of_others_are_not_written_into(tmp_path: Path, maniskill: Path, l
     before = tree(tmp_path)
     library.refresh()
     first, second = library.rows()
+    dates = [first.date, second.date]
     library.set_tags([second.id], add=["fast"])
     library.set_note([first.id], "odd")
     assert [(row.tags, row.note) for row in library.rows()] == [((), "odd"), (("fast",), "")]
     assert tree(tmp_path).keys() - before.keys() == {"demo.notes.json"}
+    assert [row.date for row in library.rows()] == dates
     assert before.items() <= tree(tmp_path).items()
     assert [(row.tags, row.note) for row in read(tmp_path)] == [((), "odd"), (("fast",), "")]
     library.set_tags([second.id], remove=["fast"])

@@ -130,7 +130,7 @@ def test_cells_say_what_there_is_and_nothing_where_nothing_is_known() -> None:
     said = [cells(one, {}, NOW) for one in ROWS]
     assert [one.outcome for one in said] == ["success", "once", "fail", "no", ""]
     assert (said[0].seed, said[0].steps, said[0].total) == ("3", "9", "1")
-    assert (said[4].task, said[4].date, said[4].seed, said[4].remark) == ("?", "", "", ".rrd only")
+    assert (said[4].task, said[4].date, said[4].seed, said[4].remark) == ("?", "", "", "")
     assert said[4].problem == "e.rrd is broken."
 
 

@@ -23,7 +23,7 @@ from pathlib import Path
 from workbench.recording.annotations import write_into_description, write_notes
 from workbench.recording.library_index import Kept, LibraryIndex
 from workbench.recording.library_read import Entry, read_found
-from workbench.recording.library_row import Facts, LibraryRow, clean_note, clean_tags
+from workbench.recording.library_row import Facts, LibraryRow, clean_note, clean_tags, text
 from workbench.recording.library_scan import NOTES, Found, Scan, found_of, key_of, scan_folder
 from workbench.recording.trash import (
     Trash,
@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 
 LOOK_EVERY = 1.0
 """Seconds between two looks at the folders' times."""
+LONGEST_PAUSE = 5.0
 LOOK_THOROUGHLY_EVERY = 30.0
 """Seconds between two looks at every file: a file that was written to in place leaves its folder's time alone."""
 PUBLISH_EVERY = 0.3
@@ -144,6 +145,7 @@ class Library:
 
     def _watch(self) -> None:
         while not self._stopping.is_set():
+            began = time.monotonic()
             try:
                 self.refresh(thorough=self._asked.is_set())
             except Exception:
@@ -151,7 +153,8 @@ class Library:
                 log.exception("The library in %s could not be read; trying again.", self.folder)
                 self._publish(problem="The library could not be read. The reason is in the terminal.")
             self._asked.clear()
-            self._asked.wait(LOOK_EVERY)
+            # Of a huge folder that is being written to, a tenth of the time goes into looking and not all of it.
+            self._asked.wait(min(max(LOOK_EVERY, 9 * (time.monotonic() - began)), LONGEST_PAUSE))
 
     def refresh(self, thorough: bool = True) -> None:
         """Read what has changed since the last look.
@@ -245,7 +248,8 @@ class Library:
             where = f"{found.key}#{facts.trajectory or ''}"
             id = f"at-{hashlib.blake2b(where.encode(errors='surrogateescape'), digest_size=10).hexdigest()}"
         name = found.key if facts.trajectory is None else f"{found.key}#{facts.trajectory}"
-        return LibraryRow(id, name, found.paths(self.folder), sum(found.sizes.values()), facts)
+        # A file's name may hold bytes that are no text, which no page can be sent.
+        return LibraryRow(id, text(name, 400), found.paths(self.folder), sum(found.sizes.values()), facts)
 
     def _publish(self, places: dict[str, tuple[str, int]] | None = None, **changes: object) -> None:
         with self._changed:
@@ -312,7 +316,7 @@ class Library:
                 of_file = {id for id, (other, _) in self._places.items() if other == key}
                 if not wanted >= of_file:
                     raise LibraryError(
-                        f"{key}.h5 holds {len(of_file)} recordings and is deleted only as a whole: "
+                        f"{text(key, 400)}.h5 holds {len(of_file)} recordings and is deleted only as a whole: "
                         "select all of them."
                     )
             paths = [self._found[key].paths(self.folder) for key in sorted(keys)]

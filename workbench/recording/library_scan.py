@@ -44,7 +44,8 @@ class Found:
 
     @property
     def newest(self) -> int:
-        return max(self.times.values())
+        """When the recording was last written to, in nanoseconds. Notes are not the recording."""
+        return max(at for suffix, at in self.times.items() if suffix != NOTES)
 
     def path(self, folder: Path, suffix: str) -> Path:
         return folder / f"{self.key}{suffix}"
@@ -114,11 +115,11 @@ def scan_folder(folder: Path) -> Scan:
                         _add(names, below, entry)
         except FileNotFoundError:
             if not below:
-                problem = f"{folder} is not there."
+                problem = f"{_said(folder)} is not there."
         except OSError as error:
-            problem = f"{path} cannot be looked into: {error.strerror or error}."
+            problem = f"{_said(path)} cannot be looked into: {error.strerror or error}."
         if entries > MOST_ENTRIES:
-            problem = f"{folder} holds more than {MOST_ENTRIES:,} files; not all of them were looked at. Choose a folder with recordings in it."
+            problem = f"{_said(folder)} holds more than {MOST_ENTRIES:,} files; not all of them were looked at. Choose a folder with recordings in it."
             break
     found, waits = {}, False
     for key, stats in names.items():
@@ -151,3 +152,8 @@ def _group(key: str, stats: dict[str, os.stat_result]) -> Found | None:
         {suffix: stats[suffix].st_size for suffix in order},
         {suffix: stats[suffix].st_mtime_ns for suffix in order},
     )
+
+
+def _said(path: str | Path) -> str:
+    """A path as text that can be sent to a page."""
+    return os.fsencode(path).decode(errors="replace")

@@ -14,6 +14,7 @@ from __future__ import annotations
 import base64
 import datetime
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -89,6 +90,7 @@ class LibraryPanel:
     ) -> None:
         self._server, self._library = server, library
         self._on_selection = on_selection
+        self._folder = os.fsencode(library.folder).decode(errors="replace")
         self._lock = threading.RLock()
         self._actions = [
             Action("Open", "Show it in the review (Enter, or press it twice)", on_open, MOST_OPEN),
@@ -119,6 +121,8 @@ class LibraryPanel:
         self._selected: frozenset[str] = frozenset()
         self._cursor: str | None = None
         self._anchor: str | None = None
+        self._place = 0
+        """Of the cursor when it was set: where to go on from when its row is deleted."""
         self._follow = False
         """Whether the page shall scroll to the cursor."""
         self._ids: list[str] = []
@@ -317,7 +321,7 @@ class LibraryPanel:
         if view.problem is not None or view.reading is not None:
             return ""
         return (
-            f"There are no recordings in {self._library.folder} yet. Those that are made there, on the Episodes tab of "
+            f"There are no recordings in {self._folder} yet. Those that are made there, on the Episodes tab of "
             "a task or with workbench record, appear here."
         )
 
@@ -333,10 +337,18 @@ class LibraryPanel:
 
     def _draw_tools(self, view: LibraryView, rows: Sequence[LibraryRow], page: Sequence[LibraryRow]) -> None:
         count = len(self._selected)
-        wanted = (count, len(rows), self._first, len(page), bool(view.rows), len(self._actions))
+        wanted = (
+            count,
+            len(rows),
+            self._first,
+            len(page),
+            bool(view.rows),
+            len(self._actions),
+            bool(view.trash.files),
+        )
         if not self._is_new("tools", wanted):
             return
-        if not view.rows:
+        if not view.rows and not view.trash.files:
             fill(self._tools, "")
             return
         last = self._first + len(page)
@@ -356,10 +368,11 @@ class LibraryPanel:
                     }
                     for k, action in enumerate(self._actions)
                 ],
-                summary=f"{count} selected" if count else "Press a row to select it",
+                summary=f"{count} selected" if count else "Press a row to select it" if rows else "",
                 count=len(rows),
                 all=self._press("all", self._select_all) if count < len(rows) else "",
                 none=self._press("none", lambda: self.select(())) if count else "",
+                undo=self._press("undo", self._undo_delete) if view.trash.files else "",
                 pages=None
                 if len(rows) <= MOST_ROWS
                 else {
@@ -384,7 +397,6 @@ class LibraryPanel:
             "library_trash",
             files=view.trash.files,
             size=size_in_words(view.trash.size),
-            undo=self._press("undo", self._undo_delete),
             empty=self._press("empty", self._ask_empty),
         )
 
@@ -406,9 +418,11 @@ class LibraryPanel:
             if not 1 <= number <= len(self._ids):
                 return
             id = self._ids[number - 1]
-            if id not in {row.id for row in self._rows()}:
+            order = [row.id for row in self._rows()]
+            if id not in order:
                 return
             self._take(id, held & (TOGGLE | RANGE))
+            self._place = order.index(id)
         self._tell()
         if held & OPEN:
             self._run(self._actions[0])
@@ -437,9 +451,9 @@ class LibraryPanel:
             if self._cursor in order:
                 place = min(max(order.index(self._cursor) + by, 0), len(order) - 1)
             else:
-                place = self._first
+                place = min(max(self._place, self._first), len(order) - 1)
             self._take(order[place], held, follow=True)
-            self._first = place // MOST_ROWS * MOST_ROWS
+            self._first, self._place = place // MOST_ROWS * MOST_ROWS, place
         self._tell()
 
     def _turn(self, by: int) -> None:
