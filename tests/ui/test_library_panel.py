@@ -12,7 +12,8 @@ import viser
 
 from tests.recording.library_files import describe
 from workbench.recording.library import Library
-from workbench.ui.library_panel import MOST_ROWS, OPEN, RANGE, TOGGLE, LibraryPanel
+from workbench.ui.library_list import MOST_ROWS, RANGE, TOGGLE
+from workbench.ui.library_panel import OPEN, LibraryPanel
 
 COUNT = MOST_ROWS + 5
 
@@ -92,10 +93,10 @@ def test_pages_sorting_and_filters_are_pressed(panel: LibraryPanel, server: vise
     assert shown(panel)[0] == newest(0, 1)[0]
     press(panel, server, "failed")
     assert len(shown(panel)) == COUNT // 2 and shown(panel)[0] == "id53"
-    panel._look_for("seed:7", None)
+    panel._list.look_for("seed:7", None)
     panel.draw()
     assert shown(panel) == ["id07"]
-    panel._look_for("nothing has this", None)
+    panel._list.look_for("nothing has this", None)
     panel.draw()
     assert shown(panel) == [] and "No recording is like that" in panel._table.content
 
@@ -119,22 +120,22 @@ def test_rows_are_selected_as_in_a_list_of_files(panel: LibraryPanel, told: Told
 
 
 def test_keys_walk_over_the_pages(panel: LibraryPanel) -> None:
-    panel._move(1)
+    panel._list.move(1)
     assert panel.selected() == (newest(0, 1)[0],)
     for _ in range(MOST_ROWS):
-        panel._move(1)
+        panel._list.move(1)
     panel.draw()
     assert panel.selected() == tuple(newest(MOST_ROWS, MOST_ROWS + 1))
     assert shown(panel) == newest(MOST_ROWS, COUNT) and "scrollIntoView" in panel._marks.content
-    panel._move(-1, RANGE)
-    panel._move(-1, RANGE)
+    panel._list.move(-1, RANGE)
+    panel._list.move(-1, RANGE)
     assert panel.selected() == tuple(newest(MOST_ROWS - 2, MOST_ROWS + 1))
 
 
 def test_what_is_no_longer_listed_is_no_longer_selected(
     panel: LibraryPanel, server: viser.ViserServer, library: Library, told: Told
 ) -> None:
-    panel._select_all()
+    panel._list.select_all()
     assert len(panel.selected()) == COUNT
     press(panel, server, "success")
     assert len(panel.selected()) == (COUNT + 1) // 2 == len(told.selections[-1])

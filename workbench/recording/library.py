@@ -81,6 +81,7 @@ class Library:
         self._view = LibraryView(reading=(0, 0))
         self._places: dict[str, tuple[str, int]] = {}
         """Id to key and number of the row in what its files gave."""
+        self._by_id: dict[str, LibraryRow] = {}
         self._found: dict[str, Found] = {}
         self._scan = Scan(fresh=True)
         self._thorough_at = -1e9
@@ -100,7 +101,7 @@ class Library:
 
     def row(self, id: str) -> LibraryRow | None:
         """None for an id that is not in the table (any more)."""
-        return next((row for row in self._view.rows if row.id == id), None)
+        return self._by_id.get(id)
 
     def wait(self, seen: int, timeout: float) -> int:
         """Wait until the table's serial is not `seen`, at most `timeout` seconds; returns the serial."""
@@ -256,6 +257,7 @@ class Library:
             view = replace(self._view, trash=look_into_trash(self.folder), **changes)  # type: ignore[arg-type]
             if places is not None:
                 self._places = places
+                self._by_id = {row.id: row for row in view.rows}
             if replace(view, serial=0) != replace(self._view, serial=0) or self._view.serial == 0:
                 self._view = replace(view, serial=self._view.serial + 1)
                 self._changed.notify_all()
