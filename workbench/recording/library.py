@@ -312,15 +312,7 @@ class Library:
                 moved; the recordings before it were.
         """
         with self._changing:
-            wanted = set(ids)
-            keys = {self._there(id)[1].key for id in wanted}
-            for key in keys:
-                of_file = {id for id, (other, _) in self._places.items() if other == key}
-                if not wanted >= of_file:
-                    raise LibraryError(
-                        f"{text(key, 400)}.h5 holds {len(of_file)} recordings and is deleted only as a whole: "
-                        "select all of them."
-                    )
+            keys = self._keys_to_delete(ids)
             paths = [self._found[key].paths(self.folder) for key in sorted(keys)]
             try:
                 batch = put_into_trash(self.folder, paths)
@@ -331,6 +323,23 @@ class Library:
             if batch is None:
                 raise LibraryError("Those files were gone already.")
             return batch
+
+    def may_delete(self, ids: Iterable[str]) -> None:
+        """Raise LibraryError where `delete` would refuse them."""
+        with self._changing:
+            self._keys_to_delete(ids)
+
+    def _keys_to_delete(self, ids: Iterable[str]) -> set[str]:
+        wanted = set(ids)
+        keys = {self._there(id)[1].key for id in wanted}
+        for key in keys:
+            of_file = {id for id, (other, _) in self._places.items() if other == key}
+            if not wanted >= of_file:
+                raise LibraryError(
+                    f"{text(key, 400)}.h5 holds {len(of_file)} recordings and is deleted only as a whole: "
+                    "select all of them."
+                )
+        return keys
 
     def undo_delete(self, batch: str | None = None) -> None:
         """Bring back what one deletion took, or the last one.

@@ -67,7 +67,7 @@ class LibraryEdits:
 
     def ask_delete(self, ids: tuple[str, ...]) -> None:
         rows = self._rows(ids)
-        if not rows:
+        if not rows or not self._do(lambda: self._library.may_delete(ids)):
             return
         self._ask(
             lambda: ask_whether(
@@ -77,7 +77,7 @@ class LibraryEdits:
                 [row.name for row in rows],
                 "All their files go to the folder .trash in the library, and can be taken back from there.",
                 "Delete",
-                lambda: self._do(lambda: self._library.delete(ids)),
+                lambda: self._delete(ids),
                 self._closed,
             )
         )
@@ -92,10 +92,16 @@ class LibraryEdits:
                 [],
                 "This cannot be undone.",
                 "Delete for good",
-                lambda: self._do(self._library.empty_trash),
+                self._empty,
                 self._closed,
             )
         )
+
+    def _delete(self, ids: tuple[str, ...]) -> None:
+        self._do(lambda: self._library.delete(ids))
+
+    def _empty(self) -> None:
+        self._do(self._library.empty_trash)
 
     def undo_delete(self) -> None:
         self._do(self._library.undo_delete)
@@ -130,8 +136,11 @@ class LibraryEdits:
         rows = (self._library.row(id) for id in ids)
         return [row for row in rows if row is not None]
 
-    def _do(self, work: Callable[[], object]) -> None:
+    def _do(self, work: Callable[[], object]) -> bool:
+        """Whether it could be done; if not, it is said why."""
         try:
             work()
         except LibraryError as error:
             self.notify("Not possible", str(error))
+            return False
+        return True
