@@ -53,7 +53,7 @@ def write_one(folder: Path) -> Path:
     corner = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.uint32))
     both = np.array([0, 1], np.int32)
     visual = Visual("box", corner, Material((1.0, 0.5, 0.0, 1.0)), np.zeros(2, np.int32), both)
-    geometry = SceneGeometry(1, ("floor", "cube"), ("static", "actor"), (False, False), (visual,))
+    geometry = SceneGeometry(1, ("floor", "cube"), ("static", "dynamic"), (False, False), (visual,))
     source = (Path(__file__).parents[2] / "tasks" / "push_cube.py").read_text()
     info = EpisodeInfo(
         task="PushCube-v1",

@@ -13,6 +13,7 @@ from playwright.sync_api import Locator, Page, expect, sync_playwright
 from tests.browser.opened import launch, new_page, until
 from tests.recording.library_files import describe
 from workbench.recording.library import Library
+from workbench.ui.commands import register
 from workbench.ui.fragments import style_sheet
 from workbench.ui.library_panel import LibraryPanel
 
@@ -53,6 +54,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Itera
     window = server.gui.add_panel()
     with window.add_tab("Library"):
         panel = LibraryPanel(server, library, opened.append)
+    register(server, panel.commands())
     window.dock_left()
     window.set_width(520)
     stopping = threading.Event()
@@ -141,6 +143,10 @@ def test_a_recording_is_tagged_and_deleted_and_comes_back(shown: Shown) -> None:
     page.keyboard.press("Enter")
     expect(page.get_by_text("Delete 1 recording (3 files")).to_be_hidden()
     assert len(shown.opened) == opened and len(shown.library.rows()) == COUNT
+    page.keyboard.press("Delete")
+    expect(page.get_by_text("Delete 1 recording (3 files")).to_be_visible()
+    page.keyboard.press("Escape")
+    expect(page.get_by_text("Delete 1 recording (3 files")).to_be_hidden()
     page.keyboard.press("Delete")
     page.get_by_role("button", name="Delete", exact=True).click()
     until(lambda: shown.seeds()[:2] == [0, 2], "one row fewer")

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +22,13 @@ from hypothesis import strategies as st
 from mani_skill.utils.wrappers.record import RecordEpisode
 
 from tests.recording.library_files import describe, jpeg
+from tests.recording.made import Made
 from workbench.recording.library import Library, LibraryError
 from workbench.recording.library_index import LibraryIndex
 from workbench.recording.library_read import read_found
 from workbench.recording.library_row import LibraryRow, facts_as_dict, facts_from_dict
 from workbench.recording.library_scan import scan_folder
+from workbench.recording.read_episode import read_episode
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +92,25 @@ def test_a_recording_of_ours_is_a_row_with_what_its_description_says(
     assert [path.suffix for path in row.paths] == [".json", ".h5", ".rrd"]
     assert row.size == sum(path.stat().st_size for path in row.paths)
     assert library.thumbnail("ab12") == jpeg() and library.thumbnail("other") is None
+
+
+def test_what_the_writer_wrote_is_a_row_and_is_read_as_before_when_it_has_tags(
+    tmp_path: Path, library: Library, make_episode: Callable[..., Made]
+) -> None:
+    made = make_episode(5, reward=np.full(5, 0.5, np.float32), evaluate={"success": np.arange(6) >= 4})
+    unfinished = make_episode().writer(tmp_path)
+    files = made.write(tmp_path)
+    library.refresh()
+    (row,) = library.rows()
+    assert (row.id, row.task, row.seed, row.length) == (made.info.id, "Made-v1", 7, 5)
+    assert (row.total_reward, row.success, row.problem) == (2.5, True, None)
+    assert set(row.paths) == {files.json, files.h5, files.rrd}
+    library.set_tags([row.id], add=["good"])
+    library.set_note([row.id], "slips")
+    read_back = read_episode(files.json)
+    assert read_back.info == made.info and len(read_back.reward) == 5
+    assert [row.tags for row in library.rows()] == [("good",)]
+    unfinished.discard()
 
 
 def test_each_trajectory_of_maniskills_recorder_is_a_row(maniskill: Path) -> None:

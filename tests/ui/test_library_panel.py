@@ -12,6 +12,7 @@ import viser
 
 from tests.recording.library_files import describe
 from workbench.recording.library import Library
+from workbench.ui.commands import register
 from workbench.ui.library_list import MOST_ROWS, RANGE, TOGGLE
 from workbench.ui.library_panel import OPEN, LibraryPanel
 
@@ -51,6 +52,7 @@ def told() -> Told:
 @pytest.fixture
 def panel(server: viser.ViserServer, library: Library, told: Told) -> LibraryPanel:
     panel = LibraryPanel(server, library, told.opened.append, told.selections.append)
+    register(server, panel.commands())
     panel.draw()
     return panel
 
@@ -198,9 +200,9 @@ def test_tags_note_and_deletion_are_asked_for_and_done(
     press_row(panel, first)
     press_row(panel, second, RANGE)
     press(panel, server, ("action", 1))
-    assert all(key.disabled for key in panel._keys)
+    assert all(key.disabled for key in panel._keys) and not panel._escapes[0].disabled
     answer(server, "Save", "good, new <b>")
-    assert not any(key.disabled for key in panel._keys)
+    assert panel._keys and not any(key.disabled for key in panel._keys) and panel._escapes[0].disabled
     assert [library.row(id).tags for id in (first, second)] == [  # type: ignore[union-attr]
         ("mine", "good", "new <b>"),
         ("good", "new <b>"),

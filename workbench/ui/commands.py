@@ -33,6 +33,8 @@ class Command:
     key: HotkeyKey | None = None
     modifier: KeyModifier | None = None
     description: str | None = None
+    registered: Callable[[viser.CommandHandle], None] | None = None
+    """Gets its handle, for who wants to disable it at times."""
 
     @property
     def key_name(self) -> str:
@@ -44,9 +46,8 @@ class Command:
         return " ".join([*held, name])
 
 
-def register(server: viser.ViserServer, commands: list[Command]) -> list[viser.CommandHandle]:
+def register(server: viser.ViserServer, commands: list[Command]) -> None:
     """Put the commands into the palette of every page."""
-    handles = []
     for command in commands:
         handle = server.gui.add_command(
             command.label,
@@ -55,8 +56,8 @@ def register(server: viser.ViserServer, commands: list[Command]) -> list[viser.C
             modifier=command.modifier,
         )
         handle.on_trigger(_without_event(command.run))
-        handles.append(handle)
-    return handles
+        if command.registered is not None:
+            command.registered(handle)
 
 
 def _without_event(run: Callable[[], None]) -> Callable[[object], None]:

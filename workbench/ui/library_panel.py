@@ -17,14 +17,14 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import viser
 
 from workbench.recording.library import Library, LibraryView
 from workbench.recording.library_row import LibraryRow
 from workbench.ui.changed import fill, show
-from workbench.ui.commands import Command, register
+from workbench.ui.commands import Command
 from workbench.ui.fragments import render
 from workbench.ui.library_edits import LibraryEdits
 from workbench.ui.library_list import MOST_ROWS, RANGE, TOGGLE, LibraryList
@@ -112,12 +112,8 @@ class LibraryPanel:
         self._drawn: dict[str, object] = {}
         self._told: tuple[str, ...] = ()
 
-        commands = self._commands()
-        self._keys = register(server, commands)
-        self._escape = register(server, [Command("Cancel", self.close, "escape")])[0]
-        self._escape.disabled = True
-        with server.gui.add_folder("Keys of the library", expand_by_default=False):
-            server.gui.add_html(render("keys", commands=commands))
+        self._keys: list[viser.CommandHandle] = []
+        self._escapes: list[viser.CommandHandle] = []
         self._find.on_update(lambda _: self._on_typed())
         self._tasks.on_update(lambda _: self._on_task())
 
@@ -147,6 +143,15 @@ class LibraryPanel:
     def close(self) -> None:
         """Close the window with a question, if there is one. For when the page goes."""
         self._edits.close()
+
+    def commands(self) -> list[Command]:
+        """Keys of the table, for the page to register."""
+        commands = [replace(command, registered=self._keys.append) for command in self._commands()]
+        return [*commands, Command("Cancel", self.close, "escape", registered=self._add_escape)]
+
+    def _add_escape(self, handle: viser.CommandHandle) -> None:
+        handle.disabled = True  # of no use but while something is asked
+        self._escapes.append(handle)
 
     def _commands(self) -> list[Command]:
         listed, actions = self._list, {action.label: action for action in self._actions}
@@ -431,7 +436,8 @@ class LibraryPanel:
         # viser's keys come before a focused button's: Enter on Cancel would open a recording.
         for key in self._keys:
             key.disabled = asking
-        self._escape.disabled = not asking
+        for key in self._escapes:
+            key.disabled = not asking
 
 
 def data_address_of_jpeg(jpeg: bytes | None) -> str:
