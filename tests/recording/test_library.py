@@ -174,7 +174,7 @@ def test_an_h5_alone_is_a_row_once_it_is_clear_that_nothing_comes_to_it(tmp_path
 
 def test_what_is_no_recording_is_no_row(tmp_path: Path) -> None:
     (tmp_path / "package.json").write_text('{"name": "x"}')
-    (tmp_path / "lonely.notes.json").write_text("{}")
+    (tmp_path / "lonely.notes").write_text("{}")
     (tmp_path / "notes.txt").write_text("x")
     describe(tmp_path / ".hidden", "a")
     (tmp_path / "round").symlink_to(tmp_path)
@@ -431,7 +431,7 @@ def test_files_of_others_are_not_written_into(tmp_path: Path, maniskill: Path, l
     library.set_tags([second.id], add=["fast"])
     library.set_note([first.id], "odd")
     assert [(row.tags, row.note) for row in library.rows()] == [((), "odd"), (("fast",), "")]
-    assert tree(tmp_path).keys() - before.keys() == {"demo.notes.json"}
+    assert tree(tmp_path).keys() - before.keys() == {"demo.notes"}
     assert [row.date for row in library.rows()] == dates
     assert before.items() <= tree(tmp_path).items()
     assert [(row.tags, row.note) for row in read(tmp_path)] == [((), "odd"), (("fast",), "")]

@@ -18,8 +18,9 @@ from pathlib import Path
 
 SUFFIXES = (".json", ".h5", ".rrd")
 """In the order in which a recording is opened by them."""
-NOTES = ".notes.json"
-"""Ending of the file with tags and notes of recordings that are not ours to write into."""
+NOTES = ".notes"
+"""Ending of the file with tags and notes of recordings that are not ours to write into: JSON, but a ``.json`` would be
+taken for a recording's by whoever looks for those."""
 SETTLES = 3.0
 """Seconds in which a folder may change again within one tick of its time, and files of one recording come one by one."""
 MOST_ENTRIES = 500_000
@@ -62,11 +63,7 @@ def found_of(key: str, signature: str) -> Found:
 
 def key_of(path: str) -> str:
     """Of a file, by its path below the library's folder."""
-    return path.removesuffix(suffix_of(path))
-
-
-def suffix_of(name: str) -> str:
-    return NOTES if name.endswith(NOTES) else os.path.splitext(name)[1]
+    return os.path.splitext(path)[0]
 
 
 @dataclass(frozen=True)
@@ -135,7 +132,7 @@ def scan_folder(folder: Path) -> Scan:
 
 
 def _add(names: dict[str, dict[str, os.stat_result]], below: str, entry: os.DirEntry[str]) -> None:
-    suffix = suffix_of(entry.name)
+    suffix = os.path.splitext(entry.name)[1]
     try:
         found = entry.stat()
     except OSError:
