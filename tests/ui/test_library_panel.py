@@ -77,7 +77,7 @@ def shown(panel: LibraryPanel) -> list[str]:
 
 
 def marked(panel: LibraryPanel) -> list[str]:
-    numbers = re.findall(r'data-row="(\d+)"\] \.wb-tick', panel._marks.content)
+    numbers = re.findall(r'data-row="(\d+)"\] \.wb-tick i \{', panel._marks.content)
     return [panel._ids[int(number) - 1] for number in numbers]
 
 
