@@ -165,8 +165,8 @@ class EpisodeLog:
         for camera, entity in zip(self._survey.cameras, self._cameras):
             begin, end = np.searchsorted(camera.frames, [states[0], states[-1] + 1])
             if begin < end and not camera.still:
-                translation, quaternion = optical_pose(np.stack(camera.poses[begin:end]))
-                self._log.pose(entity, np.array(camera.frames[begin:end]), translation, quaternion)
+                translation, quaternion = optical_pose(camera.poses[begin:end])
+                self._log.pose(entity, camera.frames[begin:end], translation, quaternion)
 
     def _take_numbers(self, piece: Piece) -> None:
         log, survey, states = self._log, self._survey, piece.states
