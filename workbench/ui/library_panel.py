@@ -1,0 +1,445 @@
+"""The library of recordings as a table: sort and filter it, select, open, tag, note, delete.
+
+What the rows say is in `library_rows`. Thousands of rows are shown a page at a time. Which are selected changes with
+every press, and a page of rows with their pictures is 150 KB; so the selection is not part of the table but a style
+sheet of its own that marks rows by their numbers, and only it is sent.
+
+A row has a number for as long as the page lives, and what a browser sends is such a number: if the table has moved
+meanwhile because a recording came in, the row that was pressed is still the one that is selected. Like everything on
+the page, selection, sorting and filter are the same for all who look at it.
+"""
+
+from __future__ import annotations
+
+import base64
+import datetime
+import os
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import viser
+
+from workbench.recording.library import Library, LibraryView
+from workbench.recording.library_row import LibraryRow
+from workbench.ui.changed import fill, show
+from workbench.ui.commands import Command
+from workbench.ui.fragments import render
+from workbench.ui.library_edits import LibraryEdits
+from workbench.ui.library_list import MOST_ROWS, RANGE, TOGGLE, LibraryList
+from workbench.ui.library_rows import (
+    COLUMNS,
+    HINTS,
+    MEANS,
+    OUTCOMES,
+    SECOND_LINE,
+    Column,
+    cells,
+    chosen,
+    has_outcome,
+    newest_sources,
+    size_in_words,
+)
+from workbench.ui.presses import Presses
+
+MOST_OPEN = 4
+"""Recordings that a review shows at once."""
+TYPING = 0.2
+"""Seconds without a keystroke after which the words that are looked for are taken."""
+ALL_TASKS = "all tasks"
+OPEN = 4
+"""In what ``choosable.html`` says of a press, beside `TOGGLE` and `RANGE`: it was the second of two."""
+
+
+@dataclass(frozen=True)
+class Action:
+    """Something to be done with the selected recordings."""
+
+    label: str
+    hint: str
+    run: Callable[[tuple[str, ...]], None]
+    most: int | None = None
+    """Recordings that it can take at once."""
+
+
+class LibraryPanel:
+    """The table in the present container.
+
+    Args:
+        on_open: gets the ids of one to `MOST_OPEN` recordings, in the order of the table.
+        on_selection: gets the ids that are selected, whenever they change.
+    Both are called on any thread, one call at a time or several at once, and must not block.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        library: Library,
+        on_open: Callable[[tuple[str, ...]], None],
+        on_selection: Callable[[tuple[str, ...]], None] | None = None,
+    ) -> None:
+        self._server, self._library = server, library
+        self._on_selection = on_selection
+        self._folder = os.fsencode(library.folder).decode(errors="replace")
+        self._list = LibraryList(library)
+        self._edits = LibraryEdits(server, library, self._on_asking)
+        self._lock = threading.RLock()
+        self._actions = [
+            Action("Open", "Show it in the review (Enter, or press it twice)", on_open, MOST_OPEN),
+            Action("Tag", "Add tags or take them away (T)", self._edits.ask_tags),
+            Action("Note", "Write a note to it", self._edits.ask_note),
+            Action("Delete", "Move its files to the trash (Delete)", self._edits.ask_delete),
+        ]
+        self._filters = server.gui.add_html("")
+        self._find = server.gui.add_text(
+            "Find",
+            "",
+            hint="Words in task, tags, note, name or version, all of which must be found; seed:3 for a seed",
+        )
+        self._tasks: viser.GuiDropdownHandle = server.gui.add_dropdown("Task", (ALL_TASKS,), visible=False)
+        self._tools = server.gui.add_html("")
+        self._marks = server.gui.add_html("")
+        self._table = server.gui.add_html("")
+        self._trash = server.gui.add_html("")
+        self._presses = Presses(server)
+        self._numbers = self._presses.number_id("rows", self._on_row)
+
+        self._typed_at: float | None = None
+        self._ids: list[str] = []
+        """By the number of its row."""
+        self._number_of: dict[str, int] = {}
+        self._drawn: dict[str, object] = {}
+        self._told: tuple[str, ...] = ()
+
+        self._keys: list[viser.CommandHandle] = []
+        self._escapes: list[viser.CommandHandle] = []
+        self._find.on_update(lambda _: self._on_typed())
+        self._tasks.on_update(lambda _: self._on_task())
+
+    # --- for whoever hosts it --------------------------------------------------------------------------
+
+    def selected(self) -> tuple[str, ...]:
+        """Ids of the selected recordings, in the order of the table."""
+        return self._list.selected_ids()
+
+    def select(self, ids: Iterable[str]) -> None:
+        """Select these recordings, of those that are listed."""
+        self._list.select(ids)
+        self._tell()
+
+    def add_action(
+        self, label: str, hint: str, run: Callable[[tuple[str, ...]], None], most: int | None = None
+    ) -> None:
+        """One more button for the selected recordings.
+
+        Args:
+            run: gets their ids; called on any thread, must not block.
+            most: recordings that it can take at once.
+        """
+        with self._lock:
+            self._actions.append(Action(label, hint, run, most))
+
+    def close(self) -> None:
+        """Close the window with a question, if there is one. For when the page goes."""
+        self._edits.close()
+
+    def commands(self) -> list[Command]:
+        """Keys of the table, for the page to register."""
+        commands = [replace(command, registered=self._keys.append) for command in self._commands()]
+        return [*commands, Command("Cancel", self.close, "escape", registered=self._add_escape)]
+
+    def _add_escape(self, handle: viser.CommandHandle) -> None:
+        handle.disabled = True  # of no use but while something is asked
+        self._escapes.append(handle)
+
+    def _commands(self) -> list[Command]:
+        listed, actions = self._list, {action.label: action for action in self._actions}
+
+        def move(by: int, held: int = 0) -> Callable[[], None]:
+            return self._then_tell(lambda: listed.move(by, held))
+
+        return [
+            Command("The next recording of the table", move(1), "arrowdown"),
+            Command("The recording before it", move(-1), "arrowup"),
+            Command("Select the next recording too", move(1, RANGE), "arrowdown", "shift"),
+            Command("Select the one before it too", move(-1, RANGE), "arrowup", "shift"),
+            Command("The next page of recordings", lambda: listed.turn(1), "pagedown"),
+            Command("The page of recordings before it", lambda: listed.turn(-1), "pageup"),
+            Command("Select this recording, or no longer", self._then_tell(listed.toggle_cursor), "X"),
+            Command(
+                "Select all recordings that are listed", self._then_tell(listed.select_all), "A", "cmd/ctrl"
+            ),
+            Command("Open the selected recordings", lambda: self._run(actions["Open"]), "enter"),
+            Command("Tag the selected recordings", lambda: self._run(actions["Tag"]), "T"),
+            Command("Delete the selected recordings", lambda: self._run(actions["Delete"]), "delete"),
+            Command("Take back the last deletion", self._edits.undo_delete, "Z"),
+        ]
+
+    # --- drawing ---------------------------------------------------------------------------------------
+
+    def draw(self, _view: object = None) -> None:
+        """Draw what has changed. To be called often; costs nothing while nothing has.
+
+        Args:
+            _view: of the page that hosts it; not looked at.
+        """
+        view = self._library.view()
+        with self._lock, self._list.lock:
+            if self._typed_at is not None and time.monotonic() - self._typed_at > TYPING:
+                self._typed_at = None
+                self._list.look_for(self._find.value, self._list.task)
+            if not self._is_new("all", (view.serial, self._list.state(), len(self._actions))):
+                return
+            page = self._list.page(view)
+            self._draw_filters(view)
+            self._draw_table(view, page)
+            self._draw_tools(view, page)
+            self._draw_marks(page)
+            if self._is_new("trash", view.trash):
+                fill(self._trash, self._trash_html(view))
+        self._tell()
+
+    def _is_new(self, part: str, wanted: object) -> bool:
+        if part in self._drawn and self._drawn[part] == wanted:
+            return False
+        self._drawn[part] = wanted
+        return True
+
+    def _draw_filters(self, view: LibraryView) -> None:
+        listed = self._list
+        if not self._is_new("filters", (view.serial, listed.words, listed.task, listed.outcome)):
+            return
+        tasks = tuple(sorted({row.task for row in view.rows if row.task}))
+        if self._tasks.options != (ALL_TASKS, *tasks):
+            listed.look_for(listed.words, listed.task)  # its task may have gone
+            self._tasks.options = (ALL_TASKS, *tasks)
+            self._tasks.value = ALL_TASKS if listed.task is None else listed.task
+        show(self._tasks, len(tasks) > 1)
+        show(self._find, bool(view.rows))
+        others = chosen(view.rows, listed.words, "all", listed.task)
+        counts = {outcome: sum(has_outcome(row, outcome) for row in others) for outcome in OUTCOMES}
+        done, total = view.reading or (0, 0)
+        fill(
+            self._filters,
+            render(
+                "library_filters",
+                problem=view.problem or "",
+                reading=""
+                if view.reading is None
+                else f"Reading {done} of {total} recordings"
+                if total
+                else "Looking through the folder",
+                percent=f"{100 * done / max(1, total):.0f}",
+                pills=[
+                    {
+                        "name": outcome,
+                        "hint": MEANS[outcome],
+                        "count": counts[outcome],
+                        "on": outcome == listed.outcome,
+                        "press": self._press(outcome, lambda outcome=outcome: listed.choose(outcome)),
+                    }
+                    for outcome in OUTCOMES
+                    if outcome != "broken" or counts["broken"] or listed.outcome == "broken"
+                ]
+                if view.rows
+                else [],
+            ),
+        )
+
+    def _draw_table(self, view: LibraryView, page: Sequence[LibraryRow]) -> None:
+        now = datetime.datetime.now().astimezone()
+        newest = newest_sources(view.rows)
+        here = {row.task: newest.get(row.task) for row in page}
+        wanted = (
+            page,
+            here,
+            bool(view.rows),
+            self._none_so(view),
+            self._list.column,
+            self._list.descending,
+            now.date(),
+        )
+        if not self._is_new("table", wanted):
+            return
+        pictures = self._library.thumbnails([row.id for row in page])
+        fill(
+            self._table,
+            render(
+                "library",
+                numbers=self._numbers,
+                some=bool(view.rows),
+                none_so=self._none_so(view),
+                head=[self._head(column) for column in COLUMNS],
+                second=[self._head(column) for column in SECOND_LINE],
+                rows=[
+                    {
+                        "number": self._number(row.id),
+                        "cells": cells(row, newest, now),
+                        "picture": data_address_of_jpeg(pictures.get(row.id)),
+                    }
+                    for row in page
+                ],
+            ),
+        )
+
+    def _none_so(self, view: LibraryView) -> str:
+        if view.rows:
+            return "No recording is like that. Press all, or look for something else."
+        if view.problem is not None or view.reading is not None:
+            return ""
+        return (
+            f"There are no recordings in {self._folder} yet. Those that are made there, on the Episodes tab of "
+            "a task or with workbench record, appear here."
+        )
+
+    def _head(self, column: Column) -> dict[str, str]:
+        listed = self._list
+        arrow = "" if column != listed.column else " ↓" if listed.descending else " ↑"
+        press = self._press(("sort", column), lambda: listed.sort_by(column))
+        return {
+            "name": column,
+            "arrow": arrow,
+            "press": press,
+            "hint": f"{HINTS[column]}. Press to sort by it",
+        }
+
+    def _draw_tools(self, view: LibraryView, page: Sequence[LibraryRow]) -> None:
+        listed, rows = self._list, self._list.rows(view)
+        count, first = len(listed.selected), listed.first
+        wanted = (
+            count,
+            len(rows),
+            first,
+            len(page),
+            bool(view.rows),
+            len(self._actions),
+            bool(view.trash.files),
+        )
+        if not self._is_new("tools", wanted):
+            return
+        if not view.rows and not view.trash.files:
+            fill(self._tools, "")
+            return
+        last = first + len(page)
+        fill(
+            self._tools,
+            render(
+                "library_tools",
+                tools=[
+                    {
+                        "name": action.label,
+                        "hint": f"At most {action.most} at once"
+                        if action.most is not None and count > action.most
+                        else action.hint,
+                        "press": self._press(("action", k), lambda k=k: self._run(self._actions[k]))
+                        if 0 < count <= (action.most or count)
+                        else "",
+                    }
+                    for k, action in enumerate(self._actions)
+                ],
+                summary=f"{count} selected" if count else "Press a row to select it" if rows else "",
+                count=len(rows),
+                all=self._press("all", self._then_tell(listed.select_all)) if count < len(rows) else "",
+                none=self._press("none", lambda: self.select(())) if count else "",
+                undo=self._press("undo", self._edits.undo_delete) if view.trash.files else "",
+                pages=None
+                if len(rows) <= MOST_ROWS
+                else {
+                    "first": first + 1,
+                    "last": last,
+                    "of": len(rows),
+                    "back": self._press("back", lambda: listed.turn(-1)) if first else "",
+                    "on": self._press("on", lambda: listed.turn(1)) if last < len(rows) else "",
+                },
+            ),
+        )
+
+    def _draw_marks(self, page: Sequence[LibraryRow]) -> None:
+        listed = self._list
+        selected = [self._number(row.id) for row in page if row.id in listed.selected]
+        cursor = None if listed.cursor is None else self._number(listed.cursor)
+        if self._is_new("marks", (selected, cursor)):
+            fill(
+                self._marks,
+                render("library_marks", selected=selected, cursor=cursor, follow=listed.follow),
+            )
+
+    def _trash_html(self, view: LibraryView) -> str:
+        return render(
+            "library_trash",
+            files=view.trash.files,
+            size=size_in_words(view.trash.size),
+            empty=self._press("empty", self._edits.ask_empty),
+        )
+
+    def _number(self, id: str) -> int:
+        """Of its row, from 1 on."""
+        if id not in self._number_of:
+            self._ids.append(id)
+            self._number_of[id] = len(self._ids)
+        return self._number_of[id]
+
+    # --- what is pressed, typed and chosen ---------------------------------------------------------------
+
+    def _press(self, key: object, do: Callable[[], None]) -> str:
+        return self._presses.id_of(("library", key), lambda _client: do())
+
+    def _then_tell(self, do: Callable[[], None]) -> Callable[[], None]:
+        def done() -> None:
+            do()
+            self._tell()
+
+        return done
+
+    def _on_row(self, sent: int, _client: viser.ClientHandle | None) -> None:
+        number, held = divmod(sent, 8)
+        with self._lock:
+            id = self._ids[number - 1] if 1 <= number <= len(self._ids) else None
+        if id is None or not self._list.press(id, held & (TOGGLE | RANGE)):
+            return
+        self._tell()
+        if held & OPEN:
+            self._run(self._actions[0])
+
+    def _on_typed(self) -> None:
+        with self._lock:
+            self._typed_at = time.monotonic()
+
+    def _on_task(self) -> None:
+        self._list.look_for(self._list.words, self._tasks.value)
+
+    def _tell(self) -> None:
+        """Say which are selected, if others are."""
+        with self._lock:
+            selected = self.selected()
+            if selected == self._told:
+                return
+            self._told = selected
+        if self._on_selection is not None:
+            self._on_selection(selected)
+
+    # --- what is done with the selected ones ---------------------------------------------------------------
+
+    def _run(self, action: Action) -> None:
+        ids = self.selected()
+        if not ids:
+            self._edits.notify("Nothing is selected", f"Select a recording to {action.label.lower()} it.")
+        elif action.most is not None and len(ids) > action.most:
+            self._edits.notify(
+                f"{len(ids)} are selected", f"{action.label} takes at most {action.most} at once."
+            )
+        else:
+            action.run(ids)
+
+    def _on_asking(self, asking: bool) -> None:
+        # viser's keys come before a focused button's: Enter on Cancel would open a recording.
+        for key in self._keys:
+            key.disabled = asking
+        for key in self._escapes:
+            key.disabled = not asking
+
+
+def data_address_of_jpeg(jpeg: bytes | None) -> str:
+    """``data:image/jpeg;base64,...``; empty for none."""
+    return "" if jpeg is None else "data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii")
