@@ -24,7 +24,13 @@ from workbench.core.body_table import BodyTable, build_body_table, read_poses
 from workbench.core.contact_list import Contact, list_contacts
 from workbench.core.cpu_scene import batched_class
 from workbench.core.render_device import keep_render_device
-from workbench.core.seams import episode_seeds, flatten_observation, keep_observation, set_episode_seeds
+from workbench.core.seams import (
+    drawing_from,
+    episode_seeds,
+    flatten_observation,
+    keep_observation,
+    set_episode_seeds,
+)
 from workbench.core.snapshot import (
     RestoreReport,
     Snapshot,
@@ -164,7 +170,10 @@ class TaskEnv:
         return self.env.control_timestep
 
     def reset(
-        self, seed: int | Sequence[int] | None = None, env_idx: Sequence[int] | None = None
+        self,
+        seed: int | Sequence[int] | None = None,
+        env_idx: Sequence[int] | None = None,
+        options: Mapping[str, Any] | None = None,
     ) -> StepResult:
         """Start new episodes in all envs, or in those of `env_idx`.
 
@@ -176,6 +185,7 @@ class TaskEnv:
         Args:
             seed: one seed for the whole batch (the i-th env that is reset gets ``seed + i``), or one for
                 each env that is reset; None goes on with the task's own random numbers.
+            options: further ``options`` for the task's own ``reset``.
         """
         chosen = list(range(self.num_envs)) if env_idx is None else [int(i) for i in env_idx]
         if not chosen:
@@ -184,22 +194,24 @@ class TaskEnv:
             raise IndexError(f"env_idx {chosen} is out of range for {self.num_envs} envs")
         seeds = _seed_list(seed, len(chosen))
         if env_idx is None:
-            self.obs, info = self.env.reset(seed=seeds)
+            self.obs, info = self.env.reset(seed=seeds, options=dict(options or {}))
         else:
-            self.obs, info = self._partial_reset(chosen, seeds)
+            self.obs, info = self._partial_reset(chosen, seeds, options or {})
         info = {key: value for key, value in info.items() if key != "reconfigure"}
         self._refresh_if_rebuilt()
         if self._check is not None:
             self._check(info, None)
         return self._result(info, np.zeros(self.num_envs, np.float32), self._terminated(info), None)
 
-    def _partial_reset(self, chosen: list[int], seeds: list[int] | None) -> tuple[Any, dict[str, Any]]:
-        options = {"env_idx": torch.tensor(chosen, device=self.env.device)}
+    def _partial_reset(
+        self, chosen: list[int], seeds: list[int] | None, further: Mapping[str, Any]
+    ) -> tuple[Any, dict[str, Any]]:
+        options = {**further, "env_idx": torch.tensor(chosen, device=self.env.device)}
         if seeds is None:
             return self.env.reset(options=options)
         set_episode_seeds(self.env, chosen, seeds)
         devices = [self.env.device] if self.env.device.type == "cuda" else []
-        with torch.random.fork_rng(devices=devices):
+        with torch.random.fork_rng(devices=devices), drawing_from(self.env, chosen[0]):
             torch.manual_seed(seeds[0])
             return self.env.reset(options=options)
 

@@ -124,10 +124,11 @@ def reset_checked(
     loaded: LoadedTask,
     seed: int | Sequence[int] | None = None,
     env_idx: Sequence[int] | None = None,
+    options: Mapping[str, Any] | None = None,
 ) -> StepResult:
     """`TaskEnv.reset`; what goes wrong is raised as a TaskError with the author's line."""
     with blamed("reset", loaded, task):
-        return task.reset(seed=seed, env_idx=env_idx)
+        return task.reset(seed=seed, env_idx=env_idx, options=options)
 
 
 def restore_checked(
