@@ -16,13 +16,14 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
 from workbench.recording.episode import Episode
 from workbench.recording.read_episode import UnreadableRecording, read_episode, read_maniskill
+from workbench.session.recorded_scene import SceneError
 from workbench.session.review_events import happenings
 from workbench.session.review_view import START, Opened, ReviewView
 
@@ -65,19 +66,15 @@ def read_row(row: Row) -> Episode:
 
 
 class SceneMaker(Protocol):
-    """Makes the scene of a recording that has none. `stop` is asked now and then.
-
-    Raises:
-        SceneError: it cannot be made; the message is a sentence for a person.
-    """
+    """Makes the scenes of recordings that have none (`recorded_scene.SceneProcess`)."""
 
     def __call__(
-        self, episode: Episode, stop: Callable[[], bool], on_progress: Callable[[str], None]
-    ) -> Episode: ...
-
-
-class SceneError(RuntimeError):
-    """Why a recording's scene cannot be made."""
+        self,
+        episodes: Mapping[int, Episode],
+        stop: Callable[[], bool],
+        on_progress: Callable[[int, str], None],
+        on_end: Callable[[int, Episode | SceneError, tuple[str, ...]], None],
+    ) -> None: ...
 
 
 @dataclass
@@ -216,27 +213,33 @@ class Review:
                 if state is not None:
                     self._seek(state)
             self._change(loading="", problems=self._unread)
-        for index, one in enumerate(opened):
-            if not one.has_scene:
-                self._give_scene(number, index, one)
+        self._give_scenes(number, {index: one for index, one in enumerate(opened) if not one.has_scene})
 
-    def _give_scene(self, number: int, index: int, one: Opened) -> None:
-        def stop() -> bool:
-            return number != self._opening
-
-        def say(words: str, making: bool) -> None:
+    def _give_scenes(self, number: int, without: Mapping[int, Opened]) -> None:
+        def say(index: int, words: str, making: bool = True) -> None:
             self._replace_opened(number, index, lambda now: replace(now, scene=words, making=making))
 
-        if self._make_scene is None or not one.episode.env_states:
-            say("This recording holds no scene to draw.", False)
-            return
-        say("making its scene", True)
-        try:
-            episode = self._make_scene(one.episode, stop, lambda words: say(words, True))
-        except SceneError as error:
-            say(str(error), False)
-            return
-        self._replace_opened(number, index, lambda now: replace(now, episode=episode, scene="", making=False))
+        def end(index: int, made: Episode | SceneError, missed: tuple[str, ...]) -> None:
+            if isinstance(made, SceneError):
+                say(index, str(made), False)
+                return
+            words = f"Not put back: {'; '.join(missed)}." if missed else ""
+            self._replace_opened(
+                number, index, lambda now: replace(now, episode=made, scene=words, making=False)
+            )
+
+        wanted = {index: one.episode for index, one in without.items() if one.episode.env_states}
+        for index in without:
+            if index not in wanted or self._make_scene is None:
+                say(index, "This recording holds no scene to draw.", False)
+            else:
+                say(index, "its scene is made next")
+        if wanted and self._make_scene is not None:
+            try:
+                self._make_scene(wanted, lambda: number != self._opening, say, end)
+            except OSError as error:
+                for index in wanted:
+                    say(index, f"The process that makes its scene could not be started: {error}.", False)
 
     def _replace_opened(self, number: int, index: int, change: Callable[[Opened], Opened]) -> None:
         with self._changed:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import PurePath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,6 +115,11 @@ def source_changes(
 ) -> tuple[tuple[str, tuple[tuple[str, str], ...]], ...]:
     """Of each file that is not the same in both: its name, and the changed lines with two around them."""
     found = []
+    if not set(before) & set(after):
+        # Recorded from two folders: the same file all the same.
+        before, after = (
+            {PurePath(name).name: text for name, text in texts.items()} for texts in (before, after)
+        )
     for name in dict.fromkeys([*before, *after]):
         old, new = before.get(name, ""), after.get(name, "")
         if old == new:

@@ -17,6 +17,7 @@ from workbench.session.review_compare import (
     metres,
 )
 from workbench.session.review_view import Opened, ReviewView
+from workbench.session.reward_terms import PREFIX
 from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_choice
 from workbench.ui.fragments import render
@@ -31,7 +32,9 @@ class ReviewComparePanel:
     def __init__(self, server: viser.ViserServer, review: Review) -> None:
         self._review = review
         gui = server.gui
-        self._other = gui.add_dropdown("A against", ("B",), initial_value="B", visible=False)
+        self._other: viser.GuiDropdownHandle = gui.add_dropdown(
+            "A against", ("B",), initial_value="B", visible=False
+        )
         self._tolerance = gui.add_dropdown(
             "Moved from",
             tuple(TOLERANCE_NAMES),
@@ -83,7 +86,7 @@ class ReviewComparePanel:
             totals=next((p.whole for p in found.numbers if p.name == "reward"), ""),
             rows=rows,
             more=len(differing) - len(rows),
-            same=", ".join(p.name for p in same),
+            same=", ".join(p.name.removeprefix(PREFIX) for p in same),
             one_sided=", ".join((*one_sided, *found.not_in_both)),
             source=found.source,
             source_is_same=found.same_source,

@@ -38,7 +38,9 @@ class ReviewCurves:
         self._numbers = server.gui.add_html("")
         self._numbers_drawn: object = None
         self._charts_folder = server.gui.add_folder(None)
-        self._entry = server.gui.add_dropdown("Also", ("-",), initial_value="-", visible=False)
+        self._entry: viser.GuiDropdownHandle = server.gui.add_dropdown(
+            "Also", ("-",), initial_value="-", visible=False
+        )
         self._entry.on_update(lambda _: self._choose())
         self._charts: dict[str, viser.GuiUplotHandle] = {}
         self._drawn: object = None
@@ -83,13 +85,13 @@ class ReviewCurves:
         steps = [step_of(view.opened[i].episode, view.states[i]) for i in shown_together(view)]
         own = step_of(chosen.episode, view.states[view.selected])
         rows = number_rows(own, 0, chosen.length)
-        others = [{row.name: row.selected for row in number_rows(step, 0, None)} for step in steps]
+        others = [{row.name: known(row.selected) for row in number_rows(step, 0, None)} for step in steps]
         heads = [letter(i) for i in shown_together(view)] if len(steps) > 1 else ["value"]
         table = [
             {
                 "name": row.name,
                 "mood": row.mood,
-                "values": [o.get(row.name, "—") for o in others] if len(steps) > 1 else [row.selected],
+                "values": [o.get(row.name, "—") for o in others] if len(steps) > 1 else [known(row.selected)],
             }
             for row in rows
         ]
@@ -210,6 +212,11 @@ class ReviewCurves:
 
 
 ORDER = {"reward": 1.0, "also": 2.0, "terms": 3.0, "action": 4.0}
+
+
+def known(number: str) -> str:
+    """A number as it is said in the table: an entry that the state lacks is kept as NaN."""
+    return "—" if number == "nan" else number
 
 
 def shown_together(view: ReviewView) -> tuple[int, ...]:

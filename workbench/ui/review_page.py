@@ -20,8 +20,9 @@ import viser
 
 from workbench.core.camera_settings import CameraKey
 from workbench.core.pictures import Picture
+from workbench.recording.library import Library
 from workbench.session.messages import CameraRequest
-from workbench.session.review import Review
+from workbench.session.review import MOST_OPEN, Review
 from workbench.session.review_events import success_words
 from workbench.session.review_pictures import PictureReader
 from workbench.session.review_view import ReviewView
@@ -32,6 +33,7 @@ from workbench.ui.commands import Command, register
 from workbench.ui.env_layout import env_under_ray
 from workbench.ui.fragments import render, style_sheet
 from workbench.ui.framing import Framing
+from workbench.ui.library_panel import LibraryPanel
 from workbench.ui.lights import light
 from workbench.ui.review_as_session import as_session_view
 from workbench.ui.review_compare_panel import ReviewComparePanel
@@ -60,14 +62,15 @@ class Drawn(Protocol):
 
 @dataclass(frozen=True)
 class Places:
-    """Where a `Part` may put itself: containers, to be entered with ``with``."""
+    """Where a `Part` may put itself: tabs, to be entered with ``with``, and the table of recordings."""
 
-    library: viser.GuiTabHandle
-    """Beside the table of recordings, under it."""
     review: viser.GuiTabHandle
+    compare: viser.GuiTabHandle
     share: viser.GuiTabHandle
     tabs: viser.GuiTabGroupHandle
     """For a tab of its own."""
+    library: LibraryPanel | None
+    """Says which recordings are selected, and takes further buttons for them (`LibraryPanel.add_action`)."""
 
 
 Part = Callable[[viser.ViserServer, Places], "Drawn | None"]
@@ -82,8 +85,8 @@ class ReviewOffers:
     """Go on live from a state of a recording: its id and the state."""
     on_back: Callable[[], None] | None = None
     """Back to the live page."""
-    library: Part | None = None
-    """The table of recordings."""
+    on_rescore: Callable[[tuple[str, ...]], None] | None = None
+    """Judge recordings again: their ids."""
     parts: tuple[Part, ...] = ()
     commands: tuple[Command, ...] = ()
 
@@ -94,12 +97,18 @@ class ReviewPage:
     Args:
         server: Of viser, already behind its door.
         review: What is shown and asked.
+        library: The recordings that can be opened; None leaves their table out.
         offers: What else there is on the page.
         dark: How it begins.
     """
 
     def __init__(
-        self, server: viser.ViserServer, review: Review, offers: ReviewOffers | None = None, dark: bool = True
+        self,
+        server: viser.ViserServer,
+        review: Review,
+        library: Library | None = None,
+        offers: ReviewOffers | None = None,
+        dark: bool = True,
     ) -> None:
         self._server, self._review = server, review
         offers = offers or ReviewOffers()
@@ -142,21 +151,29 @@ class ReviewPage:
             self._cameras = CamerasPanel(server, self, "This recording has no pictures.")
         with tabs.add_tab("Curves", viser.Icon.CHART_LINE):
             self._curves = ReviewCurves(server)
-        with tabs.add_tab("Compare", viser.Icon.ARROWS_DIFF):
+        compare_tab = tabs.add_tab("Compare", viser.Icon.ARROWS_DIFF)
+        with compare_tab:
             self._compare = ReviewComparePanel(server, review)
         share_tab = tabs.add_tab("Share", viser.Icon.SHARE) if offers.parts else review_tab
-        self._library_window = server.gui.add_panel(order=5.0)
-        library_tab = self._library_window.add_tab("Library", viser.Icon.LIST_DETAILS)
-        places = Places(library_tab, review_tab, share_tab, tabs)
-        parts: list[Drawn | None] = []
-        if offers.library is not None:
-            with library_tab:
-                parts.append(offers.library(server, places))
-        self._library_window.dock_left()
-        self._library_window.set_width(LIBRARY_WIDTH)
+        self._library_window: viser.PanelHandle | None = None
+        self._library: LibraryPanel | None = None
+        if library is not None:
+            self._library_window = server.gui.add_panel(order=5.0)
+            with self._library_window.add_tab("Library", viser.Icon.LIST_DETAILS):
+                self._library = LibraryPanel(server, library, review.open)
+            self._library.add_action(
+                "Side by side", "Watch them all at once, each at its own place", review.open, MOST_OPEN
+            )
+            if offers.on_rescore is not None:
+                self._library.add_action(
+                    "Judge again", "Run today's reward and evaluate over them", offers.on_rescore
+                )
+            self._library_window.dock_left()
+            self._library_window.set_width(LIBRARY_WIDTH)
         self._library_open = True
-        parts += [part(server, places) for part in offers.parts]
-        self._parts = tuple(part for part in parts if part is not None)
+        places = Places(review_tab, compare_tab, share_tab, tabs, self._library)
+        made = [part(server, places) for part in offers.parts]
+        self._parts = tuple(part for part in made if part is not None)
         with review_tab:
             self._view_panel = ViewPanel(server, dark)
         self._timeline = ReviewTimeline(server, review)
@@ -165,6 +182,8 @@ class ReviewPage:
         self._mark = SelectionMark(server)
         self._frustums = CameraFrustums(server)
         commands = [*self._commands(offers), *offers.commands]
+        if self._library is not None:
+            commands += self._library.commands()
         register(server, commands)
         with review_tab, server.gui.add_folder("Keys", expand_by_default=False):
             server.gui.add_html(render("keys", commands=commands))
@@ -184,6 +203,8 @@ class ReviewPage:
         self._stopping.set()
         if self._thread is not None:
             self._thread.join(timeout=5.0)
+        if self._library is not None:
+            self._library.close()
 
     @property
     def dark(self) -> bool:
@@ -228,6 +249,8 @@ class ReviewPage:
         self._draw_cameras(view)
         self._curves.draw(view)
         self._compare.draw(view)
+        if self._library is not None:
+            self._library.draw()
         for part in self._parts:
             part.draw(view)
 
@@ -239,6 +262,8 @@ class ReviewPage:
 
     def _show_library(self, shown: bool) -> None:
         self._library_open = shown
+        if self._library_window is None:
+            return
         if shown:
             self._library_window.expand()
         else:
@@ -314,7 +339,10 @@ class ReviewPage:
         alone = len(view.opened) == 1 or scene.ghosts
         pictures = self._pictures if self._cameras.show_frustums else {}
         if alone:
-            pictures = without_the_viewpoint(pictures, self._pictures)
+            human = self._human_picture()
+            pictures = without_the_viewpoint(
+                pictures, {} if human is None else {("human", human.camera): human}
+            )
         self._frustums.draw(
             self._reader.cameras(chosen.episode), pictures, scene.layout.offsets[view.selected], SMALL
         )
@@ -351,8 +379,20 @@ class ReviewPage:
         assert scene is not None, "asked only where a scene is drawn"
         if len(scene.layout.offsets) > 1 and not scene.ghosts:
             return frame_all(scene.layout, aspect, TIMELINE_HEIGHT / height)
-        human = next((p for (kind, _), p in self._pictures.items() if kind == "human"), None)
-        return frame_one(scene.layout, human, aspect, TIMELINE_HEIGHT / height)
+        return frame_one(scene.layout, self._human_picture(), aspect, TIMELINE_HEIGHT / height)
+
+    def _human_picture(self) -> Picture | None:
+        """Where the recording's own camera for people stood at its start; the picture itself is not looked at."""
+        chosen = self._review.view().chosen
+        tracks = [] if chosen is None else chosen.episode.cameras
+        return next(
+            (
+                Picture(t.info.name, "human", 0, t.pose[0])
+                for t in tracks
+                if t.info.kind == "human" and len(t.pose)
+            ),
+            None,
+        )
 
     def _on_scene_click(self, event: viser.SceneClickEvent) -> None:
         scene, view = self._drawn_scene, self._review.view()

@@ -46,6 +46,7 @@ class ReviewPanel:
         self._live = gui.add_button(
             GO_LIVE,
             icon=viser.Icon.PLAYER_TRACK_NEXT,
+            color="gray",
             visible=False,
             hint="Restores the state that is shown in the live env, with today's code (G).",
         )
@@ -66,8 +67,11 @@ class ReviewPanel:
         self._arrange = gui.add_dropdown(
             "Draw them", (GHOSTS, GRID), initial_value=GHOSTS, visible=False, hint="The O key changes it."
         )
+        align: viser.GuiDropdownHandle = gui.add_dropdown(
+            "Align at", ("start",), initial_value="start", visible=False
+        )
         self._align = Control(
-            gui.add_dropdown("Align at", ("start",), initial_value="start", visible=False),
+            align,
             read=lambda value: checked_choice(value, review.view().alignments, "moment"),
             send=review.align,
         )

@@ -4,7 +4,7 @@ The view draws envs of one scene. Recordings are made into that: each is an env,
 looks the same in several is one shape with several wearers, so four recordings of a task cost what four envs do.
 
 Drawn over each other, the first keeps its looks and each other one is the same shapes in its colour, half
-see-through. What stands at the same place in both for the whole time (the table, the floor) is drawn once: a tint
+see-through, for as long as they are elsewhere than the first one's. What stands at the same place in both for the whole time (the table, the floor) is drawn once: a tint
 over all of it would say nothing and hide the rest.
 """
 
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.geometry import BodyKind, Material, SceneGeometry, Visual
+from workbench.session.review_compare import distances
 from workbench.session.review_view import Opened
 from workbench.ui.env_layout import EnvLayout, lay_out
 from workbench.ui.meshes_as_glb import fingerprint
@@ -25,6 +26,8 @@ COLOURS = ("#228be6", "#f08c00", "#2f9e44", "#be4bdb")
 """Of the recordings that are compared, in legends, curves and the view."""
 SEE_THROUGH = 0.45
 """Alpha of a ghost. Less vanishes over a white table, more hides what is behind."""
+APART = 5e-4
+"""Metres from which on a ghost is drawn beside the body that it is a ghost of."""
 _SAME_PLACE = 1e-5
 
 
@@ -42,7 +45,12 @@ class ReviewScene:
 
     def poses(self, states: Sequence[int]) -> NDArray[np.float32]:
         """(N, B, 7) at that state of each recording; NaN for what a recording lacks."""
-        return _side_by_side(self._poses, self._bodies, len(self.geometry.body_names), states)
+        found = _side_by_side(self._poses, self._bodies, len(self.geometry.body_names), states)
+        if self.ghosts:
+            for ghost in found[1:]:
+                # Two skins at one place make a pattern of patches; one sees better where they part.
+                ghost[distances(found[0], ghost) < APART] = np.nan
+        return found
 
 
 def letter(index: int) -> str:
