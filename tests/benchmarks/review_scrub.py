@@ -34,6 +34,7 @@ from tests.browser.opened import launch, new_page, until
 from workbench.machine.chromium import find_chromium, how_to_get_chromium
 
 TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
+expect.set_options(timeout=180_000)
 STEPS = 50
 REPEATS = 3
 WATCH = """() => {
