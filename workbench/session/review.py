@@ -274,6 +274,12 @@ class Review:
         )
         self._align(align if align in alignments else START, position=None)
 
+    def say(self, sentence: str) -> None:
+        """Let the page say this, until something is opened."""
+        with self._changed:
+            self._unread = (*self._unread, sentence)
+            self._change(problems=(*self._view.problems, sentence))
+
     # --- the position --------------------------------------------------------------------------------
 
     def seek(self, position: int) -> None:
