@@ -110,6 +110,20 @@ class BatchedCpuSystem:
         self.stepper.forget()
         self.stepper.still = frozenset(envs)
 
+    def keep_drives(self, envs: Sequence[int], flags: Sequence[NDArray[np.bool_]]) -> None:
+        """Forget drive targets that were written for these envs while they stood still.
+
+        Args:
+            flags: `drive_flags` as they were before.
+        """
+        env_of = {id(scene): env for env, scene in enumerate(self.scenes)}
+        chosen = set(envs)
+        for row, articulation in enumerate(self._laid_out.articulations):
+            if env_of[id(articulation.root.entity.scene)] in chosen:
+                for now, was in zip(self.drive_flags, flags, strict=True):
+                    now[row] = was[row]
+        self._fetch_targets()
+
     @contextmanager
     def merging(self, substeps: int) -> Iterator[None]:
         """The next `substeps` calls of `step` may be done together; asking for state does them at once."""
@@ -290,7 +304,7 @@ class BatchedCpuSystem:
         self._moved()
 
     def _stepped(self) -> None:
-        self.contacts.stepped()
+        self.contacts.stepped(self.stepper.still)
         self._moved()
 
     def _moved(self) -> None:

@@ -13,7 +13,6 @@ robot did would be to run to where it stood before.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -29,51 +28,45 @@ _FIXED = 13
 """Numbers of a state that every actor and articulation has: pose, linear and angular velocity."""
 
 
-def write_state(env: Any, env_idx: Sequence[int], state: Mapping[str, NDArray]) -> dict[str, str]:
-    """Put one recorded state into each of these envs; the others are not touched. The tensors are fetched.
+def misfits(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> dict[str, str]:
+    """What of a recorded state cannot be put into this env, and what of the env is in no such state: name and reason.
 
     Args:
         env: an unwrapped ManiSkill env, batched.
         state: (D,) by name, as `RecordedRun.state` gives it.
-
-    Returns:
-        what could not be put back, and why.
     """
-    return write_states(env, {int(i): state for i in env_idx})
-
-
-def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> dict[str, str]:
-    """As `write_state`, with a state for each env, of one recorded task or several."""
     missed: dict[str, str] = {}
     structs = _structs(env)
     for name, struct in structs.items():
-        of = seams.envs_of(struct).tolist()
+        if env_idx not in seams.envs_of(struct):
+            continue
+        value = state.get(name)
+        if value is None or np.isnan(value).any():
+            missed[name] = "the recording has none of this name: it is as the reset left it"
+        elif value.shape != (_width(struct),):
+            missed[name] = f"it has {_width(struct)} numbers now, and {value.shape[-1]} in the recording"
+    for name, value in state.items():
+        kind = name.partition("/")[0]
+        if kind in ("actors", "articulations") and name not in structs and not np.isnan(value).all():
+            missed[name] = "this env has none of this name"
+    return missed
+
+
+def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
+    """Put a recorded state into each of these envs, but for its `misfits`. The others are not touched, and the
+    tensors are fetched."""
+    for name, struct in _structs(env).items():
         width = _width(struct)
         rows: dict[int, NDArray] = {}
-        for i, state in states.items():
-            if i not in of:
-                continue
-            value = state.get(name)
-            if value is None or np.isnan(value).any():
-                missed[name] = "the recording has none of this name: it is as the reset left it"
-            elif value.shape != (width,):
-                missed[name] = f"it has {width} numbers now, and {value.shape[-1]} in the recording"
-            else:
+        for i in seams.envs_of(struct).tolist():
+            value = states[i].get(name) if i in states else None
+            if value is not None and value.shape == (width,) and not np.isnan(value).any():
                 rows[i] = value
         if rows:
-            ordered = [i for i in of if i in rows]
-            values = np.stack([rows[i] for i in ordered]).astype(np.float32)
-            struct.set_state(
-                torch.as_tensor(values, device=env.device), torch.tensor(ordered, device=env.device)
-            )
-    for state in states.values():
-        for name, value in state.items():
-            if name.partition("/")[0] in ("actors", "articulations") and name not in structs:
-                if not np.isnan(value).all():
-                    missed[name] = "this env has none of this name"
+            values = torch.as_tensor(np.stack([*rows.values()]).astype(np.float32), device=env.device)
+            struct.set_state(values, torch.tensor([*rows], device=env.device))
     _apply(env)
     _write_controllers(env, states)
-    return missed
 
 
 def settle_robot(env: Any, env_idx: Sequence[int]) -> None:
@@ -99,20 +92,6 @@ def new_physics(env: Any, env_idx: Sequence[int]) -> None:
     """Let PhysX forget what these envs did before; on a GPU there is no way to."""
     if seams.batched_system(env.scene) is not None:
         renew_physics(env.scene, [int(i) for i in env_idx])
-
-
-@contextmanager
-def only_these_move(env: Any, env_idx: Sequence[int]) -> Iterator[None]:
-    """Within this, a control step is one of these envs; PhysX does not step the others. On a GPU all step."""
-    px = seams.batched_system(env.scene)
-    if px is None:
-        yield
-        return
-    px.hold_still(set(range(env.num_envs)) - {int(i) for i in env_idx})
-    try:
-        yield
-    finally:
-        px.hold_still(set())
 
 
 def read_states(env: Any) -> dict[str, NDArray[np.float32]]:

@@ -18,6 +18,7 @@ from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.geometry import SceneGeometry
 from workbench.core.inspection import Inspection, Section
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
+from workbench.core.recorded_run import RecordedRun
 from workbench.core.step import StepResult
 from workbench.session.camera_messages import (
     CameraAnswer,
@@ -213,6 +214,16 @@ class Restore:
 
 
 @dataclass(frozen=True)
+class StepBack:
+    """Put envs into a state of a recorded episode; the answer is a `Stepped` with `Stepped.restored`."""
+
+    run: RecordedRun
+    """Up to the state."""
+    env_idx: tuple[int, ...]
+    """The envs to be set, all to the same state."""
+
+
+@dataclass(frozen=True)
 class DrawPast:
     """Draw one env as it was, without touching its simulation; the answer is `PastPictures`."""
 
@@ -296,6 +307,7 @@ Request = (
     | CameraQuestion
     | SetCapture
     | Restore
+    | StepBack
     | DrawPast
     | WarmUp
     | Inspect
@@ -353,9 +365,13 @@ class Failed:
     kept: bool
 
 
+NO_MOMENT = -1
+"""The `Restored.origin` of a state that is not of this history."""
+
+
 @dataclass(frozen=True)
 class Restored:
-    """What a `Restore` did."""
+    """What a `Restore` or a `StepBack` did."""
 
     env_idx: tuple[int, ...]
     source: tuple[int, ...]
@@ -363,6 +379,10 @@ class Restored:
     undoes: int | None
     not_carried: dict[str, str]
     """What could not be put back, and why; empty within one version of a task."""
+    recording: str = ""
+    """Of a `StepBack`: the episode and the state, in words. Its `origin` is `NO_MOMENT`."""
+    how: str = ""
+    """Of a `StepBack`: how the state was come to, in a sentence."""
 
 
 @dataclass(frozen=True)

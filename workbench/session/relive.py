@@ -26,14 +26,15 @@ from numpy.typing import NDArray
 from workbench.core.recorded_run import RecordedRun
 from workbench.core.recorded_state import (
     apart,
+    misfits,
     new_physics,
-    only_these_move,
     read_states,
     same_state,
     settle_robot,
     write_states,
 )
-from workbench.core.snapshot import Snapshot, restore_snapshot
+from workbench.core.snapshot import Snapshot
+from workbench.core.stand_still import only_these_move
 from workbench.core.step import StepResult
 from workbench.session.open_task import OpenedTask, blamed, reset_checked, step_checked
 
@@ -92,11 +93,13 @@ def begin_again(
         reset_checked(task, opened.loaded, seed, [i], options)
     now = read_states(env)
     other = {i: not same_state(_of(now, i), run.state(0)) for i, run in runs.items()}
-    wrong = {i: run.state(0) for i, run in runs.items() if other[i] or not run.env_states}
-    wrong = {i: state for i, state in wrong.items() if state}
-    if wrong:
-        with blamed("restore", opened.loaded, task):
-            missed |= write_states(env, wrong)
+    wrong = {i: run.state(0) for i, run in runs.items() if other[i]}
+    with blamed("restore", opened.loaded, task):
+        for i, run in runs.items():
+            if run.env_states:
+                missed |= misfits(env, i, run.state(0))
+        if wrong:
+            write_states(env, wrong)
             settle_robot(env, list(wrong))
     return other, missed
 
@@ -128,28 +131,23 @@ def arrive(
     kept, reason = _kept(opened, others)
     why_not = why_not or reason
     corrected = 0
-    try:
-        with only_these_move(env, chosen):
-            begins_otherwise, missed = begin_again(opened, dict.fromkeys(chosen, run))
-            if not why_not:
-                for t in range(state):
-                    step_checked(task, opened.loaded, _for_all(opened, run.action[t]))
-                    wanted = run.state(t + 1)
-                    if wanted and _far(env, chosen, wanted):
-                        with blamed("restore", opened.loaded, task):
-                            missed |= write_states(env, dict.fromkeys(chosen, wanted))
-                        corrected += 1
-                    on_step(t + 1)
-            elif state > 0:
-                missed["the way there"] = why_not
-                with blamed("restore", opened.loaded, task):
-                    missed |= write_states(env, dict.fromkeys(chosen, run.state(state)))
-                    settle_robot(env, chosen)
-                    env.elapsed_steps[chosen] = state
-    finally:
-        if kept is not None:
-            # Their physics was not touched: a new one would make them forget what they had.
-            restore_snapshot(env, kept, fresh_physics=False)
+    with only_these_move(env, chosen, kept):
+        begins_otherwise, missed = begin_again(opened, dict.fromkeys(chosen, run))
+        if not why_not:
+            for t in range(state):
+                step_checked(task, opened.loaded, _for_all(opened, run.action[t]))
+                wanted = run.state(t + 1)
+                if wanted and _far(env, chosen, wanted):
+                    with blamed("restore", opened.loaded, task):
+                        write_states(env, dict.fromkeys(chosen, wanted))
+                    corrected += 1
+                on_step(t + 1)
+        elif state > 0:
+            missed["the way there"] = why_not
+            with blamed("restore", opened.loaded, task):
+                write_states(env, dict.fromkeys(chosen, run.state(state)))
+                settle_robot(env, chosen)
+                env.elapsed_steps[chosen] = state
     with blamed("restore", opened.loaded, task):
         step = task.judge()
     metres, radians = _distance(env, chosen, run.state(state))
@@ -161,7 +159,7 @@ def arrive(
         metres,
         radians,
         corrected,
-        any(begins_otherwise.values()) and bool(run.env_states),
+        any(begins_otherwise.values()),
         missed,
         otherwise_said(step, chosen[0], run, state) if near else (),
     )

@@ -19,6 +19,7 @@ from typing import get_args
 
 from workbench.authoring.watch import SourceWatcher
 from workbench.core.inspection import Section
+from workbench.core.recorded_run import RecordedRun
 from workbench.session.camera_judging import ShownMoment
 from workbench.session.camera_messages import CameraAnswer
 from workbench.session.camera_studio import CameraStudio
@@ -49,6 +50,7 @@ from workbench.session.messages import (
     SetSliders,
     SetSpeed,
     SingleStep,
+    StepBack,
     Stepped,
     TaskOptions,
     WarmUp,
@@ -95,6 +97,8 @@ class Session:
         self._change = 0
         self._state = LiveState(task, options, history_bytes)
         self._closing = False
+        self._step_in: tuple[RecordedRun, bool] | None = None
+        """What is to be gone into as soon as a task is there."""
         self._recovery = Recovery(self._state.newest_moment)
         self._printed = PrintedLog(self._on_lines)
         self._worker = KeptWorker(
@@ -332,6 +336,19 @@ class Session:
         self.pause()
         self._travel(lambda timeline, env: timeline.undo(env))
 
+    def step_back(self, run: RecordedRun, everywhere: bool = False) -> None:
+        """Put the selected env, or all, into the last state of a recorded run; pauses there. Before a task is loaded
+        it is done when one is."""
+        self.seek(None)
+        self.pause()
+        with self._lock:
+            task, env = self._state.task, self._state.selected_env
+            if task is None:
+                self._step_in = run, everywhere
+                return
+        self._send(StepBack(run, tuple(range(task.num_envs)) if everywhere else (env,)))
+        self._note()
+
     def draw_past(self) -> None:
         """Ask for pictures of the moment that is shown, if it has none of the cameras looked through."""
         with self._lock:
@@ -489,6 +506,10 @@ class Session:
             self._send(request)
         if recording:
             self._record_on(event, recording, one_each)
+        with self._lock:
+            step_in, self._step_in = self._step_in, None
+        if step_in is not None:
+            self.step_back(*step_in)
 
     def _record_on(self, event: Loaded, env_idx: tuple[int, ...], one_each: bool) -> None:
         """A version came in while these envs were recorded."""

@@ -80,6 +80,7 @@ from workbench.session.messages import (
     SetSpeed,
     SingleStep,
     Status,
+    StepBack,
     WarmedUp,
     WarmUp,
     WatchCameras,
@@ -90,6 +91,7 @@ from workbench.session.pacing import Pacer, Rate
 from workbench.session.picture_maker import PictureMaker
 from workbench.session.pulse import Doing, PulseWriter
 from workbench.session.reload import Running, load_version
+from workbench.session.step_back_run import going_there, step_back
 from workbench.session.step_events import StepEvents
 from workbench.session.warm_up import warm_up
 
@@ -139,6 +141,7 @@ class Worker:
             SuggestCameras: self._answer_about_camera,
             SetCapture: self._set_capture,
             Restore: self._restore,
+            StepBack: self._step_back,
             DrawPast: self._draw_past,
             WarmUp: self._warm_up,
             Inspect: self._inspect,
@@ -394,6 +397,9 @@ class Worker:
     def _restore(self, request: Restore) -> None:
         self._guarded(lambda opened: self._restore_envs(opened, request))
 
+    def _step_back(self, request: StepBack) -> None:
+        self._guarded(lambda opened: self._into_recording(opened, request))
+
     def _draw_past(self, request: DrawPast) -> None:
         if self._opened is None:
             return
@@ -484,6 +490,28 @@ class Worker:
         did = Restored(request.env_idx, request.source, request.origin, request.undoes, report.not_carried)
         self._send_step(step, mask, opened.env.episode_seeds, did)
 
+    def _into_recording(self, opened: OpenedTask, request: StepBack) -> None:
+        self._settle()
+        told = time.monotonic()
+
+        def tell(done: int) -> None:
+            nonlocal told
+            if time.monotonic() - told > _STATUS_PERIOD:
+                told = time.monotonic()
+                self._send_status(None, going_there(request, done))
+
+        try:
+            step, restored = step_back(opened, request, tell)
+        except TaskError:
+            self._back_to_the_moment()
+            raise
+        finally:
+            self._placed.put_back(opened.env.env)
+        mask = np.zeros(opened.env.num_envs, bool)
+        mask[list(request.env_idx)] = True
+        self._send_step(step, mask, opened.env.episode_seeds, restored)
+        self._send_status(None)
+
     def _send_step(
         self,
         step: StepResult,
@@ -540,6 +568,7 @@ _DOING: dict[type, Doing] = {
     SingleStep: "stepping",
     Reset: "resetting",
     Restore: "resetting",
+    StepBack: "resetting",
     SetActionSource: "importing the policy",
     WarmUp: "warming up",
 }
