@@ -191,6 +191,32 @@ def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved
     wait_until(session, seen_from(BASE, away), "the camera where it was placed, after the comparison")
 
 
+def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session: Session) -> None:
+    session.reset()
+    wait_until(session, lambda v: not v.step.elapsed_steps.any(), "a fresh episode")
+    for step in range(1, 5):
+        session.step()
+        wait_until(session, lambda v, step=step: v.step.elapsed_steps[0] == step, "a step")
+    session.studio.judge_steps(BASE)
+    studio = settled(session, lambda s: len(s.report_moments) == 5, "five moments")
+    assert [moment.step for moment in studio.report_moments] == [0, 1, 2, 3, 4]
+    assert {moment.env for moment in studio.report_moments} == {0} == set(studio.report.envs)
+    (cube,) = studio.report.wanted_objects(("cube",))
+    assert cube.summary().seen == 1.0
+    session.seek(studio.report_moments[2].serial)
+    assert session.view().step.elapsed_steps[0] == 2
+    session.studio.judge_steps(BASE, 2)
+    moments = settled(session, lambda s: len(s.report_moments) == 2, "its ends").report_moments
+    assert [moment.step for moment in moments] == [0, 4], (
+        "of the whole episode, also where a moment in it is shown"
+    )
+    session.reset()
+    wait_until(session, lambda v: not v.step.elapsed_steps.any() or v.timeline.shown is not None, "another")
+    session.seek(None)
+    session.studio.judge_steps(BASE)
+    settled(session, lambda s: len(s.report_moments) == 1, "the episode that has just begun")
+
+
 def test_a_picked_pixel_is_the_place_of_what_is_seen_there(session: Session) -> None:
     view = session.view()
     cube = view.step.poses[0, list(view.task.geometry.body_names).index("cube")]
@@ -259,3 +285,33 @@ def test_placements_outlive_reloads_and_workers_until_the_file_says_otherwise(
     wait_until(session, lambda v: v.task_serial > serial, "another worker")
     wait_until(session, seen_from(BASE, there), "its camera where the last one's was")
     assert moved(session.view()) == {BASE, PEOPLE}
+
+
+def test_an_installed_task_is_copied_opened_and_the_placement_planned_in_the_copy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "push_cube.py").write_text("somebody's own")
+    options = TaskOptions(num_envs=1, env_kwargs={"obs_mode": "rgb"})
+    session = Session("PushCube-v1", options, recordings=tmp_path / "recordings")
+    try:
+        wait_until(session, lambda view: view.task is not None, "the first load")
+        start = camera(session, BASE).now
+        there = replace(start, position=(0.31, 0.02, 0.55))
+        session.studio.place(BASE, there)
+        session.studio.plan_write(BASE)
+        view = wait_until(session, said(lambda s: s.writing.stage == "refused"), "the refusal")
+        assert view.studio.writing.can_copy and "is installed" in view.studio.writing.message
+        session.studio.copy_task()
+        view = wait_until(session, said(lambda s: s.writing.stage == "planned"), "the plan in the copy")
+        file = tmp_path / "push_cube_2.py"
+        assert view.task.file == str(file) == view.studio.writing.edit.file
+        assert view.task.env_id == "MyPushCube2-v1" and view.reload.level == "rebuilt"
+        assert view.reload.reason == "push_cube_2.py was opened in place of PushCubeEnv"
+        assert moved(view) == {BASE}, "the placement is lost"
+        session.studio.write()
+        view = wait_until(session, said(lambda s: s.writing.stage in ("checked", "mismatch")), "the check")
+        assert view.studio.writing.stage == "checked", view.studio.writing.message
+        assert (tmp_path / "push_cube.py").read_text() == "somebody's own"
+    finally:
+        session.close()

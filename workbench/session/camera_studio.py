@@ -15,6 +15,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -33,12 +34,14 @@ from workbench.core.pictures import CameraInfo
 from workbench.core.step import StepResult
 from workbench.session.camera_judging import CameraJudging, ShownMoment
 from workbench.session.camera_messages import CameraAnswer
-from workbench.session.camera_writing import CameraWriting, Wish, plan
+from workbench.session.camera_writing import CameraWriting, Wish, copy, plan
+from workbench.session.episode_moments import EpisodeMoment
 from workbench.session.messages import Load, PlaceCamera, Placed, ReloadLevel, Request, TaskDescription
 from workbench.session.placements import Placements
 from workbench.session.studio_view import StudioCamera, StudioView
 
 MOST_SEEDS = 1000
+MOST_STEPS = 1000
 _ON_THE_GPU = "in GPU simulation cameras cannot be moved; open the task with --backend cpu to place them"
 
 
@@ -51,6 +54,8 @@ class CameraStudio:
         on_change: Callable[[], None],
         shown: Callable[[], ShownMoment],
         load: Callable[[], Load | None],
+        episode: Callable[[int], tuple[EpisodeMoment, ...]],
+        open_copy: Callable[[Path, str], None],
     ) -> None:
         """
         Args:
@@ -58,8 +63,13 @@ class CameraStudio:
             on_change: called, on any thread, when `view` has something new.
             shown: what the page shows now.
             load: how another worker gets the version that runs; None before there is one.
+            episode: so many moments at most of the selected env's episode at the shown moment.
+            open_copy: open this class of this file, in a folder of the user's, in place of the task.
         """
         self._send, self._on_change, self._shown, self._load = send, on_change, shown, load
+        self._episode, self._open_copy = episode, open_copy
+        self.folder = Path.cwd()
+        """Where a copy of a task goes: where the program was started."""
         self._lock = threading.Lock()
         self._thread = ThreadPoolExecutor(1, "studio")
         self._closing = False
@@ -147,17 +157,17 @@ class CameraStudio:
         self._plan(Wish("remove", key, None))
 
     def _plan(self, wish: Wish) -> None:
-        def work() -> None:
-            with self._lock:
-                task, info = self._task, self._info(wish.key)
-            if task is None:
-                return
-            writing = plan(task, info, wish)
-            with self._lock:
-                self._writing.planned(wish, writing)
-            self._note()
+        self._later(self._find_plan, wish)
 
-        self._later(work)
+    def _find_plan(self, wish: Wish) -> None:
+        with self._lock:
+            task, info = self._task, self._info(wish.key)
+        if task is None:
+            return
+        writing = plan(task, info, wish)
+        with self._lock:
+            self._writing.planned(wish, writing)
+        self._note()
 
     def write(self) -> None:
         """Make the planned edit; the file is reloaded, and the new camera compared with what was written."""
@@ -166,6 +176,25 @@ class CameraStudio:
     def undo_write(self) -> None:
         """Take the edit that was made last out of the file again."""
         self._later(self._write, self._writing.undo)
+
+    def copy_task(self) -> None:
+        """Copy the task's file into `folder` and open the copy; what was refused before is planned in it then.
+
+        Does nothing unless ``StudioView.writing.can_copy``. Nothing is written over.
+        """
+        self._later(self._copy)
+
+    def _copy(self) -> None:
+        with self._lock:
+            task, can = self._task, self._writing.view.can_copy
+        if task is None or not can:
+            return
+        file, view = copy(task, self.folder)
+        with self._lock:
+            self._writing.copied(file, view)
+        self._note()
+        if file is not None:
+            self._open_copy(file, task.class_name)
 
     def _write(self, do: Callable[[], bool]) -> None:
         with self._lock:  # the version with it must not come in before it is known to be awaited
@@ -192,6 +221,18 @@ class CameraStudio:
             self._judging.judge(key, now, self._shown())
         elif known and (load := self._load()) is not None:
             self._judging.judge_seeds(key, now, moved, load, min(seeds, MOST_SEEDS))
+
+    def judge_steps(self, key: CameraKey, most: int = MOST_STEPS) -> None:
+        """Judge a camera as it is placed over the steps of the episode that the selected env is in.
+
+        Args:
+            most: how many of them, evenly spread.
+        """
+        with self._lock:
+            known, now = self._known(key), self._placements.now(key)
+        if known and (moments := self._episode(min(max(1, most), MOST_STEPS))):
+            self._judging.judge_steps(key, now, moments)
+        self._note()
 
     def suggest(
         self,
@@ -338,6 +379,7 @@ class CameraStudio:
                 report=looked.report,
                 report_of=looked.report_of,
                 report_seeds=looked.report_seeds,
+                report_moments=looked.report_moments,
                 report_stale=looked.report is not None and (moved or looked.outdated),
                 suggestions=looked.suggestions,
                 suggestions_of=looked.suggestions_of,
@@ -407,6 +449,9 @@ class CameraStudio:
                 self._follow_the_file(wish)
                 self._writing.compare(task)
             dropped = self._placements.loaded(said, own)
+            refused = self._writing.wish_for(task)
+            if refused is not None and not self._closing:
+                self._submit(self._find_plan, refused)
             self._problem = ""
             if dropped:
                 names = " and ".join(key[1] for key in dropped)
@@ -488,7 +533,10 @@ class CameraStudio:
     def _later(self, work: Callable[..., None], *args: object) -> None:
         with self._lock:
             if not self._closing:
-                self._thread.submit(work, *args).add_done_callback(self._worked)
+                self._submit(work, *args)
+
+    def _submit(self, work: Callable[..., None], *args: object) -> None:
+        self._thread.submit(work, *args).add_done_callback(self._worked)
 
     def _worked(self, future: Future[None]) -> None:
         error = None if future.cancelled() else future.exception()

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from workbench.authoring.copy_task import NoCopy, copy_task
 from workbench.authoring.modules import decode
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.core.pictures import CameraInfo
@@ -61,7 +62,7 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish) -> Writing:
         where = "" if task.file is None else f" ({task.file})"
         made = camera_source.Refusal(
             f"{task.class_name} is installed{where}, and an installed file is not to be edited: copy the task into a "
-            "file of your own and open that",
+            "folder of your own",
             text,
         )
     elif unread:
@@ -74,10 +75,33 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish) -> Writing:
             text = "" if wish.settings is None else camera_source.snippet(wish.result[1], wish.settings)
             made = camera_source.Refusal(blocked, text)
     if isinstance(made, camera_source.Refusal):
-        copy = " You can copy the text below into the file yourself." if made.snippet else ""
-        return Writing("refused", wish.result, None, made, f"Not written: {made.reason}.{copy}")
+        can_copy = _could_be_copied(task)
+        ways = " You can copy the text below into the file yourself." if made.snippet and not can_copy else ""
+        return Writing("refused", wish.result, None, made, f"Not written: {made.reason}.{ways}", can_copy)
     message = f"This is what changes in {Path(made.file).name}. Nothing is written yet."
     return Writing("planned", wish.result, made, None, message)
+
+
+def _could_be_copied(task: TaskDescription) -> bool:
+    """Whether the task's file is one that is not to be edited, and is all that the task is made of."""
+    from workbench.authoring import camera_source
+
+    if task.file is None or len(task.source_files) > 1:
+        return False
+    return not task.source_files or camera_source.not_writable(task.file) is not None
+
+
+def copy(task: TaskDescription, folder: Path) -> tuple[Path | None, Writing]:
+    """Copy the task's file into a folder; the copy, or None, and what is said of it."""
+    if task.file is None:
+        return None, Writing("refused", message="Not copied: the task has no file.")
+    try:
+        made = copy_task(Path(task.file), folder)
+    except NoCopy as reason:
+        return None, Writing("refused", message=f"Not copied: {reason}.")
+    named = ", ".join(f"{new} for {old}" for old, new in made.ids)
+    ids = f" It registers {named}." if named else ""
+    return made.file, Writing(message=f"The task is copied to {made.file}, which is being opened.{ids}")
 
 
 def _made(task: TaskDescription, texts: dict[str, str], info: CameraInfo | None, wish: Wish) -> Plan:
@@ -126,12 +150,26 @@ class CameraWriting:
     def __init__(self) -> None:
         self.view = Writing()
         self.wish: Wish | None = None
+        self.copy: Path | None = None
+        """Of the task, which is being opened."""
 
     def planned(self, wish: Wish, view: Writing) -> None:
         self.wish, self.view = wish, view
 
     def drop(self) -> None:
-        self.wish, self.view = None, Writing()
+        self.wish, self.view, self.copy = None, Writing(), None
+
+    def copied(self, copy: Path | None, view: Writing) -> None:
+        """The task was copied, or not: the wish waits until its copy is there."""
+        self.copy = copy
+        self.view = view if copy is not None else replace(view, key=self.view.key)
+
+    def wish_for(self, task: TaskDescription) -> Wish | None:
+        """What was wanted of the task whose copy this is, if this is the one that is awaited."""
+        if self.copy is None or task.file != str(self.copy):
+            return None
+        self.copy = None
+        return self.wish
 
     def write(self) -> bool:
         """Make the planned edit. False if there is none, or it cannot be made."""
@@ -199,6 +237,10 @@ class CameraWriting:
         self.view = replace(view, stage="checked", message=done)
 
     def failed_to_load(self) -> None:
+        if self.copy is not None:
+            self.view = Writing(
+                "refused", message=f"{self.copy} was made, but does not load: mend or delete it."
+            )
         if self.awaited and self.view.edit is not None:
             file = Path(self.view.edit.file).name
             told = "the change is in it; take it back if that is the reason"
