@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from workbench.core import seams
 from workbench.core.body_table import BodyTable, build_body_table, read_poses
 from workbench.core.camera_frames import compose, intrinsic_of, make_pose, matrix3, scaled_intrinsic
-from workbench.core.camera_report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen
+from workbench.core.camera_report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen, ObjectToSee
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.take_pictures import body_name, cameras_of
@@ -91,6 +91,20 @@ def list_objects(env: Any, table: BodyTable | None = None) -> tuple[SceneObject,
             )
         )
     return tuple(found)
+
+
+def objects_to_see(env: Any, table: BodyTable | None = None) -> tuple[ObjectToSee, ...]:
+    """What of a scene a camera may be asked to see, as plain data."""
+    table = table or build_body_table(env)
+    return tuple(
+        ObjectToSee(
+            thing.name,
+            thing.hidden,
+            tuple(table.names[body] for body in thing.bodies) if len(thing.bodies) > 1 else (),
+        )
+        for thing in list_objects(env, table)
+        if not (thing.robot or thing.scenery)
+    )
 
 
 def judge_camera(

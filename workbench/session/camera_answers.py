@@ -101,6 +101,7 @@ def _suggested(
     cancelled: Callable[[], bool],
 ) -> Suggested:
     told = 0.0
+    info = next((info for info in opened.description.cameras if info.key == question.key), None)
 
     def progress(at: SearchProgress) -> None:
         nonlocal told
@@ -110,7 +111,14 @@ def _suggested(
 
     found = suggest_cameras(
         opened.env.env,
-        SearchSpace(question.objects, question.low, question.high, question.settings, question.key[0]),
+        SearchSpace(
+            question.objects,
+            question.low,
+            question.high,
+            question.settings,
+            question.key[0],
+            mount=None if info is None else info.mount,
+        ),
         question.envs,
         table=opened.env.table,
         progress=progress,

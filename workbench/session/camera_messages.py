@@ -54,10 +54,10 @@ class SuggestCameras:
     number: int
     key: CameraKey
     settings: CameraSettings
-    """Its lens; the pose does not matter."""
+    """Its lens; of the pose it matters only which way up a mounted camera's picture is."""
     objects: tuple[str, ...]
     low: tuple[float, float, float]
-    """Of the box for the eye, metres in the env's frame."""
+    """Of the box for the eye, metres in the frame of its mount, or the env's if it has none."""
     high: tuple[float, float, float]
     envs: tuple[int, ...]
 

@@ -242,15 +242,15 @@ class CameraStudio:
         high: tuple[float, float, float],
         seeds: int,
     ) -> None:
-        """Search placements that see these objects over so many seeds, with the eye between two corners."""
+        """Search placements that see these objects over so many seeds, with the eye between two corners.
+
+        Args:
+            objects: names of objects, or of single links of them (``TaskDescription.objects``).
+            low, high: metres, in the frame of the camera's mount, or the env's if it has none.
+        """
         with self._lock:
-            known, lens, info = self._known(key), self._placements.now(key), self._info(key)
-            if known and info is not None and info.mount is not None:
-                self._problem = (
-                    f"{key[1]} rides on {info.mount}: places are searched for cameras that stand still."
-                )
-                known = False
-            elif known and lens is None:
+            known, lens = self._known(key), self._placements.now(key)
+            if known and lens is None:
                 self._problem = f"{key[1]} cannot be placed: {self._refusal(key)}."
         if known and lens is not None and (load := self._load()) is not None:
             self._judging.suggest(key, lens, tuple(objects), low, high, load, seeds)

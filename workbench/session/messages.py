@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.authoring.problem import Problem
+from workbench.core.camera_report import ObjectToSee
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.geometry import SceneGeometry
 from workbench.core.inspection import Inspection, Section
@@ -91,6 +92,8 @@ class TaskDescription:
     can_render: bool
     others: tuple[str, ...] = ()
     """Further task classes in the file."""
+    objects: tuple[ObjectToSee, ...] = ()
+    """What a camera may be asked to see."""
 
 
 # --- requests: server to worker ------------------------------------------------------------------
