@@ -70,7 +70,9 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish) -> Writing:
     else:
         made = _made(task, texts, info, wish)
     if isinstance(made, camera_source.SourceEdit):
-        blocked = camera_source.not_writable(made.file)
+        blocked = next(
+            filter(None, (camera_source.not_writable(change.file) for change in made.changes)), None
+        )
         if blocked is not None:
             text = "" if wish.settings is None else camera_source.snippet(wish.result[1], wish.settings)
             made = camera_source.Refusal(blocked, text)
@@ -78,7 +80,7 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish) -> Writing:
         can_copy = _could_be_copied(task)
         ways = " You can copy the text below into the file yourself." if made.snippet and not can_copy else ""
         return Writing("refused", wish.result, None, made, f"Not written: {made.reason}.{ways}", can_copy)
-    message = f"This is what changes in {Path(made.file).name}. Nothing is written yet."
+    message = f"This is what changes in {made.names}. Nothing is written yet."
     return Writing("planned", wish.result, made, None, message)
 
 
@@ -173,11 +175,11 @@ class CameraWriting:
 
     def write(self) -> bool:
         """Make the planned edit. False if there is none, or it cannot be made."""
-        return self._apply("planned", "apply", "written", "Written to {file}; it is being loaded.")
+        return self._apply("planned", "apply", "written", "Written to {file}, being loaded now.")
 
     def undo(self) -> bool:
         """Take the edit that was made out of the file again."""
-        return self._apply(None, "revert", "undone", "{file} is as it was before; it is being loaded.")
+        return self._apply(None, "revert", "undone", "{file} {was} before, being loaded now.")
 
     def _apply(self, needs: str | None, how: str, stage: str, message: str) -> bool:
         from workbench.authoring import camera_source
@@ -188,19 +190,21 @@ class CameraWriting:
             return False
         do: Callable[[SourceEdit], Refusal | None] = getattr(camera_source, how)
         refusal = do(view.edit)
-        file = Path(view.edit.file).name
+        file = view.edit.names
         if refusal is not None:
             kept = view.stage if needs is None else "refused"
             self.view = replace(view, stage=kept, refusal=refusal, message=f"Not done: {refusal.reason}.")
             return False
-        self.view = replace(view, stage=stage, refusal=None, message=message.format(file=file))  # type: ignore[arg-type]
+        self.view = replace(
+            view, stage=stage, refusal=None, message=message.format(file=file, was=_was(view.edit))
+        )  # type: ignore[arg-type]
         return True
 
     @property
     def awaited(self) -> bool:
         """The edit was made or taken back, and the version with it has not come in yet."""
         return self.view.stage == "written" or (
-            self.view.stage == "undone" and self.view.message.endswith("loaded.")
+            self.view.stage == "undone" and self.view.message.endswith("loaded now.")
         )
 
     def is_in(self, task: TaskDescription) -> bool:
@@ -208,17 +212,20 @@ class CameraWriting:
         edit = self.view.edit
         if edit is None or not self.awaited:
             return False
-        wanted = edit.new_text if self.view.stage == "written" else edit.old_text
-        return task.source.get(edit.file) == wanted
+        written = self.view.stage == "written"
+        return all(
+            task.source.get(change.file) == (change.new_text if written else change.old_text)
+            for change in edit.changes
+        )
 
     def compare(self, task: TaskDescription) -> None:
         """The version that was awaited runs: does it have what was written?"""
         view, wish = self.view, self.wish
         assert view.edit is not None and wish is not None
         infos = {c.key: c for c in task.cameras}
-        file = Path(view.edit.file).name
+        file = view.edit.names
         if view.stage == "undone":
-            self.view = replace(view, message=f"{file} is as it was before.")
+            self.view = replace(view, message=f"{file} {_was(view.edit)} before.")
             return
         wrong = _mismatch(wish, infos, view.edit.settings)
         if wrong:
@@ -242,11 +249,16 @@ class CameraWriting:
                 "refused", message=f"{self.copy} was made, but does not load: mend or delete it."
             )
         if self.awaited and self.view.edit is not None:
-            file = Path(self.view.edit.file).name
+            file = self.view.edit.names
             told = "the change is in it; take it back if that is the reason"
             if self.view.stage == "undone":
                 told = "the camera's change is out of it"
-            self.view = replace(self.view, message=f"{file} does not load: {told}.")
+            does = "does" if len(self.view.edit.changes) == 1 else "do"
+            self.view = replace(self.view, message=f"{file} {does} not load: {told}.")
+
+
+def _was(edit: SourceEdit) -> str:
+    return "is as it was" if len(edit.changes) == 1 else "are as they were"
 
 
 def _mismatch(wish: Wish, infos: dict[CameraKey, CameraInfo], wanted: CameraSettings | None) -> str:

@@ -170,7 +170,7 @@ class CameraWriting:
         leave = LEAVE if writing.stage == "planned" else CLOSE
         if self._drop.label != leave:
             self._drop.label = leave
-        name = "" if writing.edit is None else PurePath(writing.edit.file).name
+        name = "" if writing.edit is None else writing.edit.names
         label = f"Write it to {name}" if name else "Write it"
         if self._write.label != label:
             self._write.label = label
@@ -191,15 +191,13 @@ class CameraWriting:
 def writing_html(writing: Writing, chosen: StudioCamera | None, stale: bool) -> str:
     """How far the change is; every value escaped."""
     edit, refusal = writing.edit, writing.refusal
-    diff = "" if edit is None else edit.diff
+    files = [] if edit is None or writing.stage == "undone" else edit.changes
     return render(
         "camera_writing",
         message="The camera was moved since: show the change again." if stale else writing.message,
         mood="warn" if stale else MOODS.get(writing.stage, "plain"),
-        file="" if edit is None else edit.file,
-        name="" if edit is None else PurePath(edit.file).name,
+        files=[(change.file, PurePath(change.file).name, diff_lines(change.diff)) for change in files],
         folded=writing.stage in DONE,
-        lines=[] if writing.stage == "undone" else diff_lines(diff),
         notes=() if edit is None or writing.stage == "undone" else edit.notes,
         reason="" if refusal is None or refusal.reason in writing.message else refusal.reason,
         snippet="" if refusal is None else refusal.snippet,
