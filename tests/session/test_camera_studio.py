@@ -111,6 +111,29 @@ def test_size_and_lens_change_the_live_camera_and_the_observation(session: Sessi
     wait_until(session, lambda v: v.pictures_serial > serial + 1 and seen_from(BASE, other)(v), "it stayed")
 
 
+def test_a_quick_look_in_another_size_leaves_the_camera_and_the_observation_alone(session: Session) -> None:
+    start = camera(session, BASE).now
+    session.studio.select(BASE)
+    session.studio.set_quick_scale(0.25)
+    there = replace(start, position=(0.31, 0.02, 0.55))
+    session.studio.place(BASE, there)
+
+    def looked(view: SessionView) -> bool:
+        if view.studio.wants_quick:
+            session.studio.look()  # as the page does
+        picture = view.studio.quick
+        return picture is not None and np.allclose(picture.pose[:3], there.position, atol=1e-6)
+
+    view = wait_until(session, looked, "the look from there")
+    size = (start.width, start.height)
+    assert view.studio.quick.rgb.shape == (size[1] // 4, size[0] // 4, 3) and view.studio.quick.rgb.std() > 5
+    assert (camera(session, BASE).now.width, camera(session, BASE).info.width) == (size[0], size[0])
+    session.studio.set_quick_scale(1.0)
+    view = wait_until(session, seen_from(BASE, there), "the picture in its own size")
+    assert view.studio.quick is None and not view.studio.wants_quick
+    session.studio.select(None)
+
+
 def test_a_moment_of_the_past_is_drawn_again_when_the_camera_moves(session: Session) -> None:
     start = camera(session, BASE).now
     session.step()
@@ -261,6 +284,11 @@ def test_cameras_go_out_and_poses_come_in(session: Session) -> None:
         assert session.studio.export([BASE, PEOPLE], form)
     session.studio.import_pose(BASE, "1 0 0 5\n0 1 0 6\n0 0 1 7\n0 0 0 1", "camera_to_world", "maniskill")
     assert camera(session, BASE).now.position == (5.0, 6.0, 7.0)
+    in_millimetres = "1 0 0 500\n0 1 0 -60\n0 0 1 700\n0 0 0 1"
+    session.studio.import_pose(BASE, in_millimetres, "camera_to_world", "opencv", 0.001)
+    assert camera(session, BASE).now.position == pytest.approx((0.5, -0.06, 0.7))
+    session.studio.import_pose(BASE, text, None, None, 0.001)
+    assert not camera(session, BASE).moved, "our own file is in metres whatever is chosen"
     with pytest.raises(ValueError, match="no pose is in it"):
         session.studio.import_pose(BASE, "{}", None, None)
 

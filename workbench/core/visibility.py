@@ -168,12 +168,17 @@ def judge_placement(
 
 
 def picture_of(
-    env: Any, e: int, placement: Placement, table: BodyTable, poses: NDArray[np.float32] | None = None
+    env: Any,
+    e: int,
+    placement: Placement,
+    table: BodyTable,
+    poses: NDArray[np.float32] | None = None,
+    size: tuple[int, int] | None = None,
 ) -> Picture:
-    """What a camera that does not exist sees of one env, in its own size; raises as `judge_placement`."""
+    """What a camera that does not exist sees of one env, in its own size or another; raises as `judge_placement`."""
     bodies = read_poses(env, table)[e] if poses is None else poses
     pose = pose_in_env(placement, bodies, table)
-    with placed_camera(env, e, placement, None, poses) as view:
+    with placed_camera(env, e, placement, size, poses) as view:
         segmentation, depth = view.look(pose)
         rgb = view.colours()
     return Picture("suggested", placement.kind, e, pose.astype(np.float32), rgb, depth, segmentation)

@@ -32,6 +32,9 @@ class DrawCamera:
     """Those that its shader does not give are left out."""
     poses: NDArray[np.float32] | None = None
     """(N, B, 7) of the bodies at a moment of the past; None for now."""
+    scale: float = 1.0
+    """Other than 1: colours alone, in a picture whose sides are so much of `settings`' (which must be given), by a
+    camera beside the env's, with the minimal shader."""
 
 
 @dataclass(frozen=True)

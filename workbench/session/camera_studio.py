@@ -38,6 +38,7 @@ from workbench.session.camera_writing import CameraWriting, Wish, copy, plan
 from workbench.session.episode_moments import EpisodeMoment
 from workbench.session.messages import Load, PlaceCamera, Placed, ReloadLevel, Request, TaskDescription
 from workbench.session.placements import Placements
+from workbench.session.quick_look import QuickLook, Sight
 from workbench.session.studio_view import StudioCamera, StudioView
 
 MOST_SEEDS = 1000
@@ -80,6 +81,7 @@ class CameraStudio:
         self._placements = Placements()
         self._writing = CameraWriting()
         self._judging = CameraJudging(send, self._note)
+        self._quick = QuickLook(send, self._note)
         self._drawn: tuple[StepResult | None, int] = (None, 0)
         """What was shown last: the step and the selected env."""
 
@@ -289,6 +291,26 @@ class CameraStudio:
         if known:
             self._judging.make_sheet(key, self._shown())
 
+    def set_quick_scale(self, scale: float) -> None:
+        """Look through the chosen camera in a picture of so much of its own size; 1 for that itself. Never written."""
+        self._quick.set_scale(scale)
+        self._note()
+
+    def look(self) -> None:
+        """Take the quick look that `StudioView.wants_quick` tells of."""
+        with self._lock:
+            sight = self._sight()
+        if sight is not None and self._quick.wants(sight):
+            self._quick.look(sight, self._shown())
+
+    def _sight(self) -> Sight | None:
+        key = self._selected
+        now = None if key is None else self._placements.now(key)
+        if key is None or now is None or self._refusal(key) is not None:
+            return None
+        step, env = self._drawn
+        return Sight(key, now, env, step, self._quick.scale)
+
     def pick(self, key: CameraKey, u: float, v: float) -> None:
         """What is seen at a place of the picture: 0, 0 is its upper left corner, 1, 1 its lower right one."""
         with self._lock:
@@ -370,6 +392,7 @@ class CameraStudio:
         with self._lock:
             self._drawn = step, env
             infos = () if self._task is None else self._task.cameras
+            sight = self._sight()
             judged = None if looked.report_of is None else self._placements.now(looked.report_of)
             was = looked.report_settings
             # Not what is rounded away when it is written.
@@ -386,12 +409,15 @@ class CameraStudio:
                 compared=looked.compared,
                 picked=looked.picked,
                 sheet=looked.sheet,
+                quick_scale=self._quick.scale,
+                quick=self._quick.picture(self._selected, env),
+                wants_quick=sight is not None and self._quick.wants(sight),
                 progress=progress,
                 selected=self._selected,
                 undo=self._placements.undo_words,
                 redo=self._placements.redo_words,
                 writing=self._writing.view,
-                problem=self._problem or looked.problem,
+                problem=self._problem or looked.problem or self._quick.problem,
                 serial=self._serial,
             )
 
@@ -488,10 +514,12 @@ class CameraStudio:
     def answered(self, answer: CameraAnswer) -> None:
         """The worker that plays answered a question about a camera."""
         self._judging.take(answer)
+        self._quick.take(answer)
 
     def interrupted(self) -> None:
         """The file was saved, or the worker is gone: what is under way is about what there was before."""
         self._judging.stop()
+        self._quick.stop()
 
     def failed_to_load(self) -> None:
         """A version does not load; the one before goes on."""
@@ -518,6 +546,7 @@ class CameraStudio:
         with self._lock:
             self._closing = True
         self._judging.close()
+        self._quick.close()
         self._thread.shutdown(wait=True, cancel_futures=True)
 
     # --- small things ----------------------------------------------------------------------------------

@@ -122,6 +122,12 @@ class StudioView:
     picked: Picked | None = None
     sheet: tuple[Picture, ...] = ()
     """The selected camera's picture in every env, worst first where it was judged."""
+    quick_scale: float = 1.0
+    """Other than 1: the chosen camera is looked through in a picture of so much of its own size."""
+    quick: Picture | None = None
+    """That picture, while there is one."""
+    wants_quick: bool = False
+    """There is something new to be looked at: see `CameraStudio.look`."""
     progress: Progress | None = None
     """None while nothing runs in the background."""
     problem: str = ""
