@@ -19,7 +19,7 @@ What makes it quick:
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -103,6 +103,12 @@ class BatchedCpuSystem:
         """One substep of every env."""
         if self.stepper.step():
             self._stepped()
+
+    def hold_still(self, envs: Collection[int]) -> None:
+        """From now on PhysX does not step these envs; the others and the task's hooks go on."""
+        self._catch_up()
+        self.stepper.forget()
+        self.stepper.still = frozenset(envs)
 
     @contextmanager
     def merging(self, substeps: int) -> Iterator[None]:

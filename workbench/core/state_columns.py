@@ -1,0 +1,80 @@
+"""What a recording keeps of every env beside its poses: the simulation's state and the state observation, as columns.
+
+A dataset is asked for both: the observation is what a policy is trained on, and the state is what puts an episode back
+(``env.set_state_dict``). ManiSkill has them as nested dicts of tensors; what crosses a pipe and lands in a file is
+flat and numpy. So here they become one dict of arrays with names: ``state/actors/cube`` (N, 13),
+``state/articulations/panda`` (N, 13 + 2 * joints), both as ``get_state_dict`` lays them out, and ``obs/agent/qpos`` (N, ...)
+by the names that the task gave them.
+
+Three things are not as they are in ManiSkill. What only some envs have is NaN in the others (there the tensor has
+fewer rows than envs, and ``RecordEpisode`` records no state at all). A flattened observation (``obs_mode="state"``) is
+taken apart by the names that it was flattened from, where they can be told; else it is one array, ``obs/``. And
+pictures are left out: a recording has its own, of all cameras, encoded.
+
+On a GPU each tensor that is fetched by itself waits for the device; so all of them go in one copy.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from workbench.core.env_states import env_states
+from workbench.core.inspect_env import names_of_flat
+from workbench.core.state_names import OBS, STATE
+from workbench.core.task_env import TaskEnv, flat_entries, to_numpy
+
+_PICTURES = ("sensor_data", "sensor_param", "pointcloud")
+"""Parts of an observation that are made of pictures."""
+
+
+def read_state_columns(task: TaskEnv) -> dict[str, NDArray]:
+    """The columns of the present moment, (N, ...) each; copies. About 0.1 ms for 16 PickCube envs.
+
+    Raises:
+        Exception: whatever a ``get_state_dict`` of the author's own raises.
+    """
+    count = task.num_envs
+    values: dict[str, Any] = {STATE + name: value for name, value in env_states(task.env).items()}
+    obs = task.obs if isinstance(task.obs, Mapping) else {} if task.obs is None else {"": task.obs}
+    for name, value in flat_entries({k: v for k, v in obs.items() if k not in _PICTURES}):
+        if len(getattr(value, "shape", ())) > 0 and len(value) == count:
+            values[OBS + name] = value
+    columns: dict[str, NDArray] = {}
+    for name, column in _fetched(values, count, task.env.device).items():
+        flat = name in (OBS, OBS + "state")
+        parts = names_of_flat(task, values[name]) if flat else None
+        if parts is None:
+            columns[name] = column
+            continue
+        at = 0
+        for part, shape, _ in parts:
+            width = math.prod(shape)
+            columns[OBS + part] = column[:, at : at + width].reshape(count, *shape)
+            at += width
+    return columns
+
+
+def _fetched(values: Mapping[str, Any], count: int, device: torch.device) -> dict[str, NDArray]:
+    if device.type == "cpu":
+        return {name: to_numpy(value) for name, value in values.items()}
+    columns: dict[str, NDArray] = {}
+    by_type: dict[torch.dtype, list[str]] = {}
+    for name, value in values.items():
+        columns[name] = np.empty(0)  # keeps the order
+        if isinstance(value, torch.Tensor):
+            by_type.setdefault(value.dtype, []).append(name)
+        else:
+            columns[name] = np.array(value)
+    for names in by_type.values():
+        rows = [values[name].reshape(count, -1) for name in names]
+        together = torch.cat(rows, dim=1).cpu().numpy()
+        ends = np.cumsum([row.shape[1] for row in rows])[:-1]
+        for name, column in zip(names, np.split(together, ends, axis=1), strict=True):
+            columns[name] = np.ascontiguousarray(column).reshape(tuple(values[name].shape))
+    return columns
