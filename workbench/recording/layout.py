@@ -73,7 +73,7 @@ class EpisodeLog:
         log, survey, states = self._log, self._survey, piece.states
         poses = piece.columns["poses"]
         for body, entity in self._bodies:
-            if not _stands(survey, body):
+            if not survey.still[body]:
                 log.pose(entity, states, poses[:, body, :3], xyzw(poses[:, body, 3:]))
         for (index, modality), (frames, blobs) in piece.pictures.items():
             _log_pictures(log, survey.cameras[index], self._cameras[index], modality, frames, blobs)
@@ -150,14 +150,10 @@ def evaluate_entity(name: str) -> str:
 # --- scene ----------------------------------------------------------------------------------------
 
 
-def _stands(survey: Survey, body: int) -> bool:
-    return bool(survey.still[body]) and survey.header.geometry.body_kinds[body] == "static"
-
-
 def _log_scene(log: Log, survey: Survey, entities: dict[int, str]) -> None:
     log.static(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     for body, entity in entities.items():
-        if _stands(survey, body):
+        if survey.still[body]:
             pose = survey.first_poses[body]
             log.still(entity, pose[:3], xyzw(pose[3:]))
     worn: Counter[int] = Counter()
