@@ -1,11 +1,12 @@
 """What recording costs, beside ManiSkill's own RecordEpisode: python tests/benchmarks/recording.py
 
-The same env, the same seed, the same actions: bare, inside RecordEpisode, inside `workbench.Recorder`, in turn, several rounds. Both
+The same env, the same seed, the same actions: inside RecordEpisode, inside `workbench.Recorder`, in turn, several rounds. Both
 recorders keep actions, rewards, flags, state observations and env states; ours also every pose, what ``evaluate`` returned, and
 a second file, the .rrd. With a camera, both keep the base camera's colour, depth and segmentation, which the env observes.
 
-Prints for each of one env and sixteen: the milliseconds that a step takes more than bare (median of the rounds), until the files are
-closed; and the bytes that a step of one env adds to the files, which is a difference of two lengths, so that neither
+What a recorder takes is what a step takes beyond the env's own, which is measured within the same step: on a machine that others use
+too, two runs differ by more than a recorder takes. Prints for each of one env and sixteen the milliseconds a step, by the clock and of
+the processor (the median of the rounds), and what making the files takes at the end of the episodes; and the bytes that a step of one env adds to the files, which is a difference of two lengths, so that neither
 side's fixed parts (the scene's meshes, the sources' texts) count.
 """
 
@@ -20,6 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch
 import tyro
@@ -29,7 +31,7 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 
 import workbench
 
-SIDES = ("bare", "RecordEpisode", "Recorder")
+SIDES = ("RecordEpisode", "Recorder")
 
 
 @dataclass
@@ -44,36 +46,54 @@ class Options:
     """With a camera; 0 leaves it out."""
 
 
+class Timed(gym.Wrapper):
+    """Sums up what its env takes."""
+
+    clock = processor = 0.0
+
+    def step(self, action: Any) -> Any:
+        clock, processor = time.perf_counter(), time.process_time()
+        given = self.env.step(action)
+        self.clock += time.perf_counter() - clock
+        self.processor += time.process_time() - processor
+        return given
+
+
 @dataclass(frozen=True)
 class Run:
-    seconds: float
-    """Of stepping and of closing, that is until all files are there."""
-    stepping: float
-    """Of stepping alone."""
+    bare: float
+    """Seconds of the env's own steps."""
+    clock: float
+    """Seconds that the recorder took while stepping."""
+    processor: float
+    """The same, of the processor, all threads."""
+    files: float
+    """Seconds of the processor for making the files."""
     size: dict[str, int]
     """Bytes by suffix."""
 
 
-def run(side: str, env: Any, base_actions: list[torch.Tensor], camera: bool) -> Run:
+def run(side: str, env: Any, actions: list[torch.Tensor], camera: bool) -> Run:
     folder = Path(tempfile.mkdtemp(prefix="recording-"))
-    wrapped = env
+    timed = Timed(env)
     if side == "RecordEpisode":
-        wrapped = RecordEpisode(env, str(folder), save_video=False, trajectory_name="run")
-    elif side == "Recorder":
-        wrapped = workbench.Recorder(env, folder, pictures=("base_camera",) if camera else False)
-    wrapped.reset(seed=0)
-    began = time.perf_counter()
-    for action in base_actions:
-        wrapped.step(action)
-    stepped = time.perf_counter()
-    finish(side, wrapped)
-    ended = time.perf_counter()
+        recorder: Any = RecordEpisode(timed, str(folder), save_video=False, trajectory_name="run")  # type: ignore[arg-type]
+    else:
+        recorder = workbench.Recorder(timed, folder, pictures=("base_camera",) if camera else False)
+    recorder.reset(seed=0)
+    clock, processor = time.perf_counter(), time.process_time()
+    for action in actions:
+        recorder.step(action)
+    clock, processor = time.perf_counter() - clock, time.process_time() - processor
+    began = time.process_time()
+    finish(side, recorder)
+    files = time.process_time() - began
     size = {
         suffix: sum(p.stat().st_size for p in folder.glob(f"*{suffix}"))
         for suffix in (".h5", ".json", ".rrd")
     }
     shutil.rmtree(folder)
-    return Run(ended - began, stepped - began, size)
+    return Run(timed.clock, clock - timed.clock, processor - timed.processor, files, size)
 
 
 def finish(side: str, wrapped: Any) -> None:
@@ -102,35 +122,30 @@ def measure(options: Options, num_envs: int, camera: bool) -> None:
         for side in SIDES if number % 2 else SIDES[::-1]:
             runs[side].append(run(side, env, actions, camera))
     sizes = {}
-    for side in SIDES[1:]:
+    for side in SIDES:
         half = run(side, env, actions[: steps // 2], camera).size
         whole = runs[side][-1].size
         rest = (steps - steps // 2) * num_envs
         sizes[side] = {suffix: (whole[suffix] - half[suffix]) / rest for suffix in whole}
     env.close()
 
-    def more(side: str, what: str) -> float:
-        pairs = zip(runs[side], runs["bare"], strict=True)
-        return statistics.median(1000 * (getattr(a, what) - getattr(b, what)) / steps for a, b in pairs)
+    def took(side: str, what: str) -> float:
+        return statistics.median(1000 * getattr(r, what) / steps for r in runs[side])
 
-    bare = statistics.median(1000 * r.seconds / steps for r in runs["bare"])
-    print(
-        f"{options.task}, {num_envs} env(s), {'with a camera' if camera else 'states'}; a bare step {bare:.2f} ms"
-    )
-    for side in SIDES[1:]:
+    about = f"{options.task}, {num_envs} env{'s' if num_envs > 1 else ''}, {'with a camera' if camera else 'states'}"
+    print(f"{about}; {steps} steps of {took('Recorder', 'bare'):.2f} ms without recording")
+    for side in SIDES:
         size = sizes[side]
-        h5, rrd = size[".h5"] + size[".json"], size[".rrd"]
         print(
-            f"  {side:14s} + {more(side, 'stepping'):6.3f} ms while stepping, + {more(side, 'seconds'):6.3f} ms with the files;"
-            f" a step of an env {h5:7.0f} bytes in .h5 and .json, {rrd:7.0f} in .rrd"
+            f"  {side:14s} {took(side, 'clock'):7.3f} ms a step, {took(side, 'processor'):7.3f} of the processor; files "
+            f"{took(side, 'files') * steps / num_envs:6.1f} ms an episode; bytes a step and env: "
+            f"{size['.h5'] + size['.json']:6.0f} in .h5 and .json, {size['.rrd']:6.0f} in .rrd"
         )
-    theirs, ours = more("RecordEpisode", "seconds"), more("Recorder", "seconds")
-    stepping = more("Recorder", "stepping") / more("RecordEpisode", "stepping")
-    total = {side: sum(size.values()) for side, size in sizes.items()}
+    theirs, ours = sizes["RecordEpisode"], sizes["Recorder"]
     print(
-        f"  ratio of times {stepping:.2f} while stepping, {ours / theirs:.2f} with the files; of bytes "
-        f"{sizes['Recorder']['.h5'] / sizes['RecordEpisode']['.h5']:.2f} (.h5), "
-        f"{total['Recorder'] / total['RecordEpisode']:.2f} (all files)"
+        f"  ratio of times {took('Recorder', 'clock') / took('RecordEpisode', 'clock'):.2f} by the clock, "
+        f"{took('Recorder', 'processor') / took('RecordEpisode', 'processor'):.2f} of the processor; of bytes "
+        f"{ours['.h5'] / theirs['.h5']:.2f} .h5 to .h5, {sum(ours.values()) / sum(theirs.values()):.2f} all files"
     )
 
 

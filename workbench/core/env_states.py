@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
 
+import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 
@@ -27,11 +28,11 @@ class _Plan:
     """Names, in the order of `rows`; actors first."""
     actors: int
     """How many of these are actors."""
-    rows: torch.Tensor
+    rows: Any
     """(N * bodies,) rows of ``cuda_rigid_body_data``, env by env."""
     still: list[int]
     """Which of `bodies` are moved by the task and have no velocity."""
-    joints: list[tuple[torch.Tensor, int]]
+    joints: list[tuple[Any, int]]
     """Of each articulation: its rows (N,) in the tensors of joints, and how many joints it has."""
     others: list[str]
     """Actors and articulations that not every env has."""
@@ -40,8 +41,10 @@ class _Plan:
 _plans: WeakKeyDictionary[Any, _Plan] = WeakKeyDictionary()
 
 
-def env_states(env: BaseEnv) -> dict[str, torch.Tensor]:
-    """(N, D) by name: ``actors/cube``, ``articulations/panda``, and ``controller/...`` where a controller has a state."""
+def env_states(env: BaseEnv) -> dict[str, Any]:
+    """(N, D) by name: ``actors/cube``, ``articulations/panda``, and ``controller/...`` where a controller has a state.
+
+    Tensors, or on the CPU arrays; copies of the simulation's own."""
     if type(env).get_state_dict is not BaseEnv.get_state_dict or not env.scene.gpu_sim_enabled:
         whole: Any = env.get_state_dict()
         return dict(_widened(env, name, value) for name, value in flat_entries(whole))
@@ -49,18 +52,30 @@ def env_states(env: BaseEnv) -> dict[str, torch.Tensor]:
     if plan is None:
         plan = _plans[env.scene] = _planned(env)
     scene: Any = env.scene
-    structs = _structs(scene)
-    data = scene.px.cuda_rigid_body_data.torch()[plan.rows].reshape(env.num_envs, -1, 13)
+    data, qpos, qvel = (
+        # numpy's calls on a few hundred numbers take a quarter of torch's.
+        tensor.numpy() if tensor.device.type == "cpu" else tensor
+        for tensor in (
+            scene.px.cuda_rigid_body_data.torch(),
+            scene.px.cuda_articulation_qpos.torch(),
+            scene.px.cuda_articulation_qvel.torch(),
+        )
+    )
+    data = data[plan.rows].reshape(env.num_envs, -1, 13)
     if plan.still:
         data[:, plan.still, 7:] = 0.0
-    states: dict[str, torch.Tensor] = {}
+    states: dict[str, Any] = {}
+    actors = {actor.name: actor for actor in scene.state_dict_registry.actors.values()}
     for k, name in enumerate(plan.bodies[: plan.actors]):
-        states[name] = structs[name].get_state() if structs[name].hidden else data[:, k]
-    qpos, qvel = scene.px.cuda_articulation_qpos.torch(), scene.px.cuda_articulation_qvel.torch()
+        actor = actors[name.removeprefix("actors/")]
+        states[name] = actor.get_state() if actor.hidden else data[:, k]
     for k, (rows, dof) in enumerate(plan.joints, plan.actors):
-        states[plan.bodies[k]] = torch.cat([data[:, k], qpos[rows, :dof], qvel[rows, :dof]], dim=1)
+        parts = [data[:, k], qpos[rows, :dof], qvel[rows, :dof]]
+        states[plan.bodies[k]] = (
+            np.concatenate(parts, axis=1) if isinstance(data, np.ndarray) else torch.cat(parts, dim=1)
+        )
     for name in plan.others:
-        states[name] = _widened(env, name, structs[name].get_state())[1]
+        states[name] = _widened(env, name, _structs(scene)[name].get_state())[1]
     if env.agent is not None:
         controllers: Any = env.agent.get_controller_state()
         states.update(flat_entries(controllers, "controller/"))
@@ -74,7 +89,7 @@ def _structs(scene: Any) -> dict[str, Any]:
 
 
 def _planned(env: BaseEnv) -> _Plan:
-    plan = _Plan([], 0, torch.zeros(0, dtype=torch.long), [], [], [])
+    plan = _Plan([], 0, None, [], [], [])
     every = list(range(env.num_envs))
     rows: list[torch.Tensor] = []
     for name, struct in _structs(env.scene).items():
@@ -89,12 +104,15 @@ def _planned(env: BaseEnv) -> _Plan:
         else:
             rows.append(seams.data_rows_of(struct.root))
             plan.bodies.append(name)
-            plan.joints.append((seams.data_rows_of_articulation(struct).long(), int(struct.max_dof)))
-    if rows:
-        plan.rows = torch.stack([row.long() for row in rows], dim=1).reshape(-1)
-    else:
-        plan.rows = plan.rows.to(env.device)
+            of_joints = _index(seams.data_rows_of_articulation(struct))
+            plan.joints.append((of_joints, int(struct.max_dof)))
+    none = torch.zeros(0, dtype=torch.long, device=env.device)
+    plan.rows = _index(torch.stack([row.long() for row in rows], dim=1).reshape(-1) if rows else none)
     return plan
+
+
+def _index(rows: torch.Tensor) -> Any:
+    return rows.long().numpy() if rows.device.type == "cpu" else rows.long()
 
 
 def _widened(env: BaseEnv, name: str, value: torch.Tensor) -> tuple[str, torch.Tensor]:

@@ -62,7 +62,11 @@ def read_state_columns(task: TaskEnv) -> dict[str, NDArray]:
 
 def _fetched(values: Mapping[str, Any], count: int, device: torch.device) -> dict[str, NDArray]:
     if device.type == "cpu":
-        return {name: to_numpy(value) for name, value in values.items()}
+        # What is an array already was made for this.
+        return {
+            name: value if isinstance(value, np.ndarray) else to_numpy(value)
+            for name, value in values.items()
+        }
     columns: dict[str, NDArray] = {}
     by_type: dict[torch.dtype, list[str]] = {}
     for name, value in values.items():
