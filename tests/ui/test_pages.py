@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -86,6 +88,16 @@ def test_an_episode_whose_writer_was_killed_is_mended_and_said(
         until(lambda: [row.seed for row in place.shelf.library.rows()] == [8], "its row")
     finally:
         place.close()
+
+
+def test_looking_at_recordings_needs_no_simulator() -> None:
+    said = subprocess.run(
+        [sys.executable, "-c", "import sys, workbench.ui.put_together; print(*sys.modules)"],
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout.split()
+    assert not {"torch", "sapien", "mani_skill", "libcst"} & set(said)
 
 
 def until(reached: Callable[[], bool], what: str) -> None:
