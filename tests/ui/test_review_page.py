@@ -56,7 +56,7 @@ def open_seeds(page: ReviewPage, *seeds: int) -> None:
 def draw(page: ReviewPage) -> None:
     # Each part is drawn as often as can be read; a test does not wait for that.
     page._curves._drawn_at = page._curves._numbers_at = page._timeline._drawn_at = 0.0
-    page._cameras._drawn_at = 0.0
+    page._cameras._drawn_at = page._status_at = 0.0
     page.redraw()
 
 
