@@ -44,6 +44,7 @@ class ReviewCurves:
         self._entry.on_update(lambda _: self._choose())
         self._charts: dict[str, viser.GuiUplotHandle] = {}
         self._drawn: object = None
+        self._lines_drawn: object = None
         self._drawn_at = self._numbers_at = 0.0
         self._found: dict[str, dict[str, Lines]] = {}
         self._wish = ""
@@ -68,8 +69,12 @@ class ReviewCurves:
         self._offer(view, shown)
         self._draw_entry("reward", REWARD, view, shown)
         self._draw_entry("also", self._entry.value if self._entry.visible else "", view, shown)
-        self._draw_lines("terms", TERMS, view)
-        self._draw_lines("action", ACTION, view)
+        lines = (view.opened_serial, view.selected, view.anchors, len(view.opened))
+        if lines != self._lines_drawn:
+            # They do not follow the position, and a chart that is sent anew is drawn anew.
+            self._lines_drawn = lines
+            self._draw_lines("terms", TERMS, view)
+            self._draw_lines("action", ACTION, view)
 
     # --- numbers -------------------------------------------------------------------------------------
 

@@ -51,6 +51,8 @@ log = logging.getLogger(__name__)
 
 FRAME = 1 / 30
 """Seconds, as the live page's."""
+STATUS_EVERY = 0.1
+"""Seconds. Faster, its numbers cannot be read."""
 PANEL_WIDTH = 340
 LIBRARY_WIDTH = 520
 NARROW = 700
@@ -127,6 +129,7 @@ class ReviewPage:
         self._labels: list[viser.LabelHandle] = []
         self._labelled: object = None
         self._had_opened = tuple(one.id for one in review.view().opened)
+        self._status_at = 0.0
         self._built_for = 0
         """How many triangles the scene was built for."""
 
@@ -247,7 +250,9 @@ class ReviewPage:
             self._draw_scene(view)
         self._server.flush()
         self._make_way_for_the_first(view)
-        fill(self._status, status_html(view))
+        if time.monotonic() - self._status_at >= STATUS_EVERY:
+            self._status_at = time.monotonic()
+            fill(self._status, status_html(view))
         self._panel.draw(view)
         self._timeline.draw(view)
         self._draw_cameras(view)
