@@ -336,6 +336,7 @@ def test_an_installed_task_is_copied_opened_and_the_placement_planned_in_the_cop
         assert view.task.file == str(file) == view.studio.writing.edit.file
         assert view.task.env_id == "MyPushCube2-v1" and view.reload.level == "rebuilt"
         assert view.reload.reason == "push_cube_2.py was opened in place of PushCubeEnv"
+        assert view.studio.writing.message.startswith(f"This is your copy of the task, {file}. This is what")
         assert moved(view) == {BASE}, "the placement is lost"
         session.studio.write()
         view = wait_until(session, said(lambda s: s.writing.stage in ("checked", "mismatch")), "the check")

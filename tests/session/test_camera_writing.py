@@ -13,6 +13,7 @@ import pytest
 from tests.session.conftest import wait_until
 from tests.session.test_camera_studio import BASE, camera, moved, said
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
+from workbench.session.camera_writing import Wish, copy, plan
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
 from workbench.session.studio_view import Writing
@@ -134,3 +135,26 @@ def test_a_change_with_which_the_file_does_not_load_says_so_and_is_taken_back(
         session, lambda v: v.problem is None and "as it was before." in v.studio.writing.message, "it back"
     )
     assert task_file.read_text() == before
+
+
+def test_a_read_only_file_may_be_copied_and_one_with_modules_beside_it_may_not(
+    session: Session, task_file: Path, tmp_path: Path
+) -> None:
+    task = session.view().task
+    wish = Wish("add", ("human", "side"), there(session, ("human", "render_camera")))
+    assert not plan(task, None, wish).can_copy, "it can be edited where it is"
+    task_file.chmod(0o444)
+    try:
+        refused = plan(task, None, wish)
+        assert refused.can_copy and "is read-only" in refused.message
+        file, told = copy(task, tmp_path)
+        assert file == tmp_path / task_file.name and "MyWorkbenchPushCube-v1" in told.message
+        assert file.stat().st_mode & 0o200, "the copy is there to be edited"
+        helper = tmp_path / "helper.py"
+        helper.touch()
+        with_helper = replace(task, source_files=(*task.source_files, str(helper)))
+        assert not plan(with_helper, None, wish).can_copy
+        file, told = copy(replace(task, file=str(tmp_path / "gone.py")), tmp_path)
+        assert file is None and told.message.startswith("Not copied: gone.py cannot be read")
+    finally:
+        task_file.chmod(0o644)

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.authoring import camera_files
-from workbench.core.camera_frames import Convention, Direction, relative_to, with_pose
+from workbench.core.camera_frames import Convention, Direction, with_pose
 from workbench.core.camera_settings import (
     CameraKey,
     CameraKind,
@@ -32,6 +32,7 @@ from workbench.core.camera_settings import (
 )
 from workbench.core.pictures import CameraInfo
 from workbench.core.step import StepResult
+from workbench.session import camera_in_words
 from workbench.session.camera_judging import CameraJudging, ShownMoment
 from workbench.session.camera_messages import CameraAnswer
 from workbench.session.camera_writing import CameraWriting, Wish, copy, plan
@@ -336,11 +337,7 @@ class CameraStudio:
         """
         with self._lock:
             cameras = [self._to_export(key) for key in keys]
-        if form == "json":
-            return camera_files.cameras_as_json(cameras)
-        if form == "opencv":
-            return camera_files.cameras_as_opencv_yaml(cameras)
-        return "---\n".join(camera_files.camera_as_ros_yaml(camera) for camera in cameras)
+        return camera_in_words.exported(cameras, form)
 
     def _to_export(self, key: CameraKey) -> camera_files.CameraToExport:
         info, now = self._info(key), self._placements.now(key)
@@ -363,21 +360,12 @@ class CameraStudio:
         Raises:
             ValueError: with a sentence for the reader.
         """
-        found = camera_files.find_poses(text)
-        chosen = [pose for pose in found if key[1] in pose.label] or list(found)
-        if len(chosen) > 1:
-            labels = ", ".join(pose.label for pose in chosen)
-            raise ValueError(f"there are several poses in it ({labels}): paste the one that is meant")
-        pose = camera_files.camera_pose(chosen[0], convention, direction, metres_per_unit)
         with self._lock:
             info, now = self._info(key), self._placements.now(key)
             mount = None if info is None else self._mount_pose(info, *self._drawn)
         if now is None or info is None:
             raise ValueError(f"there is no {key[0]} camera {key[1]} that can be placed")
-        if chosen[0].said is not None and info.mount is not None:
-            if mount is None:
-                raise ValueError(f"where {info.mount} is, on which {key[1]} rides, is not known yet")
-            pose = relative_to(mount, pose)  # ours is of the env's frame
+        pose = camera_in_words.imported(info, mount, text, direction, convention, metres_per_unit)
         self.place(key, with_pose(now, pose))
 
     # --- what the page reads ---------------------------------------------------------------------------

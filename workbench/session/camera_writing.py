@@ -154,17 +154,22 @@ class CameraWriting:
         self.wish: Wish | None = None
         self.copy: Path | None = None
         """Of the task, which is being opened."""
+        self._just_copied = ""
+        """What is said first of the plan in it."""
 
     def planned(self, wish: Wish, view: Writing) -> None:
+        if self._just_copied:
+            view, self._just_copied = replace(view, message=f"{self._just_copied} {view.message}"), ""
         self.wish, self.view = wish, view
 
     def drop(self) -> None:
-        self.wish, self.view, self.copy = None, Writing(), None
+        self.wish, self.view, self.copy, self._just_copied = None, Writing(), None, ""
 
     def copied(self, copy: Path | None, view: Writing) -> None:
         """The task was copied, or not: the wish waits until its copy is there."""
         self.copy = copy
         self.view = view if copy is not None else replace(view, key=self.view.key)
+        self._just_copied = "" if copy is None else f"This is your copy of the task, {copy}."
 
     def wish_for(self, task: TaskDescription) -> Wish | None:
         """What was wanted of the task whose copy this is, if this is the one that is awaited."""

@@ -237,7 +237,8 @@ def report_html(
     unit = "envs"
     if moments:
         span = moments[0]["words"] if count == 1 else f"{moments[0]['words']} to {moments[-1]['words']}"
-        over, unit = f"{count} moments of env {report.envs[-1]}'s episode, {span}", "steps"
+        many = "1 moment" if count == 1 else f"{count} moments"
+        over, unit = f"{many} of env {report.envs[-1]}'s episode, {span}; press a step to go there", "steps"
     width, height = report.judged_size
     return render(
         "camera_report",
