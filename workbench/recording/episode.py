@@ -1,18 +1,28 @@
-"""One episode of one env, as columns, before it becomes a file.
+"""One episode of one env, as columns: what every file of it is written from, and what reading one gives.
 
-Rerun takes columns forty times faster than calls a step (measured), and ManiSkill's own format is
-columns too; so an episode is gathered as columns once and every file is written from them.
+Rerun takes columns forty times faster than calls a step (measured), ManiSkill's own format is columns
+too, and a review, a replay and a dataset all ask for whole columns. Only pictures are not plain arrays:
+an hour of four cameras is more than a machine holds, so they stay encoded until one is looked at
+(`EncodedPictures`).
 """
 
 from __future__ import annotations
 
+import datetime
+import uuid
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import CameraInfo
+from workbench.recording.encoded_pictures import EncodedPictures
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
 
 
 @dataclass(frozen=True)
@@ -24,15 +34,28 @@ class EpisodeInfo:
     seed: int
     """Episode seed; below 0 where it is not known."""
     source_file: str | None
+    """The task's own file. Of a recording that was read: its path where it is still there, else its name alone."""
     source_hash: str
     source: dict[str, str]
-    """Path to text of the task's own files."""
+    """Path to text of the task's own files; of a recording that was read, paths as seen from `source_file`'s folder."""
     control_dt: float
     """Seconds of simulated time per step."""
     control_mode: str | None
     backend: str
     versions: dict[str, str] = field(default_factory=dict)
     """Package name to version."""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keywords of ``gym.make`` that make this env (``robot_uids``, ``obs_mode``, ``control_mode`` ...), as JSON can say
+    them."""
+    reset_options: dict[str, Any] = field(default_factory=dict)
+    """``options`` of the reset that began the episode."""
+    max_episode_steps: int | None = None
+    written_at: str = field(default_factory=_now)
+    """When it was recorded, ISO 8601 in UTC."""
+    id: str = field(default_factory=lambda: uuid.uuid4().hex)
+    """Unique for ever, whatever the files are called."""
+    recovered: bool = False
+    """Its writer ended in the middle; the episode is cut where that was."""
 
 
 @dataclass
@@ -44,12 +67,9 @@ class CameraTrack:
     """(P,) state index 0..T of each picture."""
     pose: NDArray[np.float32]
     """(P, 7) camera pose in the env's frame, ManiSkill convention (x forward, y left, z up), wxyz."""
-    rgb: NDArray[np.uint8] | None
-    """(P, H, W, 3)"""
-    depth: NDArray[np.float32] | None
-    """(P, H, W) metres, 0 = nothing."""
-    segmentation: NDArray[np.int32] | None
-    """(P, H, W)"""
+    rgb: EncodedPictures | None = None
+    depth: EncodedPictures | None = None
+    segmentation: EncodedPictures | None = None
 
 
 @dataclass
@@ -57,10 +77,11 @@ class Episode:
     """T actions and T + 1 states of one env. State 0 is the reset; action t leads to state t + 1."""
 
     info: EpisodeInfo
-    geometry: SceneGeometry
+    geometry: SceneGeometry | None
+    """Of this env alone (one env, index 0) where it was read from a recording; None where a recording holds no scene."""
     segmentation: dict[int, str]
-    poses: NDArray[np.float32]
-    """(T + 1, B, 7) position and wxyz of every body; NaN rows for bodies this env lacks."""
+    poses: NDArray[np.float32] | None
+    """(T + 1, B, 7) position and wxyz of every body; NaN rows for bodies this env lacks. None without a scene."""
     action: NDArray[np.float32]
     """(T, A)"""
     action_names: tuple[str, ...]
@@ -71,6 +92,15 @@ class Episode:
     truncated: NDArray[np.bool_]
     """(T,)"""
     evaluate: dict[str, NDArray]
-    """(T + 1, ...) every entry of ``evaluate()``; ``success`` and ``fail`` are among them if the
-    task has them."""
+    """(T + 1, ...) every entry of ``evaluate()``; ``success`` and ``fail`` are among them if the task has them, and the
+    terms of the reward under ``reward_terms/`` if it names any. NaN where a state lacks an entry."""
     cameras: list[CameraTrack]
+    env_states: dict[str, NDArray] = field(default_factory=dict)
+    """``actors/cube``, ``articulations/panda``, each (T + 1, D) as ManiSkill's ``get_state_dict`` lays it out."""
+    obs: dict[str, NDArray] = field(default_factory=dict)
+    """State observations flattened by ``/``, each (T + 1, ...); no pictures. The key of one that was no dict is ``""``."""
+
+    @property
+    def length(self) -> int:
+        """T, the number of control steps."""
+        return len(self.reward)
