@@ -193,21 +193,29 @@ def record(
 
 
 @app.command
-def view(files: Annotated[tuple[Path, ...], tyro.conf.Positional], /, web: bool = False) -> int:
+def view(
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    /,
+    web: bool = False,
+    host: str = "127.0.0.1",
+    port: int = 0,
+) -> int:
     """Open recordings in rerun's own viewer: a window, or a page where there is no screen.
 
     Args:
         files: one or more .rrd files.
-        web: a page, also where there is a screen; it is served on this machine only and asks no other.
+        web: a page, also where there is a screen; it asks nobody but this program.
+        host: address to serve the page on.
+        port: port of the page; 0 takes any free one.
     """
-    from workbench.recording.viewer import open_in_rerun
+    from workbench.recording.viewer import has_screen, open_window, recordings_among
 
     try:
-        viewer = open_in_rerun(files, web=True if web else None)
+        if web or not has_screen(os.environ):
+            return _view_in_page(recordings_among(files), host, port)
+        viewer = open_window(files)
     except (OSError, ValueError, RuntimeError) as error:
         return _refuse(str(error))
-    if viewer.url is not None:
-        print(f"  page    {viewer.url}\n  Ctrl-C ends it.", flush=True)
     try:
         viewer.wait()
     except RuntimeError as error:
@@ -216,6 +224,28 @@ def view(files: Annotated[tuple[Path, ...], tyro.conf.Positional], /, web: bool 
         print("closing", flush=True)
     finally:
         viewer.close()
+    return 0
+
+
+def _view_in_page(files: Sequence[Path], host: str, port: int) -> int:
+    from workbench.recording.web_viewer import web_viewer_folder
+    from workbench.ui.door import DoorOptions, open_door
+    from workbench.ui.offers import Offers
+    from workbench.ui.rerun_view import RerunPages
+
+    web_viewer_folder()
+    door = open_door(DoorOptions(host=host, port=port))
+    try:
+        address = RerunPages(door, Offers(door)).address(files)
+        if door.warning:
+            err.print(f"[yellow]{escape(door.warning)}[/]")
+        print(f"  page    {door.address(address)}", flush=True)
+        print(f"  remote  {door.ssh_hint}\n  Ctrl-C ends it.", flush=True)
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        print("closing", flush=True)
+    finally:
+        door.close()
     return 0
 
 

@@ -1,0 +1,170 @@
+"""Recordings in rerun's own viewer, beside the page or in a tab of its own, through the page's one door.
+
+rerun's web viewer is a program of 43 MB that looks at any address it is given and tells its makers that it runs. Here
+it comes from the wheel that wrote the recordings (so file and viewer are of one version), packed; it is served under
+the page's own address, where the same cookie lets it in and one forwarded port carries all of it; and a content
+security policy lets it talk to nobody else.
+
+Which recordings it opens stands in its address, and has to be a whole address there, host and port included. What
+host a browser sees is known in the browser alone (behind ``ssh -L`` it is another one), so the page that is opened
+is a small one of ours that puts the addresses together and goes on to rerun's.
+"""
+
+from __future__ import annotations
+
+import gzip
+import html
+import json
+import secrets
+import threading
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+
+import viser
+
+from workbench.recording.web_viewer import VIEWER_FILES, VIEWER_POLICY, is_kept, viewer_file
+from workbench.ui.changed import fill, show
+from workbench.ui.door import Door
+from workbench.ui.file_reply import FileReply
+from workbench.ui.fragments import render
+from workbench.ui.offers import Offers
+
+WIDTH = 720
+"""Pixels of the docked panel; rerun's own panels are folded away in our recordings."""
+
+_SHOW = "/rerun/show/"
+_VIEWER = f"/rerun/viewer-{version('rerun-sdk')}/"
+_GO_ON = """<!doctype html><meta charset="utf-8"><title>Workbench: {title}</title>
+<style>body {{ background: #0d1011; color: #cad8de; font: 14px system-ui, sans-serif; margin: 2em }}</style>
+<p>Opening {title} in rerun&hellip;</p>
+<script>
+const query = new URLSearchParams([["hide_welcome_screen", "1"], ["persist", "0"]]);
+for (const path of {paths}) query.append("url", location.origin + path);
+// rerun's own look-ups of a fast graphics driver end in a dialog where there is none.
+if (!navigator.gpu) query.append("renderer", "webgl");
+location.replace({viewer} + "index.html?" + query);
+</script>
+"""
+
+_WITH_COOKIE = b"""<script>
+const fetch_as_told = window.fetch;
+window.fetch = (what, how) => fetch_as_told(what, { ...how, credentials: "same-origin" });
+</script>"""
+"""rerun fetches recordings without cookies (0.41), and the door lets nobody in without."""
+
+
+class RerunPages:
+    """The addresses under which recordings are shown. One a door."""
+
+    def __init__(self, door: Door, offers: Offers) -> None:
+        self._offers = offers
+        self._lock = threading.Lock()
+        self._shown: dict[str, tuple[Path, ...]] = {}
+        self._keys: dict[tuple[Path, ...], str] = {}
+        headers = {"Content-Security-Policy": VIEWER_POLICY, "Cache-Control": "private, max-age=604800"}
+        door.add_route(_VIEWER, _viewer_file, headers)
+        door.add_route(_SHOW, self._go_on, {**headers, "Cache-Control": "no-store"})
+
+    def address(self, recordings: Sequence[Path]) -> str:
+        """The address, from the root of the server, that opens these ``.rrd`` files together."""
+        paths = tuple(Path(path).resolve() for path in recordings)
+        with self._lock:
+            key = self._keys.setdefault(paths, secrets.token_urlsafe(16))
+            self._shown[key] = paths
+        return f"{_SHOW}{key}/"
+
+    def _go_on(self, asked: str) -> tuple[int, str, bytes]:
+        with self._lock:
+            paths = self._shown.get(asked.partition("/")[0])
+        if paths is None:
+            return 404, "text/plain; charset=utf-8", b"There is no such recording."
+        names = ", ".join(path.stem for path in paths)
+        page = _GO_ON.format(
+            title=html.escape(names),
+            # "</script>" in a file's name would end the script.
+            paths=json.dumps([self._offers.address(path) for path in paths]).replace("<", "\\u003c"),
+            viewer=json.dumps(_VIEWER),
+        )
+        return 200, "text/html; charset=utf-8", page.encode()
+
+
+def _viewer_file(name: str) -> tuple[int, str, bytes] | FileReply:
+    if name not in VIEWER_FILES:
+        return 404, "text/plain; charset=utf-8", b"There is no such file."
+    if name == "index.html":
+        page = gzip.decompress(viewer_file(name).read_bytes())
+        before, head, after = page.partition(b"<head>")
+        return 200, VIEWER_FILES[name], before + head + _WITH_COOKIE + after
+    return FileReply(viewer_file(name), VIEWER_FILES[name], gzipped=True)
+
+
+class RerunView:
+    """Buttons in the present container that open recordings in rerun, and the panel in which they are shown.
+
+    Args:
+        server: The page.
+        pages: Where rerun is served.
+    """
+
+    def __init__(self, server: viser.ViserServer, pages: RerunPages) -> None:
+        self._server, self._pages = server, pages
+        self._paths: tuple[Path, ...] = ()
+        self._panel: viser.GuiPanelHandle | None = None
+        self._lock = threading.Lock()
+        self._problem = ""
+        self._waiting = False
+        self._button = server.gui.add_button("Open in rerun", icon=viser.Icon.APP_WINDOW, disabled=True)
+        self._close = server.gui.add_button("Close rerun", icon=viser.Icon.X, visible=False)
+        self._words = server.gui.add_html("")
+        self._button.on_click(lambda _: self.open())
+        self._close.on_click(lambda _: self.close())
+
+    def draw(self, paths: Sequence[Path]) -> None:
+        """From now on the buttons are about these ``.rrd`` files."""
+        self._paths = tuple(paths)
+        disabled = not self._paths or self._waiting
+        if self._button.disabled != disabled:
+            self._button.disabled = disabled
+        show(self._close, self._panel is not None)
+        words = render(
+            "rerun",
+            address=self._pages.address(self._paths) if self._paths else None,
+            waiting=self._waiting,
+            problem=self._problem,
+        )
+        fill(self._words, words)
+
+    def open(self) -> None:
+        """Show the recordings in a panel beside the scene; returns when the viewer is there to be loaded."""
+        paths = self._paths
+        with self._lock:
+            if not paths or self._waiting:
+                return
+            self._waiting, self._problem = not is_kept(), ""
+        try:
+            if self._waiting:
+                self.draw(paths)
+                viewer_file("index.html")
+        except RuntimeError as error:
+            self._problem = str(error)
+            return
+        finally:
+            self._waiting = False
+            self.draw(self._paths)
+        self.close()
+        with self._lock:
+            self._panel = panel = self._server.gui.add_panel(order=6.0)
+        with panel.add_tab("rerun", viser.Icon.APP_WINDOW):
+            self._server.gui.add_html(render("rerun_frame", address=self._pages.address(paths)))
+        panel.dock_left()
+        panel.set_width(WIDTH)
+        self.draw(self._paths)
+
+    def close(self) -> None:
+        """Take the panel away, and the program that runs in it."""
+        with self._lock:
+            panel, self._panel = self._panel, None
+        if panel is not None:
+            panel.remove()
+        show(self._close, False)
