@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import subprocess
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -52,24 +52,21 @@ def write_mp4(
     first = next(coming, None)
     if first is None:
         raise ValueError("There is no picture to make a film of.")
-    with new_file(path) as temporary, _Encoder(temporary, first.shape, fps, encoding) as encoder:
-        count = 0
-        for frame in _with(first, coming):
-            encoder.add(frame)
-            count += 1
-    return count
+    with new_file(path) as temporary, FilmWriter(temporary, first.shape, fps, encoding) as film:
+        film.add(first)
+        for frame in coming:
+            film.add(frame)
+    return len(film)
 
 
-def _with(first: NDArray[np.uint8], rest: Iterator[NDArray[np.uint8]]) -> Iterator[NDArray[np.uint8]]:
-    yield first
-    yield from rest
+class FilmWriter:
+    """An ffmpeg that writes an mp4 at `path` and takes frames until `close`; see `write_mp4` for what is raised.
 
-
-class _Encoder:
-    """An ffmpeg that takes frames until its block ends."""
+    As a context it closes at the end of the block, and ends ffmpeg at once where the block raised.
+    """
 
     def __init__(self, path: Path, shape: tuple[int, ...], fps: float, encoding: Encoding) -> None:
-        self._shape = shape
+        self._shape, self._count = shape, 0
         height, width = shape[:2]
         odd = bool(height % 2 or width % 2)
         self._pad = odd and not encoding.exact_size
@@ -91,7 +88,7 @@ class _Encoder:
             start_new_session=True,
         )
 
-    def __enter__(self) -> _Encoder:
+    def __enter__(self) -> FilmWriter:
         return self
 
     def add(self, frame: NDArray[np.uint8]) -> None:
@@ -106,17 +103,28 @@ class _Encoder:
         except OSError:
             self._process.wait()
             raise self._error() from None
+        self._count += 1
+
+    def __len__(self) -> int:
+        """Frames so far."""
+        return self._count
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        self.close(abandoned=error is not None)
+
+    def close(self, abandoned: bool = False) -> None:
+        """Finish the file; one that is `abandoned` is left as it is. Can be called twice."""
+        if self._said.closed:
+            return
         assert self._process.stdin is not None
         try:
-            if error is not None:
+            if abandoned:
                 self._process.kill()
             try:
                 self._process.stdin.close()
             except OSError:
                 pass  # it is gone; its exit status says why
-            if self._process.wait() and error is None:
+            if self._process.wait() and not abandoned:
                 raise self._error()
         finally:
             self._said.close()

@@ -65,7 +65,6 @@ def _recorded(server, episode: Episode, eye: Eye, on_progress: Callable[[float],
     assert geometry is not None and poses is not None
     env = 0 if geometry.num_envs == 1 else episode.info.env_index
     server.scene.set_up_direction("+z")
-    light(server)
     camera = server.initial_camera
     camera.position, camera.look_at, camera.up, camera.fov = eye.position, eye.look_at, eye.up, eye.fovy
     camera.near, camera.far = 0.05, 300.0
