@@ -89,7 +89,7 @@ def open_page(
     except (ValueError, DoorError) as error:
         return _refuse(str(error))
     from workbench.session.session import Session
-    from workbench.ui.page import Page
+    from workbench.ui.put_together import Workplace
 
     _use_private_driver()
     for line in (door.warning, door.notice):
@@ -112,15 +112,15 @@ def open_page(
         on_event=on_event,
         on_line=_echo,
     )
-    page = Page(door.server, session)
+    place = Workplace(door.server, recordings, session)
     end.at_signals()
     try:
-        page.start()
-        _announce(door, task, num_envs)
+        place.pages.start("live")
+        _announce(door, f"{task}, {num_envs} envs")
         end.wait()
     finally:
         out.print("closing")
-        page.stop()
+        place.close()
         session.close()
         door.close()
     _leave(end.code)
@@ -130,66 +130,102 @@ def open_page(
 def record(
     task: Task,
     /,
-    episodes: int = 4,
+    episodes: int | None = None,
+    successes: int | None = None,
+    tries: int | None = None,
     num_envs: int = 4,
+    workers: int = 1,
     seed: int = 0,
     actions: str = "random",
+    use_env_states: bool = False,
     out: Path = Path("recordings"),
     pictures: bool = True,
     max_steps: int | None = None,
     backend: Backend = "auto",
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
 ) -> int:
-    """Record episodes of a task, one .rrd file each, without a page.
+    """Record episodes of a task without a page: for each an .rrd, and ManiSkill's own .h5 with its .json.
 
     Args:
         task: a task file, file.py:ClassName, or a registered env id such as PickCube-v1.
-        episodes: how many, over all envs.
-        num_envs: environments to run at once.
+        episodes: how many, over all envs; 4, or as many as a file of actions has.
+        successes: go on until so many episodes succeeded, and keep no others.
+        tries: give up after so many episodes where successes are wanted; 100 for each.
+        num_envs: environments to run at once, over all workers.
+        workers: processes, each with its share of the envs; the episodes are the same with any number.
         seed: seed of the first episode; each further one counts up.
-        actions: random, zero, hold, or a policy as module:function or file.py:function.
+        actions: random, zero, hold; a policy as module:function or file.py:function; or a file: .npy or .npz with
+            actions, or .h5 with ManiSkill's demonstrations, which begin from their own seeds.
+        use_env_states: put every env state of a demonstration back after its step.
         out: folder for the files.
         pictures: record what every camera sees (--no-pictures is much faster).
         max_steps: longest episode; else the task's own limit.
         backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (gpu if it works).
         env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
     """
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
     _use_private_driver()
-    from workbench.authoring.problem import TaskError
+    from workbench.record_command import record_in_terminal
     from workbench.session.record import RecordOptions
-    from workbench.session.record import record as record_episodes
 
     try:
         options = _task_options(num_envs, backend, seed, env)
     except ValueError as error:
         return _refuse(str(error))
-    what = RecordOptions(task, out, episodes, actions, pictures, max_steps, options)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    what = RecordOptions(
+        task, out, episodes, successes, tries, actions, use_env_states, pictures, max_steps, workers, options
+    )
+    return record_in_terminal(what, err, _print_problem, _refuse)
+
+
+@app.command
+def review(
+    folder: Annotated[Path, tyro.conf.Positional] = Path("recordings"),
+    /,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    token: bool = True,
+    task: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = (),
+) -> int:
+    """Look through a folder of recordings in a browser page: play, compare, share. No task file is needed.
+
+    Args:
+        folder: where the recordings are, in folders below it too: .rrd, .h5 and .json of the workbench, and .h5
+            with .json of ManiSkill's RecordEpisode.
+        host: address to listen on; anything but this machine's own needs the token.
+        port: port of the page; 0 takes any free one.
+        token: ask for the token of the printed address (--no-token: this machine only).
+        task: a task file in which the envs of ManiSkill's recordings may be found; repeatable. Envs that ManiSkill
+            itself has need none.
+    """
+    from workbench.ui.door import DoorError, DoorOptions, open_door
+
+    if not folder.is_dir():
+        return _refuse(f"there is no folder {folder}; workbench record and the page's Episodes tab make one")
+    for file in task:
+        if not file.is_file():
+            return _refuse(f"there is no file {file}")
     try:
-        with Progress(*columns, console=err) as bar:
-            row = bar.add_task("opening", total=episodes)
-            written = record_episodes(
-                what,
-                on_activity=lambda activity: bar.update(row, description=activity),
-                on_progress=lambda now: bar.update(
-                    row, completed=now.episodes, description=f"recording, step {now.steps}"
-                ),
-            )
-            bar.update(row, completed=len(written), description="recorded")
-    except TaskError as error:
-        _print_problem(error.problem)
-        return 1
-    except (OSError, ValueError) as error:
+        door = open_door(DoorOptions(host=host, port=port, token=token), label="Recordings")
+    except (ValueError, DoorError) as error:
         return _refuse(str(error))
-    except KeyboardInterrupt:
-        return _refuse("interrupted; episodes that had ended are kept")
-    for episode in written:
-        ended = {None: "", True: "success", False: "no success"}[episode.success]
-        print(f"{episode.path}  {episode.steps} steps  return {episode.total_reward:.3f}  {ended}".rstrip())
-    print(f"Open one with: workbench view {written[0].path}")
-    return 0
+    from workbench.ui.put_together import Workplace
+
+    _use_private_driver()
+    for line in (door.warning, door.notice):
+        if line:
+            err.print(f"[yellow]{escape(line)}[/]")
+    end = _End()
+    place = Workplace(door.server, folder, tasks=task)
+    end.at_signals()
+    try:
+        place.pages.start("review")
+        _announce(door, f"recordings in {folder}")
+        end.wait()
+    finally:
+        out.print("closing")
+        place.close()
+        door.close()
+    _leave(end.code)
 
 
 @app.command
@@ -298,8 +334,8 @@ class _End:
         self._due.wait()
 
 
-def _announce(door: Door, task: str, num_envs: int) -> None:
-    out.print(f"[bold]Workbench[/] {workbench.__version__}: {escape(task)}, {num_envs} envs", soft_wrap=True)
+def _announce(door: Door, what: str) -> None:
+    out.print(f"[bold]Workbench[/] {workbench.__version__}: {escape(what)}", soft_wrap=True)
     # Not through rich, which would break the address in a narrow terminal.
     print(f"  page    {door.url}", flush=True)
     print(f"  remote  {door.ssh_hint}", flush=True)

@@ -14,7 +14,7 @@ was read, 1,200 us since; 850 of these are ManiSkill's own torch calls.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -97,10 +97,10 @@ class ContactReader:
     def invalidate(self) -> None:
         self._cache = None
 
-    def stepped(self) -> None:
-        """A substep was made: the systems' own lists hold again."""
+    def stepped(self, but: Collection[int] = ()) -> None:
+        """A substep was made of all systems but these: their own lists hold again."""
         self._cache = None
-        self._carried.clear()
+        self._carried = {env: touching for env, touching in self._carried.items() if env in but}
 
     def counted(self) -> list[tuple[tuple[int, int], NDArray[np.float32]]]:
         """The ids of the two bodies, and the impulse on the first, of every contact that a query counts."""

@@ -19,7 +19,7 @@ What makes it quick:
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -103,6 +103,26 @@ class BatchedCpuSystem:
         """One substep of every env."""
         if self.stepper.step():
             self._stepped()
+
+    def hold_still(self, envs: Collection[int]) -> None:
+        """From now on PhysX does not step these envs; the others and the task's hooks go on."""
+        self._catch_up()
+        self.stepper.forget()
+        self.stepper.still = frozenset(envs)
+
+    def keep_drives(self, envs: Sequence[int], flags: Sequence[NDArray[np.bool_]]) -> None:
+        """Forget drive targets that were written for these envs while they stood still.
+
+        Args:
+            flags: `drive_flags` as they were before.
+        """
+        env_of = {id(scene): env for env, scene in enumerate(self.scenes)}
+        chosen = set(envs)
+        for row, articulation in enumerate(self._laid_out.articulations):
+            if env_of[id(articulation.root.entity.scene)] in chosen:
+                for now, was in zip(self.drive_flags, flags, strict=True):
+                    now[row] = was[row]
+        self._fetch_targets()
 
     @contextmanager
     def merging(self, substeps: int) -> Iterator[None]:
@@ -284,7 +304,7 @@ class BatchedCpuSystem:
         self._moved()
 
     def _stepped(self) -> None:
-        self.contacts.stepped()
+        self.contacts.stepped(self.stepper.still)
         self._moved()
 
     def _moved(self) -> None:

@@ -13,6 +13,8 @@ upgrade fails loudly there and not in the middle of an author's task.
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property, wraps
 from itertools import islice
 from types import FrameType
@@ -195,6 +197,20 @@ def set_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: list[int]) -> Non
     env._episode_rng = env._batched_episode_rng[0]
 
 
+@contextmanager
+def drawing_from(env: BaseEnv, index: int) -> Iterator[None]:
+    """Within this ``_episode_rng``, from which the robot's first joints are drawn, is the generator of that env.
+
+    ManiSkill keeps it for code that was written for one env, and it is env 0's for good: a partial reset of env 3
+    would draw on from wherever env 0's episode got to, whatever its own seed.
+    """
+    env._episode_rng = env._batched_episode_rng[index]
+    try:
+        yield
+    finally:
+        env._episode_rng = env._batched_episode_rng[0]
+
+
 def keep_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: NDArray[np.int64]) -> None:
     """Say that these envs were reset with these seeds; their generators are left as they are."""
     every = np.array(env._episode_seed, dtype=np.int64)
@@ -212,6 +228,16 @@ def set_reset_mask(env: BaseEnv, env_idx: list[int]) -> None:
 def keep_observation(env: BaseEnv, obs: Any) -> None:
     """What ``reset`` and ``step`` do with what they observed: ``_last_obs``."""
     env._last_obs = obs
+
+
+def last_observation(env: BaseEnv) -> Any:
+    """What ``reset`` or ``step`` observed last, before any wrapper: ``_last_obs``."""
+    return env._last_obs
+
+
+def task_class(env: BaseEnv) -> type[BaseEnv]:
+    """The author's class, without what the CPU core puts in front of it."""
+    return getattr(type(env), "_workbench_task", type(env))
 
 
 def episode_generators(env: BaseEnv) -> dict[str, list[np.random.RandomState]]:
@@ -241,6 +267,17 @@ def data_rows_of(struct: Any) -> torch.Tensor:
     Only where ``scene.gpu_sim_enabled``, for what is not static, and after ``gpu_init``.
     """
     return struct._body_data_index
+
+
+def robots(env: Any) -> list[Articulation]:
+    """Those of ``env.agent``, which must be there."""
+    agent = env.agent
+    return [one.robot for one in (agent.agents if isinstance(agent, MultiAgent) else [agent])]
+
+
+def data_rows_of_articulation(articulation: Any) -> torch.Tensor:
+    """Its row of each env in the tensors of joints, ``px.cuda_articulation_qpos`` and its kin: ``_data_index``."""
+    return articulation._data_index
 
 
 def hidden_objects(env: Any) -> list[Any]:

@@ -60,6 +60,8 @@ class Stepper:
         self._writes: list[Callable[[int], None]] = []
         self._packs: list[bytes] | None = None
         self._pose_packs: list[bytes] | None = None
+        self.still: frozenset[int] = frozenset()
+        """Envs that are neither stepped nor given drive targets; their numbers stay."""
 
     def renew(self, env: int) -> None:
         """Another system stands in the list for this env."""
@@ -99,7 +101,7 @@ class Stepper:
         """Make the writes that were put off."""
         writes, self._writes = self._writes, []
         for env in range(len(self._systems)) if writes else ():
-            for write in writes:
+            for write in writes if env not in self.still else ():
                 write(env)
 
     def catch_up(self) -> None:
@@ -114,11 +116,12 @@ class Stepper:
         packing = count > 1
 
         def advance(env: int) -> None:
-            for write in writes:
-                write(env)
-            step = self.step_once[env]
-            for _ in range(count):
-                step()
+            if env not in self.still:
+                for write in writes:
+                    write(env)
+                step = self.step_once[env]
+                for _ in range(count):
+                    step()
             if packing:
                 packs[env] = self._systems[env].pack()
                 pose_packs[env] = self._scenes[env].pack_poses()

@@ -8,7 +8,7 @@ GPU simulation, and the caller need not know which.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -24,7 +24,14 @@ from workbench.core.body_table import BodyTable, build_body_table, read_poses
 from workbench.core.contact_list import Contact, list_contacts
 from workbench.core.cpu_scene import batched_class
 from workbench.core.render_device import keep_render_device
-from workbench.core.seams import episode_seeds, flatten_observation, keep_observation, set_episode_seeds
+from workbench.core.seams import (
+    drawing_from,
+    episode_seeds,
+    flatten_observation,
+    keep_observation,
+    last_observation,
+    set_episode_seeds,
+)
 from workbench.core.snapshot import (
     RestoreReport,
     Snapshot,
@@ -164,7 +171,10 @@ class TaskEnv:
         return self.env.control_timestep
 
     def reset(
-        self, seed: int | Sequence[int] | None = None, env_idx: Sequence[int] | None = None
+        self,
+        seed: int | Sequence[int] | None = None,
+        env_idx: Sequence[int] | None = None,
+        options: Mapping[str, Any] | None = None,
     ) -> StepResult:
         """Start new episodes in all envs, or in those of `env_idx`.
 
@@ -176,6 +186,7 @@ class TaskEnv:
         Args:
             seed: one seed for the whole batch (the i-th env that is reset gets ``seed + i``), or one for
                 each env that is reset; None goes on with the task's own random numbers.
+            options: further ``options`` for the task's own ``reset``.
         """
         chosen = list(range(self.num_envs)) if env_idx is None else [int(i) for i in env_idx]
         if not chosen:
@@ -184,22 +195,24 @@ class TaskEnv:
             raise IndexError(f"env_idx {chosen} is out of range for {self.num_envs} envs")
         seeds = _seed_list(seed, len(chosen))
         if env_idx is None:
-            self.obs, info = self.env.reset(seed=seeds)
+            self.obs, info = self.env.reset(seed=seeds, options=dict(options or {}))
         else:
-            self.obs, info = self._partial_reset(chosen, seeds)
+            self.obs, info = self._partial_reset(chosen, seeds, options or {})
         info = {key: value for key, value in info.items() if key != "reconfigure"}
         self._refresh_if_rebuilt()
         if self._check is not None:
             self._check(info, None)
         return self._result(info, np.zeros(self.num_envs, np.float32), self._terminated(info), None)
 
-    def _partial_reset(self, chosen: list[int], seeds: list[int] | None) -> tuple[Any, dict[str, Any]]:
-        options = {"env_idx": torch.tensor(chosen, device=self.env.device)}
+    def _partial_reset(
+        self, chosen: list[int], seeds: list[int] | None, further: Mapping[str, Any]
+    ) -> tuple[Any, dict[str, Any]]:
+        options = {**further, "env_idx": torch.tensor(chosen, device=self.env.device)}
         if seeds is None:
             return self.env.reset(options=options)
         set_episode_seeds(self.env, chosen, seeds)
         devices = [self.env.device] if self.env.device.type == "cuda" else []
-        with torch.random.fork_rng(devices=devices):
+        with torch.random.fork_rng(devices=devices), drawing_from(self.env, chosen[0]):
             torch.manual_seed(seeds[0])
             return self.env.reset(options=options)
 
@@ -257,6 +270,26 @@ class TaskEnv:
             self._check(info, given)
         return self._result(info, reward, self._terminated(info), action)
 
+    def result_of(
+        self,
+        info: Mapping[str, Any],
+        reward: Any,
+        terminated: Any,
+        truncated: Any,
+        action: NDArray[np.float32] | None,
+    ) -> StepResult:
+        """What somebody else's ``env.step`` (or ``env.reset``: no action) gave, who went past this object."""
+        self._refresh_if_rebuilt()
+        self.obs = last_observation(self.env)
+        info = {key: value for key, value in info.items() if key != "reconfigure"}
+        result = self._result(
+            info,
+            _batch(to_numpy(reward).astype(np.float32), self.num_envs),
+            _batch(to_numpy(terminated).astype(bool), self.num_envs),
+            action,
+        )
+        return replace(result, truncated=_batch(to_numpy(truncated).astype(bool), self.num_envs))
+
     @property
     def observes_pictures(self) -> bool:
         """Whether every step draws the scene for the observation."""
@@ -294,7 +327,9 @@ class TaskEnv:
         elapsed = to_numpy(self.env.elapsed_steps).astype(np.int32)
         limit = self.max_episode_steps
         truncated = np.zeros(self.num_envs, bool) if limit is None else elapsed >= limit
-        evaluate = {k: _batch(to_numpy(v), self.num_envs) for k, v in _flat(info) if k != "elapsed_steps"}
+        evaluate = {
+            k: _batch(to_numpy(v), self.num_envs) for k, v in flat_entries(info) if k != "elapsed_steps"
+        }
         return StepResult(
             elapsed_steps=elapsed,
             reward=reward,
@@ -315,10 +350,11 @@ def _seed_list(seed: int | Sequence[int] | None, count: int) -> list[int] | None
     return seeds
 
 
-def _flat(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flat_entries(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The leaves of a nested dict, named by the keys that lead to them, joined by ``/``."""
     for key, value in info.items():
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}/")
+            yield from flat_entries(value, f"{prefix}{key}/")
         else:
             yield f"{prefix}{key}", value
 

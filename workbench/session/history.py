@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.snapshot_bytes import WholeSnapshot
 from workbench.core.step import StepResult
-from workbench.session.messages import PastPictures, Pictures, Restored, Stepped
+from workbench.session.messages import NO_MOMENT, PastPictures, Pictures, Restored, Stepped
 from workbench.session.standing import Standing
 
 RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, NOT_A_NUMBER = 1, 2, 4, 8, 16, 32
@@ -267,7 +267,7 @@ class History:
         return [
             (moment.serial, moment.restored.origin)
             for moment in self._jumps
-            if moment.restored is not None and moment.jumped[env]
+            if moment.restored is not None and moment.restored.origin != NO_MOMENT and moment.jumped[env]
         ]
 
     def stretch_at(self, env: int, serial: int) -> tuple[int, int]:

@@ -18,6 +18,7 @@ from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.geometry import SceneGeometry
 from workbench.core.inspection import Inspection, Section
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
+from workbench.core.recorded_run import RecordedRun
 from workbench.core.step import StepResult
 from workbench.session.camera_messages import (
     CameraAnswer,
@@ -91,6 +92,8 @@ class TaskDescription:
     can_render: bool
     others: tuple[str, ...] = ()
     """Further task classes in the file."""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keywords of ``gym.make`` that make such an env, as far as JSON can say them."""
 
 
 # --- requests: server to worker ------------------------------------------------------------------
@@ -185,10 +188,13 @@ class PlaceCamera:
 
 @dataclass(frozen=True)
 class SetCapture:
-    """While on, every step comes back with the pictures of all cameras of these envs, to be recorded."""
+    """While on, every step comes back with the state columns of the batch, and with the pictures of all cameras of
+    these envs, to be recorded."""
 
     env_idx: tuple[int, ...]
     """Empty turns it off."""
+    from_reset: bool = False
+    """Of each of these envs from its next reset on: until then a picture would be made for nobody."""
 
 
 @dataclass(frozen=True)
@@ -205,6 +211,16 @@ class Restore:
     """The server's number of that moment; comes back as it is."""
     undoes: int | None = None
     """The server's number of the jump that this takes back, if it takes one back; comes back as it is."""
+
+
+@dataclass(frozen=True)
+class StepBack:
+    """Put envs into a state of a recorded episode; the answer is a `Stepped` with `Stepped.restored`."""
+
+    run: RecordedRun
+    """Up to the state."""
+    env_idx: tuple[int, ...]
+    """The envs to be set, all to the same state."""
 
 
 @dataclass(frozen=True)
@@ -254,6 +270,25 @@ class JudgeMoments:
 
 
 @dataclass(frozen=True)
+class MomentToCapture:
+    """A moment of the past of which some envs are to be recorded after the fact."""
+
+    snapshot: bytes
+    """A pickled `core.snapshot.Snapshot` of the whole batch."""
+    env_idx: tuple[int, ...]
+    """Those whose pictures are wanted."""
+
+
+@dataclass(frozen=True)
+class CaptureMoments:
+    """Put the envs back to these moments, and say what a recording would have kept; the answer is `Captured`. Only for a
+    worker that does not play."""
+
+    moments: tuple[MomentToCapture, ...]
+    pictures: bool
+
+
+@dataclass(frozen=True)
 class Quit:
     pass
 
@@ -272,10 +307,12 @@ Request = (
     | CameraQuestion
     | SetCapture
     | Restore
+    | StepBack
     | DrawPast
     | WarmUp
     | Inspect
     | JudgeMoments
+    | CaptureMoments
     | Quit
 )
 
@@ -328,9 +365,13 @@ class Failed:
     kept: bool
 
 
+NO_MOMENT = -1
+"""The `Restored.origin` of a state that is not of this history."""
+
+
 @dataclass(frozen=True)
 class Restored:
-    """What a `Restore` did."""
+    """What a `Restore` or a `StepBack` did."""
 
     env_idx: tuple[int, ...]
     source: tuple[int, ...]
@@ -338,6 +379,10 @@ class Restored:
     undoes: int | None
     not_carried: dict[str, str]
     """What could not be put back, and why; empty within one version of a task."""
+    recording: str = ""
+    """Of a `StepBack`: the episode and the state, in words. Its `origin` is `NO_MOMENT`."""
+    how: str = ""
+    """Of a `StepBack`: how the state was come to, in a sentence."""
 
 
 @dataclass(frozen=True)
@@ -362,6 +407,9 @@ class Stepped:
     number: int = 0
     """Counts these events since the worker began; `Pictures.numbers` refers to it."""
     restored: Restored | None = None
+    columns: dict[str, NDArray] = field(default_factory=dict)
+    """(N, ...) each, as `core.state_columns` names them: ``state/actors/cube``, ``obs/agent/qpos``. Only while
+    capturing."""
 
 
 @dataclass(frozen=True)
@@ -410,6 +458,17 @@ class Judged:
 
 
 @dataclass(frozen=True)
+class Captured:
+    """The answer to `CaptureMoments`."""
+
+    columns: tuple[dict[str, NDArray], ...]
+    """As `Stepped.columns`, one for each moment."""
+    pictures: tuple[tuple[Picture, ...], ...]
+    not_carried: dict[str, str]
+    """What could not be put back, and why."""
+
+
+@dataclass(frozen=True)
 class Status:
     playing: bool
     steps_per_second: float
@@ -439,6 +498,7 @@ Event = (
     | PastPictures
     | Inspection
     | Judged
+    | Captured
     | Status
     | WarmedUp
 )

@@ -44,6 +44,8 @@ class TimelineView:
     """What `Session.undo` would take back, in words."""
     not_carried: tuple[str, ...] = ()
     """What the last going back could not put back, each with its reason."""
+    arrived: str = ""
+    """Where the last jump came from, and how, if that was a recording."""
     wants_pictures: bool = False
     """The shown moment has no pictures of the cameras that are looked through."""
 
@@ -73,6 +75,7 @@ class Timeline:
         self._num_envs = num_envs
         self._shown: int | None = None
         self._not_carried: tuple[str, ...] = ()
+        self._arrived = ""
         self._asked: tuple[int, int, tuple[CameraRequest, ...]] | None = None
 
     # --- what comes ----------------------------------------------------------------------------------
@@ -82,6 +85,7 @@ class Timeline:
         if stepped.reset_mask.any():
             missed = {} if stepped.restored is None else stepped.restored.not_carried
             self._not_carried = tuple(f"{what}: {why}" for what, why in missed.items())
+            self._arrived = "" if stepped.restored is None else stepped.restored.how
         if self._shown is not None and self._shown < self.history.first:
             self._shown = self.history.first  # what was looked at had to go
         return moment
@@ -151,6 +155,7 @@ class Timeline:
             can_go_on=moment is not None and bool(moment.snapshot),
             undo=None if jump is None else _in_words(jump, history.moved_last_by(jump), self._num_envs),
             not_carried=self._not_carried,
+            arrived=self._arrived,
             wants_pictures=moment is not None and bool(self._lacking(moment, env, cameras)),
         )
 
@@ -225,6 +230,8 @@ class Timeline:
 
 def _in_words(jump: Moment, envs: tuple[int, ...], num_envs: int) -> str:
     what = "reset" if jump.restored is None else "going back"
+    if jump.restored is not None and jump.restored.recording:
+        what = "stepping in"
     if num_envs == 1:
         return what
     if len(envs) == num_envs:

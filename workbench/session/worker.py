@@ -47,10 +47,12 @@ from workbench.session.camera_messages import (
     JudgeCamera,
     SuggestCameras,
 )
+from workbench.session.capture_moments import capture_moments
 from workbench.session.interrupts import Interrupted, Interrupts
 from workbench.session.judge_moments import judge_moments
 from workbench.session.messages import (
     SCENE_KEPT,
+    CaptureMoments,
     DrawPast,
     EpisodeEnd,
     Event,
@@ -78,6 +80,7 @@ from workbench.session.messages import (
     SetSpeed,
     SingleStep,
     Status,
+    StepBack,
     WarmedUp,
     WarmUp,
     WatchCameras,
@@ -88,6 +91,7 @@ from workbench.session.pacing import Pacer, Rate
 from workbench.session.picture_maker import PictureMaker
 from workbench.session.pulse import Doing, PulseWriter
 from workbench.session.reload import Running, load_version
+from workbench.session.step_back_run import going_there, step_back
 from workbench.session.step_events import StepEvents
 from workbench.session.warm_up import warm_up
 
@@ -137,10 +141,12 @@ class Worker:
             SuggestCameras: self._answer_about_camera,
             SetCapture: self._set_capture,
             Restore: self._restore,
+            StepBack: self._step_back,
             DrawPast: self._draw_past,
             WarmUp: self._warm_up,
             Inspect: self._inspect,
             JudgeMoments: self._judge_moments,
+            CaptureMoments: self._capture_moments,
             Quit: self._stop,
         }
 
@@ -386,10 +392,13 @@ class Worker:
         self._place_cameras()
 
     def _set_capture(self, request: SetCapture) -> None:
-        self._steps.captured_envs = request.env_idx
+        self._steps.capture(request.env_idx, request.from_reset)
 
     def _restore(self, request: Restore) -> None:
         self._guarded(lambda opened: self._restore_envs(opened, request))
+
+    def _step_back(self, request: StepBack) -> None:
+        self._guarded(lambda opened: self._into_recording(opened, request))
 
     def _draw_past(self, request: DrawPast) -> None:
         if self._opened is None:
@@ -411,6 +420,13 @@ class Worker:
     def _judge_moments(self, request: JudgeMoments) -> None:
         if self._opened is not None:
             self._send(judge_moments(self._opened, request))
+
+    def _capture_moments(self, request: CaptureMoments) -> None:
+        def capture(opened: OpenedTask) -> None:
+            self._settle()  # the same scene is about to be drawn
+            self._send(capture_moments(opened, request))
+
+        self._guarded(capture)
 
     def _stop(self, request: Quit) -> None:
         self._quit = True
@@ -474,6 +490,28 @@ class Worker:
         did = Restored(request.env_idx, request.source, request.origin, request.undoes, report.not_carried)
         self._send_step(step, mask, opened.env.episode_seeds, did)
 
+    def _into_recording(self, opened: OpenedTask, request: StepBack) -> None:
+        self._settle()
+        told = time.monotonic()
+
+        def tell(done: int) -> None:
+            nonlocal told
+            if time.monotonic() - told > _STATUS_PERIOD:
+                told = time.monotonic()
+                self._send_status(None, going_there(request, done))
+
+        try:
+            step, restored = step_back(opened, request, tell)
+        except TaskError:
+            self._back_to_the_moment()
+            raise
+        finally:
+            self._placed.put_back(opened.env.env)
+        mask = np.zeros(opened.env.num_envs, bool)
+        mask[list(request.env_idx)] = True
+        self._send_step(step, mask, opened.env.episode_seeds, restored)
+        self._send_status(None)
+
     def _send_step(
         self,
         step: StepResult,
@@ -483,7 +521,7 @@ class Worker:
     ) -> None:
         assert self._opened is not None
         self._last = step
-        if self._steps.captured_envs:
+        if self._steps.pictures_due(step, reset_mask):
             self._settle()  # the same scene is about to be drawn
         event = self._steps.event(self._opened, step, reset_mask, seeds, restored)
         self._pictures.scene_changed(event.number)
@@ -530,6 +568,7 @@ _DOING: dict[type, Doing] = {
     SingleStep: "stepping",
     Reset: "resetting",
     Restore: "resetting",
+    StepBack: "resetting",
     SetActionSource: "importing the policy",
     WarmUp: "warming up",
 }

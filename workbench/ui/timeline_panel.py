@@ -170,7 +170,8 @@ class TimelinePanel:
         travel = go_on_labels(view) if past.can_go_on else ()
         if travel and self._travel.options != travel:
             self._travel.options = travel
-        hint = render("timeline_hint", live=past.shown is None, not_carried="; ".join(past.not_carried))
+        not_carried = "; ".join(past.not_carried)
+        hint = render("timeline_hint", live=past.shown is None, not_carried=not_carried, arrived=past.arrived)
         fill(self._hint, hint)
         if self._travel.visible != bool(travel):
             with self._server.atomic():

@@ -40,7 +40,8 @@ def strip_values(strip: Strip, view: SessionView) -> dict[str, object]:
     for serial, flags in strip.events[-MOST_MARKS:]:
         style, name = next((style, name) for flag, style, name in MARKS if flags & flag)
         if style == "back":
-            name = f"went back {serial - origins.get(serial, serial)} steps"
+            origin = origins.get(serial)
+            name = "from a recording" if origin is None else f"went back {serial - origin} steps"
         marks.append({"x": place(serial), "style": style, "name": name, "ago": past.last - serial})
     arcs = [
         {

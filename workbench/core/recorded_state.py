@@ -1,0 +1,176 @@
+"""A recorded state put into an env that runs, and how far an env is from a recorded state.
+
+What a recording keeps of a state is what ManiSkill's ``get_state_dict`` gives: by the names of actors and
+articulations, poses, velocities and joints. The env it is put into may be of other code: an actor gone, one renamed,
+an arm with another joint. So everything is matched by name and shape, what matches is put back with ManiSkill's own
+setters (the same rows, the same device), and what does not is told by name with the reason.
+
+Controllers stand outside of that dict unless they keep a target of their own. Without one they are left as a reset
+leaves them, but at the joints as they are now, and so are the drive targets: else the first thing that a restored
+robot did would be to run to where it stood before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from workbench.core import seams
+from workbench.core.fresh_physics import renew_physics
+from workbench.core.partial_reset import active_controllers
+
+_POSE = 7
+_FIXED = 13
+"""Numbers of a state that every actor and articulation has: pose, linear and angular velocity."""
+
+
+def misfits(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> dict[str, str]:
+    """What of a recorded state cannot be put into this env, and what of the env is in no such state: name and reason.
+
+    Args:
+        env: an unwrapped ManiSkill env, batched.
+        state: (D,) by name, as `RecordedRun.state` gives it.
+    """
+    missed: dict[str, str] = {}
+    structs = _structs(env)
+    for name, struct in structs.items():
+        if env_idx not in seams.envs_of(struct):
+            continue
+        value = state.get(name)
+        if value is None or np.isnan(value).any():
+            missed[name] = "the recording has none of this name: it is as the reset left it"
+        elif value.shape != (_width(struct),):
+            missed[name] = f"it has {_width(struct)} numbers now, and {value.shape[-1]} in the recording"
+    for name, value in state.items():
+        kind = name.partition("/")[0]
+        if kind in ("actors", "articulations") and name not in structs and not np.isnan(value).all():
+            missed[name] = "this env has none of this name"
+    return missed
+
+
+def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
+    """Put a recorded state into each of these envs, but for its `misfits`. The others are not touched, and the
+    tensors are fetched."""
+    for name, struct in _structs(env).items():
+        width = _width(struct)
+        rows: dict[int, NDArray] = {}
+        for i in seams.envs_of(struct).tolist():
+            value = states[i].get(name) if i in states else None
+            if value is not None and value.shape == (width,) and not np.isnan(value).any():
+                rows[i] = value
+        if rows:
+            values = torch.as_tensor(np.stack([*rows.values()]).astype(np.float32), device=env.device)
+            struct.set_state(values, torch.tensor([*rows], device=env.device))
+    _apply(env)
+    _write_controllers(env, states)
+
+
+def settle_robot(env: Any, env_idx: Sequence[int]) -> None:
+    """Let controllers and drive targets of these envs' robots be where the joints are."""
+    chosen = [int(i) for i in env_idx]
+    if env.agent is None or not chosen:
+        return
+    seams.set_reset_mask(env, chosen)
+    for controller in active_controllers(env):
+        controller.reset()
+    seams.set_reset_mask(env, list(range(env.num_envs)))
+    targets = env.scene.px.cuda_articulation_target_qpos.torch()
+    velocities = env.scene.px.cuda_articulation_target_qvel.torch()
+    for robot in seams.robots(env):
+        qpos = robot.get_qpos()
+        rows = seams.data_rows_of_articulation(robot)[chosen].long()
+        targets[rows, : qpos.shape[1]] = qpos[chosen]
+        velocities[rows] = 0.0
+    _apply(env)
+
+
+def new_physics(env: Any, env_idx: Sequence[int]) -> None:
+    """Let PhysX forget what these envs did before; on a GPU there is no way to."""
+    if seams.batched_system(env.scene) is not None:
+        renew_physics(env.scene, [int(i) for i in env_idx])
+
+
+def read_states(env: Any) -> dict[str, NDArray[np.float32]]:
+    """(N, D) of every actor and articulation of the env, by the names of a recording; NaN in envs without it."""
+    states: dict[str, NDArray[np.float32]] = {}
+    for name, struct in _structs(env).items():
+        value = struct.get_state().cpu().numpy()
+        whole = np.full((env.num_envs, value.shape[1]), np.nan, np.float32)
+        whole[seams.envs_of(struct)] = value
+        states[name] = whole
+    return states
+
+
+def apart(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tuple[float, float]:
+    """How far one env's state is from a recorded one: metres of the body that is furthest, and radians of the body
+    or joint (of a sliding joint: metres) that is turned most. What only one of them has does not count.
+
+    Args:
+        now, was: (D,) by name.
+    """
+    metres = radians = 0.0
+    for name, value in now.items():
+        other = was.get(name)
+        if other is None or other.shape != value.shape or len(value) < _FIXED:
+            continue
+        a, b = value.astype(np.float64), other.astype(np.float64)
+        if np.isnan(a).all() or np.isnan(b).all():
+            continue  # an env that lacks it
+        metres = max(metres, float(np.linalg.norm(a[:3] - b[:3])))
+        # The chord, and not the arc cosine of the product, which loses small angles; q and -q are the same.
+        chord = min(np.linalg.norm(a[3:_POSE] - b[3:_POSE]), np.linalg.norm(a[3:_POSE] + b[3:_POSE]))
+        radians = max(radians, float(4 * np.arcsin(min(1.0, chord / 2))))
+        joints = (len(value) - _FIXED) // 2
+        if joints:
+            qpos = slice(_FIXED, _FIXED + joints)
+            radians = max(radians, float(np.abs(a[qpos] - b[qpos]).max()))
+    return _or_inf(metres), _or_inf(radians)
+
+
+def same_state(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> bool:
+    """Whether all that both have is equal to the last bit, velocities included."""
+    both = [name for name in was if name in now and now[name].shape == was[name].shape]
+    return all(np.array_equal(now[name], was[name], equal_nan=True) for name in both)
+
+
+def _or_inf(value: float) -> float:
+    return value if np.isfinite(value) else float("inf")
+
+
+def _structs(env: Any) -> dict[str, Any]:
+    registry = env.scene.state_dict_registry
+    found = {f"actors/{a.name}": a for a in registry.actors.values() if a.px_body_type != "static"}
+    return {**found, **{f"articulations/{a.name}": a for a in registry.articulations.values()}}
+
+
+def _width(struct: Any) -> int:
+    return _FIXED + 2 * int(getattr(struct, "max_dof", 0))
+
+
+def _apply(env: Any) -> None:
+    env.scene._gpu_apply_all()
+    env.scene.px.gpu_update_articulation_kinematics()
+    env.scene._gpu_fetch_all()
+
+
+def _write_controllers(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
+    """What controllers with a target of their own remember, where it was recorded (``controller/arm/target_qpos``)."""
+    if env.agent is None:
+        return
+    for name, value in _leaves(env.agent.get_controller_state(), "controller/"):
+        for i, state in states.items():
+            recorded = state.get(name)
+            if recorded is not None and recorded.shape == tuple(value.shape[1:]):
+                value[i] = torch.as_tensor(recorded, dtype=value.dtype, device=value.device)
+
+
+def _leaves(tree: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, torch.Tensor]]:
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{key}/")
+        else:
+            yield f"{prefix}{key}", value

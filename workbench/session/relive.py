@@ -1,0 +1,229 @@
+"""A recorded episode lived through again by envs that run: to a chosen state of it, or to its end.
+
+Two ways lead to a recorded state. One can put it there (`core.recorded_state`): then every body is where it was, and
+what is in no recording is not as it was (contacts, drive targets, what the task counted on itself). Or one can
+live up to it: the reset with the recorded seed, and the recorded actions. With the same code that gives everything,
+to the last bit; with another it gives another state. So both are done at once: the episode is lived through, after each
+step the bodies are compared with the record, and where they have parted by more than can be overlooked they
+are put back on it. How far they were and how often that was needed is told, never assumed.
+
+What a task draws at a reset hangs on more than the env's own seed where several envs were reset together: torch's
+numbers come in one piece for all of them. So the first state is compared as well, and put back where it is another.
+
+In a batch the envs that do not take part stand still (`only_these_move`), and what the task keeps for them is put
+back afterwards, so that nobody is disturbed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.core.recorded_run import RecordedRun
+from workbench.core.recorded_state import (
+    apart,
+    misfits,
+    new_physics,
+    read_states,
+    same_state,
+    settle_robot,
+    write_states,
+)
+from workbench.core.snapshot import Snapshot
+from workbench.core.stand_still import only_these_move
+from workbench.core.step import StepResult
+from workbench.session.open_task import OpenedTask, blamed, reset_checked, step_checked
+
+FAR_METRES, FAR_RADIANS = 1e-4, 1e-3
+"""From here on a state is another one than the recorded, and is put back to it."""
+_SAME_VALUE = 1e-3
+"""Entries of ``evaluate`` that differ by no more, or by no more than this share, say the same of a state."""
+
+Way = Literal["re-simulated", "corrected", "put there"]
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """How an env came to a recorded state."""
+
+    way: Way
+    steps: int
+    metres: float | None
+    """How far the body that is furthest is from the record; None where it holds no states to compare with."""
+    radians: float | None
+    """The same of turning: bodies and joints."""
+    corrected: int = 0
+    """Steps after which it was put back on the record."""
+    begins_otherwise: bool = False
+    """The reset with its seed gave another state than the recorded one, which was put in its place."""
+    missed: dict[str, str] = field(default_factory=dict)
+    """What could not be put back, and why."""
+    otherwise: tuple[str, ...] = ()
+    """Entries that ``evaluate`` says otherwise of the same state."""
+
+
+def begin_again(
+    opened: OpenedTask, runs: Mapping[int, RecordedRun]
+) -> tuple[dict[int, bool], dict[str, str]]:
+    """Let these envs stand at the first state of their runs.
+
+    Returns:
+        of each env, whether the reset gave another state, which the recorded one then took the place of; and what
+        could not be put back, with the reason.
+
+    Raises:
+        TaskError: a reset raised.
+    """
+    task, env = opened.env, opened.env.env
+    missed: dict[str, str] = {}
+    with blamed("restore", opened.loaded, task):
+        new_physics(env, list(runs))
+    for i, run in runs.items():
+        options = {name: value for name, value in run.reset_options.items() if name != "env_idx"}
+        if options.pop("reconfigure", False):
+            missed["reset option reconfigure"] = "the scene is not built anew for one env of a batch"
+        if run.seed < 0:
+            missed["the seed"] = "the recording does not know it: what the task drew at the reset is new"
+        seed = [run.seed] if run.seed >= 0 else None
+        # One by one: numbers that are drawn for several envs together are others than each would get alone.
+        reset_checked(task, opened.loaded, seed, [i], options)
+    now = read_states(env)
+    other = {i: not same_state(_of(now, i), run.state(0)) for i, run in runs.items()}
+    wrong = {i: run.state(0) for i, run in runs.items() if other[i]}
+    with blamed("restore", opened.loaded, task):
+        for i, run in runs.items():
+            if run.env_states:
+                missed |= misfits(env, i, run.state(0))
+        if wrong:
+            write_states(env, wrong)
+            settle_robot(env, list(wrong))
+    return other, missed
+
+
+def arrive(
+    opened: OpenedTask,
+    run: RecordedRun,
+    state: int,
+    env_idx: Sequence[int],
+    on_step: Callable[[int], None] = lambda done: None,
+) -> tuple[StepResult, Arrival]:
+    """Let envs stand at one state of a recorded run, all of them at the same; the others are not disturbed.
+
+    Args:
+        on_step: called with the number of steps that are lived through.
+
+    Raises:
+        TaskError: the task's code raised on the way; then the envs stand somewhere on it.
+        IndexError: the run has no such state, or the task no such env.
+    """
+    task, env = opened.env, opened.env.env
+    chosen = [int(i) for i in env_idx]
+    if not 0 <= state <= run.length:
+        raise IndexError(f"{run.name} has states 0 to {run.length}, not {state}")
+    if not chosen or any(not 0 <= i < task.num_envs for i in chosen):
+        raise IndexError(f"env_idx {chosen} is out of range for {task.num_envs} envs")
+    others = [i for i in range(task.num_envs) if i not in chosen]
+    why_not = why_not_lived_through(opened, run)
+    kept, reason = _kept(opened, others)
+    why_not = why_not or reason
+    corrected = 0
+    with only_these_move(env, chosen, kept):
+        begins_otherwise, missed = begin_again(opened, dict.fromkeys(chosen, run))
+        if not why_not:
+            for t in range(state):
+                step_checked(task, opened.loaded, _for_all(opened, run.action[t]))
+                wanted = run.state(t + 1)
+                if wanted and _far(env, chosen, wanted):
+                    with blamed("restore", opened.loaded, task):
+                        write_states(env, dict.fromkeys(chosen, wanted))
+                    corrected += 1
+                on_step(t + 1)
+        elif state > 0:
+            missed["the way there"] = why_not
+            with blamed("restore", opened.loaded, task):
+                write_states(env, dict.fromkeys(chosen, run.state(state)))
+                settle_robot(env, chosen)
+                env.elapsed_steps[chosen] = state
+    with blamed("restore", opened.loaded, task):
+        step = task.judge()
+    metres, radians = _distance(env, chosen, run.state(state))
+    way: Way = "put there" if why_not and state > 0 else "corrected" if corrected else "re-simulated"
+    near = metres is not None and metres <= FAR_METRES and (radians or 0.0) <= FAR_RADIANS
+    return step, Arrival(
+        way,
+        state,
+        metres,
+        radians,
+        corrected,
+        any(begins_otherwise.values()),
+        missed,
+        otherwise_said(step, chosen[0], run, state) if near else (),
+    )
+
+
+def why_not_lived_through(opened: OpenedTask, run: RecordedRun) -> str:
+    """Why the recorded actions cannot be made; empty where they can."""
+    width = sum(len(part.names) for part in opened.env.parts)
+    recorded = run.action.shape[1] if run.action.ndim == 2 else 0
+    if width == recorded:
+        return ""
+    return f"the recorded actions have {recorded} numbers each, and this robot takes {width}: they were not made again"
+
+
+def otherwise_said(step: StepResult, env: int, run: RecordedRun, state: int) -> tuple[str, ...]:
+    """Entries of ``evaluate`` that are another value, of this env now, than the record has for that state."""
+    differ = []
+    for name, rows in run.evaluate.items():
+        now = step.evaluate.get(name)
+        if name.startswith("reward_terms/") or now is None or state >= len(rows):
+            continue
+        a, b = np.asarray(now[env]), np.asarray(rows[state])
+        if a.shape != b.shape or a.dtype.kind not in "fiub" or b.dtype.kind not in "fiub":
+            continue
+        a, b = a.astype(float), b.astype(float)
+        if np.isnan(b).all():
+            continue  # the record lacks it there
+        if not np.allclose(a, b, rtol=_SAME_VALUE, atol=_SAME_VALUE, equal_nan=True):
+            differ.append(name)
+    return tuple(differ)
+
+
+def _kept(opened: OpenedTask, others: list[int]) -> tuple[Snapshot | None, str]:
+    """What the envs that do not take part are put back to; where that cannot be had, why no step may be made."""
+    if not others:
+        return None, ""
+    try:
+        return opened.env.snapshot(others), ""
+    except Exception as error:  # what a task keeps on itself is open
+        return (
+            None,
+            f"the other envs cannot be put back after steps, since this task's state cannot be kept ({error})",
+        )
+
+
+def _for_all(opened: OpenedTask, action: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.broadcast_to(action, (opened.env.num_envs, len(action))).astype(np.float32)
+
+
+def _of(states: Mapping[str, NDArray], env: int) -> dict[str, NDArray]:
+    return {name: rows[env] for name, rows in states.items()}
+
+
+def _far(env: object, chosen: list[int], wanted: Mapping[str, NDArray]) -> bool:
+    metres, radians = _distance(env, chosen, wanted)
+    return (metres or 0.0) > FAR_METRES or (radians or 0.0) > FAR_RADIANS
+
+
+def _distance(
+    env: object, chosen: list[int], wanted: Mapping[str, NDArray]
+) -> tuple[float | None, float | None]:
+    """Of the env that is furthest; None where nothing was recorded."""
+    if not wanted:
+        return None, None
+    now = read_states(env)
+    found = [apart(_of(now, i), wanted) for i in chosen]
+    return max(metres for metres, _ in found), max(radians for _, radians in found)

@@ -1,0 +1,175 @@
+"""From an episode that was read to what an env needs to stand in it: the run, the task, the options.
+
+A recording names its task by id and by file, and holds the text that it was made with. Which of these is opened
+is a choice: today's code of it, that a person is about to try on an old situation; or the recorded text, to see again
+what happened. The text is written into a folder of its own, which goes when whoever opened it is done; so it can be
+looked at, even edited, and nobody's file is touched. What lay beside the file and is no Python (meshes, say) is
+not in a recording, and such a task must be opened where it is.
+"""
+
+from __future__ import annotations
+
+import ast
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path, PurePath
+
+import numpy as np
+
+from workbench.core.recorded_run import RecordedRun
+from workbench.recording.episode import Episode, EpisodeInfo
+from workbench.session.messages import TaskDescription, TaskOptions
+
+
+class CannotStepIn(ValueError):
+    """The recording cannot be gone into; the message says why, and what to do."""
+
+
+def run_of(episode: Episode, state: int | None = None) -> RecordedRun:
+    """What of an episode is lived through again, up to `state`; to its end if None.
+
+    Raises:
+        CannotStepIn: it has no such state.
+    """
+    if state is not None and not 0 <= state <= episode.length:
+        raise CannotStepIn(f"this episode has states 0 to {episode.length}, and not {state}")
+    info = episode.info
+    action = np.asarray(episode.action, np.float32).reshape(episode.length, -1)
+    run = RecordedRun(
+        name=name_of(info),
+        seed=info.seed,
+        reset_options=dict(info.reset_options),
+        action=action,
+        env_states={name: np.asarray(rows) for name, rows in episode.env_states.items()},
+        evaluate=dict(episode.evaluate),
+        reward=np.asarray(episode.reward, np.float32),
+    )
+    return run if state is None else run.until(state)
+
+
+def name_of(info: EpisodeInfo) -> str:
+    """What a person calls the episode."""
+    return f"{info.task}, seed {info.seed}" if info.seed >= 0 else info.task
+
+
+def why_not_into(task: TaskDescription, info: EpisodeInfo) -> str:
+    """Why an episode cannot be gone into with the task that is open; empty where it can."""
+    if task.env_id == info.task:
+        return ""
+    return f"it is an episode of {info.task}, and {task.env_id} is open"
+
+
+def reference_of(info: EpisodeInfo) -> str:
+    """What `workbench open` would be given for today's code of a recording's task.
+
+    Its file where that is still there, with the class where the file has several; else the id, which may be one of
+    ManiSkill's own.
+    """
+    file = None if info.source_file is None else Path(info.source_file)
+    if file is None or not file.is_absolute() or not file.is_file() or _is_installed(file):
+        return info.task
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return str(file)
+    return _with_class(str(file), text, info.task)
+
+
+def options_of(info: EpisodeInfo, num_envs: int, base: TaskOptions | None = None) -> TaskOptions:
+    """How the recording's task is made: with its own robot, modes and control."""
+    kwargs = dict(info.env_kwargs)
+    if info.control_mode is not None:
+        kwargs.setdefault("control_mode", info.control_mode)
+    for name in ("num_envs", "sim_backend", "render_backend", "render_mode", "human_render_camera_configs"):
+        kwargs.pop(name, None)  # how it is run, and not what it is
+    base = base or TaskOptions()
+    return TaskOptions(num_envs, base.backend, max(info.seed, 0), kwargs)
+
+
+@contextmanager
+def recorded_source(info: EpisodeInfo) -> Iterator[str]:
+    """The task as it was recorded, in a folder that is removed at the end; what is to be opened.
+
+    Raises:
+        CannotStepIn: the recording holds no text, or the folder cannot be written.
+    """
+    folder, reference = write_source(info)
+    try:
+        yield reference
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def write_source(info: EpisodeInfo) -> tuple[Path, str]:
+    """A fresh folder with the recorded text, to be removed by the caller, and what is to be opened of it.
+
+    Raises:
+        CannotStepIn: as of `recorded_source`.
+    """
+    if not info.source or info.source_file is None:
+        raise CannotStepIn("this recording does not hold the text of its task")
+    main, texts = _below_one_folder(info.source_file, info.source)
+    folder = Path(tempfile.mkdtemp(prefix="workbench-recorded-"))
+    try:
+        for name, text in texts.items():
+            path = folder / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise CannotStepIn(f"the recorded text cannot be written: {error}") from error
+    return folder, _with_class(str(folder / main), texts[main], info.task)
+
+
+def _below_one_folder(main: str, source: Mapping[str, str]) -> tuple[str, dict[str, str]]:
+    """Names relative to the task's folder, none of which leads out of it: a recording is somebody else's file."""
+    names = {path: PurePath(path) for path in source}
+    # As it was recorded every path is absolute; as it is read, as seen from the main file's folder.
+    folder = PurePath(main).parent
+    found: dict[str, str] = {}
+    chosen = ""
+    for path, pure in names.items():
+        relative = pure.relative_to(folder) if pure.is_absolute() and pure.is_relative_to(folder) else pure
+        if relative.is_absolute() or ".." in relative.parts or not relative.parts:
+            relative = PurePath(pure.name)
+        found[str(relative)] = source[path]
+        if path == main or (pure.name == PurePath(main).name and not chosen):
+            chosen = str(relative)
+    if not chosen:
+        raise CannotStepIn("this recording does not hold the text of its task's own file")
+    return chosen, found
+
+
+def _with_class(file: str, text: str, env_id: str) -> str:
+    """``file.py:Class`` of the class that is registered under, or has, this name; the file alone if none is found."""
+    try:
+        tree = ast.parse(text)
+    except (SyntaxError, ValueError):
+        return file
+    classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
+    for node in classes:
+        if any(_registers(decorator, env_id) for decorator in node.decorator_list):
+            return f"{file}:{node.name}"
+    return f"{file}:{env_id}" if any(node.name == env_id for node in classes) else file
+
+
+def _registers(decorator: ast.expr, env_id: str) -> bool:
+    """Whether it is ``@register_env("this id", ...)``."""
+    if not isinstance(decorator, ast.Call):
+        return False
+    called = decorator.func
+    name = called.attr if isinstance(called, ast.Attribute) else getattr(called, "id", "")
+    values = [*decorator.args[:1], *(k.value for k in decorator.keywords if k.arg == "uid")]
+    return name == "register_env" and any(isinstance(v, ast.Constant) and v.value == env_id for v in values)
+
+
+def _is_installed(file: Path) -> bool:
+    """Whether it is a file of ManiSkill, or of another installed package: that is opened by its id."""
+    if {"site-packages", "dist-packages"} & set(file.parts):
+        return True
+    spec = find_spec("mani_skill")  # does not import it
+    folders = [] if spec is None else list(spec.submodule_search_locations or [])
+    return any(file.is_relative_to(folder) for folder in folders)
