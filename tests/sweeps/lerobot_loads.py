@@ -37,7 +37,9 @@ def main(folder: Path, backend: str) -> None:
     shifts = {"action": [0.0, 1 / dataset.fps], "observation.state": [-1 / dataset.fps, 0.0]}
     window = LeRobotDataset("local/export", root=folder, video_backend=backend, delta_timestamps=shifts)[1]
     assert window["action"].shape[0] == 2 and window["observation.state"].shape[0] == 2
-    print(f"{dataset.meta.total_episodes} episodes, {len(dataset)} frames, fps {dataset.fps}, {dataset.meta.video_keys}")
+    print(
+        f"{dataset.meta.total_episodes} episodes, {len(dataset)} frames, fps {dataset.fps}, {dataset.meta.video_keys}"
+    )
     print("tasks:", list(dataset.meta.tasks.index), " stats:", sorted(dataset.meta.stats))
 
 

@@ -112,7 +112,9 @@ def _material(material: Material) -> sapien.render.RenderMaterial:
         # SAPIEN asks whether the dtype is that very object of numpy's; of an array that crossed a pipe it is another.
         pixels = np.empty(material.texture.shape, np.uint8)
         pixels[...] = material.texture
-        made.base_color_texture = sapien.render.RenderTexture2D(pixels, "R8G8B8A8Unorm", _levels(pixels), srgb=True)
+        made.base_color_texture = sapien.render.RenderTexture2D(
+            pixels, "R8G8B8A8Unorm", _levels(pixels), srgb=True
+        )
     return made
 
 

@@ -73,7 +73,9 @@ def export_lerobot(
     """
     folder = Path(folder).absolute()
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise FileExistsError(f"There is something at {folder} already; name a folder that does not exist yet.")
+        raise FileExistsError(
+            f"There is something at {folder} already; name a folder that does not exist yet."
+        )
     made = Exported(folder)
     temporary = folder.parent / f".{folder.name}.{uuid.uuid4().hex[:8]}.part"
     try:
@@ -88,7 +90,9 @@ def export_lerobot(
     except OSError as error:
         if isinstance(error, FileExistsError) or error.errno is None:
             raise
-        raise OSError(error.errno, f"Cannot write the dataset {folder}: {os.strerror(error.errno)}.") from error
+        raise OSError(
+            error.errno, f"Cannot write the dataset {folder}: {os.strerror(error.errno)}."
+        ) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     on_progress(len(sources), "done")
@@ -190,7 +194,9 @@ class _Writer:
                 entry[f"stats/{key}/{statistic}"] = value.tolist()
         self._episodes.append(entry)
         info = episode.info
-        self._from.append({"id": info.id, "task": info.task, "seed": info.seed, "source_hash": info.source_hash})
+        self._from.append(
+            {"id": info.id, "task": info.task, "seed": info.seed, "source_hash": info.source_hash}
+        )
         self._made.episodes += 1
         self._made.frames += len(frames.states)
 
@@ -200,7 +206,9 @@ class _Writer:
         if self._options.fps is None:
             fps = max(1, round(rate))
             if abs(rate - fps) > 1e-3 and not self._made.notes:
-                self._made.notes.append(f"The format knows whole frames a second only: {rate:.3f} is written as {fps}.")
+                self._made.notes.append(
+                    f"The format knows whole frames a second only: {rate:.3f} is written as {fps}."
+                )
             return fps, 1
         every = round(rate / self._options.fps)
         if every < 1 or abs(rate / self._options.fps - every) > 1e-3:
@@ -232,7 +240,9 @@ class _Writer:
         if self._rows is None:
             self._path = self._folder / form.DATA.format(chunk=self._chunk, file=self._file)
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._rows = self._stack.enter_context(pq.ParquetWriter(self._path, table.schema, compression="snappy"))
+            self._rows = self._stack.enter_context(
+                pq.ParquetWriter(self._path, table.schema, compression="snappy")
+            )
         self._rows.write_table(table)
         return {
             "data/chunk_index": self._chunk,
@@ -309,7 +319,11 @@ def _arrow(values: np.ndarray) -> pa.Array:
 
 def _succeeds(episode: Episode) -> bool:
     values = episode.evaluate.get("success")
-    return values is not None and values.ndim == 1 and bool((np.nan_to_num(values.astype(np.float64)) != 0).any())
+    return (
+        values is not None
+        and values.ndim == 1
+        and bool((np.nan_to_num(values.astype(np.float64)) != 0).any())
+    )
 
 
 def _difference(one: dict[str, dict], other: dict[str, dict]) -> str:

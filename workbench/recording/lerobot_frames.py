@@ -109,14 +109,20 @@ def frames_of(episode: Episode, choice: Choice = Choice()) -> Frames:
 
 def _numbers(episode: Episode) -> dict[str, NDArray[np.float32]]:
     """State observations (T + 1, D) by key; where there are none, the joints of the robots from the env states."""
-    found = {key: values for key, values in episode.obs.items() if np.issubdtype(values.dtype, np.number) or values.dtype == bool}
+    found = {
+        key: values
+        for key, values in episode.obs.items()
+        if np.issubdtype(values.dtype, np.number) or values.dtype == bool
+    }
     if not found:
         for name, values in episode.env_states.items():
             if name.startswith("articulations/"):
                 # Pose of the root (7), its velocities (6), then positions and velocities of the joints.
                 joints = (values.shape[1] - 13) // 2
                 found[f"agent/{name.split('/', 1)[1]}/qpos"] = values[:, 13 : 13 + joints]
-    return {key or "state": values.reshape(len(values), -1).astype(np.float32) for key, values in found.items()}
+    return {
+        key or "state": values.reshape(len(values), -1).astype(np.float32) for key, values in found.items()
+    }
 
 
 def _usual_state(sources: dict[str, NDArray[np.float32]]) -> tuple[str, ...]:

@@ -101,7 +101,9 @@ def read_lerobot(folder: Path, index: int) -> Episode:
 
 
 def _episode(folder: Path, info: dict[str, Any], entry: dict[str, Any], index: int) -> Episode:
-    file = info["data_path"].format(chunk_index=entry["data/chunk_index"], file_index=entry["data/file_index"])
+    file = info["data_path"].format(
+        chunk_index=entry["data/chunk_index"], file_index=entry["data/file_index"]
+    )
     table = pq.read_table(_inside(folder, file), filters=[("episode_index", "=", index)])
     length, features = table.num_rows, info["features"]
     columns = {
@@ -141,7 +143,9 @@ def _episode(folder: Path, info: dict[str, Any], entry: dict[str, Any], index: i
         truncated=np.zeros(length, np.bool_),
         evaluate=evaluate,
         cameras=[
-            _camera(folder, info, entry, key, length) for key, feature in features.items() if feature["dtype"] == "video"
+            _camera(folder, info, entry, key, length)
+            for key, feature in features.items()
+            if feature["dtype"] == "video"
         ],
         obs={
             key.removeprefix("observation."): np.concatenate([values, np.full((1, values.shape[1]), np.nan)])
@@ -156,7 +160,10 @@ def _camera(folder: Path, info: dict[str, Any], entry: dict[str, Any], key: str,
     if info["features"][key]["names"][0] == "channels":  # (3, H, W), as some datasets say it
         height, width = info["features"][key]["shape"][1:]
     focal = height / 2 / math.tan(USUAL_FOVY / 2)
-    where = {"chunk_index": entry[f"videos/{key}/chunk_index"], "file_index": entry[f"videos/{key}/file_index"]}
+    where = {
+        "chunk_index": entry[f"videos/{key}/chunk_index"],
+        "file_index": entry[f"videos/{key}/file_index"],
+    }
     film = _inside(folder, info["video_path"].format(video_key=key, **where))
     pose = np.tile(np.array([0, 0, 0, 1, 0, 0, 0], np.float32), (length, 1))
     return CameraTrack(
@@ -175,7 +182,8 @@ def _camera(folder: Path, info: dict[str, Any], entry: dict[str, Any], key: str,
         np.arange(length),
         pose,
         rgb=EncodedPictures(
-            "rgb", FilmPictures(film, float(entry[f"videos/{key}/from_timestamp"]), length, float(info["fps"]))
+            "rgb",
+            FilmPictures(film, float(entry[f"videos/{key}/from_timestamp"]), length, float(info["fps"])),
         ),
     )
 
@@ -207,7 +215,9 @@ class FilmPictures(Sequence[bytes]):
         # Half a frame early, so that rounding cannot skip the first one.
         begin = max(0.0, self._begin - 0.5 / self._fps)
         frames = imageio_ffmpeg.read_frames(
-            str(self._film), input_params=["-ss", f"{begin:.6f}"], output_params=["-frames:v", str(self._count)]
+            str(self._film),
+            input_params=["-ss", f"{begin:.6f}"],
+            output_params=["-frames:v", str(self._count)],
         )
         try:
             width, height = next(frames)["size"]

@@ -72,7 +72,16 @@ class FilmWriter:
         self._pad = odd and not encoding.exact_size
         height, width = (height + height % 2, width + width % 2) if self._pad else (height, width)
         rate = Fraction(fps).limit_denominator(1000)
-        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "rgb24"]
+        command = [
+            imageio_ffmpeg.get_ffmpeg_exe(),
+            "-y",
+            "-loglevel",
+            "error",
+            "-f",
+            "rawvideo",
+            "-pix_fmt",
+            "rgb24",
+        ]
         command += ["-s", f"{width}x{height}", "-r", f"{rate.numerator}/{rate.denominator}", "-i", "-"]
         command += ["-c:v", "libx264", "-crf", str(encoding.crf), "-pix_fmt"]
         # Half resolution of colour is what all players have; it needs an even size.

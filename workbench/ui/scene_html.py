@@ -19,7 +19,6 @@ from workbench.recording.new_file import new_file
 from workbench.recording.scene_eye import Eye, usual_eye
 from workbench.ui.door import DoorOptions, open_door
 from workbench.ui.env_layout import lay_out
-from workbench.ui.lights import light
 from workbench.ui.scene_view import SceneView
 
 TRIANGLES = 80_000
