@@ -73,8 +73,10 @@ class RecordedScene:
         for body, entity in self._bodies.items():
             pose = poses[body]
             there = bool(np.isfinite(pose).all())
-            entity.pose = sapien.Pose(pose[:3], pose[3:]) if there else sapien.Pose([0, 0, -1000])
-        self._eye.pose = sapien.Pose(eye[:3], eye[3:])
+            entity.pose = (
+                sapien.Pose(pose[:3].tolist(), pose[3:].tolist()) if there else sapien.Pose([0, 0, -1000])
+            )
+        self._eye.pose = sapien.Pose(eye[:3].tolist(), eye[3:].tolist())
         self._scene.update_render()
         self._camera.take_picture()
         colour = np.asarray(self._camera.get_picture("Color"))[..., :3]

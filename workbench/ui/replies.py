@@ -200,7 +200,7 @@ def _compresses(kind: str) -> bool:
     )
 
 
-def folder_handler(folder: Path) -> Handler:
+def folder_handler(folder: Path) -> Callable[[str], tuple[int, str, bytes]]:
     """A handler that serves the files below ``folder``, and nothing that a link there points out to."""
     root = folder.resolve()
 

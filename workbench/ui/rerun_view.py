@@ -110,7 +110,7 @@ class RerunView:
     def __init__(self, server: viser.ViserServer, pages: RerunPages) -> None:
         self._server, self._pages = server, pages
         self._paths: tuple[Path, ...] = ()
-        self._panel: viser.GuiPanelHandle | None = None
+        self._panel: viser.PanelHandle | None = None
         self._lock = threading.Lock()
         self._problem = ""
         self._waiting = False

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import datetime
 import tempfile
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from workbench.recording.lerobot_export import ExportOptions
 from workbench.recording.scene_eye import Eye
@@ -58,7 +59,7 @@ class SharePanel:
         self._drawn: object = None
         self._about = server.gui.add_html("")
         self._what = server.gui.add_dropdown("Make", tuple(WHAT))
-        self._camera = server.gui.add_dropdown("Camera", (ALL_CAMERAS,))
+        self._camera = server.gui.add_dropdown("Camera", _names(()))
         self._successes = server.gui.add_checkbox(
             "Only successes", True, hint="Leave out recordings that reach success at no step"
         )
@@ -81,7 +82,7 @@ class SharePanel:
         self._drawn = now
         names = [source.name for source in chosen.sources]
         fill(self._about, render("share_about", count=len(names), name=names[0] if names else ""))
-        options = (ALL_CAMERAS, *chosen.cameras)
+        options = _names(chosen.cameras)
         if self._camera.options != options:
             self._camera.options = options
         show(self._camera, what == "film" and len(options) > 2)
@@ -131,6 +132,10 @@ class SharePanel:
         return {"links": links, "words": made.words, "folder": ", ".join(map(str, made.paths))}
 
 
+def _names(cameras: tuple[str, ...]) -> tuple[str, ...]:
+    return (ALL_CAMERAS, *cameras)
+
+
 def _size(path: Path) -> str:
     size = path.stat().st_size
     return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{max(size / 1e3, 1):.0f} kB"
@@ -146,6 +151,6 @@ def _eye_of(client: viser.ClientHandle | None) -> Eye | None:
     )
 
 
-def _triple(values: Sequence[float]) -> tuple[float, float, float]:
+def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
     x, y, z = (float(value) for value in values)
     return x, y, z
