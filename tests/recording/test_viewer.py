@@ -16,14 +16,14 @@ from PIL import Image
 from rerun.experimental import ViewerClient
 
 from workbench.recording.rerun_process import await_port, end, free_port
-from workbench.recording.rrd import write_rrd
 from workbench.recording.verify import quiet_environment, rerun_command, verify_rrd
 from workbench.recording.viewer import has_screen, open_window
 
 
 @pytest.fixture(scope="module")
 def file(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_rrd(recorded.episode, tmp_path_factory.mktemp("recordings") / "PickCube ä.rrd")
+    written = recorded.episode.write(tmp_path_factory.mktemp("recordings"))
+    return written.rrd.rename(written.rrd.with_name("PickCube ä.rrd"))
 
 
 @pytest.fixture

@@ -125,8 +125,8 @@ class Log:
 
     def scalars(self, entity: str, steps: NDArray[np.int64], values: NDArray) -> None:
         """`values` (len(steps), ...), all of a step as one batch."""
-        flat = np.asarray(values, dtype=np.float64).reshape(len(steps), -1)
-        if flat.size:
+        if np.size(values):
+            flat = np.asarray(values, dtype=np.float64).reshape(len(steps), -1)
             columns = rr.Scalars.columns(scalars=flat.reshape(-1))
             self.columns(entity, steps, columns.partition([flat.shape[1]] * len(flat)))
 
@@ -165,8 +165,8 @@ class EpisodeLog:
         for camera, entity in zip(self._survey.cameras, self._cameras):
             begin, end = np.searchsorted(camera.frames, [states[0], states[-1] + 1])
             if begin < end and not camera.still:
-                translation, quaternion = optical_pose(np.stack(camera.poses[begin:end]))
-                self._log.pose(entity, np.array(camera.frames[begin:end]), translation, quaternion)
+                translation, quaternion = optical_pose(camera.poses[begin:end])
+                self._log.pose(entity, camera.frames[begin:end], translation, quaternion)
 
     def _take_numbers(self, piece: Piece) -> None:
         log, survey, states = self._log, self._survey, piece.states

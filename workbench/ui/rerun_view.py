@@ -30,8 +30,8 @@ from workbench.ui.file_reply import FileReply
 from workbench.ui.fragments import render
 from workbench.ui.offers import Offers
 
-WIDTH = 720
-"""Pixels of the docked panel; rerun's own panels are folded away in our recordings."""
+WIDTH = 760
+"""Pixels of the panel; rerun's own panels are folded away in our recordings."""
 
 _SHOW = "/rerun/show/"
 _VIEWER = f"/rerun/viewer-{version('rerun-sdk')}/"
@@ -41,6 +41,10 @@ _GO_ON = """<!doctype html><meta charset="utf-8"><title>Workbench: {title}</titl
 <script>
 const query = new URLSearchParams([["hide_welcome_screen", "1"], ["persist", "0"]]);
 for (const path of {paths}) query.append("url", location.origin + path);
+// Dark or light as the page that this is in.
+let theme = "dark";
+try {{ theme = parent.document.documentElement.dataset.mantineColorScheme || theme; }} catch {{ }}
+query.append("theme", theme);
 // rerun's own look-ups of a fast graphics driver end in a dialog where there is none.
 if (!navigator.gpu) query.append("renderer", "webgl");
 location.replace({viewer} + "index.html?" + query);
@@ -157,8 +161,9 @@ class RerunView:
             self._panel = panel = self._server.gui.add_panel(order=6.0)
         with panel.add_tab("rerun", viser.Icon.APP_WINDOW):
             self._server.gui.add_html(render("rerun_frame", address=self._pages.address(paths)))
-        panel.dock_left()
-        panel.set_width(WIDTH)
+        # Over the scene and not beside it: beside the library a small window has no room for a third column. Who
+        # has a larger one docks it.
+        panel.float(x=12, y=12, width=WIDTH)
         self.draw(self._paths)
 
     def close(self) -> None:
