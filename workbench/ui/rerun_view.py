@@ -17,14 +17,14 @@ import html
 import json
 import secrets
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
 import viser
 
 from workbench.recording.web_viewer import VIEWER_FILES, VIEWER_POLICY, is_kept, viewer_file
-from workbench.ui.changed import fill, show
+from workbench.ui.changed import fill
 from workbench.ui.door import Door
 from workbench.ui.file_reply import FileReply
 from workbench.ui.fragments import render
@@ -109,20 +109,21 @@ class RerunView:
     Args:
         server: The page.
         pages: Where rerun is served.
+        make_way: Called before the panel comes, to make room for it.
     """
 
-    def __init__(self, server: viser.ViserServer, pages: RerunPages) -> None:
-        self._server, self._pages = server, pages
+    def __init__(
+        self, server: viser.ViserServer, pages: RerunPages, make_way: Callable[[], None] = lambda: None
+    ) -> None:
+        self._server, self._pages, self._make_way = server, pages, make_way
         self._paths: tuple[Path, ...] = ()
         self._panel: viser.PanelHandle | None = None
         self._lock = threading.Lock()
         self._problem = ""
         self._waiting = False
         self._button = server.gui.add_button("Open in rerun", icon=viser.Icon.APP_WINDOW, disabled=True)
-        self._close = server.gui.add_button("Close rerun", icon=viser.Icon.X, visible=False)
         self._words = server.gui.add_html("")
         self._button.on_click(lambda _: self.open())
-        self._close.on_click(lambda _: self.close())
 
     def draw(self, paths: Sequence[Path]) -> None:
         """From now on the buttons are about these ``.rrd`` files."""
@@ -130,7 +131,6 @@ class RerunView:
         disabled = not self._paths or self._waiting
         if self._button.disabled != disabled:
             self._button.disabled = disabled
-        show(self._close, self._panel is not None)
         words = render(
             "rerun",
             address=self._pages.address(self._paths) if self._paths else None,
@@ -157,10 +157,12 @@ class RerunView:
             self._waiting = False
             self.draw(self._paths)
         self.close()
+        self._make_way()
         with self._lock:
             self._panel = panel = self._server.gui.add_panel(order=6.0)
         with panel.add_tab("rerun", viser.Icon.APP_WINDOW):
             self._server.gui.add_html(render("rerun_frame", address=self._pages.address(paths)))
+            self._server.gui.add_button("Close rerun", icon=viser.Icon.X).on_click(lambda _: self.close())
         # Over the scene and not beside it: beside the library a small window has no room for a third column. Who
         # has a larger one docks it.
         panel.float(x=12, y=12, width=WIDTH)
@@ -172,4 +174,3 @@ class RerunView:
             panel, self._panel = self._panel, None
         if panel is not None:
             panel.remove()
-        show(self._close, False)
