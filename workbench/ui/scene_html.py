@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import viser
 
 from workbench.recording.episode import Episode
 from workbench.recording.new_file import new_file
@@ -23,6 +24,9 @@ from workbench.ui.scene_view import SceneView
 
 TRIANGLES = 80_000
 """About how many are drawn. A robot's own meshes have twice that, and the file would be three times the size."""
+
+PAUSE = 1.0
+"""Seconds at the end."""
 
 
 def write_scene_html(
@@ -59,11 +63,14 @@ def write_scene_html(
     on_progress(1.0)
 
 
-def _recorded(server, episode: Episode, eye: Eye, on_progress: Callable[[float], None]) -> str:
+def _recorded(
+    server: viser.ViserServer, episode: Episode, eye: Eye, on_progress: Callable[[float], None]
+) -> str:
     geometry, poses = episode.geometry, episode.poses
     assert geometry is not None and poses is not None
     env = 0 if geometry.num_envs == 1 else episode.info.env_index
     server.scene.set_up_direction("+z")
+    # viser's own lights: its player goes back to them at every turn, and other ones would flash.
     camera = server.initial_camera
     camera.position, camera.look_at, camera.up, camera.fov = eye.position, eye.look_at, eye.up, eye.fovy
     camera.near, camera.far = 0.05, 300.0
@@ -77,6 +84,8 @@ def _recorded(server, episode: Episode, eye: Eye, on_progress: Callable[[float],
     for state, now in enumerate(poses):
         batch[env] = now
         scene.move(batch, layout, env)
-        recording.insert_sleep(episode.info.control_dt)
+        recording.insert_sleep(max(episode.info.control_dt, 1e-3))
         on_progress(0.9 * state / len(poses))
+    # It begins anew by itself; without a pause one does not see how it ended.
+    recording.insert_sleep(PAUSE)
     return recording.as_html(dark_mode=True)
