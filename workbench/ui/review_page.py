@@ -128,7 +128,7 @@ class ReviewPage:
         self._framed: object = None
         self._labels: list[viser.LabelHandle] = []
         self._labelled: object = None
-        self._had_opened: tuple[str, ...] = ()
+        self._had_opened = tuple(one.id for one in review.view().opened)
         self._built_for = 0
         """How many triangles the scene was built for."""
 
@@ -144,7 +144,7 @@ class ReviewPage:
         server.gui.add_html(style_sheet())
         self._status = server.gui.add_html("")
         if offers.on_back is not None:
-            go_back = server.gui.add_button(BACK, icon=viser.Icon.ARROW_BACK_UP)
+            go_back = server.gui.add_button(BACK, icon=viser.Icon.ARROW_BACK_UP, color="gray")
             go_back.on_click(lambda _: offers.on_back() if offers.on_back else None)
         tabs = server.gui.add_tab_group()
         review_tab = tabs.add_tab("Review", viser.Icon.PLAYER_PLAY)
@@ -175,6 +175,8 @@ class ReviewPage:
             self._library_window.dock_left()
             self._library_window.set_width(LIBRARY_WIDTH)
         self._library_open = True
+        if self._had_opened:
+            self._show_library(False)
         places = Places(
             review_tab, compare_tab, share_tab, tabs, self._library, lambda: self._show_library(False)
         )
