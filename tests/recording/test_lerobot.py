@@ -15,7 +15,9 @@ from workbench.recording.episode import Episode
 from workbench.recording.lerobot_export import ExportOptions, export_lerobot
 from workbench.recording.lerobot_frames import Choice, frames_of
 from workbench.recording.lerobot_read import is_lerobot, lerobot_rows, read_lerobot
+from workbench.recording.library import Library, LibraryError
 from workbench.recording.read_episode import UnreadableRecording, read_episode
+from workbench.session.review import read_row
 
 
 @pytest.fixture(scope="module")
@@ -183,3 +185,22 @@ def test_a_broken_dataset_is_said(episode: Episode, tmp_path: Path) -> None:
     (folder / "meta/info.json").write_text("{")
     with pytest.raises(UnreadableRecording, match="no LeRobot dataset"):
         lerobot_rows(folder)
+
+
+def test_a_dataset_is_in_the_library_an_episode_a_row(
+    episode: Episode, succeeding: Episode, tmp_path: Path
+) -> None:
+    export(tmp_path / "sets" / "push", episode, succeeding)
+    library = Library(tmp_path)
+    try:
+        library.refresh()
+        first, second = library.rows()
+        assert (first.name, first.kind, first.success) == ("sets/push#0", "lerobot", False)
+        assert (second.success, second.length, second.seed) == (True, episode.length, episode.info.seed)
+        assert second.problem is None
+        np.testing.assert_array_equal(read_row(second).action, episode.action)
+        with pytest.raises(LibraryError, match="delete the folder"):
+            library.delete([first.id, second.id])
+        assert is_lerobot(tmp_path / "sets" / "push")
+    finally:
+        library.close()

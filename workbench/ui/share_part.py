@@ -77,6 +77,8 @@ class SharePart:
 
 def source_of(row: LibraryRow) -> Source:
     """What a row of the library is read from."""
+    if row.kind == "lerobot" and row.trajectory is not None:
+        return Source(row.paths[0].parents[1], row.trajectory)
     if row.trajectory is not None:
         return Source(row.paths[0].with_suffix(".h5"), row.trajectory)
     return Source(row.paths[0])
