@@ -117,6 +117,7 @@ class RerunView:
     ) -> None:
         self._server, self._pages, self._make_way = server, pages, make_way
         self._paths: tuple[Path, ...] = ()
+        self._chosen = 0
         self._panel: viser.PanelHandle | None = None
         self._lock = threading.Lock()
         self._problem = ""
@@ -125,8 +126,9 @@ class RerunView:
         self._words = server.gui.add_html("")
         self._button.on_click(lambda _: self.open())
 
-    def draw(self, paths: Sequence[Path]) -> None:
-        """From now on the buttons are about these ``.rrd`` files."""
+    def draw(self, paths: Sequence[Path], chosen: int | None = None) -> None:
+        """From now on the buttons are about these ``.rrd`` files, of as many recordings as are `chosen`."""
+        self._chosen = len(paths) if chosen is None else chosen
         self._paths = tuple(paths)
         disabled = not self._paths or self._waiting
         if self._button.disabled != disabled:
@@ -134,6 +136,7 @@ class RerunView:
         words = render(
             "rerun",
             address=self._pages.address(self._paths) if self._paths else None,
+            lacking=self._chosen > len(self._paths),
             waiting=self._waiting,
             problem=self._problem,
         )
@@ -148,14 +151,14 @@ class RerunView:
             self._waiting, self._problem = not is_kept(), ""
         try:
             if self._waiting:
-                self.draw(paths)
+                self.draw(paths, self._chosen)
                 viewer_file("index.html")
         except RuntimeError as error:
             self._problem = str(error)
             return
         finally:
             self._waiting = False
-            self.draw(self._paths)
+            self.draw(self._paths, self._chosen)
         self.close()
         self._make_way()
         with self._lock:
@@ -166,7 +169,6 @@ class RerunView:
         # Over the scene and not beside it: beside the library a small window has no room for a third column. Who
         # has a larger one docks it.
         panel.float(x=12, y=12, width=WIDTH)
-        self.draw(self._paths)
 
     def close(self) -> None:
         """Take the panel away, and the program that runs in it."""

@@ -72,7 +72,7 @@ class SharePart:
         cameras = {name: None for row in rows if row.id in opened for name in cameras_by_name(opened[row.id])}
         alone = len(rows) == 1 and len(view.opened) == 1 and rows[0].id in opened
         self._share.draw(Chosen(tuple(map(source_of, rows)), tuple(cameras), in_view=alone))
-        self._rerun.draw(rerun_files(rows))
+        self._rerun.draw(rerun_files(rows), len(rows))
 
 
 def source_of(row: LibraryRow) -> Source:
