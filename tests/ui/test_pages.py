@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,7 +16,9 @@ from tests.session.conftest import TASKS, wait_until
 from tests.session.recordings import begin, made, write
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
+from workbench.ui.page import Page
 from workbench.ui.put_together import Workplace
+from workbench.ui.review_page import ReviewPage
 
 SWAPS = 20
 
@@ -58,7 +62,9 @@ def test_twenty_swaps_leave_nothing_and_the_session_lives_on(
         which = "review" if number % 2 == 0 else "live"
         place.pages.show(which)
         assert place.pages.wait_for(which, timeout=60)
-        place.pages._page.redraw()
+        page = place.pages._page
+        assert isinstance(page, (Page, ReviewPage))
+        page.redraw()
         seen[which].append(counts(server))
         threads.append(threading.active_count())
     for found in seen.values():
@@ -82,6 +88,16 @@ def test_an_episode_whose_writer_was_killed_is_mended_and_said(
         until(lambda: [row.seed for row in place.shelf.library.rows()] == [8], "its row")
     finally:
         place.close()
+
+
+def test_looking_at_recordings_needs_no_simulator() -> None:
+    said = subprocess.run(
+        [sys.executable, "-c", "import sys, workbench.ui.put_together; print(*sys.modules)"],
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout.split()
+    assert not {"torch", "sapien", "mani_skill", "libcst"} & set(said)
 
 
 def until(reached: Callable[[], bool], what: str) -> None:

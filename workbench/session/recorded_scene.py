@@ -27,7 +27,6 @@ from workbench.core.geometry import SceneGeometry
 from workbench.recording.episode import Episode
 
 _LOOK = 0.1
-_NICENESS = 10
 _NOT_PASSED_ON = (
     "num_envs", "obs_mode", "reward_mode", "render_mode", "sim_backend", "render_backend", "backend",
     "parallel_in_single_scene", "sensor_configs", "human_render_camera_configs", "viewer_camera_configs",

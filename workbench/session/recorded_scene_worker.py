@@ -6,7 +6,6 @@ nobody listens any more. An env is kept for the next episode as long as that was
 
 from __future__ import annotations
 
-import os
 import sys
 import traceback
 from multiprocessing.connection import Connection
@@ -33,7 +32,6 @@ def main() -> None:
     """Entry of the process."""
     connection = Connection(int(sys.argv[1]))
     end_with(int(sys.argv[2]))
-    os.nice(10)
     made: tuple[object, TaskEnv] | None = None
     while True:
         try:
