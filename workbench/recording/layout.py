@@ -4,7 +4,7 @@ A recording is read by people in the viewer and by programs, so where a thing li
 
 - ``/world`` right-handed, z up; ``/world/<body>`` its pose, ``/world/<body>/<n>`` its static meshes;
 - ``/world/cameras/<name>`` pose and pinhole, with children ``rgb``, ``depth`` and ``segmentation``;
-- ``/action``, ``/reward`` and ``/reward/<term>``, ``/evaluate/<entry>``, ``/observation/state/<entry>``,
+- ``/action``, ``/reward`` and ``/reward/<term>``, ``/evaluate/<entry>``, ``/observation/state``,
   ``/episode/{success,fail,terminated,truncated}`` as numbers, ``/logs/events`` as text.
 
 Two timelines index all of it: ``step``, the state's number, and ``sim_time``. Row k is what
@@ -18,117 +18,36 @@ z forward); ManiSkill has wxyz and x forward, y left, z up.
 
 from __future__ import annotations
 
+import math
+import weakref
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from workbench.core.geometry import Material, Mesh, SceneGeometry
+from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo
 from workbench.recording.columns import EVALUATE, OBS, Column
 from workbench.recording.encoded_pictures import MILLIMETRES_PER_METRE, decode
+from workbench.recording.rerun_log import Log
 from workbench.recording.survey import CameraSurvey, Piece, Survey
 
-STEP = "step"
-SIM_TIME = "sim_time"
 WORLD = "/world"
 CAMERAS = "/world/cameras"
 EVENTS = "/logs/events"
+OBSERVATION = "/observation/state"
+"""All observations but pictures as one batch, as LeRobot has them: an entity each would be 5 kB a file and 40 B a step."""
 REWARD_TERMS = "reward_terms/"
 """What an entry of ``evaluate()`` begins with that is a part of the reward."""
 
 FRUSTUM_METRES = 0.12
 """How far in front of a camera its picture is drawn in the 3-D view."""
-SERIES_COLORS = (
-    (86, 180, 233),
-    (230, 159, 0),
-    (0, 158, 115),
-    (204, 121, 167),
-    (213, 94, 0),
-    (0, 114, 178),
-    (150, 150, 150),
-    (136, 100, 220),
-)
-"""Okabe and Ito's palette, which the colour-blind can tell apart, with grey and violet for its black and
-yellow: the viewer comes dark and light, and each of those vanishes on one of the two."""
-
 _OPTICAL_FROM_CAMERA = (0.5, -0.5, 0.5, -0.5)
 """wxyz of the OpenCV camera axes (x right, y down, z forward) within ManiSkill's (x forward, y left,
 z up): the rotation matrix [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]."""
-
-
-@dataclass(frozen=True)
-class Account:
-    """What was handed to rerun, for the finished file to be held against.
-
-    Rerun writes on threads of its own, and what those fail to write is at best a line on stderr.
-    """
-
-    rows: Counter[str] = field(default_factory=Counter)
-    """Entity to number of rows in time."""
-    statics: set[str] = field(default_factory=set)
-    """Entities that hold something static."""
-
-
-class Log:
-    """Rerun's two ways in, with an account of what went in."""
-
-    def __init__(self, recording: rr.RecordingStream, control_dt: float) -> None:
-        self._recording = recording
-        self._control_dt = control_dt
-        self.account = Account()
-
-    def static(self, entity: str, values: Any) -> None:
-        self._recording.log(entity, values, static=True)
-        self.account.statics.add(entity)
-
-    def columns(self, entity: str, steps: NDArray[np.int64], columns: Iterable[Any]) -> None:
-        if len(steps) == 0:
-            return
-        times = [
-            rr.TimeColumn(STEP, sequence=steps),
-            # Whole nanoseconds by rounding: rerun itself cuts off, and 3 * 0.05 s would be 149999999 ns.
-            rr.TimeColumn(
-                SIM_TIME, duration=np.rint(steps * self._control_dt * 1e9).astype("timedelta64[ns]")
-            ),
-        ]
-        self._recording.send_columns(entity, times, columns)
-        self.account.rows[entity] += len(steps)
-
-    def pose(
-        self,
-        entity: str,
-        steps: NDArray[np.int64],
-        translation: NDArray[np.float32],
-        xyzw: NDArray[np.float32],
-    ) -> None:
-        """`translation` (len(steps), 3) and `xyzw` (len(steps), 4)."""
-        self.columns(entity, steps, rr.Transform3D.columns(translation=translation, quaternion=xyzw))
-
-    def still(self, entity: str, translation: NDArray[np.float32], xyzw: NDArray[np.float32]) -> None:
-        """The one pose, (3,) and (4,), of what never moves."""
-        quaternion = rr.Quaternion(xyzw=xyzw)
-        self.static(entity, rr.Transform3D(translation=translation, quaternion=quaternion))
-
-    def series(self, entity: str, names: Sequence[str], first_color: int = 0) -> None:
-        """Name and colour of each number of the batched `scalars` of `entity`."""
-        if names:
-            # Left to itself rerun gives all series of an entity one colour, and entities of one folder much the same.
-            colors = [
-                SERIES_COLORS[(first_color + index) % len(SERIES_COLORS)] for index in range(len(names))
-            ]
-            self.static(entity, rr.SeriesLines(names=list(names), colors=colors))
-
-    def scalars(self, entity: str, steps: NDArray[np.int64], values: NDArray) -> None:
-        """`values` (len(steps), ...), all of a step as one batch."""
-        if np.size(values):
-            flat = np.asarray(values, dtype=np.float64).reshape(len(steps), -1)
-            columns = rr.Scalars.columns(scalars=flat.reshape(-1))
-            self.columns(entity, steps, columns.partition([flat.shape[1]] * len(flat)))
 
 
 class EpisodeLog:
@@ -154,7 +73,7 @@ class EpisodeLog:
         log, survey, states = self._log, self._survey, piece.states
         poses = piece.columns["poses"]
         for body, entity in self._bodies:
-            if not _stands(survey, body):
+            if not survey.still[body]:
                 log.pose(entity, states, poses[:, body, :3], xyzw(poses[:, body, 3:]))
         for (index, modality), (frames, blobs) in piece.pictures.items():
             _log_pictures(log, survey.cameras[index], self._cameras[index], modality, frames, blobs)
@@ -179,6 +98,11 @@ class EpisodeLog:
                 log.scalars(entity, states, piece.columns[name])
         for name, values in survey.flags.items():
             log.scalars(f"/episode/{name}", states, values[states])
+        if observed := [piece.columns[OBS + name] for name in survey.named(OBS)]:
+            flat = [
+                np.asarray(v, dtype=np.float64).reshape(len(states), math.prod(v.shape[1:])) for v in observed
+            ]
+            log.scalars(OBSERVATION, states, np.concatenate(flat, axis=1))
 
 
 # --- names ----------------------------------------------------------------------------------------
@@ -223,40 +147,51 @@ def evaluate_entity(name: str) -> str:
     return rr.new_entity_path(["evaluate", name or "unnamed"])
 
 
-def observation_entity(name: str) -> str:
-    return rr.new_entity_path(["observation", "state", *(part for part in name.split("/") if part)])
-
-
 # --- scene ----------------------------------------------------------------------------------------
-
-
-def _stands(survey: Survey, body: int) -> bool:
-    return bool(survey.still[body]) and survey.header.geometry.body_kinds[body] == "static"
 
 
 def _log_scene(log: Log, survey: Survey, entities: dict[int, str]) -> None:
     log.static(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     for body, entity in entities.items():
-        if _stands(survey, body):
+        if survey.still[body]:
             pose = survey.first_poses[body]
             log.still(entity, pose[:3], xyzw(pose[3:]))
     worn: Counter[int] = Counter()
     for visual in survey.header.geometry.visuals:
-        mesh = _mesh(visual.mesh, visual.material) if survey.info.env_index in visual.envs else None
-        if mesh is None:
+        worn_by = [int(body) for body in visual.bodies[visual.envs == survey.info.env_index]]
+        drawn = _drawn(visual) if any(body in entities for body in worn_by) else None
+        if drawn is None:
             continue
+        for body in worn_by:
+            if body in entities:
+                log.static(f"{entities[body]}/{worn[body]}", *drawn)
+                worn[body] += 1
+
+
+_made: dict[int, tuple[weakref.ref[Visual], tuple[Any, ...] | None]] = {}
+"""What `_drawn` made, by the visual's id, for as long as the visual lives: episodes follow each other in one scene, and its textures
+are megabytes to convert."""
+
+
+def _drawn(visual: Visual) -> tuple[Any, ...] | None:
+    """`visual` as what rerun logs for it; None where it has no triangles."""
+    held = _made.get(id(visual))
+    if held is not None and held[0]() is visual:
+        return held[1]
+    mesh = _mesh(visual.mesh, visual.material)
+    drawn = None
+    if mesh is not None:
         # What rerun's mesh does not say, for whoever reads the scene back.
-        material = rr.AnyValues(
+        said = rr.AnyValues(
             visual=visual.name,
             base_color=list(visual.material.base_color),
             metallic=visual.material.metallic,
             roughness=visual.material.roughness,
         )
-        for body in visual.bodies[visual.envs == survey.info.env_index]:
-            if int(body) in entities:
-                log.static(f"{entities[int(body)]}/{worn[int(body)]}", mesh)
-                log.static(f"{entities[int(body)]}/{worn[int(body)]}", material)
-                worn[int(body)] += 1
+        drawn = (mesh, said)
+    key = id(visual)
+    _made[key] = (weakref.ref(visual, lambda _: _made.pop(key, None)), drawn)
+    return drawn
 
 
 def _mesh(mesh: Mesh, material: Material) -> rr.Mesh3D | None:
@@ -340,10 +275,9 @@ def _numbers(survey: Survey) -> list[tuple[str, str, list[str]]]:
         ("terminated", "/episode/terminated", ["terminated"]),
         ("truncated", "/episode/truncated", ["truncated"]),
     ]
-    for prefix, entity in ((EVALUATE, evaluate_entity), (OBS, observation_entity)):
-        for name, column in survey.named(prefix).items():
-            said = name.removeprefix(REWARD_TERMS) if prefix == EVALUATE else name or "obs"
-            found.append((prefix + name, entity(name), series_names(said, column)))
+    for name, column in survey.evaluate().items():
+        series = series_names(name.removeprefix(REWARD_TERMS), column)
+        found.append((EVALUATE + name, evaluate_entity(name), series))
     return found
 
 
@@ -355,8 +289,6 @@ def series_names(name: str, column: Column) -> list[str]:
 
 
 def _log_series(log: Log, survey: Survey) -> None:
-    if survey.length == 0:
-        return
     drawn: Counter[str] = Counter()
     for _, entity, series in _numbers(survey):
         folder = entity.split("/")[1]  # one view shows all entities of a folder
@@ -365,6 +297,8 @@ def _log_series(log: Log, survey: Survey) -> None:
         drawn[folder] += len(series)
     for name in survey.flags:
         log.series(f"/episode/{name}", [name])
+    observed = survey.named(OBS).items()
+    log.series(OBSERVATION, [one for name, column in observed for one in series_names(name or "obs", column)])
 
 
 def events(survey: Survey) -> list[tuple[int, str, str]]:
