@@ -90,6 +90,7 @@ def open_page(
         return _refuse(str(error))
     from workbench.session.session import Session
     from workbench.ui.put_together import Workplace
+    from workbench.ui.share_part import Sharing
 
     _use_private_driver()
     for line in (door.warning, door.notice):
@@ -113,6 +114,8 @@ def open_page(
         on_line=_echo,
     )
     place = Workplace(door.server, recordings, session)
+    sharing = Sharing(door)
+    place.offer(sharing.offer)
     end.at_signals()
     try:
         place.pages.start("live")
@@ -121,6 +124,7 @@ def open_page(
     finally:
         out.print("closing")
         place.close()
+        sharing.close()
         session.close()
         door.close()
     _leave(end.code)
@@ -209,6 +213,7 @@ def review(
     except (ValueError, DoorError) as error:
         return _refuse(str(error))
     from workbench.ui.put_together import Workplace
+    from workbench.ui.share_part import Sharing
 
     _use_private_driver()
     for line in (door.warning, door.notice):
@@ -216,6 +221,8 @@ def review(
             err.print(f"[yellow]{escape(line)}[/]")
     end = _End()
     place = Workplace(door.server, folder, tasks=task)
+    sharing = Sharing(door)
+    place.offer(sharing.offer)
     end.at_signals()
     try:
         place.pages.start("review")
@@ -224,26 +231,90 @@ def review(
     finally:
         out.print("closing")
         place.close()
+        sharing.close()
         door.close()
     _leave(end.code)
 
 
 @app.command
-def view(files: Annotated[tuple[Path, ...], tyro.conf.Positional], /, web: bool = False) -> int:
+def share(
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    /,
+    mp4: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    html: bool = False,
+    sheet: bool = False,
+    out: Path = Path("."),
+) -> int:
+    """Make films, moving 3-D pages and sheets of pictures of recordings.
+
+    Args:
+        files: recordings, or folders of them.
+        mp4: a film of the camera of this name, of "scene" (the 3-D view), or of "cameras" (each of them); repeatable.
+        html: the moving 3-D view as one HTML file that needs no server and no network.
+        sheet: what each camera saw over time, on one picture.
+        out: folder for what is made; nothing that is there is written over.
+    """
+    from workbench.share_command import share_in_terminal
+
+    _use_private_driver()
+    return share_in_terminal(files, mp4, html, sheet, out, err, _refuse)
+
+
+@app.command
+def export(
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    /,
+    lerobot: Path,
+    only_successes: bool = False,
+    task: str | None = None,
+    fps: int | None = None,
+    cameras: tuple[str, ...] | None = None,
+    state: tuple[str, ...] = (),
+    environment_state: tuple[str, ...] = (),
+) -> int:
+    """Make a dataset for training of recordings.
+
+    Args:
+        files: recordings, or folders of them.
+        lerobot: folder that becomes a LeRobot dataset (version 3); must not exist yet.
+        only_successes: leave out recordings that reach success at no step.
+        task: the task in words, for policies that read; else its id.
+        fps: frames a second, of which the control rate is a whole multiple; else the control rate.
+        cameras: names of cameras; else all. Give none (--cameras) for a dataset without films.
+        state: observations that become observation.state, such as agent/qpos; else all that the robot knows of itself.
+        environment_state: observations that become observation.environment_state, such as extra; else none.
+    """
+    from workbench.share_command import export_in_terminal
+
+    return export_in_terminal(
+        files, lerobot, only_successes, task, fps, cameras, state, environment_state, err, _refuse
+    )
+
+
+@app.command
+def view(
+    files: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    /,
+    web: bool = False,
+    host: str = "127.0.0.1",
+    port: int = 0,
+) -> int:
     """Open recordings in rerun's own viewer: a window, or a page where there is no screen.
 
     Args:
         files: one or more .rrd files.
-        web: a page, also where there is a screen; it is served on this machine only and asks no other.
+        web: a page, also where there is a screen; it asks nobody but this program.
+        host: address to serve the page on.
+        port: port of the page; 0 takes any free one.
     """
-    from workbench.recording.viewer import open_in_rerun
+    from workbench.recording.viewer import has_screen, open_window, recordings_among
 
     try:
-        viewer = open_in_rerun(files, web=True if web else None)
+        if web or not has_screen(os.environ):
+            return _view_in_page(recordings_among(files), host, port)
+        viewer = open_window(files)
     except (OSError, ValueError, RuntimeError) as error:
         return _refuse(str(error))
-    if viewer.url is not None:
-        print(f"  page    {viewer.url}\n  Ctrl-C ends it.", flush=True)
     try:
         viewer.wait()
     except RuntimeError as error:
@@ -252,6 +323,28 @@ def view(files: Annotated[tuple[Path, ...], tyro.conf.Positional], /, web: bool 
         print("closing", flush=True)
     finally:
         viewer.close()
+    return 0
+
+
+def _view_in_page(files: Sequence[Path], host: str, port: int) -> int:
+    from workbench.recording.web_viewer import web_viewer_folder
+    from workbench.ui.door import DoorOptions, open_door
+    from workbench.ui.offers import Offers
+    from workbench.ui.rerun_view import RerunPages
+
+    web_viewer_folder()
+    door = open_door(DoorOptions(host=host, port=port))
+    try:
+        address = RerunPages(door, Offers(door)).address(files)
+        if door.warning:
+            err.print(f"[yellow]{escape(door.warning)}[/]")
+        print(f"  page    {door.address(address)}", flush=True)
+        print(f"  remote  {door.ssh_hint}\n  Ctrl-C ends it.", flush=True)
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        print("closing", flush=True)
+    finally:
+        door.close()
     return 0
 
 

@@ -5,9 +5,6 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import urllib.error
-import urllib.parse
-import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,12 +13,11 @@ import numpy as np
 import psutil
 import pytest
 from PIL import Image
-from playwright.sync_api import Request, sync_playwright
 from rerun.experimental import ViewerClient
 
-from workbench.recording import viewer
+from workbench.recording.rerun_process import await_port, end, free_port
 from workbench.recording.verify import quiet_environment, rerun_command, verify_rrd
-from workbench.recording.viewer import Viewer, has_screen, open_in_rerun
+from workbench.recording.viewer import has_screen, open_window
 
 
 @pytest.fixture(scope="module")
@@ -30,17 +26,10 @@ def file(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return written.rrd.rename(written.rrd.with_name("PickCube ä.rrd"))
 
 
-@pytest.fixture(scope="module")
-def page(file: Path) -> Iterator[Viewer]:
-    shown = open_in_rerun([file], web=True)
-    yield shown
-    shown.close()
-
-
 @pytest.fixture
 def headless(file: Path) -> Iterator[ViewerClient]:
     """Rerun's viewer without a window; `ViewerClient.spawn` would listen on every address."""
-    port = viewer.free_port()
+    port = free_port()
     command = [
         *rerun_command(),
         "--headless",
@@ -52,11 +41,11 @@ def headless(file: Path) -> Iterator[ViewerClient]:
     ]
     process = subprocess.Popen(command, env=quiet_environment(), stderr=subprocess.DEVNULL)
     try:
-        viewer._await_port(process, port)
+        await_port(process, port)
         assert listening(process.pid) == {"127.0.0.1"}
         yield ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
     finally:
-        viewer._end(process)
+        end(process)
 
 
 def listening(pid: int) -> set[str]:
@@ -105,89 +94,11 @@ def test_the_native_viewer_shows_the_whole_layout(headless: ViewerClient, file: 
     assert 0.2 < rows.mean() / scene.shape[0] < 0.8 and 0.2 < columns.mean() / scene.shape[1] < 0.8
 
 
-def test_the_page_opens_the_recording_and_talks_to_nobody_else(page: Viewer, chromium_path: str) -> None:
-    assert page.url is not None
-    ours = page.url.split("?")[0]
-    requests: list[Request] = []
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=chromium_path, args=["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader"]
-        )
-        tab = browser.new_page(viewport={"width": 640, "height": 400})
-        tab.on("request", lambda request: requests.append(request))
-        failed: dict[str, str | None] = {}
-        tab.on("requestfailed", lambda request: failed.update({request.url: request.failure}))
-        with tab.expect_response(lambda answer: "/recordings/" in answer.url, timeout=120_000) as recording:
-            tab.goto(page.url, wait_until="commit")
-        assert recording.value.status == 200
-        tab.wait_for_function(
-            "document.querySelector('canvas').classList.contains('visible')", timeout=60_000
-        )
-        browser.close()
-    asked = {request.url for request in requests}
-    assert ours + "re_viewer_bg.wasm" in asked
-    foreign = {url for url in asked if not url.startswith((ours.rsplit("/", 2)[0], "data:", "blob:"))}
-    assert {url: failed.get(url) for url in foreign} == dict.fromkeys(foreign, "csp")
-    assert foreign, "rerun's page has stopped asking others; the policy can be simpler"
-
-
-def get(url: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
-    opener = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-    try:
-        with opener.open(urllib.request.Request(url, headers=headers), timeout=20) as answer:
-            return answer.status, dict(answer.headers), answer.read()
-    except urllib.error.HTTPError as error:
-        return error.code, dict(error.headers), error.read()
-
-
-def test_the_page_serves_its_files_and_no_others(page: Viewer, file: Path) -> None:
-    assert page.url is not None and page._server is not None
-    root, query = page.url.split("?")
-    assert root.startswith("http://127.0.0.1:")
-    (recording,) = urllib.parse.parse_qs(query)["url"]
-    status, headers, body = get(recording)
-    assert (status, body) == (200, file.read_bytes())
-    assert "Access-Control-Allow-Origin" not in headers
-    assert "connect-src 'self'" in get(root)[1]["Content-Security-Policy"]
-    host = root.split("/")[2]
-    for path in ("", "recordings/0-x.rrd", "etc/passwd"):
-        assert get(f"http://{host}/{path}")[0] == 404
-        assert get(f"http://{host}/{'x' * 22}/{path}")[0] == 404
-    for path in (
-        "../",
-        "recordings/../../etc/passwd",
-        "recordings/%2e%2e%2f%2e%2e",
-        "recordings/",
-        "nothing.js",
-    ):
-        assert get(root + path)[0] == 404
-    assert get(root, Host="evil.example")[0] == 403
-    assert get(root, Host=f"localhost:{host.split(':')[1]}")[0] == 200
-    assert page._server.server_address[0] == "127.0.0.1"
-
-
-def test_a_recording_that_was_moved_away_is_not_found(file: Path, tmp_path: Path) -> None:
-    gone = tmp_path / "gone.rrd"
-    gone.write_bytes(b"short-lived")
-    with_pages = pytest.MonkeyPatch()
-    with_pages.setattr(viewer, "web_viewer_files", lambda: {"index.html": b""})
-    shown = open_in_rerun([gone], web=True)
-    with_pages.undo()
-    try:
-        assert shown.url is not None
-        (recording,) = urllib.parse.parse_qs(shown.url.split("?")[1])["url"]
-        assert get(recording)[2] == b"short-lived"
-        gone.unlink()
-        assert get(recording)[0] == 404
-    finally:
-        shown.close()
-
-
 def test_what_cannot_be_opened_is_said(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="No recording was named"):
-        open_in_rerun([])
+        open_window([])
     with pytest.raises(FileNotFoundError, match=r"none\.rrd is not a file"):
-        open_in_rerun([tmp_path / "none.rrd"])
+        open_window([tmp_path / "none.rrd"])
 
 
 @pytest.mark.skipif(os.name != "posix", reason="looks at X11 and Wayland")
@@ -202,7 +113,7 @@ def test_a_window_without_a_screen_is_refused(file: Path, monkeypatch: pytest.Mo
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(RuntimeError, match="There is no screen here"):
-        open_in_rerun([file], web=False)
+        open_window([file])
 
 
 def test_a_window_that_cannot_open_is_said_and_leaves_no_process(
@@ -213,7 +124,7 @@ def test_a_window_that_cannot_open_is_said_and_leaves_no_process(
     before = psutil.Process().children()
     with pytest.raises(RuntimeError, match="ended with"):
         # Rerun listens before it looks for its display, so it may be either of the two that finds out.
-        open_in_rerun([file], web=False).wait()
+        open_window([file]).wait()
     assert psutil.Process().children() == before
 
 

@@ -22,7 +22,7 @@ from pathlib import Path
 
 from workbench.recording.annotations import write_into_description, write_notes
 from workbench.recording.library_index import Kept, LibraryIndex
-from workbench.recording.library_read import Entry, read_found
+from workbench.recording.library_read import DATASET_KEY, Entry, read_found
 from workbench.recording.library_row import Facts, LibraryRow, clean_note, clean_tags, text
 from workbench.recording.library_scan import NOTES, Found, Scan, found_of, key_of, scan_folder
 from workbench.recording.trash import (
@@ -248,7 +248,8 @@ class Library:
             # No id of its own, or a copy of a recording that is in the table already.
             where = f"{found.key}#{facts.trajectory or ''}"
             id = f"at-{hashlib.blake2b(where.encode(errors='surrogateescape'), digest_size=10).hexdigest()}"
-        name = found.key if facts.trajectory is None else f"{found.key}#{facts.trajectory}"
+        name = found.key.removesuffix("/meta/info") if facts.kind == "lerobot" else found.key
+        name += "" if facts.trajectory is None else f"#{facts.trajectory}"
         # A file's name may hold bytes that are no text, which no page can be sent.
         return LibraryRow(id, text(name, 400), found.paths(self.folder), sum(found.sizes.values()), facts)
 
@@ -333,6 +334,11 @@ class Library:
         wanted = set(ids)
         keys = {self._there(id)[1].key for id in wanted}
         for key in keys:
+            if self._found[key].key.split("/")[-2:] == DATASET_KEY and "/" in key:
+                raise LibraryError(
+                    f"{text(key.removesuffix('/meta/info'), 400)} is a LeRobot dataset, a folder of many files, and is not "
+                    "deleted from here: delete the folder."
+                )
             of_file = {id for id, (other, _) in self._places.items() if other == key}
             if not wanted >= of_file:
                 raise LibraryError(

@@ -21,6 +21,7 @@ import numpy as np
 from PIL import Image
 
 from workbench.recording.annotations import read_json, read_notes
+from workbench.recording.lerobot_read import lerobot_rows
 from workbench.recording.library_row import (
     Facts,
     clean_note,
@@ -32,7 +33,10 @@ from workbench.recording.library_row import (
     whole,
 )
 from workbench.recording.library_scan import NOTES, Found
+from workbench.recording.read_maniskill import UnreadableRecording
 
+DATASET_KEY = ["meta", "info"]
+"""How the key of a LeRobot dataset ends."""
 THUMBNAIL_PIXELS = 96
 THUMBNAIL_BYTES = 8192
 """A thumbnail as it was recorded is taken as it is up to here, and made smaller beyond."""
@@ -65,6 +69,8 @@ def _read(folder: Path, found: Found) -> list[Entry]:
             return [_broken(folder, found, str(error))]
         if isinstance(described, dict) and isinstance(described.get("workbench"), dict):
             return [_ours(folder, found, described["workbench"])]
+        if isinstance(described, dict) and found.key.split("/")[-2:] == DATASET_KEY:
+            return _lerobots(folder, found)
         if isinstance(described, dict) and isinstance(described.get("episodes"), list):
             return _maniskills(folder, found, described)
         if ".h5" in found.sizes:
@@ -178,6 +184,31 @@ def _maniskills(folder: Path, found: Found, described: dict[str, Any]) -> list[E
             )
         )
     return entries
+
+
+def _lerobots(folder: Path, found: Found) -> list[Entry]:
+    """One row an episode of a LeRobot dataset, which is known by its ``meta/info.json``."""
+    written = found.newest / 1e9
+    try:
+        rows = lerobot_rows(found.path(folder, ".json").parents[1])
+    except UnreadableRecording as error:
+        return [(Facts("lerobot", written=written, problem=text(str(error), 500)), None)]
+    return [
+        (
+            Facts(
+                "lerobot",
+                task=text(row.task),
+                trajectory=str(row.index),
+                written=written,
+                seed=row.seed,
+                length=row.length,
+                total_reward=row.total_reward,
+                success=row.success,
+            ),
+            None,
+        )
+        for row in rows
+    ]
 
 
 def _totals(path: Path, trajectories: list[str]) -> tuple[dict[str, float | None], str | None]:

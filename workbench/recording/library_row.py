@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-Kind = Literal["workbench", "maniskill", "rrd only"]
+Kind = Literal["workbench", "maniskill", "rrd only", "lerobot"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
 LONGEST_TAG = 40
 LONGEST_NOTE = 1000
@@ -28,7 +28,7 @@ class Facts:
     kind: Kind
     task: str = ""
     trajectory: str | None = None
-    """Which one of the file, for a file with several (ManiSkill's)."""
+    """Which one of the file, for a file with several (ManiSkill's), or of a LeRobot dataset."""
     uid: str = ""
     """The recording's own id; empty for files that have none."""
     written: float | None = None

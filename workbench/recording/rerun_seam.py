@@ -54,8 +54,9 @@ def recording_into(
     try:
         layout.set_time("blueprint", sequence=0)
         blueprint._log_to_stream(layout)
-        # The blueprint's messages alone are not enough: this adds the one that says to use them.
-        rerun_bindings.send_blueprint(arrangement, False, True, recording.to_native())
+        # The blueprint's messages alone are not enough: this adds the one that says to use them. At once, too: as the
+        # default alone it comes too late for the web viewer, which draws a frame of its own making before it has it.
+        rerun_bindings.send_blueprint(arrangement, True, True, recording.to_native())
         yield recording
     finally:
         recording.disconnect()

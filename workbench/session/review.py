@@ -23,6 +23,7 @@ from typing import Protocol
 
 from workbench.core.shared_shapes import SharedShapes
 from workbench.recording.episode import Episode
+from workbench.recording.lerobot_read import read_lerobot
 from workbench.recording.read_episode import UnreadableRecording, read_episode, read_maniskill
 from workbench.session.recorded_scene import SceneError
 from workbench.session.review_events import happenings
@@ -61,6 +62,8 @@ class Shelf(Protocol):
 
 def read_row(row: Row) -> Episode:
     """The recording of a row. Raises as `read_episode`."""
+    if row.kind == "lerobot" and row.trajectory is not None:
+        return read_lerobot(row.paths[0].parents[1], int(row.trajectory))
     if row.trajectory is not None:
         # The library opens it by its .json, which is where the words are.
         return read_maniskill(row.paths[0].with_suffix(".h5"), row.trajectory)

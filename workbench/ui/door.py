@@ -121,6 +121,11 @@ class Door:
             raise ValueError(f"There is a route for {prefix} already.")
         self._routes[prefix] = (handler, dict(headers or {}))
 
+    def address(self, path: str) -> str:
+        """The address to open, with the token, for ``path`` (from the root: ``/rerun/...``) in place of the page."""
+        root, _, token = self.url.partition("/?")
+        return f"{root}{path}" + (f"?{token}" if token else "")
+
     def close(self) -> None:
         """Close every connection and stop listening. Can be called twice."""
         if self._closed:

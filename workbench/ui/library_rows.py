@@ -180,7 +180,7 @@ def _remark(row: LibraryRow) -> str:
         return "cut short"
     if row.kind == "workbench" or row.problem:
         return ""
-    return {"maniskill": "ManiSkill", "rrd only": ".rrd only"}.get(row.kind, row.kind)
+    return {"maniskill": "ManiSkill", "rrd only": ".rrd only", "lerobot": "LeRobot"}.get(row.kind, row.kind)
 
 
 def _outcome(row: LibraryRow) -> str:

@@ -24,11 +24,13 @@ from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from workbench.ui import gate, viser_seam
+from workbench.ui.file_reply import FileReply, send_file
 from workbench.web_assets import web_assets_folder
 
-Handler = Callable[[str], tuple[int, str, bytes]]
+Handler = Callable[[str], "tuple[int, str, bytes] | FileReply"]
 """Gets the path behind its prefix (decoded, no query, no ``..``, no backslash, no NUL); returns the
-status, the content type and the body. Runs in a thread of its own, so it may read files."""
+status, the content type and the body, or a file to be sent without reading it whole. Runs in a thread
+of its own, so it may read files."""
 
 SCRIPTS = ("keys.js", "timeline_width.js")
 """Of ``web_assets/``, run by the page; each says what it is for."""
@@ -144,21 +146,32 @@ async def admitted_reply(
             response.headers[name] = value
         return response
     if ".." in path.split("/") or "\0" in path:
-        return reply(404, "text/plain; charset=utf-8", b"There is no such file.", page)
+        return _no_such_file(page)
     handler, headers = routes[prefix]
     accepts_gzip = any("gzip" in value for value in request.headers.get_all("Accept-Encoding"))
 
-    def work() -> Response:
+    def work() -> Response | FileReply:
         try:
-            status, kind, body = handler(path[len(prefix) :])
+            made = handler(path[len(prefix) :])
         except Exception:
             _log.exception("The route %s failed on %s.", prefix, path)
-            status, kind, body = 500, "text/plain; charset=utf-8", b"This went wrong; the terminal says how."
+            made = 500, "text/plain; charset=utf-8", b"This went wrong; the terminal says how."
+        if isinstance(made, FileReply):
+            return made
+        status, kind, body = made
         zip_it = accepts_gzip and len(body) > 1024 and _compresses(kind)
         return reply(status, kind, gzip.compress(body, 6) if zip_it else body, {**page, **headers}, zip_it)
 
-    # In a thread: reading and compressing a recording would hold up every page's websocket.
-    return await asyncio.to_thread(work)
+    # In a thread: reading and compressing would hold up every page's websocket.
+    made = await asyncio.to_thread(work)
+    if isinstance(made, Response):
+        return made
+    fields = {**_EVERY_REPLY, **page, **headers}
+    return await send_file(connection, made, fields, accepts_gzip, lambda: _no_such_file(page))
+
+
+def _no_such_file(headers: Mapping[str, str]) -> Response:
+    return reply(404, "text/plain; charset=utf-8", b"There is no such file.", headers)
 
 
 @functools.lru_cache(maxsize=4)
@@ -187,7 +200,7 @@ def _compresses(kind: str) -> bool:
     )
 
 
-def folder_handler(folder: Path) -> Handler:
+def folder_handler(folder: Path) -> Callable[[str], tuple[int, str, bytes]]:
     """A handler that serves the files below ``folder``, and nothing that a link there points out to."""
     root = folder.resolve()
 

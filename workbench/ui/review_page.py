@@ -75,6 +75,8 @@ class Places:
     """For a tab of its own."""
     library: LibraryPanel | None
     """Says which recordings are selected, and takes further buttons for them (`LibraryPanel.add_action`)."""
+    make_way: Callable[[], None] = lambda: None
+    """Folds the table of recordings, for a part that opens a panel of its own."""
 
 
 Part = Callable[[viser.ViserServer, Places], "Drawn | None"]
@@ -178,7 +180,9 @@ class ReviewPage:
         self._library_open = True
         if self._had_opened:
             self._show_library(False)
-        places = Places(review_tab, compare_tab, share_tab, tabs, self._library)
+        places = Places(
+            review_tab, compare_tab, share_tab, tabs, self._library, lambda: self._show_library(False)
+        )
         made = [part(server, places) for part in offers.parts]
         self._parts = tuple(part for part in made if part is not None)
         with review_tab:

@@ -1,0 +1,190 @@
+"""What is made of an episode to be looked at: films, drawn scenes, sheets of pictures."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from workbench.recording.camera_pictures import camera_of, cameras_by_name, enlarged, frames
+from workbench.recording.contact_sheet import chosen_states, contact_sheet
+from workbench.recording.encoded_pictures import EncodedPictures, encode_jpeg
+from workbench.recording.episode import Episode
+from workbench.recording.mp4 import Encoding, write_mp4
+from workbench.recording.read_episode import read_episode
+from workbench.recording.scene_eye import Eye, usual_eye
+
+
+@pytest.fixture(scope="module")
+def episode(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> Episode:
+    """As it is read back from its files."""
+    return read_episode(recorded.episode.write(tmp_path_factory.mktemp("recordings")).json)
+
+
+def shades(count: int, height: int = 48, width: int = 64) -> list[NDArray[np.uint8]]:
+    return [np.full((height, width, 3), 20 * index, np.uint8) for index in range(count)]
+
+
+def film(path: Path) -> tuple[dict[str, Any], list[NDArray[np.uint8]]]:
+    """What a film says of itself, and its frames."""
+    read = imageio_ffmpeg.read_frames(str(path))
+    said: Any = next(read)
+    width, height = said["size"]
+    return said, [np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in read]
+
+
+def test_a_film_holds_every_frame_in_order_at_its_rate(tmp_path: Path) -> None:
+    assert write_mp4(tmp_path / "a.mp4", shades(10), fps=20) == 10
+    said, seen = film(tmp_path / "a.mp4")
+    assert (said["fps"], said["size"], len(seen)) == (20, (64, 48), 10)
+    for index, frame in enumerate(seen):
+        assert abs(float(frame.mean()) - 20 * index) < 3
+
+
+@pytest.mark.parametrize("exact, size", [(False, (64, 34)), (True, (63, 33))])
+def test_an_odd_size_is_padded_for_people_and_kept_for_data(
+    tmp_path: Path, exact: bool, size: tuple[int, int]
+) -> None:
+    write_mp4(tmp_path / "odd.mp4", shades(3, 33, 63), 10, Encoding(exact_size=exact))
+    assert film(tmp_path / "odd.mp4")[0]["size"] == size
+
+
+def test_a_film_is_never_written_over_another_file_and_nothing_half_written_stays(tmp_path: Path) -> None:
+    path = tmp_path / "a.mp4"
+    path.write_bytes(b"mine")
+    with pytest.raises(FileExistsError, match="not written over"):
+        write_mp4(path, shades(2), 10)
+    assert path.read_bytes() == b"mine"
+    with pytest.raises(ValueError, match="no picture"):
+        write_mp4(tmp_path / "none.mp4", [], 10)
+    with pytest.raises(ValueError, match="shape"):
+        write_mp4(tmp_path / "mixed.mp4", [*shades(2), *shades(1, 10, 10)], 10)
+    with pytest.raises(OSError, match="folder is none"):
+        (tmp_path / "folder is none").write_text("")
+        write_mp4(tmp_path / "folder is none" / "a.mp4", shades(2), 10)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.mp4", "folder is none"]
+
+
+def test_a_full_disk_ends_a_film_with_a_sentence_and_leaves_nothing(tmp_path: Path) -> None:
+    # In a process of its own: the limit on the size of files cannot be taken back by everybody.
+    noise = (
+        "import numpy as np, sys, pathlib; from workbench.recording.mp4 import write_mp4\n"
+        "rng = np.random.default_rng(0)\n"
+        "frames = (rng.integers(0, 255, (240, 320, 3), np.uint8) for _ in range(60))\n"
+        "try: write_mp4(pathlib.Path(sys.argv[1]), frames, 20)\n"
+        "except OSError as error: print('said:', error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", noise, str(tmp_path / "big.mp4")],
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000)),
+    )
+    assert "said: The film could not be written" in done.stdout, done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_state_without_a_picture_shows_the_one_before(episode: Episode) -> None:
+    camera = camera_of(episode, "base_camera")
+    assert len(list(frames(episode, camera))) == episode.length + 1
+    every_third = replace(camera, frame=np.array([0, 3, 6]), pose=camera.pose[:3], rgb=_pictures(shades(3)))
+    seen = [round(float(picture.mean()) / 20) for picture in frames(episode, every_third)]
+    assert seen == [0, 0, 0, 1, 1, 1, 2, 2, 2]
+
+
+def test_a_camera_that_is_not_there_is_said_with_those_that_are(episode: Episode) -> None:
+    with pytest.raises(ValueError, match="no camera 'nobody': it has base_camera, hand_camera"):
+        camera_of(episode, "nobody")
+    with pytest.raises(ValueError, match="without pictures"):
+        camera_of(replace(episode, cameras=[]), "base_camera")
+
+
+def test_two_cameras_of_one_name_are_told_apart(episode: Episode) -> None:
+    sensor = camera_of(episode, "base_camera")
+    human = replace(sensor, info=replace(sensor.info, kind="human"))
+    named = cameras_by_name(replace(episode, cameras=[human, sensor]))
+    assert named["base_camera"] is sensor and named["base_camera_human"] is human
+
+
+def test_small_pictures_are_enlarged_by_whole_pixels() -> None:
+    picture = np.arange(96 * 128 * 3, dtype=np.uint32).astype(np.uint8).reshape(96, 128, 3)
+    large = enlarged(picture)
+    assert large.shape == (288, 384, 3)
+    assert np.array_equal(large[::3, ::3], picture) and np.array_equal(large[2::3, 2::3], picture)
+    assert enlarged(large) is large
+
+
+def test_the_recorded_scene_is_drawn_as_the_task_s_own_camera_saw_it(episode: Episode) -> None:
+    """From the recorded place of a camera the drawn scene and the camera's picture are of the same things."""
+    from workbench.core.recorded_scene import RecordedScene
+
+    camera = camera_of(episode, "base_camera")
+    assert episode.geometry is not None and episode.poses is not None and camera.rgb is not None
+    scene = RecordedScene(episode.geometry, 0, camera.info.width, camera.info.height, camera.info.fovy)
+    for state in (0, episode.length):
+        drawn = _is_coloured(scene.picture(episode.poses[state], camera.pose[state]))
+        seen = _is_coloured(camera.rgb[state])
+        # Lights and shine differ; where the table ends and the robot stands before it does not.
+        assert 0.2 < seen.mean() < 0.8 and (drawn == seen).mean() > 0.96
+    gone = episode.poses[0].copy()
+    gone[:] = np.nan
+    nothing = scene.picture(gone, camera.pose[0])
+    assert nothing.std(axis=(0, 1)).max() < 1
+
+
+@pytest.mark.parametrize(
+    "eye",
+    [
+        Eye((1.0, 2.0, 3.0), (0.0, 0.0, 0.0)),
+        Eye((0.0, 0.0, 2.0), (0.0, 0.0, 0.0)),
+        Eye((0.0, 0.0, -2.0), (0.0, 0.0, 1.0)),
+    ],
+)
+def test_an_eye_looks_where_it_is_told(eye: Eye) -> None:
+    w, x, y, z = eye.pose[3:].astype(float)
+    assert abs(np.linalg.norm([w, x, y, z]) - 1) < 1e-6
+    forward = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
+    wanted = np.subtract(eye.look_at, eye.position)
+    assert np.allclose(forward, wanted / np.linalg.norm(wanted), atol=1e-5)
+
+
+def test_the_usual_eye_has_in_view_what_moves(episode: Episode) -> None:
+    eye = usual_eye(replace(episode, cameras=[]))
+    assert episode.poses is not None
+    to = episode.poses[:, :, :3].reshape(-1, 3) - np.array(eye.position)
+    ahead = np.subtract(eye.look_at, eye.position)
+    kinds = np.array(episode.geometry.body_kinds if episode.geometry else ())
+    moving = np.tile(np.isin(kinds, ("link", "dynamic")), len(episode.poses))
+    cosines = (to @ ahead / np.linalg.norm(to, axis=1) / np.linalg.norm(ahead))[moving]
+    assert (np.arccos(np.clip(cosines, -1, 1)) < eye.fovy / 2).all()
+
+
+def test_a_sheet_shows_every_camera_from_the_first_to_the_last_state(episode: Episode) -> None:
+    succeeds = np.zeros(episode.length + 1, np.bool_)
+    succeeds[5:] = True
+    sheet = contact_sheet(replace(episode, evaluate={"success": succeeds}), columns=4)
+    assert chosen_states(replace(episode, evaluate={"success": succeeds}), 4) == [0, 3, 5, 8]
+    pixels = np.asarray(sheet)
+    assert pixels.shape[1] > 4 * 176
+    green = (pixels[..., 1] > 100) & (pixels[..., 0] < 80) & (pixels[..., 2] < 100)
+    assert green.any(), "the success is not marked"
+    with pytest.raises(ValueError, match="no camera pictures"):
+        contact_sheet(replace(episode, cameras=[]))
+
+
+def _is_coloured(picture: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Wood is, robot and floor are grey."""
+    return np.ptp(picture.astype(int), axis=2) > 45
+
+
+def _pictures(pictures: Sequence[NDArray[np.uint8]]) -> EncodedPictures:
+    return EncodedPictures("rgb", [encode_jpeg(picture) for picture in pictures])

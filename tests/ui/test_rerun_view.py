@@ -1,0 +1,154 @@
+"""rerun's viewer through the page's door: what is served, to whom, and that nobody else is asked."""
+
+from __future__ import annotations
+
+import gzip
+import http.client
+import urllib.parse
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import rerun as rr
+from playwright.sync_api import Request, sync_playwright
+
+from workbench.recording.web_viewer import VIEWER_FILES, web_viewer_folder
+from workbench.ui.door import Door, DoorOptions, open_door
+from workbench.ui.gate import cookie_name
+from workbench.ui.offers import Offers
+from workbench.ui.rerun_view import RerunPages, RerunView
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recordings") / "Push ä <b>.rrd"
+    stream = rr.RecordingStream("workbench", recording_id="one")
+    stream.save(path)
+    stream.set_time("step", sequence=0)
+    stream.log("reward", rr.Scalars(1.0))
+    stream.disconnect()
+    return path
+
+
+@pytest.fixture
+def door() -> Iterator[Door]:
+    door = open_door(DoorOptions(port=0))
+    yield door
+    door.close()
+
+
+@pytest.fixture
+def pages(door: Door) -> RerunPages:
+    return RerunPages(door, Offers(door))
+
+
+def get(door: Door, path: str, **headers: str) -> tuple[int, http.client.HTTPMessage, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=30)
+    cookie = {"Cookie": f"{cookie_name(door.port)}={door.url.partition('token=')[2]}"}
+    try:
+        connection.request("GET", path, headers={**cookie, **headers})
+        answer = connection.getresponse()
+        return answer.status, answer.headers, answer.read()
+    finally:
+        connection.close()
+
+
+def test_a_file_is_sent_whole_and_only_under_the_address_that_was_made(door: Door, tmp_path: Path) -> None:
+    offers = Offers(door)
+    big = tmp_path / "big one.rrd"
+    big.write_bytes(bytes(range(256)) * 20_000)
+    address = offers.address(big)
+    assert address == offers.address(big)
+    status, headers, body = get(door, address)
+    assert (status, body == big.read_bytes()) == (200, True)
+    assert headers["Content-Length"] == str(big.stat().st_size)
+    assert "sandbox" in headers["Content-Security-Policy"]
+    assert get(door, f"/offered/{'x' * 22}/big%20one.rrd")[0] == 404
+    assert get(door, f"/offered/{urllib.parse.quote(str(big))}")[0] == 404
+    assert get(door, address, Cookie="")[0] == 403
+    saved = get(door, offers.address(big, download=True))[1]
+    assert saved["Content-Disposition"] == "attachment; filename*=UTF-8''big%20one.rrd"
+    big.unlink()
+    assert get(door, address)[0] == 404
+
+
+def test_a_withdrawn_file_is_not_to_be_had(door: Door, tmp_path: Path) -> None:
+    offers = Offers(door)
+    (tmp_path / "a.txt").write_text("a")
+    address = offers.address(tmp_path / "a.txt")
+    offers.withdraw(tmp_path / "a.txt")
+    assert get(door, address)[0] == 404
+
+
+def test_a_file_that_becomes_shorter_while_it_is_sent_is_no_whole_answer(door: Door, tmp_path: Path) -> None:
+    big = tmp_path / "big.rrd"
+    big.write_bytes(bytes(40_000_000))  # more than the sockets hold
+    address = Offers(door).address(big)
+    connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=30)
+    cookie = f"{cookie_name(door.port)}={door.url.partition('token=')[2]}"
+    connection.request("GET", address, headers={"Cookie": cookie})
+    answer = connection.getresponse()
+    answer.read(1000)
+    with big.open("r+b") as file:
+        file.truncate(5)
+    with pytest.raises((http.client.IncompleteRead, ConnectionError)):
+        answer.read()
+    connection.close()
+    assert get(door, "/")[0] == 200
+
+
+def test_the_viewer_is_sent_packed_to_those_who_take_it(
+    door: Door, pages: RerunPages, recording: Path
+) -> None:
+    viewer = get(door, pages.address([recording]))[2].decode().partition('location.replace("')[2]
+    root = viewer.partition('"')[0]
+    assert get(door, root + "index.html")[1]["Content-Type"] == VIEWER_FILES["index.html"]
+    for name, kind in list(VIEWER_FILES.items())[1:]:
+        packed = (web_viewer_folder() / f"{name}.gz").read_bytes()
+        status, headers, body = get(door, root + name, **{"Accept-Encoding": "gzip"})
+        assert (status, headers["Content-Type"], headers["Content-Encoding"]) == (200, kind, "gzip")
+        assert body == packed
+        assert "connect-src 'self'" in headers["Content-Security-Policy"]
+    status, headers, body = get(door, root + "re_viewer.js")
+    assert "Content-Encoding" not in headers
+    assert body == gzip.decompress((web_viewer_folder() / "re_viewer.js.gz").read_bytes())
+    for name in ("", "../secret", "index.html.gz"):
+        assert get(door, root + name)[0] == 404
+
+
+def test_a_recordings_name_is_text_and_no_script(door: Door, pages: RerunPages, tmp_path: Path) -> None:
+    page = get(door, pages.address([tmp_path / "</script><b>.rrd"]))[2].decode()
+    assert page.count("</script>") == 1
+    assert "<b>" not in page
+
+
+def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
+    door: Door, pages: RerunPages, recording: Path, chromium_path: str
+) -> None:
+    view = RerunView(door.server, pages)
+    view.draw([recording])
+    asked: list[Request] = []
+    failed: dict[str, str | None] = {}
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=chromium_path,
+            args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
+        )
+        tab = browser.new_page(viewport={"width": 1280, "height": 720})
+        tab.on("request", lambda request: asked.append(request))
+        tab.on("requestfailed", lambda request: failed.update({request.url: request.failure}))
+        tab.goto(door.url)
+        with tab.expect_response(lambda answer: "/offered/" in answer.url, timeout=120_000) as answer:
+            tab.get_by_role("button", name="Open in rerun").click()
+        assert answer.value.status == 200
+        frame = tab.frame_locator("iframe.wb-rerun")
+        frame.locator("canvas.visible").wait_for(timeout=90_000)
+        tab.get_by_role("button", name="Close rerun").click()
+        tab.locator("iframe.wb-rerun").wait_for(state="detached")
+        browser.close()
+    ours = f"http://127.0.0.1:{door.port}/"
+    foreign = {
+        r.url for r in asked if not r.url.startswith((ours, f"ws://127.0.0.1:{door.port}", "data:", "blob:"))
+    }
+    assert {url: failed.get(url) for url in foreign} == dict.fromkeys(foreign, "csp")
+    assert foreign, "rerun's page has stopped asking others; the policy can be simpler"

@@ -1,0 +1,67 @@
+"""The moving page of a scene plays from the disk, and asks nobody for anything."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import sync_playwright
+
+from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
+from workbench.recording.episode import Episode, EpisodeInfo
+from workbench.ui.scene_html import write_scene_html
+
+
+@pytest.fixture
+def episode() -> Episode:
+    steps = 20
+    poses = np.zeros((steps + 1, 1, 7), np.float32)
+    poses[:, 0, 0], poses[..., 3] = np.linspace(-0.3, 0.3, steps + 1), 1
+    corners = np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.3, 0], [0, 0, 0.3]], np.float32)
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.uint32)
+    zero = np.zeros(1, np.int32)
+    visual = Visual("cube", Mesh(corners, faces), Material((1.0, 0.0, 0.0, 1.0)), zero, zero)
+    return Episode(
+        info=EpisodeInfo("Made & <b>", 0, 7, None, "", {}, 0.1, None, "cpu"),
+        geometry=SceneGeometry(1, ("cube",), ("dynamic",), (False,), (visual,)),
+        segmentation={},
+        poses=poses,
+        action=np.zeros((steps, 1), np.float32),
+        action_names=("grip",),
+        reward=np.zeros(steps, np.float32),
+        terminated=np.zeros(steps, np.bool_),
+        truncated=np.zeros(steps, np.bool_),
+        evaluate={},
+        cameras=[],
+    )
+
+
+def test_it_plays_without_a_server(episode: Episode, tmp_path: Path, chromium_path: str) -> None:
+    path, done = tmp_path / "a.html", []
+    write_scene_html(path, episode, on_progress=done.append)
+    assert done == sorted(done) and done[-1] == 1.0
+    asked: list[str] = []
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=chromium_path,
+            args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
+        )
+        tab = browser.new_page(viewport={"width": 320, "height": 240})
+        tab.on("request", lambda request: asked.append(request.url))
+        tab.goto(path.as_uri())
+        time_shown = tab.locator("input").first
+        tab.wait_for_function(
+            "document.querySelector('input') && parseFloat(document.querySelector('input').value) > 0.3"
+        )
+        assert float(time_shown.input_value()) <= 3.2
+        assert tab.title() == "Made & <b>, 20 steps"
+        browser.close()
+    assert [url for url in asked if not url.startswith(("file:", "data:", "blob:"))] == []
+
+
+def test_it_takes_the_place_of_nothing(episode: Episode, tmp_path: Path) -> None:
+    (tmp_path / "a.html").write_text("mine")
+    with pytest.raises(FileExistsError):
+        write_scene_html(tmp_path / "a.html", episode)
+    assert (tmp_path / "a.html").read_text() == "mine"

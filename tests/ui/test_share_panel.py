@@ -1,0 +1,125 @@
+"""The Share tab without a browser: what it is about, and what a press makes."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import viser
+
+from workbench.recording.sources import Source
+from workbench.ui.door import Door, DoorOptions, open_door
+from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted
+from workbench.ui.making import Making, MakingView
+from workbench.ui.offers import Offers
+from workbench.ui.share_panel import ALL_CAMERAS, WHAT, Chosen, SharePanel
+
+
+class Noted(Making):
+    """Notes what is wanted instead of starting a process for it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.wanted: list[Wanted] = []
+        self.shown = MakingView()
+        self.started = threading.Event()
+
+    def view(self) -> MakingView:
+        return self.shown
+
+    def start(self, wanted: Wanted) -> bool:
+        self.wanted.append(wanted)
+        return True
+
+
+@pytest.fixture
+def door() -> Iterator[Door]:
+    door = open_door(DoorOptions(port=0))
+    yield door
+    door.close()
+
+
+@pytest.fixture
+def making() -> Iterator[Noted]:
+    making = Noted()
+    yield making
+    making.close()
+
+
+@pytest.fixture
+def panel(door: Door, making: Noted, tmp_path: Path) -> SharePanel:
+    return SharePanel(door.server, Offers(door), making, tmp_path)
+
+
+RECORDING = Source(Path("/recordings/Push_seed1.json"))
+
+
+def choose(panel: SharePanel, what: str) -> None:
+    panel._what.value = next(words for words, meant in WHAT.items() if meant == what)
+
+
+def test_without_a_recording_there_is_nothing_to_make(panel: SharePanel, making: Noted) -> None:
+    panel.draw(Chosen())
+    assert panel._make.disabled and "Select recordings" in panel._about.content
+    panel._start(None)
+    assert making.wanted == []
+
+
+def test_a_film_is_of_the_camera_that_was_chosen_or_of_every_one(panel: SharePanel, making: Noted) -> None:
+    panel.draw(Chosen((RECORDING,), ("base_camera", "hand_camera")))
+    assert panel._camera.visible and panel._camera.options == (ALL_CAMERAS, "base_camera", "hand_camera")
+    panel._start(None)
+    panel._camera.value = "hand_camera"
+    panel._start(None)
+    assert [wanted.camera for wanted in making.wanted] == [EVERY_CAMERA, "hand_camera"]
+    assert making.wanted[0].folder != making.wanted[1].folder
+    panel.draw(Chosen((RECORDING,), ("base_camera",)))
+    assert not panel._camera.visible, "there is no choice"
+
+
+def test_a_value_that_no_page_of_ours_sends_makes_nothing(panel: SharePanel, making: Noted) -> None:
+    panel.draw(Chosen((RECORDING,), ("base_camera",)))
+    panel._camera.value = "../../etc"
+    panel._start(None)
+    assert making.wanted[0].camera == EVERY_CAMERA
+    panel._what.value = "../../etc"
+    panel._start(None)
+    assert len(making.wanted) == 1
+
+
+def test_a_dataset_goes_into_the_recordings_folder(panel: SharePanel, making: Noted, tmp_path: Path) -> None:
+    choose(panel, "lerobot")
+    panel.draw(Chosen((RECORDING,)))
+    assert panel._successes.visible and panel._task.visible and not panel._camera.visible
+    panel._task.value = "  push it  "
+    panel._start(None)
+    (wanted,) = making.wanted
+    assert wanted.folder.parent == tmp_path / "datasets"
+    assert (wanted.export.instruction, wanted.export.only_successes) == ("push it", True)
+
+
+def test_what_was_made_can_be_saved_and_what_went_wrong_is_said(
+    panel: SharePanel, making: Noted, tmp_path: Path
+) -> None:
+    film = tmp_path / "a<b>.mp4"
+    film.write_bytes(bytes(2_500_000))
+    making.shown = MakingView(running=True, done=0.4, doing="a: the 3-D view")
+    panel.draw(Chosen((RECORDING,)))
+    assert "width: 40%" in panel._made.content and panel._stop.visible and not panel._make.visible
+    making.shown = MakingView(made=(Made((film,), "1 file"),), problem="There is no <room>.")
+    panel.draw(Chosen((RECORDING,)))
+    said = panel._made.content
+    assert "a&lt;b&gt;.mp4" in said and "2.5 MB" in said and "/offered/" in said and "<room>" not in said
+    film.unlink()
+    panel.draw(Chosen((RECORDING,), ("x",)))
+    assert "/offered/" not in panel._made.content
+
+
+def test_the_page_is_built_anew_without_a_trace(door: Door, making: Noted, tmp_path: Path) -> None:
+    offers = Offers(door)
+    for _ in range(3):
+        SharePanel(door.server, offers, making, tmp_path).draw(Chosen((RECORDING,)))
+        door.server.gui.reset()
+    assert isinstance(door.server, viser.ViserServer)

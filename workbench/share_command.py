@@ -1,0 +1,90 @@
+"""``workbench share`` and ``workbench export`` in a terminal: a bar while it is made, and what was made at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from workbench.recording.lerobot_export import ExportOptions
+from workbench.recording.lerobot_frames import Choice
+from workbench.recording.sources import Source, sources_among
+from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted, make
+
+SCENE, CAMERAS = "scene", "cameras"
+
+
+def share_in_terminal(
+    files: Sequence[Path],
+    mp4: Sequence[str],
+    html: bool,
+    sheet: bool,
+    out: Path,
+    err: Console,
+    refuse: Callable[[str], int],
+) -> int:
+    """Returns the exit code."""
+    try:
+        sources = sources_among(files)
+    except (OSError, ValueError) as error:
+        return refuse(str(error))
+    wanted = [
+        Wanted("scene", sources, out)
+        if name == SCENE
+        else Wanted("film", sources, out, EVERY_CAMERA if name == CAMERAS else name)
+        for name in mp4
+    ]
+    wanted += [Wanted("page", sources, out)] if html else []
+    wanted += [Wanted("sheet", sources, out)] if sheet else []
+    if not wanted:
+        return refuse("say what to make: --mp4 CAMERA, --mp4 scene, --html or --sheet")
+    return _make_all(wanted, err, refuse)
+
+
+def export_in_terminal(
+    files: Sequence[Path],
+    folder: Path,
+    only_successes: bool,
+    task: str | None,
+    fps: int | None,
+    cameras: tuple[str, ...] | None,
+    state: tuple[str, ...],
+    environment_state: tuple[str, ...],
+    err: Console,
+    refuse: Callable[[str], int],
+) -> int:
+    """Returns the exit code."""
+    if fps is not None and fps < 1:
+        return refuse(f"--fps must be 1 or more, not {fps}")
+    try:
+        sources: tuple[Source, ...] = sources_among(files)
+    except (OSError, ValueError) as error:
+        return refuse(str(error))
+    choice = Choice(state=state, environment=environment_state, cameras=cameras)
+    options = ExportOptions(choice, only_successes, task, fps)
+    return _make_all([Wanted("lerobot", sources, folder, export=options)], err, refuse)
+
+
+def _make_all(wanted: Sequence[Wanted], err: Console, refuse: Callable[[str], int]) -> int:
+    made: list[Made] = []
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    try:
+        with Progress(*columns, console=err) as bar:
+            row = bar.add_task("reading", total=len(wanted))
+            for number, one in enumerate(wanted):
+
+                def told(done: float, doing: str, number: int = number) -> None:
+                    bar.update(row, completed=number + done, description=doing)
+
+                made.append(make(one, told))
+    except (ValueError, OSError, RuntimeError) as error:
+        return refuse(str(error))
+    except KeyboardInterrupt:
+        return refuse("interrupted; what was finished is kept")
+    finally:
+        for one in made:
+            for path in one.paths:
+                print(path if path.is_file() else f"{path}: {one.words}")
+    return 0

@@ -1,0 +1,142 @@
+"""What is made from recordings to be handed on: films, moving pages, sheets of pictures, datasets.
+
+One list of what can be made, for the page and the command line. Making takes processor and memory, and some of it a
+renderer: the page has it done by a process of its own (`workbench.ui.making`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.recording.camera_pictures import camera_of, cameras_by_name, enlarged, frames
+from workbench.recording.contact_sheet import contact_sheet
+from workbench.recording.episode import Episode
+from workbench.recording.lerobot_export import ExportOptions, export_lerobot
+from workbench.recording.mp4 import write_mp4
+from workbench.recording.new_file import new_file
+from workbench.recording.scene_eye import Eye
+from workbench.recording.scene_film import scene_frames
+from workbench.recording.sources import Source
+from workbench.ui.scene_html import write_scene_html
+
+What = Literal["film", "scene", "page", "sheet", "lerobot"]
+EVERY_CAMERA = ""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    what: What
+    sources: tuple[Source, ...]
+    folder: Path
+    """Where the files go; for a dataset the folder that it becomes."""
+    camera: str = EVERY_CAMERA
+    """Of a film."""
+    eye: Eye | None = None
+    """From where a scene is seen; None: a usual place."""
+    export: ExportOptions = ExportOptions()
+    """Of a dataset."""
+
+
+@dataclass(frozen=True)
+class Made:
+    paths: tuple[Path, ...]
+    words: str
+    """What it is, in a sentence or two."""
+
+
+OnProgress = Callable[[float, str], None]
+
+
+def make(wanted: Wanted, on_progress: OnProgress = lambda done, doing: None) -> Made:
+    """Make it.
+
+    Args:
+        on_progress: called with the part that is done, 0..1, and what is done now.
+
+    Raises:
+        ValueError: a recording cannot be read, or lacks what is wanted; the message says which and what.
+        OSError: it cannot be written; the message says why. What was finished before stays.
+        RuntimeError: this machine has nothing to render with.
+    """
+    if wanted.what == "lerobot":
+        return _dataset(wanted, on_progress)
+    paths: list[Path] = []
+    for number, source in enumerate(wanted.sources):
+
+        def part_done(done: float, doing: str, number: int = number) -> None:
+            on_progress((number + done) / len(wanted.sources), doing)
+
+        part_done(0.0, source.name)
+        paths += _of_one(wanted, source, source.read(), part_done)
+    on_progress(1.0, "done")
+    return Made(tuple(paths), f"{len(paths)} file{'' if len(paths) == 1 else 's'}")
+
+
+def _of_one(wanted: Wanted, source: Source, episode: Episode, on_progress: OnProgress) -> list[Path]:
+    begin, name, fps = wanted.folder / source.name, source.name, _rate(episode)
+    if wanted.what == "film":
+        cameras = [wanted.camera] if wanted.camera != EVERY_CAMERA else list(cameras_by_name(episode))
+        if not cameras:
+            raise ValueError(f"{name} was recorded without pictures, so there is no film of it.")
+        paths = []
+        for number, camera in enumerate(cameras):
+            path = _beside(begin, f".{camera.replace('/', '_')}.mp4")
+            seen = (enlarged(picture) for picture in frames(episode, camera_of(episode, camera)))
+
+            def told(done: float, doing: str, number: int = number) -> None:
+                on_progress((number + done) / len(cameras), doing)
+
+            write_mp4(path, _counted(seen, episode, f"{name}: {camera}", told), fps)
+            paths.append(path)
+        return paths
+    if wanted.what == "scene":
+        path = _beside(begin, ".scene.mp4")
+        seen = _counted(scene_frames(episode, wanted.eye), episode, f"{name}: the 3-D view", on_progress)
+        write_mp4(path, seen, fps)
+    elif wanted.what == "page":
+        path = _beside(begin, ".html")
+        write_scene_html(
+            path, episode, wanted.eye, lambda done: on_progress(done, f"{name}: the moving page")
+        )
+    else:
+        path = _beside(begin, ".sheet.png")
+        with new_file(path) as temporary:
+            contact_sheet(episode).save(temporary, format="PNG")
+    return [path]
+
+
+def _dataset(wanted: Wanted, on_progress: OnProgress) -> Made:
+    count = len(wanted.sources)
+    made = export_lerobot(
+        [(source.name, source.read) for source in wanted.sources],
+        wanted.folder,
+        wanted.export,
+        lambda done, doing: on_progress(done / max(count, 1), doing),
+    )
+    words = f"{made.episodes} episode{'' if made.episodes == 1 else 's'}, {made.frames} frames"
+    if made.left_out:
+        words += f"; {made.left_out} without success left out"
+    return Made((made.folder,), " ".join([words + ".", *made.notes]))
+
+
+def _beside(begin: Path, suffix: str) -> Path:
+    """Not `with_suffix`, to which the fraction of a second in a name is a suffix."""
+    return begin.parent / (begin.name + suffix)
+
+
+def _rate(episode: Episode) -> float:
+    return 1.0 / episode.info.control_dt if episode.info.control_dt > 0 else 20.0
+
+
+def _counted(
+    pictures: Iterable[NDArray[np.uint8]], episode: Episode, doing: str, on_progress: OnProgress
+) -> Iterator[NDArray[np.uint8]]:
+    for state, picture in enumerate(pictures):
+        on_progress(state / (episode.length + 1), doing)
+        yield picture

@@ -1,0 +1,156 @@
+"""The Share tab: choose what is to be made of the recordings, make it, save it."""
+
+from __future__ import annotations
+
+import datetime
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.recording.lerobot_export import ExportOptions
+from workbench.recording.scene_eye import Eye
+from workbench.recording.sources import Source
+from workbench.ui.changed import fill, show
+from workbench.ui.fragments import render
+from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted, What
+from workbench.ui.making import Making, MakingView
+from workbench.ui.offers import Offers
+
+WHAT: dict[str, What] = {
+    "Film of a camera (mp4)": "film",
+    "Film of the 3-D view (mp4)": "scene",
+    "Moving 3-D page (html)": "page",
+    "Sheet of pictures (png)": "sheet",
+    "LeRobot dataset": "lerobot",
+}
+ALL_CAMERAS = "every camera"
+MOST_SHOWN = 6
+"""Made things in the list; the newest ones."""
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """What the tab is about."""
+
+    sources: tuple[Source, ...] = ()
+    cameras: tuple[str, ...] = ()
+    """Those that are known of them."""
+    in_view: bool = False
+    """It is the one recording that the 3-D view shows: a film of the view is made from where the page looks."""
+
+
+class SharePanel:
+    """The controls in the present container.
+
+    Args:
+        server: The page.
+        offers: Where what was made is fetched.
+        making: What makes it; it outlives this page.
+        folder: Datasets go into a folder of it that is named for them.
+    """
+
+    def __init__(self, server: viser.ViserServer, offers: Offers, making: Making, folder: Path) -> None:
+        self._offers, self._making, self._folder = offers, making, folder
+        self._chosen = Chosen()
+        self._drawn: object = None
+        self._about = server.gui.add_html("")
+        self._what = server.gui.add_dropdown("Make", tuple(WHAT))
+        self._camera = server.gui.add_dropdown("Camera", _names(()))
+        self._successes = server.gui.add_checkbox(
+            "Only successes", True, hint="Leave out recordings that reach success at no step"
+        )
+        self._task = server.gui.add_text(
+            "Task", "", hint="In words, for policies that read; empty: the task's id"
+        )
+        self._make = server.gui.add_button("Make", icon=viser.Icon.SPARKLES)
+        self._stop = server.gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, visible=False)
+        self._made = server.gui.add_html("")
+        self._make.on_click(lambda event: self._start(event.client))
+        self._stop.on_click(lambda _: self._making.stop())
+
+    def draw(self, chosen: Chosen) -> None:
+        self._chosen = chosen
+        view = self._making.view()
+        what = WHAT.get(self._what.value)
+        now = (chosen, view, what)
+        if now == self._drawn:
+            return
+        self._drawn = now
+        names = [source.name for source in chosen.sources]
+        fill(self._about, render("share_about", count=len(names), name=names[0] if names else ""))
+        options = _names(chosen.cameras)
+        if self._camera.options != options:
+            self._camera.options = options
+        show(self._camera, what == "film" and len(options) > 2)
+        show(self._successes, what == "lerobot")
+        show(self._task, what == "lerobot")
+        show(self._make, not view.running)
+        show(self._stop, view.running)
+        if self._make.disabled != (not chosen.sources):
+            self._make.disabled = not chosen.sources
+        fill(self._made, self._html(view))
+
+    def _start(self, client: viser.ClientHandle | None) -> None:
+        chosen, what = self._chosen, WHAT.get(self._what.value)
+        if not chosen.sources or what is None:
+            return
+        wanted = Wanted(what, chosen.sources, Path(), eye=_eye_of(client) if chosen.in_view else None)
+        if what == "lerobot":
+            now = datetime.datetime.now()
+            words = self._task.value.strip()[:400]
+            export = ExportOptions(only_successes=self._successes.value, instruction=words or None)
+            folder = self._folder / "datasets" / f"lerobot_{now:%Y-%m-%dT%H-%M-%S}"
+            self._making.start(replace(wanted, folder=folder, export=export))
+            return
+        camera = self._camera.value if self._camera.value in chosen.cameras else EVERY_CAMERA
+        # A folder of its own each time: names that were made before are not in the way.
+        folder = Path(tempfile.mkdtemp(dir=self._making.scratch()))
+        self._making.start(replace(wanted, folder=folder, camera=camera))
+
+    def _html(self, view: MakingView) -> str:
+        made = [self._said(one) for one in view.made[:MOST_SHOWN]]
+        return render(
+            "share",
+            running=view.running,
+            percent=round(100 * view.done),
+            doing=view.doing,
+            problem=view.problem,
+            made=made,
+            has_links=any(one["links"] for one in made),
+        )
+
+    def _said(self, made: Made) -> dict[str, object]:
+        links = [
+            {"address": self._offers.address(path, download=True), "name": path.name, "size": _size(path)}
+            for path in made.paths
+            if path.is_file()
+        ]
+        return {"links": links, "words": made.words, "folder": ", ".join(map(str, made.paths))}
+
+
+def _names(cameras: tuple[str, ...]) -> tuple[str, ...]:
+    return (ALL_CAMERAS, *cameras)
+
+
+def _size(path: Path) -> str:
+    size = path.stat().st_size
+    return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{max(size / 1e3, 1):.0f} kB"
+
+
+def _eye_of(client: viser.ClientHandle | None) -> Eye | None:
+    """From where this page looks."""
+    if client is None or client.camera.image_width == 0:
+        return None
+    camera = client.camera
+    return Eye(
+        _triple(camera.position), _triple(camera.look_at), _triple(camera.up_direction), float(camera.fov)
+    )
+
+
+def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
