@@ -89,7 +89,7 @@ def open_page(
     except (ValueError, DoorError) as error:
         return _refuse(str(error))
     from workbench.session.session import Session
-    from workbench.ui.page import Page
+    from workbench.ui.put_together import Workplace
 
     _use_private_driver()
     for line in (door.warning, door.notice):
@@ -112,15 +112,15 @@ def open_page(
         on_event=on_event,
         on_line=_echo,
     )
-    page = Page(door.server, session)
+    place = Workplace(door.server, recordings, session)
     end.at_signals()
     try:
-        page.start()
-        _announce(door, task, num_envs)
+        place.pages.start("live")
+        _announce(door, f"{task}, {num_envs} envs")
         end.wait()
     finally:
         out.print("closing")
-        page.stop()
+        place.close()
         session.close()
         door.close()
     _leave(end.code)
@@ -190,6 +190,57 @@ def record(
         print(f"{episode.path}  {episode.steps} steps  return {episode.total_reward:.3f}  {ended}".rstrip())
     print(f"Open one with: workbench view {written[0].path}")
     return 0
+
+
+@app.command
+def review(
+    folder: Annotated[Path, tyro.conf.Positional] = Path("recordings"),
+    /,
+    host: str = "127.0.0.1",
+    port: int = 8080,
+    token: bool = True,
+    task: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = (),
+) -> int:
+    """Look through a folder of recordings in a browser page: play, compare, share. No task file is needed.
+
+    Args:
+        folder: where the recordings are, in folders below it too: .rrd, .h5 and .json of the workbench, and .h5
+            with .json of ManiSkill's RecordEpisode.
+        host: address to listen on; anything but this machine's own needs the token.
+        port: port of the page; 0 takes any free one.
+        token: ask for the token of the printed address (--no-token: this machine only).
+        task: a task file in which the envs of ManiSkill's recordings may be found; repeatable. Envs that ManiSkill
+            itself has need none.
+    """
+    from workbench.ui.door import DoorError, DoorOptions, open_door
+
+    if not folder.is_dir():
+        return _refuse(f"there is no folder {folder}; workbench record and the page's Episodes tab make one")
+    for file in task:
+        if not file.is_file():
+            return _refuse(f"there is no file {file}")
+    try:
+        door = open_door(DoorOptions(host=host, port=port, token=token), label="Recordings")
+    except (ValueError, DoorError) as error:
+        return _refuse(str(error))
+    from workbench.ui.put_together import Workplace
+
+    _use_private_driver()
+    for line in (door.warning, door.notice):
+        if line:
+            err.print(f"[yellow]{escape(line)}[/]")
+    end = _End()
+    place = Workplace(door.server, folder, tasks=task)
+    end.at_signals()
+    try:
+        place.pages.start("review")
+        _announce(door, f"recordings in {folder}")
+        end.wait()
+    finally:
+        out.print("closing")
+        place.close()
+        door.close()
+    _leave(end.code)
 
 
 @app.command
@@ -268,8 +319,8 @@ class _End:
         self._due.wait()
 
 
-def _announce(door: Door, task: str, num_envs: int) -> None:
-    out.print(f"[bold]Workbench[/] {workbench.__version__}: {escape(task)}, {num_envs} envs", soft_wrap=True)
+def _announce(door: Door, what: str) -> None:
+    out.print(f"[bold]Workbench[/] {workbench.__version__}: {escape(what)}", soft_wrap=True)
     # Not through rich, which would break the address in a narrow terminal.
     print(f"  page    {door.url}", flush=True)
     print(f"  remote  {door.ssh_hint}", flush=True)

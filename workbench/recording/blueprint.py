@@ -12,8 +12,15 @@ import math
 import numpy as np
 import rerun.blueprint as rrb
 
-from workbench.recording.episode import CameraTrack, Episode
-from workbench.recording.layout import EVENTS, STEP, WORLD, camera_entities, evaluate_entity
+from workbench.recording.layout import (
+    EVENTS,
+    REWARD_TERMS,
+    STEP,
+    WORLD,
+    camera_entities,
+    evaluate_entity,
+)
+from workbench.recording.survey import CameraSurvey, Survey
 
 MAX_SERIES = 32
 """An ``evaluate()`` entry with more numbers than this is kept, but not drawn: it hides the others."""
@@ -23,8 +30,8 @@ EYE_DIRECTION = (0.75, 0.85, 0.6)
 """From where the scene is looked at, seen from its middle: ManiSkill's render cameras do likewise."""
 
 
-def episode_blueprint(episode: Episode) -> rrb.Blueprint:
-    cameras = camera_entities(episode.cameras)
+def episode_blueprint(survey: Survey) -> rrb.Blueprint:
+    cameras = camera_entities([camera.info for camera in survey.cameras])
     scene = rrb.Spatial3DView(
         name="Scene",
         origin=WORLD,
@@ -33,18 +40,18 @@ def episode_blueprint(episode: Episode) -> rrb.Blueprint:
             "$origin/**",
             *(f"- {camera}/{m}" for camera in cameras for m in ("depth", "segmentation")),
         ],
-        eye_controls=_eye(episode),
+        eye_controls=_eye(survey),
         line_grid=False,
     )
     top: rrb.ContainerLike = scene
-    if episode.cameras:
-        top = rrb.Horizontal(scene, _cameras(episode), column_shares=[3, 2])
+    if survey.cameras:
+        top = rrb.Horizontal(scene, _cameras(survey), column_shares=[3, 2])
     return rrb.Blueprint(
-        rrb.Vertical(top, _curves(episode), row_shares=[5, 2]),
+        rrb.Vertical(top, _curves(survey), row_shares=[5, 2]),
         rrb.TimePanel(
             state="collapsed",
             timeline=STEP,
-            fps=1.0 / episode.info.control_dt if episode.info.control_dt > 0 else None,
+            fps=1.0 / survey.info.control_dt if survey.info.control_dt > 0 else None,
             play_state="paused",
         ),
         rrb.BlueprintPanel(state="collapsed"),
@@ -54,19 +61,22 @@ def episode_blueprint(episode: Episode) -> rrb.Blueprint:
     )
 
 
-def _cameras(episode: Episode) -> rrb.ContainerLike:
-    alone = len(episode.cameras) == 1
-    parts = [_camera(*pair, alone) for pair in zip(episode.cameras, camera_entities(episode.cameras))]
+def _cameras(survey: Survey) -> rrb.ContainerLike:
+    alone = len(survey.cameras) == 1
+    parts = [
+        _camera(*pair, alone)
+        for pair in zip(survey.cameras, camera_entities([camera.info for camera in survey.cameras]))
+    ]
     if alone:
         return parts[0]
     return rrb.Vertical(*parts) if len(parts) <= MAX_STACKED else rrb.Tabs(*parts)
 
 
-def _camera(camera: CameraTrack, entity: str, alone: bool) -> rrb.ContainerLike:
+def _camera(camera: CameraSurvey, entity: str, alone: bool) -> rrb.ContainerLike:
     views = [
         rrb.Spatial2DView(name=f"{camera.info.name} {m}", origin=entity, contents=[f"$origin/{m}"])
         for m in ("rgb", "depth", "segmentation")
-        if getattr(camera, m) is not None
+        if m in camera.modalities
     ]
     name = camera.info.name
     if len(views) == 1:
@@ -76,9 +86,11 @@ def _camera(camera: CameraTrack, entity: str, alone: bool) -> rrb.ContainerLike:
     return rrb.Horizontal(views[0], rrb.Vertical(*views[1:]), column_shares=[2, 1], name=name)
 
 
-def _curves(episode: Episode) -> rrb.ContainerLike:
+def _curves(survey: Survey) -> rrb.ContainerLike:
     drawn = [
-        evaluate_entity(k) for k, v in episode.evaluate.items() if 0 < math.prod(v.shape[1:]) <= MAX_SERIES
+        evaluate_entity(name)
+        for name, column in survey.evaluate().items()
+        if 0 < math.prod(column.shape) <= MAX_SERIES and not name.startswith(REWARD_TERMS)
     ]
     legend = rrb.PlotLegend(visible=True)
     views: list[rrb.View] = [rrb.TimeSeriesView(name="Reward", origin="/reward", plot_legend=legend)]
@@ -86,17 +98,17 @@ def _curves(episode: Episode) -> rrb.ContainerLike:
         views.append(
             rrb.TimeSeriesView(name="Evaluate", origin="/evaluate", contents=drawn, plot_legend=legend)
         )
-    if episode.action_names:
+    if survey.header.action_names:
         views.append(rrb.TimeSeriesView(name="Action", origin="/action", plot_legend=legend))
     columns = rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
     views.append(rrb.TextLogView(name="Events", origin=EVENTS, columns=columns))
     return rrb.Horizontal(*views)
 
 
-def _eye(episode: Episode) -> rrb.EyeControls3D:
+def _eye(survey: Survey) -> rrb.EyeControls3D:
     """Look at what can move. By itself rerun frames the whole scene, and a ground plane is 100 m wide."""
-    kinds = np.array(episode.geometry.body_kinds)
-    points = episode.poses[0, np.isin(kinds, ("link", "dynamic")), :3]
+    kinds = np.array(survey.header.geometry.body_kinds)
+    points = survey.first_poses[np.isin(kinds, ("link", "dynamic")), :3]
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
         points = np.zeros((1, 3), dtype=np.float32)

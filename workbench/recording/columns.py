@@ -1,250 +1,161 @@
-"""Gather one env's episode out of the steps of the whole batch, as columns.
+"""Rows to bytes while an episode happens, and bytes to columns when it is over.
 
-What arrives is a `StepResult` a step, with every env in its leading dimension; what is written is
-one file an env, in columns. Between the two something has to pick one env's row out of each step
-and hold it until the episode ends, and it has to do so without holding the batches themselves: a
-view into row 3 keeps the other rows alive for as long as the episode lasts. `EpisodeBuilder` copies
-the row.
+A control step of one env is thirty to fifty small arrays: poses, an action, entries of ``evaluate()``, env states,
+observations. Writing each with its name and type would cost more than the step; but from one step to
+the next names and types are the same. So a row is the bytes of its arrays one behind the other, and a *layout*, kept
+once, says what they are. A layout is a numpy structured type, so a thousand rows become columns by one call.
 
-It is also the place where a broken stream is noticed. `elapsed_steps` of a real episode counts 0, 1,
-2 ...; a step that was lost, or a reset that went by unseen, would otherwise become a file that looks
-right and is not. And ``evaluate()`` of a task under way is not tidy: entries come, go and change
-their type while the author edits. A step that lacks an entry holds NaN for it.
+``evaluate()`` of a task under way is not tidy: entries come, go and change their type while the author edits. Each change is
+a new layout. A column that every row has in one shape keeps its type. Otherwise it becomes
+floating point and holds NaN where a row lacks it; rows of differing shape are flattened and padded with NaN.
 """
 
 from __future__ import annotations
 
+import json
+from collections import Counter
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.geometry import SceneGeometry
-from workbench.core.pictures import CameraInfo, CameraKind, Picture
-from workbench.core.step import StepResult
-from workbench.recording.episode import CameraTrack, Episode, EpisodeInfo
+from workbench.recording.row import EpisodeRow
 
-MODALITIES = ("rgb", "depth", "segmentation")
+EVALUATE = "evaluate/"
+STATE = "state/"
+OBS = "obs/"
+FIXED = ("poses", "action", "reward", "terminated", "truncated")
+"""Names of the columns that every row has; `EVALUATE`, `STATE` and `OBS` begin those of the others."""
+
+_Key = tuple[tuple[str, np.dtype, tuple[int, ...]], ...]
 
 
-class EpisodeBuilder:
-    """The episode of one env while it happens: `start`, then `append` a step, then `finish`.
+@dataclass(frozen=True)
+class Column:
+    """What one column of a whole episode is, without its rows."""
 
-    `len()` is the number of control steps so far. One builder is for one episode, since `info` holds
-    its seed.
-    """
+    dtype: np.dtype
+    shape: tuple[int, ...]
+    """Of one row."""
 
-    def __init__(
-        self,
-        info: EpisodeInfo,
-        geometry: SceneGeometry,
-        segmentation: Mapping[int, str],
-        action_names: Iterable[str],
-        cameras: Iterable[CameraInfo],
-    ) -> None:
-        self._info = info
-        self._geometry = geometry
-        self._segmentation = dict(segmentation)
-        self._action_names = tuple(action_names)
-        self._cameras: dict[tuple[CameraKind, str], CameraInfo] = {(c.kind, c.name): c for c in cameras}
-        self._clear()
 
-    def _clear(self) -> None:
-        self._poses: list[NDArray[np.float32]] = []
-        self._action: list[NDArray[np.float32]] = []
-        self._reward: list[float] = []
-        self._terminated: list[bool] = []
-        self._truncated: list[bool] = []
-        self._evaluate: list[dict[str, NDArray]] = []
-        self._pictures: dict[tuple[CameraKind, str], list[tuple[int, Picture]]] = {}
+class RowPacker:
+    """Packs the rows of one episode, and says when they change their layout."""
 
-    def __len__(self) -> int:
-        return len(self._action)
+    def __init__(self, bodies: int, actions: int) -> None:
+        self._bodies = bodies
+        self._no_action = np.zeros(actions, dtype=np.float32)
+        self._layouts: dict[_Key, int] = {}
 
-    def start(self, step: StepResult, env: int, pictures: Iterable[Picture] = ()) -> None:
-        """Take the state right after the reset of `env`, dropping whatever was gathered before.
-
-        `pictures` may hold those of other envs; they are passed over.
+    def pack(self, row: EpisodeRow) -> tuple[int, bytes, str | None]:
+        """Number of `row`'s layout, `row` in bytes, and the layout as text where it is new.
 
         Raises:
-            IndexError: the batch has no such env.
-            ValueError: `step` is not the first of an episode of `env`, or does not fit the scene.
+            ValueError: `row` does not fit the scene or the actions, or holds what is no number.
         """
-        self._check_env(step, env)
-        elapsed = int(step.elapsed_steps[env])
-        if elapsed != 0:
+        action = self._no_action if row.action is None else row.action
+        arrays = [
+            np.asarray(row.poses, dtype=np.float32),
+            np.asarray(action, dtype=np.float32).reshape(-1),
+            np.float32(row.reward),
+            np.bool_(row.terminated),
+            np.bool_(row.truncated),
+        ]
+        names = [*FIXED]
+        for prefix, held in ((EVALUATE, row.evaluate), (STATE, row.env_states), (OBS, row.obs)):
+            for name, value in held.items():
+                names.append(prefix + name)
+                arrays.append(np.asarray(value))
+        key: _Key = tuple([(name, a.dtype, a.shape) for name, a in zip(names, arrays)])
+        number = self._layouts.get(key)
+        text = None
+        if number is None:
+            self._check(key)
+            text = layout_text(key)
+            number = self._layouts[key] = len(self._layouts)
+        return number, b"".join([array.tobytes() for array in arrays]), text
+
+    def forget(self, number: int) -> None:
+        """Layout `number`, the last new one, was not kept."""
+        self._layouts = {key: held for key, held in self._layouts.items() if held != number}
+
+    def _check(self, key: _Key) -> None:
+        shapes = {name: shape for name, _, shape in key}
+        if shapes["poses"] != (self._bodies, 7):
             raise ValueError(
-                f"env {env} is {elapsed} steps into its episode; a recording starts at a reset. "
-                "Reset the env, or wait for its next episode."
+                f"poses are {shapes['poses']}, but the scene has {self._bodies} bodies: ({self._bodies}, 7)."
             )
-        self._clear()
-        self._append_state(step, env, pictures)
-
-    def append(self, step: StepResult, env: int, pictures: Iterable[Picture] = ()) -> None:
-        """Take the control step that led to `step`. `pictures` as in `start`.
-
-        Raises:
-            IndexError: the batch has no such env.
-            RuntimeError: `start` was not called.
-            ValueError: a step is missing between this and the last one, the step carries no action,
-                or something in it does not fit what came before.
-        """
-        if not self._poses:
-            raise RuntimeError("append() before start(): an episode begins with the state after its reset.")
-        self._check_env(step, env)
-        elapsed = int(step.elapsed_steps[env])
-        if elapsed != len(self) + 1:
+        if shapes["action"] != self._no_action.shape:
             raise ValueError(
-                f"env {env}: step {len(self) + 1} was expected and step {elapsed} came; a step was lost or "
-                "the env was reset. Finish this episode and start the next one at its reset."
+                f"an action of {shapes['action'][0]} numbers, but {len(self._no_action)} action names."
             )
-        if step.action is None:
-            raise ValueError(f"env {env}: step {elapsed} has no action, so it cannot be replayed.")
-        action = np.array(step.action[env], dtype=np.float32).reshape(-1)
-        if len(action) != len(self._action_names):
-            raise ValueError(
-                f"env {env}: an action of {len(action)} numbers, but {len(self._action_names)} action names."
-            )
-        self._append_state(step, env, pictures)
-        self._action.append(action)
-        self._reward.append(float(step.reward[env]))
-        self._terminated.append(bool(step.terminated[env]))
-        self._truncated.append(bool(step.truncated[env]))
-
-    def finish(self) -> Episode:
-        """The episode so far, in columns; the builder is empty afterwards.
-
-        Raises:
-            RuntimeError: `start` was not called.
-        """
-        if not self._poses:
-            raise RuntimeError("finish() before start(): there is no episode to finish.")
-        episode = Episode(
-            info=self._info,
-            geometry=self._geometry,
-            segmentation=self._segmentation,
-            poses=np.stack(self._poses),
-            action=_stack(self._action, (len(self._action_names),), np.float32),
-            action_names=self._action_names,
-            reward=np.array(self._reward, dtype=np.float32),
-            terminated=np.array(self._terminated, dtype=np.bool_),
-            truncated=np.array(self._truncated, dtype=np.bool_),
-            evaluate=_columns_of(self._evaluate),
-            cameras=[
-                _track(self._cameras[key], self._pictures[key])
-                for key in self._cameras
-                if key in self._pictures
-            ],
-        )
-        self._clear()
-        return episode
-
-    def _check_env(self, step: StepResult, env: int) -> None:
-        num_envs, num_bodies = step.poses.shape[:2]
-        if not 0 <= env < num_envs:
-            raise IndexError(f"env {env} of a batch of {num_envs}: choose 0 to {num_envs - 1}.")
-        if num_bodies != len(self._geometry.body_names):
-            raise ValueError(
-                f"poses of {num_bodies} bodies, but the scene has {len(self._geometry.body_names)}: the task was "
-                "rebuilt. Start a new builder with the new scene."
-            )
-
-    def _append_state(self, step: StepResult, env: int, pictures: Iterable[Picture]) -> None:
-        # Everything is checked before anything is kept, so that a step that is refused leaves no half of
-        # itself behind and the episode up to it can still be finished.
-        evaluate = {name: _numeric(name, values[env]) for name, values in step.evaluate.items()}
-        own = [picture for picture in pictures if picture.env == env]
-        for picture in own:
-            self._check_picture(picture)
-        self._poses.append(np.array(step.poses[env], dtype=np.float32))
-        self._evaluate.append(evaluate)
-        for picture in own:
-            state = len(self._poses) - 1
-            self._pictures.setdefault((picture.kind, picture.camera), []).append((state, picture))
-
-    def _check_picture(self, picture: Picture) -> None:
-        key = (picture.kind, picture.camera)
-        if key not in self._cameras:
-            known = ", ".join(f"{name} ({kind})" for kind, name in self._cameras) or "none"
-            raise ValueError(
-                f"picture of an unknown camera {picture.camera} ({picture.kind}); known: {known}."
-            )
-        info = self._cameras[key]
-        for modality in MODALITIES:
-            image = getattr(picture, modality)
-            if image is not None and image.shape[:2] != (info.height, info.width):
+        for name, dtype, _ in key:
+            if dtype.kind not in "biuf":
+                where, _, entry = name.partition("/")
+                what = f"evaluate()['{entry}']" if where == "evaluate" else f"{where} '{entry}'"
                 raise ValueError(
-                    f"camera {info.name}: {modality} of {image.shape[1]} x {image.shape[0]}, "
-                    f"but the camera is {info.width} x {info.height}."
-                )
-        if key in self._pictures:
-            before = _given(self._pictures[key][0][1])
-            if _given(picture) != before:
-                raise ValueError(
-                    f"camera {info.name} gave {', '.join(before)} first and now "
-                    f"{', '.join(_given(picture)) or 'nothing'}; a recording keeps the same all through."
+                    f"{what} has dtype {dtype}; a recording keeps booleans and real numbers. "
+                    "Return it as a tensor of numbers, or leave it out."
                 )
 
 
-def _given(picture: Picture) -> tuple[str, ...]:
-    return tuple(modality for modality in MODALITIES if getattr(picture, modality) is not None)
+def layout_text(key: _Key) -> str:
+    return json.dumps([[name, dtype.str, shape] for name, dtype, shape in key])
 
 
-def _numeric(name: str, value: NDArray) -> NDArray:
-    """A copy of one env's value of one ``evaluate()`` entry."""
-    array = np.array(value)
-    if array.dtype.kind not in "biuf":
-        raise ValueError(
-            f"evaluate()['{name}'] has dtype {array.dtype}; a recording keeps booleans and real numbers. "
-            "Return it as a tensor of numbers, or leave it out."
-        )
-    return array
+def layout_type(text: str) -> np.dtype:
+    """The structured type of rows of the layout `text`. Raises ValueError or TypeError where it is none."""
+    return np.dtype([(name, dtype, tuple(shape)) for name, dtype, shape in json.loads(text)])
 
 
-def _stack(rows: list[NDArray], shape: tuple[int, ...], dtype: type) -> NDArray:
-    """(len(rows), *shape), also where there are no rows, which `numpy.stack` refuses."""
-    return np.stack(rows) if rows else np.zeros((0, *shape), dtype=dtype)
+def merge(layouts: Mapping[np.dtype, int]) -> dict[str, Column]:
+    """The columns of an episode that has so many rows of each of these layouts, in the order in which names first appear."""
+    total = sum(layouts.values())
+    seen: dict[str, list[tuple[np.dtype, tuple[int, ...]]]] = {}
+    rows: Counter[str] = Counter()
+    for layout, count in layouts.items():
+        for name in layout.names or ():
+            dtype = layout[name]
+            seen.setdefault(name, []).append((dtype.base, dtype.shape))
+            rows[name] += count
+    return {name: _merged(kinds, rows[name] == total) for name, kinds in seen.items()}
 
 
-def _columns_of(rows: list[dict[str, NDArray]]) -> dict[str, NDArray]:
-    """One column a name over all rows, in the order in which names first appear.
+def _merged(kinds: list[tuple[np.dtype, tuple[int, ...]]], complete: bool) -> Column:
+    dtypes, shapes = zip(*kinds)
+    if complete and len(set(shapes)) == 1:
+        return Column(np.result_type(*dtypes), shapes[0])
+    shape = shapes[0] if len(set(shapes)) == 1 else (max(int(np.prod(s)) for s in shapes),)
+    return Column(np.result_type(np.float32, *dtypes), shape)
 
-    A column that every row has in one shape keeps its type. Otherwise it becomes floating point and
-    holds NaN where a row lacks it; rows of differing shape are flattened and padded with NaN.
-    """
-    names = dict.fromkeys(name for row in rows for name in row)
-    columns: dict[str, NDArray] = {}
-    for name in names:
-        present = [row[name] for row in rows if name in row]
-        if len(present) == len(rows) and len({value.shape for value in present}) == 1:
-            columns[name] = np.stack(present)
+
+def assemble(runs: Iterable[NDArray], columns: Mapping[str, Column]) -> dict[str, NDArray]:
+    """The rows of `runs`, each structured (n,), as arrays (sum of n, ...) of `columns`."""
+    runs = list(runs)
+    total = sum(len(run) for run in runs)
+    held: dict[str, NDArray] = {}
+    for name, column in columns.items():
+        have = [name in (run.dtype.names or ()) for run in runs]
+        if all(have) and len(runs) == 1 and runs[0].dtype[name] == _of(column):
+            held[name] = np.ascontiguousarray(runs[0][name])
             continue
-        shape = present[0].shape
-        if any(value.shape != shape for value in present):
-            shape = (max(value.size for value in present),)
-        dtype = np.result_type(np.float32, *(value.dtype for value in present))
-        column = np.full((len(rows), *shape), np.nan, dtype=dtype)
-        for index, row in enumerate(rows):
-            if name in row:
-                value = row[name]
-                if value.shape == shape:
-                    column[index] = value
+        fill = np.nan if column.dtype.kind == "f" else 0
+        out = np.full((total, *column.shape), fill, dtype=column.dtype)
+        begin = 0
+        for run, has in zip(runs, have):
+            if has:
+                part = run[name]
+                rows = out[begin : begin + len(run)]
+                if part.shape[1:] == column.shape:
+                    rows[...] = part
                 else:
-                    column[index, : value.size] = value.reshape(-1)
-        columns[name] = column
-    return columns
+                    flat = part.reshape(len(run), -1)
+                    rows[:, : flat.shape[1]] = flat
+            begin += len(run)
+        held[name] = out
+    return held
 
 
-def _track(info: CameraInfo, pictures: list[tuple[int, Picture]]) -> CameraTrack:
-    def column(modality: str, dtype: type) -> NDArray | None:
-        images = [getattr(picture, modality) for _, picture in pictures]
-        return None if images[0] is None else np.stack(images).astype(dtype, copy=False)
-
-    return CameraTrack(
-        info=info,
-        frame=np.array([state for state, _ in pictures], dtype=np.int64),
-        pose=np.stack([picture.pose for _, picture in pictures]).astype(np.float32, copy=False),
-        rgb=column("rgb", np.uint8),
-        depth=column("depth", np.float32),
-        segmentation=column("segmentation", np.int32),
-    )
+def _of(column: Column) -> np.dtype:
+    return np.dtype((column.dtype, column.shape))

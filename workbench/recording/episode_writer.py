@@ -1,29 +1,39 @@
-"""An episode while it happens: rows go in, and three files come out at the end."""
+"""An episode while it happens: rows go in, and the files of a recording come out at the end.
+
+Whoever records (the page, the command line, a wrapper around an env) has a row a step and must not wait for the disk, must
+not fill the memory, and may be killed at any moment. So a row is checked, packed, its pictures are encoded, and it is handed to a
+`Journal`; that is all that a step pays for. The rest (`make_files`) is done once, when the episode is over, and may be done on another
+thread.
+"""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from workbench.core.geometry import SceneGeometry
-from workbench.core.pictures import CameraInfo
+from workbench.core.pictures import CameraInfo, CameraKind, Picture
+from workbench.recording.columns import RowPacker
+from workbench.recording.encoded_pictures import MODALITIES, Modality, encode
 from workbench.recording.episode import EpisodeInfo
+from workbench.recording.journal import FOLDER, Journal
+from workbench.recording.landing import RecordingError, reason
+from workbench.recording.make_files import EpisodeFiles as EpisodeFiles
+from workbench.recording.make_files import make_files
 from workbench.recording.row import EpisodeRow
+from workbench.recording.scene_file import keep_scene
+from workbench.recording.survey import Header, header_text
 
-
-@dataclass(frozen=True)
-class EpisodeFiles:
-    rrd: Path
-    h5: Path
-    json: Path
+SCENE_SUFFIX = ".scene"
 
 
 class EpisodeWriter:
     """`append` rows (the first is the state after the reset), then `finish` or `discard`.
 
-    It has one owner at a time, which may hand it to another thread for `finish`. `len()` is the number of control steps so far, `bytes_written` what lies
-    in the journal.
+    It has one owner at a time, which may hand it to another thread for `finish`. `len()` is the number of control steps so far.
     """
 
     def __init__(
@@ -40,18 +50,44 @@ class EpisodeWriter:
         Raises:
             RecordingError: nothing can be written there.
         """
-        raise NotImplementedError
+        self._folder = Path(folder)
+        self._header = Header(info, geometry, dict(segmentation), tuple(action_names), tuple(cameras))
+        self._packer = RowPacker(len(geometry.body_names), len(self._header.action_names))
+        self._cameras: dict[tuple[CameraKind, str], int] = {
+            camera.key: index for index, camera in enumerate(self._header.cameras)
+        }
+        self._given: dict[int, tuple[Modality, ...]] = {}
+        self._states = 0
+        self._finished: EpisodeFiles | None = None
+        path = self._folder / FOLDER / f"{info.id}.arrow"
+        self._scene = path.with_suffix(SCENE_SUFFIX)
+        try:
+            self._journal = Journal(path)
+            try:
+                keep_scene(geometry, self._scene)
+                self._journal.add("header", 0, header_text(self._header).encode())
+                self._journal.commit()
+            except OSError:
+                self.discard()
+                raise
+        except OSError as error:
+            raise self._failed(error) from error
 
     @property
     def info(self) -> EpisodeInfo:
-        raise NotImplementedError
+        return self._header.info
+
+    @property
+    def folder(self) -> Path:
+        return self._folder
 
     @property
     def bytes_written(self) -> int:
-        raise NotImplementedError
+        """What the episode takes on the disk so far."""
+        return self._journal.size
 
     def __len__(self) -> int:
-        raise NotImplementedError
+        return max(self._states - 1, 0)
 
     def append(self, row: EpisodeRow) -> None:
         """The next state.
@@ -60,17 +96,107 @@ class EpisodeWriter:
             ValueError: `row` does not fit the episode; the episode is as it was.
             RecordingError: the journal cannot be written any more (also of an earlier row, since writing lags behind).
         """
-        raise NotImplementedError
+        if (row.action is None) != (self._states == 0):
+            raise ValueError(
+                "the first row is the state after a reset, which no action led to."
+                if self._states == 0
+                else f"step {self._states} has no action, so it cannot be replayed."
+            )
+        journal = self._journal
+        number, packed, layout = self._packer.pack(row)
+        try:
+            given = self._add_pictures(row.pictures) if row.pictures else {}
+            if layout is not None:
+                journal.add("layout", number, layout.encode())
+            journal.add("row", number, packed)
+            journal.commit()
+        except ValueError:
+            journal.rollback()
+            if layout is not None:
+                self._packer.forget(number)
+            raise
+        except OSError as error:
+            raise self._failed(error) from error
+        self._given |= given
+        self._states += 1
 
     def finish(self) -> EpisodeFiles:
-        """Make the files of the episode so far.
+        """Make the files of the episode so far, and be done; again after an error, if the cause is gone.
 
         Raises:
             ValueError: there is no state yet.
             RecordingError: they cannot be written; the journal stays for `recover`, nothing else does.
         """
-        raise NotImplementedError
+        if self._finished is not None:
+            return self._finished
+        try:
+            self._journal.finish()
+            self._finished = make_files(self._journal.path, self._header, self._folder, self._states)
+        except RecordingError:
+            self._journal.close()
+            raise
+        except OSError as error:
+            self._journal.close()
+            raise self._failed(error) from error
+        self.discard()
+        return self._finished
 
     def discard(self) -> None:
-        """Forget the episode: nothing of it stays on the disk."""
-        raise NotImplementedError
+        """Forget the episode: nothing of it stays on the disk, but for the files that `finish` has made."""
+        self._journal.remove()
+        self._scene.unlink(missing_ok=True)
+        tidy(self._folder)
+
+    def _add_pictures(self, pictures: Sequence[Picture]) -> dict[int, tuple[Modality, ...]]:
+        """Put `pictures` into the journal; returns what each camera gave."""
+        seen: dict[int, tuple[Modality, ...]] = {}
+        for picture in pictures:
+            index = self._check(picture, seen)
+            seen[index] = _given(picture)
+            self._journal.add(
+                f"camera/{index}", self._states, np.asarray(picture.pose, dtype=np.float32).tobytes()
+            )
+            for modality in seen[index]:
+                blob = encode(modality, getattr(picture, modality))
+                self._journal.add(f"picture/{index}/{modality}", self._states, blob)
+        return seen
+
+    def _check(self, picture: Picture, seen: Mapping[int, object]) -> int:
+        index = self._cameras.get((picture.kind, picture.camera))
+        if index is None:
+            raise ValueError(f"a picture of {picture.kind} camera {picture.camera}, which the task has not.")
+        if index in seen:
+            raise ValueError(f"camera {picture.camera} gave two pictures of one state.")
+        info = self._header.cameras[index]
+        given = _given(picture)
+        for modality in given:
+            shape = getattr(picture, modality).shape
+            if shape[:2] != (info.height, info.width):
+                raise ValueError(
+                    f"camera {info.name} gave a {modality} picture of {shape[1]} x {shape[0]}, "
+                    f"but the camera is {info.width} x {info.height}."
+                )
+        before = self._given.get(index, given)
+        if given != before or not given:
+            raise ValueError(
+                f"camera {info.name} gave {', '.join(before) or 'nothing'} first and now "
+                f"{', '.join(given) or 'nothing'}; a recording keeps the same all through."
+            )
+        return index
+
+    def _failed(self, error: OSError) -> RecordingError:
+        return RecordingError(
+            f"Cannot record {self.info.task} to {self._folder}: {reason(error, self._folder)}"
+        )
+
+
+def tidy(folder: Path) -> None:
+    """Take the folder of the journals away if nothing is in it."""
+    try:
+        os.rmdir(folder / FOLDER)
+    except OSError:  # not empty, or not there
+        pass
+
+
+def _given(picture: Picture) -> tuple[Modality, ...]:
+    return tuple(modality for modality in MODALITIES if getattr(picture, modality) is not None)

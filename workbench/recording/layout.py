@@ -1,24 +1,23 @@
-"""Which entity of a recording holds what: an `Episode` laid out for rerun.
+"""Which entity of a recording holds what: an episode laid out for rerun, a piece at a time.
 
 A recording is read by people in the viewer and by programs, so where a thing lies is a contract:
 
 - ``/world`` right-handed, z up; ``/world/<body>`` its pose, ``/world/<body>/<n>`` its static meshes;
 - ``/world/cameras/<name>`` pose and pinhole, with children ``rgb``, ``depth`` and ``segmentation``;
-- ``/action``, ``/reward``, ``/evaluate/<entry>``, ``/episode/{success,fail,terminated,truncated}``
-  as numbers, ``/logs/events`` as text.
+- ``/action``, ``/reward`` and ``/reward/<term>``, ``/evaluate/<entry>``, ``/observation/state/<entry>``,
+  ``/episode/{success,fail,terminated,truncated}`` as numbers, ``/logs/events`` as text.
 
 Two timelines index all of it: ``step``, the state's number, and ``sim_time``. Row k is what
 `StepResult` k said: the state after k control steps, with the action that led there and the reward
 that it earned, so the action of row k is ``episode.action[k - 1]`` and row 0 has neither.
 
-Everything goes in as columns (one call an entity), which research measured at forty times the speed
-of one call a row. Rerun writes quaternions as xyzw and cameras in the OpenCV frame (x right, y down,
+Everything goes in as columns (one call an entity and piece), which research measured at forty times the speed
+of one call a row; pieces are long, since each is a chunk of the file that readers and the viewer handle as one. Rerun writes quaternions as xyzw and cameras in the OpenCV frame (x right, y down,
 z forward); ManiSkill has wxyz and x forward, y left, z up.
 """
 
 from __future__ import annotations
 
-import io
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -27,21 +26,23 @@ from typing import Any
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
-from PIL import Image
 
 from workbench.core.geometry import Material, Mesh, SceneGeometry
-from workbench.recording.episode import CameraTrack, Episode
+from workbench.core.pictures import CameraInfo
+from workbench.recording.columns import EVALUATE, OBS, Column
+from workbench.recording.encoded_pictures import MILLIMETRES_PER_METRE, decode
+from workbench.recording.survey import CameraSurvey, Piece, Survey
 
 STEP = "step"
 SIM_TIME = "sim_time"
 WORLD = "/world"
 CAMERAS = "/world/cameras"
 EVENTS = "/logs/events"
+REWARD_TERMS = "reward_terms/"
+"""What an entry of ``evaluate()`` begins with that is a part of the reward."""
 
-JPEG_QUALITY = 85
 FRUSTUM_METRES = 0.12
 """How far in front of a camera its picture is drawn in the 3-D view."""
-MILLIMETRES_PER_METRE = 1000.0
 SERIES_COLORS = (
     (86, 180, 233),
     (230, 159, 0),
@@ -73,7 +74,7 @@ class Account:
     """Entities that hold something static."""
 
 
-class _Log:
+class Log:
     """Rerun's two ways in, with an account of what went in."""
 
     def __init__(self, recording: rr.RecordingStream, control_dt: float) -> None:
@@ -104,42 +105,80 @@ class _Log:
         steps: NDArray[np.int64],
         translation: NDArray[np.float32],
         xyzw: NDArray[np.float32],
-        still: bool,
     ) -> None:
-        """`translation` (len(steps), 3) and `xyzw` (len(steps), 4); their first row alone if `still`."""
-        if still:
-            quaternion = rr.Quaternion(xyzw=xyzw[0])
-            self.static(entity, rr.Transform3D(translation=translation[0], quaternion=quaternion))
-        else:
-            self.columns(entity, steps, rr.Transform3D.columns(translation=translation, quaternion=xyzw))
+        """`translation` (len(steps), 3) and `xyzw` (len(steps), 4)."""
+        self.columns(entity, steps, rr.Transform3D.columns(translation=translation, quaternion=xyzw))
 
-    def scalars(
-        self,
-        entity: str,
-        steps: NDArray[np.int64],
-        values: NDArray,
-        names: Sequence[str],
-        first_color: int = 0,
-    ) -> None:
-        """`values` (len(steps), ...) as one batched entity with a name and a colour a series."""
-        flat = np.asarray(values, dtype=np.float64).reshape(len(steps), len(names))
-        if flat.shape[1] == 0:
-            return
-        # Left to itself rerun gives all series of an entity one colour, and entities of one folder much the same.
-        colors = [SERIES_COLORS[(first_color + index) % len(SERIES_COLORS)] for index in range(len(names))]
-        self.static(entity, rr.SeriesLines(names=list(names), colors=colors))
-        columns = rr.Scalars.columns(scalars=flat.reshape(-1))
-        self.columns(entity, steps, columns.partition([flat.shape[1]] * len(flat)))
+    def still(self, entity: str, translation: NDArray[np.float32], xyzw: NDArray[np.float32]) -> None:
+        """The one pose, (3,) and (4,), of what never moves."""
+        quaternion = rr.Quaternion(xyzw=xyzw)
+        self.static(entity, rr.Transform3D(translation=translation, quaternion=quaternion))
+
+    def series(self, entity: str, names: Sequence[str], first_color: int = 0) -> None:
+        """Name and colour of each number of the batched `scalars` of `entity`."""
+        if names:
+            # Left to itself rerun gives all series of an entity one colour, and entities of one folder much the same.
+            colors = [
+                SERIES_COLORS[(first_color + index) % len(SERIES_COLORS)] for index in range(len(names))
+            ]
+            self.static(entity, rr.SeriesLines(names=list(names), colors=colors))
+
+    def scalars(self, entity: str, steps: NDArray[np.int64], values: NDArray) -> None:
+        """`values` (len(steps), ...), all of a step as one batch."""
+        flat = np.asarray(values, dtype=np.float64).reshape(len(steps), -1)
+        if flat.size:
+            columns = rr.Scalars.columns(scalars=flat.reshape(-1))
+            self.columns(entity, steps, columns.partition([flat.shape[1]] * len(flat)))
 
 
-def log_episode(recording: rr.RecordingStream, episode: Episode) -> Account:
-    """Hand the whole of `episode` to `recording`; returns the account of it."""
-    log = _Log(recording, episode.info.control_dt)
-    _log_bodies(log, episode)
-    _log_cameras(log, episode)
-    _log_numbers(log, episode)
-    _log_events(log, episode)
-    return log.account
+class EpisodeLog:
+    """Hands one episode to `recording`: what it is as a whole at once, then its pieces as they are `take`n."""
+
+    def __init__(self, recording: rr.RecordingStream, survey: Survey) -> None:
+        self._survey = survey
+        self._log = log = Log(recording, survey.info.control_dt)
+        self.account = log.account
+        self._cameras = camera_entities([camera.info for camera in survey.cameras])
+        self._bodies = [
+            (body, entity)
+            for body, entity in enumerate(body_entities(survey.header.geometry))
+            if survey.present[body]
+        ]
+        _log_scene(log, survey, dict(self._bodies))
+        _log_lenses(log, survey, self._cameras)
+        _log_series(log, survey)
+        _log_events(log, survey)
+
+    def take(self, piece: Piece) -> None:
+        """The next piece."""
+        log, survey, states = self._log, self._survey, piece.states
+        poses = piece.columns["poses"]
+        for body, entity in self._bodies:
+            if not _stands(survey, body):
+                log.pose(entity, states, poses[:, body, :3], xyzw(poses[:, body, 3:]))
+        for (index, modality), (frames, blobs) in piece.pictures.items():
+            _log_pictures(log, survey.cameras[index], self._cameras[index], modality, frames, blobs)
+        self._take_camera_poses(states)
+        self._take_numbers(piece)
+
+    def _take_camera_poses(self, states: NDArray[np.int64]) -> None:
+        for camera, entity in zip(self._survey.cameras, self._cameras):
+            begin, end = np.searchsorted(camera.frames, [states[0], states[-1] + 1])
+            if begin < end and not camera.still:
+                translation, quaternion = optical_pose(np.stack(camera.poses[begin:end]))
+                self._log.pose(entity, np.array(camera.frames[begin:end]), translation, quaternion)
+
+    def _take_numbers(self, piece: Piece) -> None:
+        log, survey, states = self._log, self._survey, piece.states
+        for name, entity, _ in _numbers(survey):
+            if name in ("action", "reward", "terminated", "truncated"):
+                # State 0 is a reset: nothing led to it.
+                skip = 1 if piece.first == 0 else 0
+                log.scalars(entity, states[skip:], piece.columns[name][skip:])
+            else:
+                log.scalars(entity, states, piece.columns[name])
+        for name, values in survey.flags.items():
+            log.scalars(f"/episode/{name}", states, values[states])
 
 
 # --- names ----------------------------------------------------------------------------------------
@@ -164,45 +203,59 @@ def body_entities(geometry: SceneGeometry) -> tuple[str, ...]:
     return tuple(entities)
 
 
-def camera_entities(cameras: Sequence[CameraTrack]) -> tuple[str, ...]:
+def camera_entities(cameras: Sequence[CameraInfo]) -> tuple[str, ...]:
     """Entity path of each camera; a human-render camera gives way to a sensor of the same name."""
     taken: set[str] = set()
     entities = [""] * len(cameras)
-    for index in sorted(range(len(cameras)), key=lambda i: cameras[i].info.kind != "sensor"):
-        name = cameras[index].info.name or "unnamed"
+    for index in sorted(range(len(cameras)), key=lambda i: cameras[i].kind != "sensor"):
+        name = cameras[index].name or "unnamed"
         while name in taken:
-            name += f"_{cameras[index].info.kind}"
+            name += f"_{cameras[index].kind}"
         taken.add(name)
         entities[index] = rr.new_entity_path(["world", "cameras", name])
     return tuple(entities)
 
 
 def evaluate_entity(name: str) -> str:
+    """Of an entry of ``evaluate()``; the terms of the reward, as the task names them, lie below ``/reward``."""
+    if name.startswith(REWARD_TERMS):
+        return rr.new_entity_path(["reward", name[len(REWARD_TERMS) :] or "unnamed"])
     return rr.new_entity_path(["evaluate", name or "unnamed"])
 
 
-# --- bodies ---------------------------------------------------------------------------------------
+def observation_entity(name: str) -> str:
+    return rr.new_entity_path(["observation", "state", *(part for part in name.split("/") if part)])
 
 
-def _log_bodies(log: _Log, episode: Episode) -> None:
+# --- scene ----------------------------------------------------------------------------------------
+
+
+def _stands(survey: Survey, body: int) -> bool:
+    return bool(survey.still[body]) and survey.header.geometry.body_kinds[body] == "static"
+
+
+def _log_scene(log: Log, survey: Survey, entities: dict[int, str]) -> None:
     log.static(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-    steps = np.arange(len(episode.poses), dtype=np.int64)
-    entities = body_entities(episode.geometry)
-    present: NDArray[np.bool_] = np.any(np.isfinite(episode.poses), axis=(0, 2))
-    for body, entity in enumerate(entities):
-        if not present[body]:
-            continue
-        poses = episode.poses[:, body]
-        still = episode.geometry.body_kinds[body] == "static" and is_constant(poses)
-        log.pose(entity, steps, poses[:, :3], xyzw(poses[:, 3:]), still)
+    for body, entity in entities.items():
+        if _stands(survey, body):
+            pose = survey.first_poses[body]
+            log.still(entity, pose[:3], xyzw(pose[3:]))
     worn: Counter[int] = Counter()
-    for visual in episode.geometry.visuals:
-        mesh = _mesh(visual.mesh, visual.material) if episode.info.env_index in visual.envs else None
+    for visual in survey.header.geometry.visuals:
+        mesh = _mesh(visual.mesh, visual.material) if survey.info.env_index in visual.envs else None
         if mesh is None:
             continue
-        for body in visual.bodies[visual.envs == episode.info.env_index]:
-            if present[body]:
-                log.static(f"{entities[body]}/{worn[int(body)]}", mesh)
+        # What rerun's mesh does not say, for whoever reads the scene back.
+        material = rr.AnyValues(
+            visual=visual.name,
+            base_color=list(visual.material.base_color),
+            metallic=visual.material.metallic,
+            roughness=visual.material.roughness,
+        )
+        for body in visual.bodies[visual.envs == survey.info.env_index]:
+            if int(body) in entities:
+                log.static(f"{entities[int(body)]}/{worn[int(body)]}", mesh)
+                log.static(f"{entities[int(body)]}/{worn[int(body)]}", material)
                 worn[int(body)] += 1
 
 
@@ -224,132 +277,118 @@ def _mesh(mesh: Mesh, material: Material) -> rr.Mesh3D | None:
 # --- cameras --------------------------------------------------------------------------------------
 
 
-def _log_cameras(log: _Log, episode: Episode) -> None:
-    if not episode.cameras:
+def _log_lenses(log: Log, survey: Survey, entities: Sequence[str]) -> None:
+    if not survey.cameras:
         return
-    names = {0: "background", **episode.segmentation}
+    names = {0: "background", **survey.header.segmentation}
     # Class ids are 16 bit in rerun; a name beyond that has nowhere to go (ManiSkill's ids are int16).
     classes = [(int(id_), name) for id_, name in sorted(names.items()) if 0 <= id_ <= 0xFFFF]
     log.static(CAMERAS, rr.AnnotationContext([(*c, (0, 0, 0)) if c[0] == 0 else c for c in classes]))
-    for camera, entity in zip(episode.cameras, camera_entities(episode.cameras)):
-        translation, quaternion = optical_pose(camera.pose)
-        log.pose(entity, camera.frame, translation, quaternion, still=is_constant(camera.pose))
+    for camera, entity in zip(survey.cameras, entities):
+        info = camera.info
+        if camera.still:
+            translation, quaternion = optical_pose(camera.poses[0][None])
+            log.still(entity, translation[0], quaternion[0])
         pinhole = rr.Pinhole(
-            image_from_camera=camera.info.intrinsic,
-            resolution=[camera.info.width, camera.info.height],
+            image_from_camera=info.intrinsic,
+            resolution=[info.width, info.height],
             camera_xyz=rr.ViewCoordinates.RDF,
             image_plane_distance=FRUSTUM_METRES,
         )
         log.static(entity, pinhole)
-        _log_pictures(log, entity, camera)
+        if "rgb" in camera.modalities:
+            log.static(f"{entity}/rgb", rr.EncodedImage.from_fields(media_type="image/jpeg"))
+        if "depth" in camera.modalities:
+            meter = rr.EncodedDepthImage.from_fields(media_type="image/png", meter=MILLIMETRES_PER_METRE)
+            log.static(f"{entity}/depth", meter)
+        if "segmentation" in camera.modalities:
+            form = rr.components.ImageFormat(
+                width=info.width,
+                height=info.height,
+                channel_datatype=rr.ChannelDatatype.from_np_dtype(_ids(camera)),
+            )
+            log.static(f"{entity}/segmentation", rr.SegmentationImage.from_fields(format=form))
 
 
-def _log_pictures(log: _Log, entity: str, camera: CameraTrack) -> None:
-    if camera.rgb is not None:
-        rgb = f"{entity}/rgb"
-        log.static(rgb, rr.EncodedImage.from_fields(media_type="image/jpeg"))
-        log.columns(
-            rgb, camera.frame, rr.EncodedImage.columns(blob=[encode_jpeg(image) for image in camera.rgb])
-        )
-    if camera.depth is not None:
-        depth = f"{entity}/depth"
-        meter = rr.EncodedDepthImage.from_fields(media_type="image/png", meter=MILLIMETRES_PER_METRE)
-        log.static(depth, meter)
-        blobs = [encode_depth_png(image) for image in camera.depth]
-        log.columns(depth, camera.frame, rr.EncodedDepthImage.columns(blob=blobs))
-    if camera.segmentation is not None:
-        segmentation = f"{entity}/segmentation"
-        small = camera.segmentation.min() >= 0 and camera.segmentation.max() <= 0xFFFF
-        ids = np.ascontiguousarray(camera.segmentation, dtype=np.uint16 if small else np.int32)
-        height, width = ids.shape[1:]
-        form = rr.components.ImageFormat(
-            width=width,
-            height=height,
-            channel_datatype=rr.ChannelDatatype.from_np_dtype(ids.dtype),
-        )
-        log.static(segmentation, rr.SegmentationImage.from_fields(format=form))
-        buffers = ids.reshape(len(ids), -1).view(np.uint8)
-        log.columns(segmentation, camera.frame, rr.SegmentationImage.columns(buffer=buffers))
+def _ids(camera: CameraSurvey) -> np.dtype:
+    return np.dtype(np.int32 if camera.wide else np.uint16)
 
 
-def encode_jpeg(image: NDArray[np.uint8]) -> bytes:
-    """(H, W, 3) as JPEG, colour at full resolution (the edges of small pictures blur otherwise)."""
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
-    return buffer.getvalue()
-
-
-def encode_depth_png(depth: NDArray[np.float32]) -> bytes:
-    """(H, W) metres as 16-bit PNG in millimetres, which is what ManiSkill itself measures in.
-
-    What is not a distance (NaN, infinite, behind the camera) becomes 0, "nothing"; 65.535 m is the
-    farthest that 16 bits hold, and what is farther stays there.
-    """
-    millimetres = np.nan_to_num(depth * MILLIMETRES_PER_METRE, nan=0.0, posinf=0.0, neginf=0.0)
-    buffer = io.BytesIO()
-    Image.fromarray(np.rint(np.clip(millimetres, 0, 0xFFFF)).astype(np.uint16)).save(
-        buffer, format="PNG", compress_level=3
-    )
-    return buffer.getvalue()
+def _log_pictures(
+    log: Log, camera: CameraSurvey, entity: str, modality: str, frames: Sequence[int], blobs: Sequence[bytes]
+) -> None:
+    steps = np.array(frames, dtype=np.int64)
+    if modality == "rgb":
+        columns = rr.EncodedImage.columns(blob=list(blobs))
+    elif modality == "depth":
+        columns = rr.EncodedDepthImage.columns(blob=list(blobs))
+    else:
+        # Rerun shows names over ids only where they are plain; its files compress them again.
+        ids = np.stack([decode("segmentation", blob) for blob in blobs]).astype(_ids(camera))
+        columns = rr.SegmentationImage.columns(buffer=ids.reshape(len(ids), -1).view(np.uint8))
+    log.columns(f"{entity}/{modality}", steps, columns)
 
 
 # --- numbers and words ----------------------------------------------------------------------------
 
 
-def _log_numbers(log: _Log, episode: Episode) -> None:
-    states = np.arange(len(episode.poses), dtype=np.int64)
-    transitions = states[1:]
-    log.scalars("/action", transitions, episode.action, episode.action_names)
-    log.scalars("/reward", transitions, episode.reward, ["reward"])
-    drawn = 0
-    for name, values in episode.evaluate.items():
-        series = [name]
-        if values.ndim > 1:
-            series = [f"{name}[{', '.join(map(str, index))}]" for index in np.ndindex(values.shape[1:])]
-        log.scalars(evaluate_entity(name), states, values, series, first_color=drawn)
-        drawn += len(series)
-    for name in ("success", "fail"):
-        if is_flag(episode, name):
-            log.scalars(f"/episode/{name}", states, episode.evaluate[name], [name])
-    log.scalars("/episode/terminated", transitions, episode.terminated, ["terminated"])
-    log.scalars("/episode/truncated", transitions, episode.truncated, ["truncated"])
+def _numbers(survey: Survey) -> list[tuple[str, str, list[str]]]:
+    """Column, entity and the name of each number in it, of all that is drawn as curves."""
+    found = [
+        ("action", "/action", list(survey.header.action_names)),
+        ("reward", "/reward", ["reward"]),
+        ("terminated", "/episode/terminated", ["terminated"]),
+        ("truncated", "/episode/truncated", ["truncated"]),
+    ]
+    for prefix, entity in ((EVALUATE, evaluate_entity), (OBS, observation_entity)):
+        for name, column in survey.named(prefix).items():
+            said = name.removeprefix(REWARD_TERMS) if prefix == EVALUATE else name or "obs"
+            found.append((prefix + name, entity(name), series_names(said, column)))
+    return found
 
 
-def is_flag(episode: Episode, name: str) -> bool:
-    """Whether ``evaluate()`` gave one number a step under `name`, as it should for ``success``."""
-    return name in episode.evaluate and episode.evaluate[name].ndim == 1
+def series_names(name: str, column: Column) -> list[str]:
+    """``name``, or ``name[0]``, ``name[1]`` ... where a step has more than one number of it."""
+    if column.shape == ():
+        return [name]
+    return [f"{name}[{', '.join(map(str, index))}]" for index in np.ndindex(column.shape)]
 
 
-def flag(episode: Episode, name: str) -> NDArray[np.bool_]:
-    """(T + 1,) `name` of ``evaluate()`` as yes or no; a step that lacks it says no."""
-    if not is_flag(episode, name):
-        return np.zeros(len(episode.poses), dtype=np.bool_)
-    return np.nan_to_num(episode.evaluate[name].astype(np.float64)) != 0
+def _log_series(log: Log, survey: Survey) -> None:
+    if survey.length == 0:
+        return
+    drawn: Counter[str] = Counter()
+    for _, entity, series in _numbers(survey):
+        folder = entity.split("/")[1]  # one view shows all entities of a folder
+        shared = folder in ("evaluate", "reward")
+        log.series(entity, series, first_color=drawn[folder] if shared else 0)
+        drawn[folder] += len(series)
+    for name in survey.flags:
+        log.series(f"/episode/{name}", [name])
 
 
-def events(episode: Episode) -> list[tuple[int, str, str]]:
+def events(survey: Survey) -> list[tuple[int, str, str]]:
     """(step, level, text) of every moment at which something began, in order of time."""
-    found = [(0, "INFO", f"reset with seed {episode.info.seed}" if episode.info.seed >= 0 else "reset")]
+    seed = survey.info.seed
+    found = [(0, "INFO", f"reset with seed {seed}" if seed >= 0 else "reset")]
     for name, level in (("success", "INFO"), ("fail", "WARN")):
-        found += [(step, level, name) for step in _onsets(flag(episode, name))]
-    for name, values in (("terminated", episode.terminated), ("truncated", episode.truncated)):
-        found += [(step, "INFO", name) for step in _onsets(np.concatenate([[False], values]))]
+        if name in survey.flags:
+            found += [(step, level, name) for step in onsets(survey.flags[name])]
+    for name, values in (("terminated", survey.terminated), ("truncated", survey.truncated)):
+        found += [(step, "INFO", name) for step in onsets(np.concatenate([[False], values]))]
     return sorted(found, key=lambda event: event[0])
 
 
-def _onsets(values: NDArray[np.bool_]) -> list[int]:
+def onsets(values: NDArray[np.bool_]) -> list[int]:
+    """Indices at which `values` becomes true."""
     before = np.concatenate([[False], values[:-1]])
     return np.flatnonzero(values & ~before).tolist()
 
 
-def _log_events(log: _Log, episode: Episode) -> None:
-    steps, levels, texts = zip(*events(episode))
+def _log_events(log: Log, survey: Survey) -> None:
+    steps, levels, texts = zip(*events(survey))
     columns = rr.TextLog.columns(text=list(texts), level=list(levels))
     log.columns(EVENTS, np.array(steps, dtype=np.int64), columns)
-
-
-def is_constant(rows: NDArray) -> bool:
-    return bool(np.all(rows == rows[:1]))
 
 
 # --- frames ---------------------------------------------------------------------------------------

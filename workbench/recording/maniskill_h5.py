@@ -1,12 +1,168 @@
-"""ManiSkill's own trajectory files: an ``.h5`` with the columns and a ``.json`` that says what they are of.
+"""Write an episode as ManiSkill's own trajectory: an ``.h5`` with the columns and a ``.json`` that says what they are of.
 
-One episode a file, ``traj_0``. The ``.json`` is ManiSkill's (``env_info``, ``commit_info``, ``episodes``) with one key more, ``workbench``:
+Whatever reads ManiSkill's demonstrations then reads ours: its replay, its datasets, the training code of half the field.
+Names, types and shapes are those of ``mani_skill.utils.wrappers.record.RecordEpisode`` (3.0.1), one episode a file, ``traj_0``:
 
-    format 1; id, task, env_index, seed (null where unknown), source_file (name), source_path (as seen from the recording's
-    folder; null), source_hash, source {path: text}, control_dt, control_mode, backend, versions, env_kwargs, reset_options,
-    max_episode_steps, written_at, recovered (all as in `EpisodeInfo`);
-    length, return, success, success_once, fail, fail_once (null where the task has no such entry);
-    action_names, thumbnail (base64 of a JPEG at most 160 pixels wide; null without cameras), cameras, segmentation, scene, evaluate.
+- ``actions`` (T, A) float32, ``rewards`` (T,) float32, ``terminated``, ``truncated``, and ``success`` and ``fail`` if the task has them,
+  (T,) bool, ``env_states/{actors,articulations}/<name>`` (T + 1, D), ``obs/...`` (T + 1, ...).
+- the ``.json``: ``env_info``, ``commit_info``, ``episodes`` and ``source_type`` as there; ``workbench`` besides (see `description`).
 
-So whoever lists recordings reads ``.json`` files and nothing else.
+HDF5 writes into a `SafeFile`, and each dataset is read back once the file is closed.
 """
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.recording.columns import EVALUATE, OBS, STATE
+from workbench.recording.description import describe_beside
+from workbench.recording.landing import SafeFile
+from workbench.recording.survey import Piece, Survey
+
+TRAJECTORY = "traj_0"
+_READ_BYTES = 8 << 20
+
+
+class _Dataset:
+    """A column on its way into the file, with a checksum of what it was given."""
+
+    def __init__(self, dataset: h5py.Dataset, column: str, from_state: int) -> None:
+        self._dataset = dataset
+        self._column = column
+        self._from_state = from_state
+        self.name: str = dataset.name or ""
+        self.sum = 0
+
+    def take(self, piece: Piece) -> None:
+        skip = max(self._from_state - piece.first, 0)
+        values = piece.columns[self._column][skip:]
+        if self._dataset.dtype == np.bool_ and values.dtype != np.bool_:
+            values = np.nan_to_num(values.astype(np.float64)) != 0
+        values = np.ascontiguousarray(values, dtype=self._dataset.dtype)
+        if len(values):
+            begin = piece.first + skip - self._from_state
+            self._dataset[begin : begin + len(values)] = values
+            self.sum = zlib.crc32(values.data, self.sum)
+
+
+class H5Writer:
+    """`take` the pieces of an episode in order. Made by `h5_writer`."""
+
+    def __init__(self, file: h5py.File, survey: Survey) -> None:
+        group = file.create_group(TRAJECTORY, track_order=True)
+        length = survey.length
+        self.datasets: list[_Dataset] = []
+
+        def add(path: str, column: str, from_state: int, dtype: Any = None) -> None:
+            *folders, leaf = path.split("/")
+            parent: Any = group
+            for folder in folders:
+                parent = parent[folder] if folder in parent else parent.create_group(folder, track_order=True)
+            what = survey.columns[column]
+            shape = (length + 1 - from_state, *what.shape)
+            self.datasets.append(
+                _Dataset(parent.create_dataset(leaf, shape, dtype or what.dtype), column, from_state)
+            )
+
+        for name in survey.named(OBS):
+            add("/".join(["obs", *_parts(name)]), OBS + name, 0)
+        add("actions", "action", 1, np.float32)
+        add("terminated", "terminated", 1, np.bool_)
+        add("truncated", "truncated", 1, np.bool_)
+        for name in survey.flags:
+            add(name, EVALUATE + name, 1, np.bool_)
+        for name in survey.named(STATE):
+            add("/".join(["env_states", *_parts(name)]), STATE + name, 0)
+        add("rewards", "reward", 1, np.float32)
+
+    def take(self, piece: Piece) -> None:
+        for dataset in self.datasets:
+            dataset.take(piece)
+
+
+@contextmanager
+def h5_writer(survey: Survey, path: Path) -> Iterator[H5Writer]:
+    """Write the episode of `survey` to `path`, which must not exist; the file is whole when the block is left.
+
+    Raises:
+        OSError: it cannot be written, or what arrived is not what was handed to HDF5.
+        ValueError: two of its columns want one name.
+    """
+    safe = SafeFile(path)
+    try:
+        with h5py.File(safe, "w") as file:
+            writer = H5Writer(file, survey)
+            yield writer
+        safe.finish()
+        _check_written(path, writer)
+    except (OSError, RuntimeError) as error:
+        raise (safe.error or error) from error
+    finally:
+        safe.close()
+
+
+def write_json(survey: Survey, path: Path, folder: Path) -> None:
+    """Write what is to be said of the episode to `path`, for files that will lie in `folder`. Raises OSError."""
+    content = json.dumps(_document(survey, folder), indent=2, default=str).encode()
+    with path.open("xb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _document(survey: Survey, folder: Path) -> dict[str, Any]:
+    info = survey.info
+    seed = info.seed if info.seed >= 0 else None
+    episode: dict[str, Any] = {
+        "episode_id": 0,
+        "episode_seed": seed,
+        "control_mode": info.control_mode,
+        "elapsed_steps": survey.length,
+        "reset_kwargs": {"options": info.reset_options, **({} if seed is None else {"seed": seed})},
+    }
+    for name, values in survey.flags.items():
+        episode[name] = bool(values[-1])
+    return {
+        "env_info": {
+            "env_id": info.task,
+            "env_kwargs": {"control_mode": info.control_mode, **info.env_kwargs},
+            "max_episode_steps": info.max_episode_steps,
+        },
+        "commit_info": None,
+        "episodes": [episode],
+        "source_type": "workbench",
+        "source_desc": f"recorded with maniskill-workbench {info.versions.get('maniskill-workbench', '')}".strip(),
+        "workbench": describe_beside(survey, folder),
+    }
+
+
+def _check_written(path: Path, writer: H5Writer) -> None:
+    with h5py.File(path, "r") as file:
+        for dataset in writer.datasets:
+            if _sum(file[dataset.name]) != dataset.sum:
+                raise OSError(errno.EIO, f"not everything arrived on the disk ({dataset.name})")
+
+
+def _sum(dataset: Any) -> int:
+    rows = max(_READ_BYTES // max(dataset.dtype.itemsize * int(np.prod(dataset.shape[1:])), 1), 1)
+    total = 0
+    for begin in range(0, len(dataset), rows):
+        values: NDArray = dataset[begin : begin + rows]
+        total = zlib.crc32(np.ascontiguousarray(values).data, total)
+    return total
+
+
+def _parts(name: str) -> list[str]:
+    """Names of nested groups; HDF5 reads a dot as "here"."""
+    return ["_" if part == "." else part for part in name.split("/") if part]

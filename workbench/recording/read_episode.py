@@ -1,10 +1,36 @@
-"""A recording as an `Episode` again, whoever wrote it."""
+"""A recording as an `Episode` again.
+
+The ``.json`` says what the episode is, the ``.rrd`` holds what there is to see (meshes, poses, pictures, curves), and the ``.h5``
+what there is to compute with (env states, observations, actions). Each is read for what it holds best, and a file that is missing takes only its
+own with it: a lone ``.rrd`` that somebody was sent can be looked at, though nobody can step into it.
+
+Pictures stay as they lie in the file, encoded, until one is asked for.
+"""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
-from workbench.recording.episode import Episode
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.core.geometry import SceneGeometry
+from workbench.recording.columns import Column
+from workbench.recording.description import columns_from, info_from
+from workbench.recording.encoded_pictures import EncodedPictures, Modality
+from workbench.recording.episode import CameraTrack, Episode
+from workbench.recording.layout import body_entities, camera_entities, evaluate_entity
+from workbench.recording.maniskill_h5 import TRAJECTORY
+from workbench.recording.read_maniskill import UnreadableRecording as UnreadableRecording
+from workbench.recording.read_maniskill import leaves
+from workbench.recording.read_maniskill import read_maniskill as read_maniskill
+from workbench.recording.read_maniskill import trajectories as trajectories
+from workbench.recording.rerun_table import RerunTable, wxyz_from_optical
+from workbench.recording.survey import camera_from
 
 
 def read_episode(path: Path) -> Episode:
@@ -16,21 +42,132 @@ def read_episode(path: Path) -> Episode:
     Raises:
         UnreadableRecording: what is there is no recording of ours, or broken; the message says which.
     """
-    raise NotImplementedError
+    path = Path(path)
+    files = {suffix: path.with_suffix(suffix) for suffix in (".rrd", ".h5", ".json")}
+    there = {suffix: file for suffix, file in files.items() if file.is_file()}
+    if not there:
+        raise UnreadableRecording(f"{path.name} is not there any more.")
+    try:
+        table = RerunTable(there[".rrd"]) if ".rrd" in there else None
+    except (OSError, ValueError, RuntimeError) as error:
+        raise UnreadableRecording(f"{files['.rrd'].name} is no .rrd that can be read: {error}") from error
+    said = _description(there.get(".json"), table, path)
+    try:
+        episode = _episode(said, table, path.parent)
+        if ".h5" in there:
+            _add_states(episode, there[".h5"])
+    except UnreadableRecording:
+        raise
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError, IndexError) as error:
+        raise UnreadableRecording(
+            f"{path.stem} is a recording, but a broken one ({type(error).__name__}: {error})"
+        ) from error
+    return episode
 
 
-def read_maniskill(path: Path, trajectory: str) -> Episode:
-    """Episode `trajectory` (``traj_0``) of an .h5 that ManiSkill's RecordEpisode wrote; its .json lies beside it.
+def _description(file: Path | None, table: RerunTable | None, path: Path) -> dict[str, Any]:
+    if file is not None:
+        try:
+            said = json.loads(file.read_bytes())
+        except (OSError, ValueError) as error:
+            raise UnreadableRecording(f"{file.name} is no JSON that can be read: {error}") from error
+        if isinstance(said, dict) and isinstance(said.get("workbench"), dict):
+            return said["workbench"]
+        if table is None:
+            raise UnreadableRecording(f"{file.name} is not from the workbench; read it as ManiSkill's.")
+    if table is None:
+        raise UnreadableRecording(f"{path.stem}.json is missing, which says what is in {path.name}.")
+    said = table.property("workbench", "description")
+    if not isinstance(said, str):
+        raise UnreadableRecording(f"{path.stem}.rrd is from another program, or from an older workbench.")
+    files, texts = (_list(table.property("source", key)) for key in ("files", "texts"))
+    return {**json.loads(said), "source": dict(zip(files, texts))}
 
-    It has no geometry and no poses. Raises as `read_episode`.
-    """
-    raise NotImplementedError
+
+def _list(value: Any) -> list[Any]:
+    return [] if value is None else value if isinstance(value, list) else [value]
 
 
-def trajectories(path: Path) -> tuple[str, ...]:
-    """Names of the episodes in a ManiSkill .h5, in order. Raises as `read_episode`."""
-    raise NotImplementedError
+def _episode(said: dict[str, Any], table: RerunTable | None, folder: Path) -> Episode:
+    states = int(said["length"]) + 1
+    scene = said["scene"]
+    names = tuple(scene["body_names"])
+    geometry = poses = None
+    cameras: list[CameraTrack] = []
+    if table is not None:
+        bare = SceneGeometry(1, names, tuple(scene["body_kinds"]), tuple(scene["body_hidden"]), ())
+        entities = body_entities(bare)
+        geometry = table.geometry(bare, entities)
+        poses = table.poses(entities, states)
+        cameras = list(_cameras(said["cameras"], table, states))
+    evaluate = {
+        name: _column(table, evaluate_entity(name), column, 0, states)
+        for name, column in columns_from(said["evaluate"]).items()
+        if table is not None
+    }
+    actions = Column(np.dtype(np.float32), (len(said["action_names"]),))
+    number, flag = Column(np.dtype(np.float32), ()), Column(np.dtype(np.bool_), ())
+    return Episode(
+        info=info_from(said, folder),
+        geometry=geometry,
+        segmentation={int(key): name for key, name in said["segmentation"].items()},
+        poses=poses,
+        action=_column(table, "/action", actions, 1, states),
+        action_names=tuple(said["action_names"]),
+        reward=_column(table, "/reward", number, 1, states),
+        terminated=_column(table, "/episode/terminated", flag, 1, states),
+        truncated=_column(table, "/episode/truncated", flag, 1, states),
+        evaluate=evaluate,
+        cameras=cameras,
+    )
 
 
-class UnreadableRecording(ValueError):
-    """A file that is no recording, or a broken one; the message says what is wrong with it in a sentence."""
+def _column(table: RerunTable | None, entity: str, column: Column, first: int, states: int) -> NDArray:
+    """States `first` to the last of the numbers of `entity`, as `column` says they were."""
+    shape = (states - first, *column.shape)
+    fill = np.nan if column.dtype.kind == "f" else 0
+    out = np.full(shape, fill, dtype=column.dtype)
+    if table is None or out.size == 0:
+        return out
+    steps, values = table.scalars(entity)
+    flat = out.reshape(len(out), -1)
+    if column.dtype.kind == "b":
+        values = values != 0
+    flat[steps - first] = values.astype(column.dtype)
+    return out
+
+
+def _cameras(said: Sequence[dict[str, Any]], table: RerunTable, states: int) -> Iterator[CameraTrack]:
+    infos = [camera_from(words) for words in said]
+    for info, entity in zip(infos, camera_entities(infos)):
+        held: dict[Modality, tuple[NDArray[np.int64], EncodedPictures]] = {}
+        for modality in ("rgb", "depth", "segmentation"):
+            found = table.pictures(f"{entity}/{modality}", modality, info)
+            if found is not None:
+                held[modality] = found
+        if not held:
+            continue
+        frame = next(iter(held.values()))[0]
+        pose = wxyz_from_optical(table.pose_rows(entity, frame, states))
+        pictures = {modality: track for modality, (_, track) in held.items()}
+        yield CameraTrack(
+            info, frame, pose, pictures.get("rgb"), pictures.get("depth"), pictures.get("segmentation")
+        )
+
+
+def _add_states(episode: Episode, path: Path) -> None:
+    """What the .h5 holds; where the .rrd holds it too, this is what ManiSkill reads."""
+    with h5py.File(path, "r") as file:
+        if TRAJECTORY not in file:
+            raise UnreadableRecording(f"{path.name} has no {TRAJECTORY}.")
+        group: Any = file[TRAJECTORY]
+        episode.env_states = dict(leaves(group.get("env_states")))
+        episode.obs = dict(leaves(group.get("obs")))
+        episode.action = group["actions"][:]
+        episode.reward = group["rewards"][:]
+        episode.terminated = group["terminated"][:]
+        episode.truncated = group["truncated"][:]
+        if not episode.evaluate:
+            for name in ("success", "fail"):
+                if name in group:
+                    episode.evaluate[name] = np.concatenate([[False], group[name][:]])

@@ -1,18 +1,113 @@
-"""What a dead process left behind: journals become episodes, half-made files go."""
+"""What a dead process left behind: journals become episodes, half-made files go.
+
+A process that records may be killed at any moment: while it gathers, while it makes the files, and between two names of one
+recording. Whatever it was at, its journal is there and its lock is gone, and that is all that has to be known. What is under way in a
+process that lives is left alone.
+"""
 
 from __future__ import annotations
 
+import json
+import os
+from collections.abc import Iterator
 from pathlib import Path
 
-from workbench.recording.episode_writer import EpisodeFiles
+from workbench.recording.episode import EpisodeInfo
+from workbench.recording.episode_writer import SCENE_SUFFIX, tidy
+from workbench.recording.journal import FOLDER, claim
+from workbench.recording.landing import RecordingError, candidates, reason
+from workbench.recording.make_files import (
+    SUFFIXES,
+    EpisodeFiles,
+    episode_stem,
+    make_files,
+    temporary_files,
+)
+from workbench.recording.scene_file import read_scene
+from workbench.recording.survey import JournalReader, recovered
 
 
 def recover(folder: Path) -> list[EpisodeFiles]:
     """Make an episode of every journal in `folder` whose writer is dead; episodes of live writers are left alone.
 
-    A journal too short to be an episode (no control step) is removed.
+    A journal without a control step is removed. Where one of several journals cannot be made an episode, the
+    others are, and the error is raised then.
 
     Raises:
-        RecordingError: the files cannot be written; the journals stay.
+        RecordingError: files cannot be written, or the folder not read; the journals stay.
     """
-    raise NotImplementedError
+    folder = Path(folder)
+    made: list[EpisodeFiles] = []
+    failed: RecordingError | None = None
+    try:
+        for journal in sorted((folder / FOLDER).glob("*.arrow")):
+            try:
+                if (files := _recover(journal, folder)) is not None:
+                    made.append(files)
+            except RecordingError as error:
+                failed = error
+        _remove_strays(folder)
+        tidy(folder)
+    except OSError as error:
+        raise RecordingError(f"Cannot recover what lies in {folder}: {reason(error, folder)}") from error
+    if failed is not None:
+        raise failed
+    return made
+
+
+def _recover(journal: Path, folder: Path) -> EpisodeFiles | None:
+    descriptor = claim(journal)
+    if descriptor is None:
+        return None
+    try:
+        scene = journal.with_suffix(SCENE_SUFFIX)
+        reader = JournalReader(journal)
+        header = reader.header(read_scene(scene))
+        files = None
+        if header is not None and not _already_made(header.info, journal, folder):
+            header = recovered(header)
+            if reader.survey(header).length > 0:
+                files = make_files(journal, header, folder)
+        journal.unlink(missing_ok=True)
+        scene.unlink(missing_ok=True)
+        return files
+    finally:
+        os.close(descriptor)
+
+
+def _already_made(info: EpisodeInfo, journal: Path, folder: Path) -> bool:
+    """Whether the writer had come to its end; takes away what it had named of files that are not all there."""
+    temporaries = dict(zip(SUFFIXES, temporary_files(journal)))
+    for stem in _stems(folder, episode_stem(info)):
+        if _id_of(folder / f"{stem}.json") == info.id:
+            return True
+        if (folder / f"{stem}.json").exists():
+            continue
+        for suffix, temporary in temporaries.items():
+            path = folder / f"{stem}{suffix}"
+            if path.exists() and temporary.exists() and os.path.samefile(path, temporary):
+                path.unlink()
+    return False
+
+
+def _stems(folder: Path, stem: str) -> Iterator[str]:
+    """Those of the names that the recording may have got which are taken."""
+    for candidate in candidates(stem):
+        if not any((folder / f"{candidate}{suffix}").exists() for suffix in SUFFIXES):
+            return
+        yield candidate
+
+
+def _id_of(path: Path) -> str | None:
+    try:
+        said = json.loads(path.read_bytes())
+        return said["workbench"]["id"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _remove_strays(folder: Path) -> None:
+    """Files of a recording whose journal is gone: its writer died while it cleaned up."""
+    for path in (folder / FOLDER).glob("*"):
+        if path.suffix in (*SUFFIXES, SCENE_SUFFIX) and not path.with_suffix(".arrow").exists():
+            path.unlink(missing_ok=True)

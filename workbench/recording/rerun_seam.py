@@ -7,27 +7,32 @@ episode for as long as the process lives (measured). And the thread that ``save`
 the first write that fails, after which a flush waits for its answer for ever: a full disk would not
 fail, it would hang (seen, with the file size limited).
 
-So rerun never gets to write a file. It encodes recording and blueprint in memory, both streams are kept
-in hand until then and cut off from their sinks afterwards, and the bytes are the caller's.
+So rerun never gets to write a file. Encoding in memory would do for short episodes only: bytes that are drained in
+between are a recording each, with an index each, and one behind the other are none (tried). What rerun writes goes into a pipe
+instead, which a thread of ours empties whatever happens, and where the bytes land is the caller's affair.
 """
 
 from __future__ import annotations
 
+import os
+import threading
 import uuid
-from collections.abc import Callable
-from typing import TypeVar
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import rerun as rr
 import rerun.blueprint as rrb
 import rerun_bindings
 
-T = TypeVar("T")
 
+@contextmanager
+def recording_into(
+    write: Callable[[bytes], object], application_id: str, blueprint: rrb.Blueprint
+) -> Iterator[rr.RecordingStream]:
+    """A new recording with its default blueprint, whose ``.rrd`` bytes go to `write` while it is filled.
 
-def encode_recording(
-    application_id: str, blueprint: rrb.Blueprint, fill: Callable[[rr.RecordingStream], T]
-) -> tuple[bytes, T]:
-    """The ``.rrd`` bytes of a new recording that `fill` fills, with its default blueprint, and what `fill` gave."""
+    `write` is called on a thread of its own and must not raise. It has got everything when the block is left.
+    """
     # Rerun derives a default id from the process, so two episodes of one process would be taken for one.
     recording = rr.RecordingStream(application_id, recording_id=uuid.uuid4().hex)
     layout = rr.RecordingStream._from_native(
@@ -35,18 +40,36 @@ def encode_recording(
             application_id=application_id, make_default=False, make_thread_default=False, default_enabled=True
         )
     )
-    content, arrangement = (stream.memory_recording().storage for stream in (recording, layout))
+    arrangement = layout.memory_recording().storage
+    out, into = os.pipe()
+    try:
+        recording.save(f"/dev/fd/{into}")
+    except BaseException:
+        os.close(out)
+        raise
+    finally:
+        os.close(into)
+    pump = threading.Thread(target=_pump, args=(out, write), name="episode-rrd", daemon=True)
+    pump.start()
     try:
         layout.set_time("blueprint", sequence=0)
         blueprint._log_to_stream(layout)
         # The blueprint's messages alone are not enough: this adds the one that says to use them.
         rerun_bindings.send_blueprint(arrangement, False, True, recording.to_native())
-        result = fill(recording)
-        return content.drain_as_bytes(), result
+        yield recording
     finally:
-        for stream, sink in ((recording, content), (layout, arrangement)):
-            sink.drain_as_bytes()  # what is still in a sink when it is cut off gives a warning
-            stream.disconnect()
+        recording.disconnect()
+        arrangement.drain_as_bytes()  # what is still in a sink when it is cut off gives a warning
+        layout.disconnect()
+        pump.join()
+
+
+def _pump(out: int, write: Callable[[bytes], object]) -> None:
+    try:
+        while content := os.read(out, 1 << 18):
+            write(content)
+    finally:
+        os.close(out)
 
 
 def release_streams() -> None:

@@ -23,7 +23,7 @@ _PR_SET_PDEATHSIG = 1
 def main() -> None:
     """Entry of the process."""
     connection, pulse_fd, stacks, server = map(int, sys.argv[1:5])
-    _end_with(server)
+    end_with(server)
     _be_the_first_to_go()
     _tell_where(stacks)
     from workbench.session.pulse import PulseWriter
@@ -36,7 +36,7 @@ def main() -> None:
     work(connection, pulse)
 
 
-def _end_with(server: int) -> None:
+def end_with(server: int) -> None:
     """Ask the kernel to end this process with its server, also when that is killed while we hang."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != server:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 import viser
@@ -17,7 +18,6 @@ import viser
 from workbench.core.camera_settings import CameraKey
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.session.messages import CameraRequest, TaskDescription
-from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.changed import fill
 from workbench.ui.false_colour import (
@@ -57,8 +57,17 @@ class _Camera:
         return tuple(modality for modality, tick in self.ticks.items() if tick.value is True)
 
 
+class MakesPictures(Protocol):
+    """Who is asked for pictures: a session, which renders them, or a review, which decodes them."""
+
+    def watch_cameras(self, cameras: tuple[CameraRequest, ...]) -> None: ...
+
+
 class CamerasPanel:
-    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+    def __init__(
+        self, server: viser.ViserServer, session: MakesPictures, no_camera: str = "This task has no camera."
+    ) -> None:
+        self._no_camera = no_camera
         self._server = server
         self._session = session
         self._cameras: dict[tuple[CameraKind, str], _Camera] = {}
@@ -130,7 +139,7 @@ class CamerasPanel:
                 "Run workbench doctor to see what is missing."
             )
         elif not task.cameras:
-            note = "This task has no camera."
+            note = self._no_camera
         else:
             note = ""
         self._note.content = render("note", text=note)
@@ -205,7 +214,9 @@ class CamerasPanel:
         wanted = camera.wanted()
         if "rgb" in wanted and picture.rgb is not None:
             self._draw_image(camera, "rgb", picture.rgb)
-            camera.captions["rgb"].content = render("rgb_caption", milliseconds=f"{milliseconds:.0f}")
+            # A recorded picture was rendered when it was recorded.
+            took = f"{milliseconds:.0f}" if np.isfinite(milliseconds) else ""
+            camera.captions["rgb"].content = render("rgb_caption", milliseconds=took)
         if "depth" in wanted and picture.depth is not None:
             span = depth_range(picture.depth)
             if span is not None:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Callable
 
 import numpy as np
 import viser
@@ -64,9 +65,17 @@ class Page:
     Args:
         server: Of viser, already behind its door.
         session: What is shown and asked.
+        dark: How it begins.
+        on_review: Called when a person wants to see the recordings; None leaves the button out.
     """
 
-    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        session: Session,
+        dark: bool = True,
+        on_review: Callable[[], None] | None = None,
+    ) -> None:
         self._server = server
         self._session = session
         self._stopping = threading.Event()
@@ -96,7 +105,7 @@ class Page:
         run_tab = tabs.add_tab("Run", viser.Icon.PLAYER_PLAY)
         with run_tab:
             self._run = RunPanel(server, session)
-            self._view_panel = ViewPanel(server)
+            self._view_panel = ViewPanel(server, dark)
             self._version = VersionPanel(server, session)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
             self._cameras = CamerasPanel(server, session)
@@ -111,6 +120,10 @@ class Page:
             self._inspect = InspectPanel(server, session)
         with tabs.add_tab("Episodes", viser.Icon.MOVIE):
             self._record = RecordPanel(server, session.start_recording, session.stop_recording)
+            self._on_review = on_review
+            if on_review is not None:
+                review = server.gui.add_button("Review recordings", icon=viser.Icon.LIST_DETAILS)
+                review.on_click(lambda _: on_review())
         with tabs.add_tab("Log", viser.Icon.TERMINAL_2):
             self._log = LogPanel(server, session.clear_printed)
         self._timeline = TimelinePanel(server, session)
@@ -149,6 +162,12 @@ class Page:
         self._stopping.set()
         if self._thread is not None:
             self._thread.join(timeout=5.0)
+        # The session may live on under another page, and nobody looks at what it would render.
+        self._session.set_clients(0)
+
+    @property
+    def dark(self) -> bool:
+        return self._view_panel.dark
 
     def _redraw_for_ever(self) -> None:
         seen = -1
@@ -325,7 +344,9 @@ class Page:
     def _commands(self) -> list[Command]:
         session, run, timeline = self._session, self._run, self._timeline
         judgement = self._judgement
+        review = [] if self._on_review is None else [Command("Review recordings", self._on_review, "V")]
         return [
+            *review,
             Command("Play or pause", run.toggle_play, "space"),
             Command("Single step", session.step, "S"),
             Command("Reset all envs", session.reset, "R"),

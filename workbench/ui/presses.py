@@ -10,6 +10,10 @@ Where in a picture somebody pressed is a number of the page, and takes another w
 a number input of viser's that is not seen either, as if it had been typed. One whole number says both coordinates, in
 ten-thousandths of the picture, and a running part, since an input that is given the value that it has says nothing.
 
+A table of thousands of rows, of which a press with shift or control means another thing, takes that way too
+(``choosable.html``): a row has a number, and the number that is written into the input is eight times that, and what
+was held.
+
 The mouse counts when it goes down: a table that is drawn anew a few times a second would lose the click of a
 person whose finger is still on the button. A touch counts as a click, or scrolling would press.
 """
@@ -25,6 +29,8 @@ from workbench.ui.viser_seam import element_id
 
 PARTS = 10_000
 """Steps from one border of a picture to the other, as ``placeable.html`` counts them."""
+NUMBERS = 10**8
+"""What ``choosable.html`` sends is below this."""
 _LAST = 1e6
 """viser's order of elements: the hidden ones come after all others of their container."""
 
@@ -50,6 +56,27 @@ class Presses:
                 button = self._server.gui.add_button("·")
             button.on_click(lambda event: pressed(event.client))
             self._ids[key] = element_id(button)
+        return self._ids[key]
+
+    def number_id(self, key: Hashable, pressed: Callable[[int, viser.ClientHandle | None], None]) -> str:
+        """The id to put into ``data-numbers`` around ``choosable.html``; the same key is the same input for good.
+
+        Args:
+            pressed: called with the number that was pressed, below `NUMBERS`, and the page that did it, on a thread of
+                viser's.
+        """
+        if key not in self._ids:
+            with self._folder:
+                number = self._server.gui.add_number("·", 0)
+
+            def typed(event: viser.GuiEvent[viser.GuiNumberHandle[int]]) -> None:
+                value = event.target.value
+                plain = isinstance(value, (int, float)) and not isinstance(value, bool)
+                if event.client is not None and plain and 0 <= value < 2**53:
+                    pressed(int(value) % NUMBERS, event.client)
+
+            number.on_update(typed)
+            self._ids[key] = element_id(number)
         return self._ids[key]
 
     def place_id(

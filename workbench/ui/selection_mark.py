@@ -18,11 +18,12 @@ class SelectionMark:
         self._server = server
         self._frame: viser.LineSegmentsHandle | None = None
         self._label: viser.LabelHandle | None = None
-        self._drawn: tuple[int, int, bool] | None = None
+        self._drawn: tuple[int, int, bool, str] | None = None
 
-    def draw(self, layout: EnvLayout, env: int, shown: bool) -> None:
-        """Mark this env; not `shown` when it is alone in the view and needs no mark."""
-        wanted = (id(layout), env, shown)
+    def draw(self, layout: EnvLayout, env: int, shown: bool, name: str | None = None) -> None:
+        """Mark this env; not `shown` when it is alone in the view and needs no mark. `name` is said instead of its number."""
+        name = f"env {env}" if name is None else name
+        wanted = (id(layout), env, shown, name)
         if wanted == self._drawn:
             return
         self._drawn = wanted
@@ -44,11 +45,11 @@ class SelectionMark:
                 "/selected/frame", edges, COLOUR, thickness=3.0, thickness_units="screen"
             )
             self._label = self._server.scene.add_label(
-                "/selected/label", f"env {env}", position=label_at, anchor="top-center"
+                "/selected/label", name, position=label_at, anchor="top-center"
             )
         else:
             self._frame.points = edges
-            self._label.text = f"env {env}"
+            self._label.text = name
             self._label.position = label_at
 
     def clear(self) -> None:

@@ -18,7 +18,7 @@ class ViewPanel:
     def __init__(self, server: viser.ViserServer, dark: bool = True) -> None:
         self._server = server
         with server.gui.add_folder("View"):
-            self._show = server.gui.add_dropdown("Show", (ALL, ONE), initial_value=ALL)
+            self._show = server.gui.add_dropdown("Show", (ALL, ONE), initial_value=ALL, visible=False)
             self._detail = server.gui.add_dropdown(
                 "Detail",
                 tuple(DETAILS),
@@ -36,6 +36,10 @@ class ViewPanel:
         return self._show.value == ONE
 
     @property
+    def dark(self) -> bool:
+        return self._theme.value != LIGHT
+
+    @property
     def triangles(self) -> int:
         return DETAILS.get(self._detail.value, DETAILS["normal"])
 
@@ -51,7 +55,7 @@ class ViewPanel:
 
     def _apply_theme(self) -> None:
         self._server.gui.configure_theme(
-            dark_mode=self._theme.value != LIGHT,
+            dark_mode=self.dark,
             show_logo=False,
             show_share_button=False,
             brand_color=BRAND,

@@ -1,0 +1,108 @@
+"""Tags and notes of recordings: where they are kept, so that they are there when the recording is.
+
+They are the only thing in a library that a person typed, and the index is thrown away without asking. So they lie with
+the recordings. A recording of ours has its description in its ``.json``, which has to be moved with it or it is no
+recording; tags and note are two entries of that description (``workbench.tags``, ``workbench.note``), and go wherever
+it goes. This is the one thing about a recording that changes after it was written: the file is made anew beside the
+old one and takes its place in one step, and everything else in it stays.
+
+Files of others are not ours to write into (ManiSkill's recorder writes its ``.json`` anew after each episode, and a
+bare ``.rrd`` cannot be changed). Theirs lie in ``NAME.notes.json`` beside them, by trajectory, which ``mv NAME.*``
+takes along.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import uuid
+from pathlib import Path
+from typing import Any
+
+from workbench.recording.library_row import clean_note, clean_tags
+
+MOST_BYTES = 64 << 20
+"""Of a .json: more is no description of episodes, and would fill the memory."""
+_NOTES = "workbench_notes"
+
+
+def read_json(path: Path) -> Any:
+    """What a ``.json`` holds.
+
+    Raises:
+        OSError: it cannot be read.
+        ValueError: it is no JSON, or much too long. The message is the end of a sentence.
+    """
+    with path.open("rb") as file:
+        content = file.read(MOST_BYTES + 1)
+    if len(content) > MOST_BYTES:
+        raise ValueError(f"is longer than {MOST_BYTES >> 20} MB")
+    try:
+        return json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise ValueError("is not JSON, or was cut short") from error
+
+
+def read_notes(path: Path) -> dict[str, tuple[tuple[str, ...], str]]:
+    """Tags and note of each trajectory ("" where the file has no trajectories) in a ``.notes.json``; what is not
+    one holds none."""
+    try:
+        entries = read_json(path)[_NOTES]
+        return {
+            str(name): (clean_tags(entry.get("tags")), clean_note(entry.get("note")))
+            for name, entry in entries.items()
+        }
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
+
+
+def write_notes(path: Path, trajectory: str | None, tags: tuple[str, ...], note: str) -> None:
+    """Put tags and note of one trajectory into a ``.notes.json``; without any left, the file goes.
+
+    Raises:
+        OSError: the folder cannot be written to.
+    """
+    entries = read_notes(path)
+    entries.pop(trajectory or "", None)
+    if tags or note:
+        entries[trajectory or ""] = (tags, note)
+    if not entries:
+        path.unlink(missing_ok=True)
+        return
+    plain = {name: {"tags": list(tags), "note": note} for name, (tags, note) in sorted(entries.items())}
+    _replace(path, json.dumps({_NOTES: plain}, indent=2, ensure_ascii=False).encode())
+
+
+def write_into_description(path: Path, tags: tuple[str, ...], note: str) -> None:
+    """Put tags and note into the ``.json`` of a recording of ours.
+
+    Raises:
+        OSError: it cannot be read or written.
+        ValueError: it is no recording of ours. The message is the end of a sentence.
+    """
+    described = read_json(path)
+    if not isinstance(described, dict) or not isinstance(described.get("workbench"), dict):
+        raise ValueError("is not a recording of the workbench")
+    described["workbench"] |= {"tags": list(tags), "note": note}
+    # Indented as what was read: these files are looked at.
+    with path.open("rb") as file:
+        indent = 2 if b"\n" in file.read(4) else None
+    _replace(path, json.dumps(described, indent=indent).encode())
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Let `path` hold `content`: all of it, or what it held before."""
+    path = path.resolve()  # a link stays one
+    temporary = path.with_name(f".{uuid.uuid4().hex}.json.part")
+    try:
+        with temporary.open("xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        with contextlib.suppress(OSError):  # a new .notes.json has no mode to keep
+            shutil.copymode(path, temporary)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,157 @@
+"""What a recording says of itself, in words: the same JSON in the ``.json`` (key ``workbench``) and in the ``.rrd``.
+
+A library of thousands of episodes lists them by this alone, and whoever reads one back learns from it what
+neither of the two formats keeps: the types of the entries of ``evaluate()``, the names and kinds of bodies, the lenses of cameras.
+
+    format          1
+    id, task, env_index, seed (null where unknown), control_dt, control_mode, backend, versions, env_kwargs, reset_options,
+    max_episode_steps, written_at, recovered, source_hash        as in `EpisodeInfo`
+    source_file     the name of the task's file; null
+    source_path     where it lies as seen from the recording's folder; null; not in the .rrd, which is handed on
+    source          path as seen from the task's file, to text
+    length, return, success, success_once, fail, fail_once       the last four null where the task has no such entry
+    action_names, cameras, segmentation, scene, evaluate, obs    what the columns are
+    thumbnail       base64 of a JPEG at most 160 pixels wide; null without cameras; in the .json alone
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from workbench.core.geometry import SceneGeometry
+from workbench.recording.columns import Column
+from workbench.recording.episode import EpisodeInfo
+from workbench.recording.survey import Survey, camera_words
+
+FORMAT = 1
+THUMBNAIL_WIDTH = 160
+
+
+def describe(survey: Survey) -> dict[str, Any]:
+    """What a recording says of itself wherever it goes; JSON."""
+    info = survey.info
+    folder = os.path.dirname(info.source_file) if info.source_file else ""
+    geometry = survey.header.geometry
+    return {
+        "format": FORMAT,
+        "id": info.id,
+        "task": info.task,
+        "env_index": info.env_index,
+        "seed": info.seed if info.seed >= 0 else None,
+        "control_dt": info.control_dt,
+        "control_mode": info.control_mode,
+        "backend": info.backend,
+        "versions": info.versions,
+        "env_kwargs": info.env_kwargs,
+        "reset_options": info.reset_options,
+        "max_episode_steps": info.max_episode_steps,
+        "written_at": info.written_at,
+        "recovered": info.recovered,
+        "source_hash": info.source_hash,
+        "source_file": os.path.basename(info.source_file) if info.source_file else None,
+        "source": {_relative(path, folder): text for path, text in info.source.items()},
+        "length": survey.length,
+        "return": float(np.sum(survey.reward, dtype=np.float64)),
+        "success": _last(survey, "success"),
+        "success_once": _once(survey, "success"),
+        "fail": _last(survey, "fail"),
+        "fail_once": _once(survey, "fail"),
+        "action_names": list(survey.header.action_names),
+        "cameras": [camera_words(camera.info) for camera in survey.cameras],
+        "segmentation": {str(key): name for key, name in survey.header.segmentation.items()},
+        "scene": _scene(geometry),
+        "evaluate": _columns(survey.evaluate()),
+        "obs": _columns(survey.named("obs/")),
+    }
+
+
+def describe_beside(survey: Survey, folder: Path) -> dict[str, Any]:
+    """`describe`, with what is only worth saying in `folder`, where the recording lies."""
+    info = survey.info
+    source = info.source_file if info.source_file and os.path.isabs(info.source_file) else None
+    return {
+        **describe(survey),
+        "source_path": None if source is None else _relative(source, os.fspath(folder.resolve())),
+        "thumbnail": thumbnail(survey.sample),
+    }
+
+
+def thumbnail(picture: bytes | None) -> str | None:
+    """`picture` (JPEG), small, in base64."""
+    if picture is None:
+        return None
+    with Image.open(io.BytesIO(picture)) as image:
+        small = image.convert("RGB")
+    small.thumbnail((THUMBNAIL_WIDTH, THUMBNAIL_WIDTH))
+    buffer = io.BytesIO()
+    small.save(buffer, format="JPEG", quality=80)
+    return base64.b64encode(buffer.getvalue()).decode()
+
+
+def info_from(said: dict[str, Any], folder: Path) -> EpisodeInfo:
+    """The info that `said` describes, of a recording in `folder`. Raises KeyError or TypeError."""
+    source_file = said["source_file"]
+    if said.get("source_path") and (path := (folder / said["source_path"])).is_file():
+        source_file = os.fspath(path.resolve())
+    return EpisodeInfo(
+        task=said["task"],
+        env_index=said["env_index"],
+        seed=-1 if said["seed"] is None else said["seed"],
+        source_file=source_file,
+        source_hash=said["source_hash"],
+        source=dict(said["source"]),
+        control_dt=said["control_dt"],
+        control_mode=said["control_mode"],
+        backend=said["backend"],
+        versions=dict(said["versions"]),
+        env_kwargs=dict(said["env_kwargs"]),
+        reset_options=dict(said["reset_options"]),
+        max_episode_steps=said["max_episode_steps"],
+        written_at=said["written_at"],
+        id=said["id"],
+        recovered=said["recovered"],
+    )
+
+
+def columns_from(said: dict[str, Any]) -> dict[str, Column]:
+    """The inverse of what `describe` says of ``evaluate`` and ``obs``."""
+    return {name: Column(np.dtype(dtype), tuple(shape)) for name, (dtype, shape) in said.items()}
+
+
+def _columns(columns: dict[str, Column]) -> dict[str, Any]:
+    return {name: [column.dtype.str, list(column.shape)] for name, column in columns.items()}
+
+
+def _scene(geometry: SceneGeometry) -> dict[str, Any]:
+    return {
+        "body_names": list(geometry.body_names),
+        "body_kinds": list(geometry.body_kinds),
+        "body_hidden": list(geometry.body_hidden),
+    }
+
+
+def _last(survey: Survey, name: str) -> bool | None:
+    return bool(survey.flags[name][-1]) if name in survey.flags else None
+
+
+def _once(survey: Survey, name: str) -> bool | None:
+    values: NDArray[np.bool_] | None = survey.flags.get(name)
+    return None if values is None else bool(values.any())
+
+
+def _relative(path: str, folder: str) -> str:
+    """Where a source file lies as seen from the task's: the folders above it are nobody's business."""
+    if not folder:
+        return os.path.basename(path)
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:  # another drive, on Windows
+        return os.path.basename(path)

@@ -1,0 +1,253 @@
+"""What has happened of an episode so far, on the disk: what is left of it when its writer is killed.
+
+The files of an episode can only be written when it is over (rerun's index comes last, HDF5 cannot be cut, both
+want whole columns), and by then it may be too late: the task's own code runs here, and it hangs, eats the memory, or takes
+native code down. So every row goes into a journal first, ``.writing/<id>.arrow`` in the recordings' folder, and the files are
+made from the journal, by the writer at the end or by the next process that finds it (`recover`).
+
+A journal is an Arrow stream of one table, ``kind``, ``number`` and ``value``, which may end anywhere: what was written whole can be
+read. A state's pictures come before its row, so a state is there with all of its pictures or not at all:
+
+- ``header``: JSON; the scene's meshes lie beside it (`scene_file`);
+- ``layout`` `number`: the layout's text (`columns`); ``row`` `number`: a row of that layout;
+- ``camera/<i>`` `state`: (7,) float32 pose; ``picture/<i>/<modality>`` `state`: the encoded picture.
+
+A row is on the disk within half a second, and its owner does not wait for that: one thread for all journals of the process writes
+what has gathered and makes it last. While a journal is written its file is locked (``flock``), which the system undoes when the
+process dies, however it dies: that is how the dead are told from the living.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pyarrow as pa
+
+FOLDER = ".writing"
+SYNC_SECONDS = 0.4
+"""How long a row may wait before it is written."""
+_BATCH_BYTES = 4 << 20
+"""More than this is written by whoever appends it: memory stays bounded where the disk is slower than the episode."""
+_SCHEMA = pa.schema([("kind", pa.string()), ("number", pa.int32()), ("value", pa.binary())])
+
+
+@dataclass(frozen=True)
+class Entry:
+    kind: str
+    number: int
+    value: bytes
+
+
+class Journal:
+    """A journal that is being written. `add` entries, `commit` them once they make a whole state."""
+
+    def __init__(self, path: Path) -> None:
+        """Begin the journal `path`, which must not exist; its folder is made. Raises OSError."""
+        self.path = path
+        self._descriptor = _create(path)
+        self._size = 0
+        self._pending: list[Entry] = []  # the owner's alone
+        self._waiting: list[Entry] = []
+        self._waiting_bytes = 0
+        self._lock = threading.Lock()  # of what waits; never held while the disk works
+        self._writing = threading.Lock()
+        self._error: OSError | None = None
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with self._writing:
+                self._put(_SCHEMA.serialize())
+        except OSError:
+            self.remove()
+            raise
+        _keeper.watch(self)
+
+    @property
+    def size(self) -> int:
+        """Bytes written and waiting."""
+        return self._size + self._waiting_bytes
+
+    def add(self, kind: str, number: int, value: bytes) -> None:
+        self._pending.append(Entry(kind, number, value))
+
+    def commit(self) -> None:
+        """What was added belongs together from here on, and will be on the disk soon.
+
+        Raises:
+            OSError: something that was committed before could not be written.
+        """
+        added = sum(len(entry.value) + len(entry.kind) + 8 for entry in self._pending)
+        with self._lock:
+            self._waiting += self._pending
+            self._waiting_bytes += added
+            full = self._waiting_bytes > _BATCH_BYTES
+        self._pending = []
+        if full:
+            self.write()
+        if self._error is not None:
+            raise self._error
+
+    def rollback(self) -> None:
+        """Forget what was added since the last `commit`."""
+        self._pending = []
+
+    def write(self) -> None:
+        """Hand what was committed to the system: a process that dies now loses nothing of it."""
+        with self._writing:
+            with self._lock:
+                entries, self._waiting = self._waiting, []
+                self._waiting_bytes = 0
+            if not entries or self._error is not None or self._descriptor < 0:
+                return
+            batch = pa.record_batch(
+                [
+                    pa.array([entry.kind for entry in entries], pa.string()),
+                    pa.array([entry.number for entry in entries], pa.int32()),
+                    pa.array([entry.value for entry in entries], pa.binary()),
+                ],
+                schema=_SCHEMA,
+            )
+            try:
+                self._put(batch.serialize())
+            except OSError as error:
+                self._error = error
+
+    def sync(self) -> None:
+        """Write what was committed and make it last, also through a power cut. An error is raised by the next `commit`."""
+        self.write()
+        with self._writing:
+            if self._error is not None or self._descriptor < 0:
+                return
+            try:
+                os.fsync(self._descriptor)
+                if os.fstat(self._descriptor).st_nlink == 0:
+                    gone = "the folder, or the file in it, was removed during the recording"
+                    raise FileNotFoundError(errno.ENOENT, gone)
+            except OSError as error:
+                self._error = error
+
+    def finish(self) -> None:
+        """Write everything and stop writing; the file stays locked until `close`. Raises OSError as `commit`."""
+        _keeper.forget(self)
+        self.sync()
+        if self._error is not None:
+            raise self._error
+
+    def close(self) -> None:
+        """Let go of the file."""
+        _keeper.forget(self)
+        with self._writing:
+            descriptor, self._descriptor = self._descriptor, -1
+        if descriptor >= 0:
+            os.close(descriptor)
+
+    def remove(self) -> None:
+        """Close, and take the file away."""
+        self.path.unlink(missing_ok=True)
+        self.close()
+
+    def _put(self, content: pa.Buffer) -> None:
+        view = memoryview(content)
+        written = 0
+        try:
+            while written < len(view):
+                written += os.write(self._descriptor, view[written:])
+        except OSError:
+            # Half a batch would end the journal for a reader, and what is written after it would be lost.
+            os.ftruncate(self._descriptor, self._size)
+            os.lseek(self._descriptor, self._size, os.SEEK_SET)
+            raise
+        self._size += written
+
+
+def _create(path: Path) -> int:
+    for _ in range(10):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        except FileNotFoundError:  # another writer was done and took the empty folder away just now
+            continue
+    raise FileNotFoundError(errno.ENOENT, "the folder vanishes as soon as it is made")
+
+
+class _Keeper:
+    """The thread that writes what has gathered in all journals of this process, while there are any."""
+
+    def __init__(self) -> None:
+        self._journals: set[Journal] = set()
+        self._changed = threading.Condition()
+        self._thread: threading.Thread | None = None
+
+    def watch(self, journal: Journal) -> None:
+        with self._changed:
+            self._journals.add(journal)
+            if self._thread is None or not self._thread.is_alive():  # a forked child has none
+                self._thread = threading.Thread(target=self._run, name="episode-journals", daemon=True)
+                self._thread.start()
+
+    def forget(self, journal: Journal) -> None:
+        with self._changed:
+            self._journals.discard(journal)
+            self._changed.notify()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                wake = time.monotonic() + SYNC_SECONDS
+                while self._journals and (left := wake - time.monotonic()) > 0:
+                    self._changed.wait(left)
+                if not self._journals:
+                    self._thread = None
+                    return
+                journals = list(self._journals)
+            for journal in journals:
+                journal.write()  # all of them before the first fsync, which may take its time
+            for journal in journals:
+                journal.sync()
+
+
+_keeper = _Keeper()
+
+
+def read_journal(path: Path) -> Iterator[list[Entry]]:
+    """The entries of the journal `path`, a batch at a time, as far as it was written whole. Raises OSError."""
+    with path.open("rb") as file:
+        try:
+            reader = pa.ipc.open_stream(file)
+        except (pa.ArrowInvalid, OSError):
+            return
+        while True:
+            try:
+                batch = reader.read_next_batch()
+                columns = [column.to_pylist() for column in batch.columns]
+            except (StopIteration, pa.ArrowInvalid, OSError):
+                return
+            yield [Entry(*row) for row in zip(*columns)]
+
+
+def claim(path: Path) -> int | None:
+    """Lock the journal `path` of a dead writer; None where its writer lives, or somebody else is at it, or it is gone.
+
+    The lock lasts until the descriptor that is returned is closed.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.fstat(descriptor).st_nlink > 0:  # else whoever held it has just finished with it
+            return descriptor
+    except BlockingIOError:
+        pass
+    except OSError:
+        os.close(descriptor)
+        raise
+    os.close(descriptor)
+    return None

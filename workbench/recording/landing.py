@@ -1,0 +1,191 @@
+"""Where the files of an episode are written to, and how they get their names: whole and together, or not at all.
+
+A recording outlives its session, so it must not lie: not half written after a full disk, not short of a camera, not written
+over yesterday's. The files of an episode are made under temporary names in a folder beside the journal, read back there, and only
+then linked to their names, the .json last. **What has no .json is not there.**
+
+The libraries that write them do not take a failing disk well: rerun waits for ever for a thread of its own that ended (seen, with the
+file size limited), HDF5 leaves files half open. So neither of them ever sees it fail: `SafeFile` keeps the first error to
+itself, swallows the rest, and tells at the end.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+_NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EACCES}
+
+
+class RecordingError(OSError):
+    """An episode could not be written; the message says what to do. No file was left behind."""
+
+
+class SafeFile(io.RawIOBase):
+    """A new file that takes everything that it is given, whether the disk does or not; `finish` says which it was."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises OSError where `path` exists or cannot be made."""
+        super().__init__()
+        self._file = path.open("x+b")
+        self._error: OSError | None = None
+
+    def write(self, content) -> int:
+        view = memoryview(content).cast("B")
+        try:
+            if self._error is None:
+                self._file.write(view)
+        except OSError as error:
+            self._error = error
+        return len(view)
+
+    def readinto(self, buffer) -> int:
+        return self._file.readinto(buffer)
+
+    def read(self, size: int = -1) -> bytes:
+        return self._file.read(size)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        try:
+            return self._file.seek(offset, whence)
+        except OSError as error:  # it writes what is buffered
+            self._error = self._error or error
+            return offset
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def truncate(self, size: int | None = None) -> int:
+        try:
+            return self._file.truncate(size)
+        except OSError as error:
+            self._error = self._error or error
+            return size or 0
+
+    def flush(self) -> None:
+        try:
+            if self._error is None and not self._file.closed:
+                self._file.flush()
+        except OSError as error:
+            self._error = error
+
+    def readable(self) -> bool:
+        return True
+
+    def writable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    @property
+    def error(self) -> OSError | None:
+        return self._error
+
+    def finish(self) -> None:
+        """Make it last, and close it. Raises the first OSError that there was."""
+        self.flush()
+        try:
+            if self._error is None:
+                os.fsync(self._file.fileno())
+        except OSError as error:
+            self._error = error
+        self.close()
+        if self._error is not None:
+            raise self._error
+
+    def close(self) -> None:
+        if not self._file.closed:
+            try:
+                self._file.close()
+            except OSError as error:
+                self._error = self._error or error
+        super().close()
+
+
+def publish(temporaries: Sequence[Path], folder: Path, stem: str) -> list[Path]:
+    """Give finished files (``<id>.rrd``, ``<id>.h5`` ...) the first stem that is free for all of them, in their order.
+
+    Two processes that race get two names. The temporaries stay, if the filesystem has links.
+
+    Raises:
+        OSError: none of them has a name then.
+    """
+    for candidate in candidates(stem):
+        paths = [folder / f"{candidate}{temporary.suffix}" for temporary in temporaries]
+        if any(os.path.lexists(path) for path in paths):
+            continue
+        done: list[Path] = []
+        try:
+            for temporary, path in zip(temporaries, paths):
+                _name(temporary, path)
+                done.append(path)
+        except FileExistsError:
+            _remove(done)
+            continue
+        except BaseException:
+            _remove(done)
+            raise
+        sync_folder(folder)
+        return paths
+    raise AssertionError("unreachable: the candidates do not end")
+
+
+def candidates(stem: str) -> Iterator[str]:
+    """``stem``, ``stem_2``, ``stem_3`` ..."""
+    yield stem
+    number = 2
+    while True:
+        yield f"{stem}_{number}"
+        number += 1
+
+
+def _name(temporary: Path, path: Path) -> None:
+    try:
+        os.link(temporary, path)
+    except FileExistsError:
+        raise
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        # A filesystem without hard links (FAT, some network drives): claim the name, then replace it.
+        path.touch(exist_ok=False)
+        os.replace(temporary, path)
+
+
+def _remove(paths: Sequence[Path]) -> None:
+    for path in reversed(paths):
+        path.unlink(missing_ok=True)
+
+
+def sync_folder(path: Path) -> None:
+    """Make a new name last: without this a power cut may take it, though not the file's content."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def reason(error: OSError, folder: Path) -> str:
+    """Why `folder` could not be written to, and what to do about it."""
+    there = next((parent for parent in (folder, *folder.parents) if parent.is_dir()), None)
+    if error.errno in (errno.ENOSPC, errno.EDQUOT) or (
+        there is not None and shutil.disk_usage(there).free < 1 << 20
+    ):
+        return f"the disk that holds {there or folder} is full. Make room there, or choose another folder."
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return f"{folder} may not be written to. Choose another folder, or change its permissions."
+    if error.errno in (errno.ENOTDIR, errno.EEXIST):
+        return f"{folder} is not a folder. Choose another one."
+    if error.errno == errno.ENAMETOOLONG:
+        return "the name is too long. Choose a shorter one."
+    if error.errno == errno.EFBIG:
+        return "the file is larger than the system allows. Record shorter episodes, or lift the limit (ulimit -f)."
+    if error.errno == errno.ENOENT:
+        return f"{folder} was removed while it was written to. Record again; it is made anew."
+    return f"{error.strerror or error}."

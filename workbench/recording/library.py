@@ -1,0 +1,359 @@
+"""The library: every recording below one folder, as a table that keeps up with the folder.
+
+A folder of recordings is the only truth: people move, copy and delete files, several processes write into it, and
+some of it comes from elsewhere. So the table is made from the files, again whenever they changed, and what can be
+done to recordings here (tags, a note, deleting) is done to the files. Reading thousands of them takes seconds, hence
+an index (`library_index`) from which the rows are there at once; then names, sizes and times are compared, and only
+what differs is read, the newest first and on a thread of its own (`watch`), with the rows so far shown meanwhile.
+
+Recordings are known by ids that this table gives. What a page sends is looked up here, and only what is found has
+paths.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from workbench.recording.annotations import write_into_description, write_notes
+from workbench.recording.library_index import Kept, LibraryIndex
+from workbench.recording.library_read import Entry, read_found
+from workbench.recording.library_row import Facts, LibraryRow, clean_note, clean_tags
+from workbench.recording.library_scan import NOTES, Found, Scan, found_of, key_of, scan_folder
+from workbench.recording.trash import (
+    Trash,
+    TrashError,
+    empty_trash,
+    look_into_trash,
+    put_into_trash,
+    take_out_of_trash,
+)
+
+log = logging.getLogger(__name__)
+
+LOOK_EVERY = 1.0
+"""Seconds between two looks at the folders' times."""
+LOOK_THOROUGHLY_EVERY = 30.0
+"""Seconds between two looks at every file: a file that was written to in place leaves its folder's time alone."""
+PUBLISH_EVERY = 0.3
+"""Seconds between two states of the table while it is being read."""
+
+
+class LibraryError(OSError):
+    """Something could not be done to recordings; the message says what to do about it."""
+
+
+@dataclass(frozen=True)
+class LibraryView:
+    """The table at one moment."""
+
+    serial: int = 0
+    """Grows with each change."""
+    rows: tuple[LibraryRow, ...] = ()
+    """By name."""
+    reading: tuple[int, int] | None = None
+    """Files read so far and to be read, while they are; (0, 0) before the first look has found out how many."""
+    problem: str | None = None
+    """A sentence, where the folder cannot be looked at."""
+    trash: Trash = Trash()
+
+
+class Library:
+    """The recordings in a folder and the folders below it.
+
+    Args:
+        folder: need not be there yet. Nothing is written into it but the index and what is asked for.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = Path(folder).absolute()
+        self._looking = threading.Lock()
+        """Held while the folder is looked through: by one thread at a time."""
+        self._changing = threading.RLock()
+        """Held while `_found` and `_kept` are changed, but not while all that changed is read."""
+        self._changed = threading.Condition()
+        self._view = LibraryView(reading=(0, 0))
+        self._places: dict[str, tuple[str, int]] = {}
+        """Id to key and number of the row in what its files gave."""
+        self._found: dict[str, Found] = {}
+        self._scan = Scan(fresh=True)
+        self._thorough_at = -1e9
+        self._index: LibraryIndex | None = LibraryIndex(self.folder) if self.folder.is_dir() else None
+        self._kept: dict[str, Kept] = {} if self._index is None else self._index.load()
+        self._stopping = threading.Event()
+        self._asked = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    # --- looking -----------------------------------------------------------------------------------
+
+    def view(self) -> LibraryView:
+        return self._view
+
+    def rows(self) -> tuple[LibraryRow, ...]:
+        return self._view.rows
+
+    def row(self, id: str) -> LibraryRow | None:
+        """None for an id that is not in the table (any more)."""
+        return next((row for row in self._view.rows if row.id == id), None)
+
+    def wait(self, seen: int, timeout: float) -> int:
+        """Wait until the table's serial is not `seen`, at most `timeout` seconds; returns the serial."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._view.serial != seen, timeout)
+            return self._view.serial
+
+    def thumbnails(self, ids: Sequence[str]) -> dict[str, bytes]:
+        """Small jpegs of those of these recordings that have one."""
+        with self._changed:
+            places = {id: self._places[id] for id in ids if id in self._places}
+        index = self._index
+        jpegs = {} if index is None or not places else index.thumbnails(list(places.values()))
+        return {id: jpegs[place] for id, place in places.items() if place in jpegs}
+
+    def thumbnail(self, id: str) -> bytes | None:
+        return self.thumbnails((id,)).get(id)
+
+    # --- keeping up with the folder ------------------------------------------------------------------
+
+    def watch(self) -> None:
+        """Keep the table up to date, on a thread of its own, until `close`."""
+        if self._thread is not None:
+            raise RuntimeError("The library is watched already.")
+        self._thread = threading.Thread(target=self._watch, name="library", daemon=True)
+        self._thread.start()
+
+    def look_soon(self) -> None:
+        """Have the watching thread look at every file now, for whoever knows that something changed."""
+        self._asked.set()
+
+    def close(self) -> None:
+        """Stop to watch; returns when the thread has ended."""
+        self._stopping.set()
+        self._asked.set()
+        if self._thread is not None:
+            self._thread.join(timeout=10.0)
+        with self._changing:
+            if self._index is not None:
+                self._index.close()
+                self._index = None
+
+    def _watch(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                self.refresh(thorough=self._asked.is_set())
+            except Exception:
+                # The table is what it was, and a thread that ended would let it be that for ever.
+                log.exception("The library in %s could not be read; trying again.", self.folder)
+                self._publish(problem="The library could not be read. The reason is in the terminal.")
+            self._asked.clear()
+            self._asked.wait(LOOK_EVERY)
+
+    def refresh(self, thorough: bool = True) -> None:
+        """Read what has changed since the last look.
+
+        Args:
+            thorough: look at every file, also if no folder says that something came or went.
+        """
+        with self._looking:
+            late = time.monotonic() - self._thorough_at > LOOK_THOROUGHLY_EVERY
+            if not (thorough or late) and self._scan.looks_the_same():
+                return
+            with self._changing:
+                if self._index is None and self.folder.is_dir() and not self._stopping.is_set():
+                    self._index = LibraryIndex(self.folder)
+                if self._view.serial == 0 and self._kept:
+                    # What the index knows, as if it were all still so, until that is known.
+                    self._found = {key: found_of(key, kept.signature) for key, kept in self._kept.items()}
+                    self._show(reading=(0, 0))
+            self._thorough_at = time.monotonic()
+            self._scan = scan_folder(self.folder)
+            self._read_changed(self._scan)
+
+    def _read_changed(self, scan: Scan) -> None:
+        with self._changing:
+            self._found = scan.found
+            changed = [
+                found
+                for key, found in scan.found.items()
+                if key not in self._kept or self._kept[key].signature != found.signature
+            ]
+            gone = self._kept.keys() - scan.found.keys()
+            for key in gone:
+                del self._kept[key]
+            # Where not all could be looked at, what is not seen may be there: the index keeps it.
+            forgotten = [] if scan.problem else sorted(gone)
+        changed.sort(key=lambda found: found.newest, reverse=True)
+        unsaved: list[tuple[str, str, list[Entry]]] = []
+        published = time.monotonic()
+        for done, found in enumerate(changed):
+            if self._stopping.is_set():
+                break
+            entries = read_found(self.folder, found)
+            with self._changing:
+                if found.key not in self._found:
+                    continue  # deleted on this page since
+                self._kept[found.key] = Kept(found.signature, tuple(facts for facts, _ in entries))
+                unsaved.append((found.key, found.signature, entries))
+                if time.monotonic() - published > PUBLISH_EVERY:
+                    self._save(unsaved, forgotten)
+                    unsaved, forgotten = [], []
+                    self._show(reading=(done + 1, len(changed)), problem=scan.problem)
+                    published = time.monotonic()
+        with self._changing:
+            self._save(unsaved, forgotten)
+            self._show(reading=None, problem=scan.problem)
+
+    def _read_again(self, keys: Iterable[str]) -> None:
+        """Of what was just done here, so that whoever did it sees it at once."""
+        self._found = scan_folder(self.folder).found
+        read, gone = [], []
+        for key in keys:
+            found = self._found.get(key)
+            if found is None:
+                self._kept.pop(key, None)
+                gone.append(key)
+            else:
+                entries = read_found(self.folder, found)
+                self._kept[key] = Kept(found.signature, tuple(facts for facts, _ in entries))
+                read.append((key, found.signature, entries))
+        self._save(read, gone)
+        self._show(reading=self._view.reading, problem=self._view.problem)
+
+    def _save(self, read: list[tuple[str, str, list[Entry]]], gone: list[str]) -> None:
+        if self._index is not None and (read or gone):
+            self._index.store(read, gone)
+
+    def _show(self, reading: tuple[int, int] | None, problem: str | None = None) -> None:
+        rows: list[LibraryRow] = []
+        places: dict[str, tuple[str, int]] = {}
+        for key in sorted(self._kept.keys() & self._found.keys()):
+            for number, facts in enumerate(self._kept[key].rows):
+                row = self._row(self._found[key], facts, places)
+                places[row.id] = (key, number)
+                rows.append(row)
+        self._publish(rows=tuple(rows), places=places, reading=reading, problem=problem)
+
+    def _row(self, found: Found, facts: Facts, taken: dict[str, tuple[str, int]]) -> LibraryRow:
+        id = facts.uid if facts.uid.isalnum() and facts.uid.isascii() else ""
+        if not id or id in taken:
+            # No id of its own, or a copy of a recording that is in the table already.
+            where = f"{found.key}#{facts.trajectory or ''}"
+            id = f"at-{hashlib.blake2b(where.encode(errors='surrogateescape'), digest_size=10).hexdigest()}"
+        name = found.key if facts.trajectory is None else f"{found.key}#{facts.trajectory}"
+        return LibraryRow(id, name, found.paths(self.folder), sum(found.sizes.values()), facts)
+
+    def _publish(self, places: dict[str, tuple[str, int]] | None = None, **changes: object) -> None:
+        with self._changed:
+            view = replace(self._view, trash=look_into_trash(self.folder), **changes)  # type: ignore[arg-type]
+            if places is not None:
+                self._places = places
+            if replace(view, serial=0) != replace(self._view, serial=0) or self._view.serial == 0:
+                self._view = replace(view, serial=self._view.serial + 1)
+                self._changed.notify_all()
+
+    # --- what is done to recordings --------------------------------------------------------------------
+
+    def set_tags(self, ids: Iterable[str], add: Iterable[str] = (), remove: Iterable[str] = ()) -> None:
+        """Add tags to recordings and take tags away.
+
+        Raises:
+            LibraryError: a file cannot be written; the recordings before it have their tags.
+        """
+        add, without = clean_tags(tuple(add)), set(clean_tags(tuple(remove)))
+        self._annotate(
+            ids, lambda facts: (clean_tags((*(t for t in facts.tags if t not in without), *add)), facts.note)
+        )
+
+    def set_note(self, ids: Iterable[str], note: str) -> None:
+        """Give recordings a note; an empty one takes it away. Raises as `set_tags`."""
+        note = clean_note(note)
+        self._annotate(ids, lambda facts: (facts.tags, note))
+
+    def _annotate(self, ids: Iterable[str], change: Callable[[Facts], tuple[tuple[str, ...], str]]) -> None:
+        with self._changing:
+            touched: set[str] = set()
+            try:
+                for id in ids:
+                    row, found = self._there(id)
+                    tags, note = change(row.facts)
+                    if (tags, note) == (row.tags, row.note):
+                        continue
+                    touched.add(found.key)
+                    try:
+                        if row.kind == "workbench":
+                            write_into_description(found.path(self.folder, ".json"), tags, note)
+                        else:
+                            write_notes(found.path(self.folder, NOTES), row.trajectory, tags, note)
+                    except (OSError, ValueError) as error:
+                        why = getattr(error, "strerror", None) or error
+                        raise LibraryError(
+                            f"Tags and note of {row.name} could not be kept ({why}). "
+                            "They are written beside the recording, so its folder must be writable."
+                        ) from error
+            finally:
+                self._read_again(touched)
+
+    def delete(self, ids: Iterable[str]) -> str:
+        """Move all files of these recordings to the trash; returns the name of the deletion, for `undo_delete`.
+
+        Raises:
+            LibraryError: nothing was moved because a file holds other recordings too, or something could not be
+                moved; the recordings before it were.
+        """
+        with self._changing:
+            wanted = set(ids)
+            keys = {self._there(id)[1].key for id in wanted}
+            for key in keys:
+                of_file = {id for id, (other, _) in self._places.items() if other == key}
+                if not wanted >= of_file:
+                    raise LibraryError(
+                        f"{key}.h5 holds {len(of_file)} recordings and is deleted only as a whole: "
+                        "select all of them."
+                    )
+            paths = [self._found[key].paths(self.folder) for key in sorted(keys)]
+            try:
+                batch = put_into_trash(self.folder, paths)
+            except TrashError as error:
+                raise LibraryError(f"Not everything was deleted. {error}") from error
+            finally:
+                self._read_again(keys)
+            if batch is None:
+                raise LibraryError("Those files were gone already.")
+            return batch
+
+    def undo_delete(self, batch: str | None = None) -> None:
+        """Bring back what one deletion took, or the last one.
+
+        Raises:
+            LibraryError: there is none, or something could not be brought back.
+        """
+        with self._changing:
+            batches = look_into_trash(self.folder).batches
+            if not batches:
+                raise LibraryError("The trash is empty.")
+            try:
+                back = take_out_of_trash(self.folder, batches[-1] if batch is None else batch)
+            except TrashError as error:
+                raise LibraryError(f"Not everything could be brought back. {error}") from error
+            self._read_again({key_of(path) for path in back})
+
+    def empty_trash(self) -> None:
+        """Delete for good what was deleted. Raises LibraryError."""
+        with self._changing:
+            try:
+                empty_trash(self.folder)
+            except TrashError as error:
+                raise LibraryError(str(error)) from error
+            finally:
+                self._publish()
+
+    def _there(self, id: str) -> tuple[LibraryRow, Found]:
+        row, place = self.row(id), self._places.get(id)
+        if row is None or place is None or place[0] not in self._found:
+            raise LibraryError("That recording is not in the library any more.")
+        return row, self._found[place[0]]

@@ -1,0 +1,203 @@
+"""What was read of a library's files, kept so that thousands of them are there at once the next time.
+
+The index is a cache and nothing else: all that it holds can be read again from the files, so whatever is wrong with it
+(another version, cut short, a page of garbage, no place to write) is answered by throwing it away, never by an error.
+For each name it keeps the signature of its files, the rows that they gave, and their thumbnails. It is SQLite, since
+that bears two processes at once and being killed; each write is one short transaction. A process that finds the file
+locked for long goes on without having written.
+
+It lies in ``.workbench`` in the library's folder, so that it goes where the library goes; where that cannot be written,
+in the user's cache folder; and else in memory, for this time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import logging
+import os
+import sqlite3
+import threading
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from workbench.recording.library_read import Entry
+from workbench.recording.library_row import Facts, facts_as_dict, facts_from_dict
+from workbench.recording.library_scan import found_of
+
+log = logging.getLogger(__name__)
+
+VERSION = 1
+"""Raised whenever rows are read or kept in another way: what another version left is read again."""
+LOCKED_SECONDS = 3.0
+_TABLES = (
+    "CREATE TABLE IF NOT EXISTS read (key TEXT PRIMARY KEY, signature TEXT NOT NULL, rows TEXT NOT NULL)",
+    "CREATE TABLE IF NOT EXISTS pictures (key TEXT, row INTEGER, jpeg BLOB NOT NULL, PRIMARY KEY (key, row))",
+)
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What the files of one name gave when they had this signature."""
+
+    signature: str
+    rows: tuple[Facts, ...]
+
+
+class LibraryIndex:
+    """The index of one folder. Safe to use from several threads."""
+
+    def __init__(self, folder: Path) -> None:
+        self._lock = threading.Lock()
+        self.path: Path | None = None
+        """Where it lies; None in memory."""
+        self._database: sqlite3.Connection | None = None
+        for path in (folder / ".workbench" / "library.sqlite", _in_cache(folder)):
+            self._database = _open(path)
+            if self._database is not None:
+                self.path = path
+                return
+        self._database = _connect(":memory:")
+
+    def load(self) -> dict[str, Kept]:
+        """All that it holds, by key."""
+        try:
+            with self._lock, self._transaction() as database:
+                kept = {}
+                for key, signature, rows in database.execute("SELECT key, signature, rows FROM read"):
+                    found_of(key, signature)  # raises where it is none
+                    kept[key] = Kept(signature, tuple(facts_from_dict(row) for row in json.loads(rows)))
+                return kept
+        except (sqlite3.Error, ValueError, TypeError, KeyError) as error:
+            self._begin_anew(error)
+            return {}
+
+    def store(self, read: Iterable[tuple[str, str, Sequence[Entry]]], gone: Iterable[str] = ()) -> None:
+        """Keep what was read (key, signature, entries) and forget the keys that are gone."""
+        read, gone = list(read), list(gone)
+        try:
+            with self._lock, self._transaction() as database:
+                keys = [(key,) for key in (*gone, *(key for key, _, _ in read))]
+                database.executemany("DELETE FROM read WHERE key = ?", keys)
+                database.executemany("DELETE FROM pictures WHERE key = ?", keys)
+                database.executemany(
+                    "INSERT INTO read VALUES (?, ?, ?)",
+                    [
+                        (key, signature, json.dumps([facts_as_dict(facts) for facts, _ in entries]))
+                        for key, signature, entries in read
+                    ],
+                )
+                database.executemany(
+                    "INSERT INTO pictures VALUES (?, ?, ?)",
+                    [
+                        (key, row, jpeg)
+                        for key, _, entries in read
+                        for row, (_, jpeg) in enumerate(entries)
+                        if jpeg is not None
+                    ],
+                )
+        except sqlite3.Error as error:
+            if not _is_locked(error):
+                self._begin_anew(error)
+
+    def thumbnails(self, wanted: Sequence[tuple[str, int]]) -> dict[tuple[str, int], bytes]:
+        """The jpegs of these rows (key, and number of the row in what its files gave), of those that have one."""
+        found: dict[tuple[str, int], bytes] = {}
+        try:
+            with self._lock, self._transaction() as database:
+                for key, row in wanted:
+                    query = "SELECT jpeg FROM pictures WHERE key = ? AND row = ?"
+                    for (jpeg,) in database.execute(query, (key, row)):
+                        if isinstance(jpeg, bytes):
+                            found[key, row] = jpeg
+        except sqlite3.Error as error:
+            if not _is_locked(error):
+                self._begin_anew(error)
+        return found
+
+    def close(self) -> None:
+        with self._lock:
+            if self._database is not None:
+                self._database.close()
+                self._database = None
+
+    @contextlib.contextmanager
+    def _transaction(self):
+        database = self._database
+        if database is None:
+            raise sqlite3.ProgrammingError("the index was closed")
+        with database:
+            yield database
+
+    def _begin_anew(self, error: Exception) -> None:
+        """Throw away what is there. Another process that has it open goes on with what it has, unharmed."""
+        with self._lock:
+            if self._database is None:
+                return
+            log.info("The index of the library is made anew: %s", error)
+            self._database.close()
+            self._database = None
+            if self.path is not None:
+                _remove(self.path)
+                self._database = _open(self.path)
+            if self._database is None:
+                self.path = None
+                self._database = _connect(":memory:")
+
+
+def _in_cache(folder: Path) -> Path:
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    name = hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=12).hexdigest()
+    return cache / "workbench" / "libraries" / f"{name}.sqlite"
+
+
+def _open(path: Path) -> sqlite3.Connection | None:
+    """None where there is no place for it. What is there and no index of this version is thrown away."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    for _ in range(2):
+        try:
+            return _connect(os.fspath(path))
+        except sqlite3.OperationalError as error:
+            if not _is_locked(error):
+                return None
+        except sqlite3.DatabaseError:
+            pass
+        if not _remove(path):
+            return None
+    return None
+
+
+def _connect(name: str) -> sqlite3.Connection:
+    database = sqlite3.connect(name, timeout=LOCKED_SECONDS, check_same_thread=False)
+    try:
+        with database:
+            if database.execute("PRAGMA user_version").fetchone()[0] != VERSION:
+                for table in ("read", "pictures"):
+                    database.execute(f"DROP TABLE IF EXISTS {table}")
+                database.execute(f"PRAGMA user_version = {VERSION}")
+            for table in _TABLES:
+                database.execute(table)
+            # A folder that may be read but not written says so only here.
+            database.execute("DELETE FROM read WHERE key = ''")
+    except sqlite3.Error:
+        database.close()
+        raise
+    return database
+
+
+def _remove(path: Path) -> bool:
+    try:
+        for name in (path, path.with_name(f"{path.name}-journal")):
+            name.unlink(missing_ok=True)
+    except OSError:
+        return False
+    return True
+
+
+def _is_locked(error: sqlite3.Error) -> bool:
+    return isinstance(error, sqlite3.OperationalError) and ("locked" in str(error) or "busy" in str(error))

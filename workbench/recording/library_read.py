@@ -1,0 +1,231 @@
+"""From the files of one name to rows: what is read, and what is said of files that cannot be.
+
+The ``.json`` is enough for all but the sum of rewards of ManiSkill's trajectories, which is in its ``.h5``. A bare
+``.rrd``, as they were written before there was a ``.json``, has to be read through, which takes a tenth of a second and
+more: one reason for an index.
+
+A broken file is a row as well: a person who looks for a recording should find it, with what is wrong with it, rather
+than find nothing. A ``.json`` that is something else (a folder of recordings may be a folder of much) is none.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import io
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from PIL import Image
+
+from workbench.recording.annotations import read_json, read_notes
+from workbench.recording.library_row import (
+    Facts,
+    clean_note,
+    clean_tags,
+    moment,
+    number,
+    text,
+    truth,
+    whole,
+)
+from workbench.recording.library_scan import NOTES, Found
+
+THUMBNAIL_PIXELS = 96
+THUMBNAIL_BYTES = 8192
+"""A thumbnail as it was recorded is taken as it is up to here, and made smaller beyond."""
+
+Entry = tuple[Facts, bytes | None]
+"""A recording and its thumbnail (jpeg)."""
+
+
+def read_found(folder: Path, found: Found) -> list[Entry]:
+    """The recordings in these files: none, one, or one a trajectory. Whatever is wrong is said in a row."""
+    try:
+        entries = _read(folder, found)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RuntimeError, MemoryError) as error:
+        # Files of strangers: what they can be wrong in has no end, and one of them must not hide the others.
+        entries = [_broken(folder, found, f"cannot be read ({error})")]
+    if NOTES in found.sizes:
+        notes = read_notes(found.path(folder, NOTES))
+        entries = [
+            (facts if facts.kind == "workbench" else _noted(facts, notes), picture)
+            for facts, picture in entries
+        ]
+    return entries
+
+
+def _read(folder: Path, found: Found) -> list[Entry]:
+    if ".json" in found.sizes:
+        try:
+            described = read_json(found.path(folder, ".json"))
+        except ValueError as error:
+            return [_broken(folder, found, str(error))]
+        if isinstance(described, dict) and isinstance(described.get("workbench"), dict):
+            return [_ours(folder, found, described["workbench"])]
+        if isinstance(described, dict) and isinstance(described.get("episodes"), list):
+            return _maniskills(folder, found, described)
+        if ".h5" in found.sizes:
+            return [_broken(folder, found, "names neither an env nor episodes")]
+    elif ".h5" in found.sizes:
+        name = Path(found.key).name
+        problem = f"{name}.h5 needs {name}.json beside it, which names the env and the episodes."
+        return [(Facts("maniskill", written=found.newest / 1e9, problem=problem), None)]
+    if ".rrd" in found.sizes:
+        return [_rrd_only(folder, found)]
+    return []
+
+
+def _broken(folder: Path, found: Found, what: str) -> Entry:
+    suffix = next(iter(found.sizes))
+    kind = "rrd only" if suffix == ".rrd" else "maniskill"
+    problem = text(f"{found.path(folder, suffix).name} {what}.", 500)
+    return Facts(kind, written=found.newest / 1e9, problem=problem), None
+
+
+def _noted(facts: Facts, notes: dict[str, tuple[tuple[str, ...], str]]) -> Facts:
+    tags, note = notes.get(facts.trajectory or "", ((), ""))
+    return Facts(**{**vars(facts), "tags": tags, "note": note})
+
+
+def _ours(folder: Path, found: Found, described: dict[str, Any]) -> Entry:
+    name = Path(found.key).name
+    lost = [f"{name}{suffix}" for suffix in (".h5", ".rrd") if suffix not in found.sizes]
+    seed = whole(described.get("seed"))
+    facts = Facts(
+        "workbench",
+        task=text(described.get("task")),
+        uid=text(described.get("id"), 64),
+        written=moment(described.get("written_at")) or found.times[".json"] / 1e9,
+        seed=None if seed is None or seed < 0 else seed,
+        env_index=whole(described.get("env_index")),
+        length=whole(described.get("length")),
+        total_reward=number(described.get("return")),
+        success=truth(described.get("success")),
+        success_once=truth(described.get("success_once")),
+        fail=truth(described.get("fail")),
+        control_mode=text(described.get("control_mode")),
+        source_hash=text(described.get("source_hash"), 64),
+        tags=clean_tags(described.get("tags")),
+        note=clean_note(described.get("note")),
+        recovered=described.get("recovered") is True,
+        problem=f"{' and '.join(lost)} {'is' if len(lost) == 1 else 'are'} missing." if lost else None,
+    )
+    return facts, _thumbnail(described.get("thumbnail"))
+
+
+def _thumbnail(encoded: object) -> bytes | None:
+    """A small jpeg of the base64 in a description; None for what is no picture."""
+    if not isinstance(encoded, str):
+        return None
+    try:
+        content = base64.b64decode(encoded.partition("base64,")[2] or encoded)
+        with Image.open(io.BytesIO(content)) as image:
+            if image.format == "JPEG" and max(image.size) <= 2 * THUMBNAIL_PIXELS:
+                if len(content) <= THUMBNAIL_BYTES:
+                    return content
+            small = image.convert("RGB")
+        small.thumbnail((THUMBNAIL_PIXELS, THUMBNAIL_PIXELS))
+    except (ValueError, OSError, SyntaxError, binascii.Error, Image.DecompressionBombError):
+        return None
+    written = io.BytesIO()
+    small.save(written, "JPEG", quality=80)
+    return written.getvalue()
+
+
+def _maniskills(folder: Path, found: Found, described: dict[str, Any]) -> list[Entry]:
+    """One row an episode of ManiSkill's ``RecordEpisode`` and of its demonstrations: they have the same form."""
+    name = Path(found.key).name
+    env_info = described.get("env_info")
+    task = text(env_info.get("env_id")) if isinstance(env_info, dict) else ""
+    episodes = [episode for episode in described["episodes"] if isinstance(episode, dict)]
+    written = found.newest / 1e9
+    if ".h5" not in found.sizes:
+        if not task:
+            return []  # a .json of something else that has episodes
+        lost = f"{name}.h5, which {name}.json describes, is missing."
+        return [(Facts("maniskill", task=task, written=written, length=None, problem=lost), None)]
+    numbers = [whole(episode.get("episode_id")) for episode in episodes]
+    totals, problem = _totals(found.path(folder, ".h5"), [f"traj_{n}" for n in numbers])
+    if not task and problem is None:
+        problem = f"{name}.json does not name the env."
+    entries: list[Entry] = []
+    for episode, trajectory in zip(episodes, (f"traj_{n}" for n in numbers)):
+        success = truth(episode.get("success"))
+        reset = episode.get("reset_kwargs")
+        seed = whole(episode.get("episode_seed"))
+        if seed is None and isinstance(reset, dict):
+            seed = whole(reset.get("seed"))
+        lost = None if problem or trajectory in totals else f"{name}.h5 has no {trajectory}."
+        entries.append(
+            (
+                Facts(
+                    "maniskill",
+                    task=task,
+                    trajectory=trajectory,
+                    written=written,
+                    seed=seed,
+                    length=whole(episode.get("elapsed_steps")),
+                    total_reward=totals.get(trajectory),
+                    success=success,
+                    fail=truth(episode.get("fail")),
+                    control_mode=text(episode.get("control_mode")),
+                    problem=problem or lost,
+                ),
+                None,
+            )
+        )
+    return entries
+
+
+def _totals(path: Path, trajectories: list[str]) -> tuple[dict[str, float | None], str | None]:
+    """The sum of rewards of each trajectory that is in the ``.h5`` (None where rewards were not recorded), and what
+    is wrong with the file."""
+    totals: dict[str, float | None] = {}
+    try:
+        # Without a lock: a recorder that has the file open would be a reason to show nothing.
+        with h5py.File(path, "r", locking=False) as file:
+            for name in trajectories:
+                group = file.get(name)
+                if not isinstance(group, h5py.Group):
+                    continue
+                rewards = group.get("rewards")
+                is_numbers = isinstance(rewards, h5py.Dataset) and rewards.dtype.kind in "fiu"
+                totals[name] = (
+                    number(float(np.asarray(rewards, dtype=np.float64).sum())) if is_numbers else None
+                )
+    except (OSError, RuntimeError, KeyError, ValueError):
+        return totals, f"{path.name} is damaged, or still being written."
+    return totals, None
+
+
+def _rrd_only(folder: Path, found: Found) -> Entry:
+    # It takes rerun along, which is half a second that a library without such files has no need of.
+    from workbench.recording.read import read_properties
+
+    path = found.path(folder, ".rrd")
+    try:
+        said = read_properties(path)
+    except (OSError, ValueError, RuntimeError):
+        return _broken(folder, found, "is no recording that rerun can read, or was cut short")
+    episode = said.get("episode", {})
+    if not episode:
+        return _broken(folder, found, "is a recording of rerun, but not of an episode")
+    facts = Facts(
+        "rrd only",
+        task=text(episode.get("task")),
+        uid=text(episode.get("id"), 64),
+        written=moment(episode.get("written_at")) or found.newest / 1e9,
+        seed=whole(episode.get("seed")),
+        env_index=whole(episode.get("env_index")),
+        length=whole(episode.get("length")),
+        total_reward=number(episode.get("return")),
+        success=truth(episode.get("success")),
+        success_once=truth(episode.get("success_once")),
+        fail=truth(episode.get("fail")),
+        control_mode=text(episode.get("control_mode")),
+        source_hash=text(episode.get("source_hash"), 64),
+    )
+    return facts, None

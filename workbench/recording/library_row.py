@@ -1,0 +1,222 @@
+"""One line of the library: what is known of a recording without opening it.
+
+Rows are made from files that anybody may have written, edited or cut short, and from an index that another version
+may have written. So every value is checked for its type on its way in, and what is of another type is treated as not
+known. Texts are cut to a length that a table can bear.
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+Kind = Literal["workbench", "maniskill", "rrd only"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+LONGEST_TAG = 40
+LONGEST_NOTE = 1000
+MOST_TAGS = 20
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What a file says of one recording in it. None is: not known."""
+
+    kind: Kind
+    task: str = ""
+    trajectory: str | None = None
+    """Which one of the file, for a file with several (ManiSkill's)."""
+    uid: str = ""
+    """The recording's own id; empty for files that have none."""
+    written: float | None = None
+    """Unix seconds."""
+    seed: int | None = None
+    env_index: int | None = None
+    length: int | None = None
+    """Actions."""
+    total_reward: float | None = None
+    success: bool | None = None
+    """Of the last state; None for a task that knows no success."""
+    success_once: bool | None = None
+    fail: bool | None = None
+    control_mode: str = ""
+    source_hash: str = ""
+    """Empty where the task's source is not known."""
+    tags: tuple[str, ...] = ()
+    note: str = ""
+    recovered: bool = False
+    """It ends where its writer died."""
+    problem: str | None = None
+    """One sentence, where something is wrong with the files."""
+
+
+@dataclass(frozen=True)
+class LibraryRow:
+    """A recording in the table."""
+
+    id: str
+    """Letters, digits and ``-``; unique in its library, and the same for as long as the recording stays in it: a
+    recording's own id, or one that is made of the place of a file that has none."""
+    name: str
+    """Of its files, with the folder below the library's and without suffix; and ``#traj_3`` of a file with several."""
+    paths: tuple[Path, ...]
+    """Its files, the one to open it by first. All of them are what *delete* takes."""
+    size: int
+    """Bytes of `paths` together."""
+    facts: Facts
+
+    @property
+    def kind(self) -> Kind:
+        return self.facts.kind
+
+    @property
+    def task(self) -> str:
+        return self.facts.task
+
+    @property
+    def trajectory(self) -> str | None:
+        return self.facts.trajectory
+
+    @property
+    def date(self) -> datetime.datetime | None:
+        """When it was written, in UTC."""
+        written = self.facts.written
+        return None if written is None else datetime.datetime.fromtimestamp(written, datetime.timezone.utc)
+
+    @property
+    def seed(self) -> int | None:
+        return self.facts.seed
+
+    @property
+    def length(self) -> int | None:
+        return self.facts.length
+
+    @property
+    def total_reward(self) -> float | None:
+        return self.facts.total_reward
+
+    @property
+    def success(self) -> bool | None:
+        return self.facts.success
+
+    @property
+    def source_hash(self) -> str:
+        return self.facts.source_hash
+
+    @property
+    def tags(self) -> tuple[str, ...]:
+        return self.facts.tags
+
+    @property
+    def note(self) -> str:
+        return self.facts.note
+
+    @property
+    def problem(self) -> str | None:
+        return self.facts.problem
+
+
+# --- to the index and back ------------------------------------------------------------------------
+
+
+def facts_as_dict(facts: Facts) -> dict[str, Any]:
+    return asdict(facts)
+
+
+def facts_from_dict(values: object) -> Facts:
+    """Of what `facts_as_dict` gave, by whichever version.
+
+    Raises:
+        ValueError: it is no such thing.
+    """
+    known = {field.name for field in fields(Facts)}
+    if not isinstance(values, dict) or set(values) != known or values["kind"] not in KINDS:
+        raise ValueError("an entry of another version")
+    return Facts(
+        kind=values["kind"],
+        task=text(values["task"]),
+        trajectory=None if values["trajectory"] is None else text(values["trajectory"]),
+        uid=text(values["uid"]),
+        written=number(values["written"]),
+        seed=whole(values["seed"]),
+        env_index=whole(values["env_index"]),
+        length=whole(values["length"]),
+        total_reward=number(values["total_reward"]),
+        success=truth(values["success"]),
+        success_once=truth(values["success_once"]),
+        fail=truth(values["fail"]),
+        control_mode=text(values["control_mode"]),
+        source_hash=text(values["source_hash"]),
+        tags=clean_tags(values["tags"]),
+        note=clean_note(values["note"]),
+        recovered=values["recovered"] is True,
+        problem=None if values["problem"] is None else text(values["problem"], 500),
+    )
+
+
+# --- values of any type, as what they should be or not at all ---------------------------------------
+
+
+def text(value: object, longest: int = 200) -> str:
+    """One line of printable characters; empty for what is no text."""
+    if not isinstance(value, str):
+        return ""
+    return "".join(c if c.isprintable() else " " for c in value[: 2 * longest]).strip()[:longest]
+
+
+def whole(value: object) -> int | None:
+    """A whole number that fits 64 bits; lists of one number (a batched env's seed) are that number."""
+    if isinstance(value, list) and len(value) == 1:
+        value = value[0]
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    if isinstance(value, bool) or not isinstance(value, int) or not -(2**63) <= value < 2**63:
+        return None
+    return value
+
+
+def number(value: object) -> float | None:
+    """A finite number."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return None
+    try:
+        as_float = float(value)
+    except OverflowError:
+        return None
+    return as_float if math.isfinite(as_float) else None
+
+
+def truth(value: object) -> bool | None:
+    if isinstance(value, list) and len(value) == 1:
+        value = value[0]
+    return value if isinstance(value, bool) else None
+
+
+def moment(value: object) -> float | None:
+    """Unix seconds of an ISO date; one without a zone is UTC."""
+    if not isinstance(value, str):
+        return None
+    try:
+        date = datetime.datetime.fromisoformat(value.replace("Z", "+00:00"))
+        if date.tzinfo is None:
+            date = date.replace(tzinfo=datetime.timezone.utc)
+        seconds = date.timestamp()
+    except (ValueError, OverflowError):
+        return None
+    # What a table can show as a date; 9999 with a zone is one that it cannot.
+    return seconds if 0 <= seconds < 32503680000 else None
+
+
+def clean_tags(values: object) -> tuple[str, ...]:
+    """At most `MOST_TAGS` words, each once, in their order; a comma parts them where they are typed."""
+    if not isinstance(values, Iterable) or isinstance(values, (str, bytes, Mapping)):
+        return ()
+    tags = (text(value, LONGEST_TAG).replace(",", " ").strip() for value in values)
+    return tuple(dict.fromkeys(tag for tag in tags if tag))[:MOST_TAGS]
+
+
+def clean_note(value: object) -> str:
+    return text(value, LONGEST_NOTE)

@@ -1,0 +1,242 @@
+"""Recordings that ManiSkill's own RecordEpisode made, as an `Episode`: its demonstrations, and everybody's own.
+
+Such a file has no meshes and no poses of bodies, which are the simulator's to make; but its curves, states, observations and
+cameras are columns like ours. Two things that it does not hold: what ``evaluate()`` said of state 0 (taken for no success and no
+failure), and entries of ``evaluate()`` besides those two.
+"""
+
+from __future__ import annotations
+
+import datetime
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+from transforms3d.quaternions import mat2quat
+
+from workbench.core.pictures import CameraInfo
+from workbench.recording.encoded_pictures import (
+    MILLIMETRES_PER_METRE,
+    MODALITIES,
+    EncodedPictures,
+    Modality,
+    encode,
+)
+from workbench.recording.episode import CameraTrack, Episode, EpisodeInfo
+
+_PICTURES = ("sensor_data", "sensor_param")
+_UNKNOWN_DT = 0.05
+"""ManiSkill's default control period (20 Hz); the file does not say it."""
+
+
+class UnreadableRecording(ValueError):
+    """A file that is no recording, or a broken one; the message says what is wrong with it in a sentence."""
+
+
+def trajectories(path: Path) -> tuple[str, ...]:
+    """Names of the episodes in a ManiSkill .h5, in the order of their numbers.
+
+    Raises:
+        UnreadableRecording: it is no such file.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            return tuple(sorted((name for name in file if name.startswith("traj_")), key=_number))
+    except (OSError, RuntimeError) as error:
+        raise UnreadableRecording(f"{Path(path).name} is no .h5 that can be read: {error}") from error
+
+
+def read_maniskill(path: Path, trajectory: str) -> Episode:
+    """Episode `trajectory` (``traj_0``) of an .h5 that ManiSkill's RecordEpisode wrote; its .json lies beside it.
+
+    It has no geometry and no poses. The control period is `control_freq` of its env's keywords if that is said, else
+    ManiSkill's default of 1/20 s.
+
+    Raises:
+        UnreadableRecording: one of the two files is missing or broken, or has no such episode.
+    """
+    path = Path(path)
+    document, said = _said(path.with_suffix(".json"), trajectory)
+    try:
+        with h5py.File(path, "r") as file:
+            if trajectory not in file:
+                raise UnreadableRecording(f"{path.name} has no {trajectory}.")
+            return _episode(file[trajectory], document, said, path, trajectory)
+    except UnreadableRecording:
+        raise
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
+        raise UnreadableRecording(
+            f"{trajectory} of {path.name} cannot be read ({type(error).__name__}: {error})"
+        ) from error
+
+
+def leaves(node: Any, prefix: str = "", skip: Sequence[str] = ()) -> Iterator[tuple[str, NDArray]]:
+    """Every dataset below `node` by its path, ``a/b``; ``""`` where `node` is one itself."""
+    if isinstance(node, h5py.Dataset):
+        yield prefix, node[:]
+    elif node is not None:
+        for name in node:
+            if name not in skip:
+                yield from leaves(node[name], f"{prefix}/{name}" if prefix else name)
+
+
+def _number(name: str) -> tuple[int, str]:
+    digits = name.removeprefix("traj_")
+    return (int(digits) if digits.isdigit() else 1 << 60, name)
+
+
+def _said(path: Path, trajectory: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    try:
+        document = json.loads(path.read_bytes())
+        for episode in document["episodes"]:
+            if f"traj_{episode['episode_id']}" == trajectory:
+                return document, episode
+    except OSError as error:
+        raise UnreadableRecording(f"{path.name} cannot be read: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise UnreadableRecording(f"{path.name} is not what ManiSkill writes beside an .h5") from error
+    raise UnreadableRecording(f"{path.name} says nothing of {trajectory}.")
+
+
+def _episode(
+    group: Any, document: dict[str, Any], said: dict[str, Any], path: Path, trajectory: str
+) -> Episode:
+    env_info = document.get("env_info") or {}
+    kwargs = dict(env_info.get("env_kwargs") or {})
+    reset = said.get("reset_kwargs") or {}
+    actions, action_names = _actions(group["actions"])
+    length = len(actions)
+    flags = {name: np.concatenate([[False], group[name][:]]) for name in ("success", "fail") if name in group}
+    rewards = group["rewards"][:] if "rewards" in group else np.full(length, np.nan)
+    frequency = (kwargs.get("sim_config") or {}).get("control_freq") or 0
+    seed: Any = said.get("episode_seed", reset.get("seed"))
+    seed = seed[0] if isinstance(seed, list) and seed else seed
+    info = EpisodeInfo(
+        task=str(env_info.get("env_id") or "unknown task"),
+        env_index=0,
+        seed=-1 if seed is None else int(seed),
+        source_file=None,
+        source_hash="",
+        source={},
+        control_dt=1 / frequency if frequency else _UNKNOWN_DT,
+        control_mode=said.get("control_mode"),
+        backend=str(kwargs.get("sim_backend") or "physx_cpu"),
+        env_kwargs=kwargs,
+        reset_options=dict(reset.get("options") or {}),
+        max_episode_steps=env_info.get("max_episode_steps"),
+        written_at=_written(path),
+        id=f"{path.stem}/{trajectory}",
+    )
+    obs = group.get("obs")
+    return Episode(
+        info=info,
+        geometry=None,
+        segmentation={},
+        poses=None,
+        action=actions,
+        action_names=action_names,
+        reward=np.asarray(rewards, dtype=np.float32),
+        terminated=group["terminated"][:].astype(np.bool_),
+        truncated=group["truncated"][:].astype(np.bool_),
+        evaluate=flags,
+        cameras=_cameras(obs, path),
+        env_states=dict(leaves(group.get("env_states"))),
+        obs=dict(leaves(obs, skip=_PICTURES)),
+    )
+
+
+def _written(path: Path) -> str:
+    when = datetime.datetime.fromtimestamp(path.stat().st_mtime, datetime.timezone.utc)
+    return when.isoformat(timespec="seconds")
+
+
+def _actions(node: Any) -> tuple[NDArray[np.float32], tuple[str, ...]]:
+    """(T, A), of several robots one behind the other, and a name for each of the A."""
+    parts = [(name, array.reshape(len(array), -1)) for name, array in leaves(node)]
+    names = [f"{name or 'action'}[{i}]" for name, array in parts for i in range(array.shape[1])]
+    return np.concatenate([array for _, array in parts], axis=1).astype(np.float32), tuple(names)
+
+
+# --- cameras --------------------------------------------------------------------------------------
+
+
+class _H5Pictures(Sequence[bytes]):
+    """Pictures of a dataset (P, H, W, C), read and encoded when they are asked for."""
+
+    def __init__(self, path: Path, dataset: str, count: int, modality: Modality) -> None:
+        self._path = path
+        self._dataset = dataset
+        self._count = count
+        self._modality: Modality = modality
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(self._count))]
+        number = range(self._count)[index]
+        with h5py.File(self._path, "r") as file:
+            dataset: Any = file[self._dataset]
+            picture = dataset[number]
+        if self._modality == "rgb":
+            return encode("rgb", np.ascontiguousarray(picture[..., :3]))
+        plain = picture.reshape(picture.shape[:2])
+        if self._modality == "depth":
+            # Whole millimetres if they are integers, metres otherwise (textures of the ray tracers).
+            scale = MILLIMETRES_PER_METRE if plain.dtype.kind in "iu" else 1.0
+            return encode("depth", plain.astype(np.float32) / scale)
+        return encode("segmentation", plain.astype(np.int32))
+
+
+def _cameras(obs: Any, path: Path) -> list[CameraTrack]:
+    if not isinstance(obs, h5py.Group) or "sensor_data" not in obs:
+        return []
+    tracks = []
+    sensors: Any = obs["sensor_data"]
+    for name in sensors:
+        held: dict[Modality, EncodedPictures] = {}
+        size = (0, 0)
+        count = 0
+        for key in sensors[name]:
+            modality: Modality | None = next((known for known in MODALITIES if known == key), None)
+            dataset = sensors[name][key]
+            if modality is None:
+                continue
+            count, size = len(dataset), dataset.shape[1:3]
+            held[modality] = EncodedPictures(modality, _H5Pictures(path, dataset.name, count, modality))
+        if held:
+            parameters: Any = obs.get(f"sensor_param/{name}")
+            info = _lens(name, size, tuple(held), parameters)
+            pose = _poses(parameters, count)
+            tracks.append(CameraTrack(info, np.arange(count), pose, **held))
+    return tracks
+
+
+def _lens(name: str, size: tuple[int, int], modalities: tuple[str, ...], parameters: Any) -> CameraInfo:
+    height, width = size
+    intrinsic = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], dtype=np.float32)
+    if parameters is not None and "intrinsic_cv" in parameters:
+        intrinsic = parameters["intrinsic_cv"][0].astype(np.float32)
+    fovy = float(2 * np.arctan2(height / 2, intrinsic[1, 1]))
+    return CameraInfo(name, "sensor", width, height, fovy, 0.01, 100.0, intrinsic, None, modalities)
+
+
+def _poses(parameters: Any, count: int) -> NDArray[np.float32]:
+    """(P, 7) in ManiSkill's camera frame, from OpenGL's (x right, y up, z backward)."""
+    poses = np.tile(np.array([0, 0, 0, 1, 0, 0, 0], dtype=np.float32), (count, 1))
+    if parameters is None or "cam2world_gl" not in parameters:
+        return poses
+    matrices = parameters["cam2world_gl"][:]
+    for index, matrix in enumerate(matrices):
+        if index and np.array_equal(matrix, matrices[index - 1]):
+            poses[index] = poses[index - 1]
+            continue
+        right, up, back = matrix[:3, 0], matrix[:3, 1], matrix[:3, 2]
+        poses[index, :3] = matrix[:3, 3]
+        poses[index, 3:] = mat2quat(np.stack([-back, -right, up], axis=1))
+    return poses

@@ -1,0 +1,227 @@
+"""An ``.rrd`` of ours as arrays, entity by entity.
+
+Rerun's own query engine is an extra of 100 MB. The chunks of a file are plain Arrow tables, though, and what `layout` put
+in by columns comes out by columns. Values are looked at without a Python object a row; pictures are slices of the
+decompressed chunk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from rerun.chunk import RrdReader
+
+from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
+from workbench.core.pictures import CameraInfo
+from workbench.recording.encoded_pictures import EncodedPictures, Modality, encode
+from workbench.recording.layout import STEP
+
+_PROPERTIES = "/__properties"
+
+
+class RerunTable:
+    def __init__(self, path: Path) -> None:
+        """Raises OSError, ValueError or RuntimeError where `path` is no ``.rrd``."""
+        self._timed: dict[tuple[str, str], list[tuple[NDArray[np.int64], pa.Array]]] = {}
+        self._static: dict[tuple[str, str], pa.Array] = {}
+        for chunk in RrdReader(path).stream():
+            batch = chunk.to_record_batch()
+            steps = None
+            if not chunk.is_static:
+                index = batch.schema.get_field_index(STEP)
+                if index < 0:
+                    continue
+                steps = batch.column(index).cast(pa.int64(), safe=False).to_numpy()
+            for field, column in zip(batch.schema, batch.columns):
+                if (field.metadata or {}).get(b"rerun:kind") != b"data":
+                    continue
+                key = (chunk.entity_path, field.name)
+                if steps is not None:
+                    self._timed.setdefault(key, []).append((steps, column))
+                elif len(column) and column[len(column) - 1].is_valid:
+                    self._static[key] = column[len(column) - 1].values
+
+    def property(self, name: str, component: str) -> Any:
+        """A property's value, a list if there are several, None if there is none."""
+        for (entity, key), values in self._static.items():
+            if entity == f"{_PROPERTIES}/{name}" and key.rsplit(":", 1)[-1] == component:
+                found = values.to_pylist()
+                return found[0] if len(found) == 1 else found
+        return None
+
+    def scalars(self, entity: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Steps (R,) and numbers (R, K) of a batched ``Scalars``."""
+        return self._rows(entity, "Scalars:scalars")
+
+    def pose_rows(self, entity: str, frames: NDArray[np.int64], states: int) -> NDArray[np.float32]:
+        """(len(frames), 7) translation and xyzw at these states."""
+        return self._poses(entity, states)[frames]
+
+    def poses(self, entities: Sequence[str], states: int) -> NDArray[np.float32]:
+        """(states, len(entities), 7) position and wxyz; NaN for an entity that is not there."""
+        poses = np.full((states, len(entities), 7), np.nan, dtype=np.float32)
+        for body, entity in enumerate(entities):
+            rows = self._poses(entity, states)
+            poses[:, body, :3] = rows[:, :3]
+            poses[:, body, 3:] = np.roll(rows[:, 3:], 1, axis=-1)
+        return poses
+
+    def _poses(self, entity: str, states: int) -> NDArray[np.float32]:
+        poses = np.full((states, 7), np.nan, dtype=np.float32)
+        for key, place in (("translation", slice(0, 3)), ("quaternion", slice(3, 7))):
+            fixed = self._static.get((entity, f"Transform3D:{key}"))
+            if fixed is not None:
+                poses[:, place] = _plain(fixed).reshape(-1)
+            else:
+                steps, rows = self._rows(entity, f"Transform3D:{key}")
+                if len(steps):
+                    poses[steps, place] = rows
+        return poses
+
+    def _rows(self, entity: str, component: str) -> tuple[NDArray[np.int64], NDArray]:
+        """Steps (R,) and values (R, K) of a component with K numbers a row."""
+        found = self._timed.get((entity, component), [])
+        if not found:
+            return np.zeros(0, np.int64), np.zeros((0, 0))
+        steps = np.concatenate([steps for steps, _ in found])
+        values = np.concatenate([_plain(column.flatten()).reshape(len(column), -1) for _, column in found])
+        order = np.argsort(steps, kind="stable")
+        return steps[order], values[order]
+
+    def pictures(
+        self, entity: str, modality: Modality, info: CameraInfo
+    ) -> tuple[NDArray[np.int64], EncodedPictures] | None:
+        """States and pictures of ``<camera>/<modality>``; None where the camera has none."""
+        component = {
+            "rgb": "EncodedImage:blob",
+            "depth": "EncodedDepthImage:blob",
+            "segmentation": "SegmentationImage:buffer",
+        }[modality]
+        found = sorted(self._timed.get((entity, component), []), key=lambda part: int(part[0][0]))
+        if not found:
+            return None
+        frames = np.concatenate([steps for steps, _ in found])
+        blobs = _Blobs([column for _, column in found])
+        if modality == "segmentation":
+            return frames, EncodedPictures(modality, _Ids(blobs, info.height, info.width))
+        return frames, EncodedPictures(modality, blobs)
+
+    def geometry(self, bare: SceneGeometry, entities: Sequence[str]) -> SceneGeometry:
+        """`bare` with the meshes that its bodies wear; `entities` are theirs."""
+        visuals: dict[str, tuple[Mesh, Material, list[int]]] = {}
+        for body, entity in enumerate(entities):
+            number = 0
+            while (mesh := self._mesh(f"{entity}/{number}")) is not None:
+                name = str(self._one(f"{entity}/{number}", "visual", f"{bare.body_names[body]}/{number}"))
+                if name not in visuals:
+                    visuals[name] = (mesh, self._material(f"{entity}/{number}"), [])
+                visuals[name][2].append(body)
+                number += 1
+        return replace(
+            bare,
+            visuals=tuple(
+                Visual(name, mesh, material, np.zeros(len(bodies), np.int32), np.array(bodies, np.int32))
+                for name, (mesh, material, bodies) in visuals.items()
+            ),
+        )
+
+    def _mesh(self, entity: str) -> Mesh | None:
+        vertices = self._static.get((entity, "Mesh3D:vertex_positions"))
+        if vertices is None:
+            return None
+        held = {
+            key: self._static.get((entity, f"Mesh3D:{component}"))
+            for key, component in (("normals", "vertex_normals"), ("uvs", "vertex_texcoords"))
+        }
+        faces = self._static[entity, "Mesh3D:triangle_indices"]
+        return Mesh(
+            vertices=_plain(vertices).reshape(-1, 3),
+            faces=_plain(faces).reshape(-1, 3),
+            normals=None if held["normals"] is None else _plain(held["normals"]).reshape(-1, 3),
+            uvs=None if held["uvs"] is None else _plain(held["uvs"]).reshape(-1, 2),
+        )
+
+    def _material(self, entity: str) -> Material:
+        buffer = self._static.get((entity, "Mesh3D:albedo_texture_buffer"))
+        texture = None
+        if buffer is not None:
+            form = self._static[entity, "Mesh3D:albedo_texture_format"][0].as_py()
+            rgb = _plain(buffer.flatten()).reshape(form["height"], form["width"], 3)
+            texture = np.concatenate([rgb, np.full((*rgb.shape[:2], 1), 255, np.uint8)], axis=-1)
+        colors = self._static.get((entity, "base_color"))
+        r, g, b, a = (1.0, 1.0, 1.0, 1.0) if colors is None else colors.to_pylist()
+        return Material(
+            base_color=(r, g, b, a),
+            metallic=float(self._one(entity, "metallic", 0.0)),
+            roughness=float(self._one(entity, "roughness", 1.0)),
+            texture=texture,
+        )
+
+    def _one(self, entity: str, component: str, otherwise: Any) -> Any:
+        values = self._static.get((entity, component))
+        return otherwise if values is None else values[0].as_py()
+
+
+class _Blobs(Sequence[bytes]):
+    """The rows of columns of one blob each."""
+
+    def __init__(self, columns: Sequence[pa.Array]) -> None:
+        self._columns = columns
+        self._ends = np.cumsum([len(column) for column in columns])
+
+    def __len__(self) -> int:
+        return int(self._ends[-1])
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        number = range(len(self))[index]
+        part = int(np.searchsorted(self._ends, number, side="right"))
+        column = self._columns[part]
+        row = column[number - int(self._ends[part]) + len(column)].values[0]
+        return row.values.to_numpy().tobytes()
+
+
+class _Ids(Sequence[bytes]):
+    """Plain ids as the PNG that they were, or would have been."""
+
+    def __init__(self, blobs: _Blobs, height: int, width: int) -> None:
+        self._blobs = blobs
+        self._shape = (height, width)
+
+    def __len__(self) -> int:
+        return len(self._blobs)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        content = self._blobs[index]
+        wide = len(content) == 4 * self._shape[0] * self._shape[1]
+        ids = np.frombuffer(content, np.int32 if wide else np.uint16).reshape(self._shape)
+        return encode("segmentation", ids.astype(np.int32))
+
+
+def _plain(values: pa.Array) -> NDArray:
+    """The numbers in an array of numbers, of fixed lists of numbers, or of bytes."""
+    while pa.types.is_fixed_size_list(values.type) or pa.types.is_list(values.type):
+        values = values.flatten()
+    return values.to_numpy(zero_copy_only=False)
+
+
+def wxyz_from_optical(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+    """ManiSkill poses (P, 7) of cameras, from translation and xyzw of their OpenCV frame: `layout.optical_pose`, undone."""
+    x, y, z, w = rows[:, 3:].astype(np.float64).T
+    a, b, c, d = 0.5, 0.5, -0.5, 0.5  # the conjugate of the rotation from one frame to the other
+    product = [
+        w * a - x * b - y * c - z * d,
+        w * b + x * a + y * d - z * c,
+        w * c - x * d + y * a + z * b,
+        w * d + x * c - y * b + z * a,
+    ]
+    return np.concatenate([rows[:, :3], np.stack(product, axis=-1).astype(np.float32)], axis=1)

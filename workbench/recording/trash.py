@@ -1,0 +1,121 @@
+"""Deleting recordings, so that it can be taken back: the files go into ``.trash`` in the library's folder.
+
+People delete the wrong one, and an episode cannot be had again. A move within one folder tree costs nothing, leaves
+the files as they are, and is found by anybody who looks. Each deletion is a folder of its own in there, named by its
+time, with the files under the paths that they had; so nothing has to be written down about it, and taking it back is
+moving them to where they were. What makes a recording one, its first file, goes first and comes back last. The room
+is given back only when the trash is emptied.
+"""
+
+from __future__ import annotations
+
+import datetime
+import os
+import shutil
+import uuid
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+TRASH = ".trash"
+
+
+@dataclass(frozen=True)
+class Trash:
+    """What is in there."""
+
+    batches: tuple[str, ...] = ()
+    """One a deletion, the last one last."""
+    files: int = 0
+    size: int = 0
+    """Bytes."""
+
+
+class TrashError(OSError):
+    """Files could not be moved; the message says which and why. Those of the same recording are where they were."""
+
+
+def put_into_trash(folder: Path, recordings: Sequence[Sequence[Path]]) -> str | None:
+    """Move the files of these recordings, each the one that makes it first; returns the name of the deletion, or None
+    if nothing was there any more.
+
+    Raises:
+        TrashError: some could not be moved; those before it were.
+    """
+    now = datetime.datetime.now()
+    batch = f"{now:%Y-%m-%dT%H-%M-%S.%f}-{uuid.uuid4().hex[:6]}"
+    moved = False
+    for paths in recordings:
+        pairs = [(path, folder / TRASH / batch / path.relative_to(folder)) for path in paths]
+        moved |= _move_together([(source, target) for source, target in pairs if os.path.lexists(source)])
+    return batch if moved else None
+
+
+def take_out_of_trash(folder: Path, batch: str) -> tuple[str, ...]:
+    """Move what this deletion took to where it was; returns the paths below `folder`, with ``/``. What stands there now is not
+    written over.
+
+    Raises:
+        TrashError: something could not be moved, and is in the trash still.
+    """
+    root = folder / TRASH / batch
+    if batch not in look_into_trash(folder).batches:
+        raise TrashError("That deletion is no longer in the trash.")
+    # The .json, which sorts after .h5, must come last.
+    order = {".h5": 0, ".rrd": 1, ".json": 2}
+    files = sorted(
+        (path for path in root.rglob("*") if path.is_symlink() or path.is_file()),
+        key=lambda path: (order.get(path.suffix, 0), path),
+    )
+    _move_together([(path, folder / path.relative_to(root)) for path in files])
+    shutil.rmtree(root, ignore_errors=True)
+    return tuple(path.relative_to(root).as_posix() for path in files)
+
+
+def look_into_trash(folder: Path) -> Trash:
+    batches, files, size = [], 0, 0
+    try:
+        with os.scandir(folder / TRASH) as listed:
+            batches = sorted(entry.name for entry in listed if entry.is_dir(follow_symlinks=False))
+    except OSError:
+        return Trash()
+    for batch in batches:
+        for below, _, names in os.walk(folder / TRASH / batch):
+            for name in names:
+                try:
+                    size += os.lstat(os.path.join(below, name)).st_size
+                    files += 1
+                except OSError:
+                    continue  # taken out meanwhile
+    return Trash(tuple(batches), files, size)
+
+
+def empty_trash(folder: Path) -> None:
+    """Delete what is in there for good.
+
+    Raises:
+        TrashError: something could not be deleted.
+    """
+    try:
+        shutil.rmtree(folder / TRASH)
+    except FileNotFoundError:
+        return
+    except OSError as error:
+        raise TrashError(f"{folder / TRASH} could not be emptied: {error.strerror or error}.") from error
+
+
+def _move_together(pairs: Sequence[tuple[Path, Path]]) -> bool:
+    """Move all or none; whether there was anything to move."""
+    done: list[tuple[Path, Path]] = []
+    try:
+        for source, target in pairs:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if os.path.lexists(target):
+                raise FileExistsError(None, "there is a file of that name already", os.fspath(target))
+            os.rename(source, target)
+            done.append((source, target))
+    except OSError as error:
+        for source, target in reversed(done):
+            os.rename(target, source)
+        raise TrashError(f"{pairs[len(done)][0]} was left where it is: {error.strerror or error}.") from error
+    return bool(done)

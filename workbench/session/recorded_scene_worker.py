@@ -1,0 +1,130 @@
+"""The process that makes scenes of recordings that hold none; see `recorded_scene`.
+
+It is started as ``python -m workbench.session.recorded_scene_worker SOCKET SERVER`` and ends with its server, or when
+nobody listens any more. An env is kept for the next episode as long as that was made in the same way.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from workbench.session.recorded_scene import Said, SceneFailed, SceneMade, SceneWanted
+from workbench.session.worker_start import end_with
+
+if TYPE_CHECKING:
+    from workbench.core.task_env import TaskEnv
+
+_SAY_EVERY = 50
+"""States between two words on how far it is."""
+
+
+class _CannotMake(Exception):
+    """A sentence for a person."""
+
+
+def main() -> None:
+    """Entry of the process."""
+    connection = Connection(int(sys.argv[1]))
+    end_with(int(sys.argv[2]))
+    os.nice(10)
+    made: tuple[object, TaskEnv] | None = None
+    while True:
+        try:
+            wanted = connection.recv()
+        except EOFError:
+            return
+        try:
+            key = (wanted.task, wanted.files, repr(sorted(wanted.env_kwargs.items())))
+            if made is None or made[0] != key:
+                if made is not None:
+                    made[1].close()
+                    made = None
+                connection.send(Said(f"making {wanted.task}"))
+                made = (key, make(wanted))
+            connection.send(scene_of(made[1], wanted, connection))
+        except _CannotMake as error:
+            connection.send(SceneFailed(str(error)))
+        except BrokenPipeError:
+            return
+        except Exception as error:
+            traceback.print_exc()
+            connection.send(
+                SceneFailed(
+                    f"The scene of {wanted.task} could not be made ({type(error).__name__}: {_line(error)}), so there "
+                    "are numbers and curves only."
+                )
+            )
+
+
+def make(wanted: SceneWanted) -> TaskEnv:
+    """One env of the recorded task, as it was made for the recording."""
+    from workbench.authoring.load import load_task
+    from workbench.authoring.problem import TaskError
+    from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+
+    loaded = None
+    for file in wanted.files:
+        try:
+            found = load_task(file)
+            loaded = found if found.env_id == wanted.task or loaded is None else loaded
+            if found.env_id != wanted.task and wanted.task in found.others:
+                loaded = load_task(f"{file}:{wanted.task}")
+        except TaskError as error:
+            raise _CannotMake(f"{Path(file).name} cannot be loaded: {error.problem.message}") from error
+    if loaded is None or loaded.env_id != wanted.task:
+        try:
+            loaded = load_task(wanted.task)
+        except TaskError as error:
+            raise _CannotMake(
+                f"There is no env {wanted.task} here to make the scene with, so there are numbers and curves only. If it "
+                "is yours, say which file it is in: workbench review --task FILE."
+            ) from error
+    try:
+        env = make_env(
+            loaded.cls,
+            EnvOptions(num_envs=1, backend="cpu", kwargs={**wanted.env_kwargs, "obs_mode": "none"}),
+            default_kwargs=loaded.default_kwargs,
+        )
+    except Exception as error:
+        traceback.print_exc()
+        raise _CannotMake(
+            f"{wanted.task} cannot be made here ({type(error).__name__}: {_line(error)}), so there are numbers and "
+            "curves only."
+        ) from error
+    return TaskEnv(env)
+
+
+def scene_of(env: TaskEnv, wanted: SceneWanted, connection: Connection) -> SceneMade:
+    """Its geometry, and the poses of every body at each recorded state."""
+    from workbench.core.body_table import read_poses
+    from workbench.core.recorded_state import misfits, write_states
+    from workbench.core.scene_geometry import read_geometry
+
+    seed = wanted.seed if wanted.seed >= 0 else None
+    env.reset(seed=seed, options=wanted.reset_options)
+    geometry = read_geometry(env.env, env.table)
+    states = wanted.env_states
+    count = min(len(values) for values in states.values())
+    poses: list[Any] = []
+    missed = misfits(env.env, 0, {name: values[0] for name, values in states.items()}) if count else {}
+    for row in range(count):
+        if row % _SAY_EVERY == 0:
+            connection.send(Said(f"putting it into state {row} of {count - 1}"))
+        write_states(env.env, {0: {name: values[row] for name, values in states.items()}})
+        poses.append(read_poses(env.env, env.table)[0])
+    return SceneMade(geometry, np.stack(poses), tuple(f"{name}: {why}" for name, why in missed.items()))
+
+
+def _line(error: Exception) -> str:
+    return (str(error).strip() or "no reason given").splitlines()[0][:300]
+
+
+if __name__ == "__main__":
+    main()

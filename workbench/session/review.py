@@ -1,0 +1,463 @@
+"""Recordings that are open: read in the background, and looked at along one time that all of them share.
+
+What a page shows of a recording is all in memory (only pictures stay encoded until one is looked at), so there is no
+worker here and nothing to wait for: to seek is to change a number. Playing is arithmetic as well. The position
+follows from the clock when somebody asks for it, and `wait` sleeps until it is another one; there is no thread that
+has to tick.
+
+What takes time is opening: reading files, and for recordings that hold no scene (ManiSkill's own) making the env
+that they were recorded in. Each opening has a thread for as long as that takes; one that comes later makes what an
+earlier one still brings worthless, which is how opening something else stops it.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+from workbench.recording.episode import Episode
+from workbench.recording.read_episode import UnreadableRecording, read_episode, read_maniskill
+from workbench.session.recorded_scene import SceneError
+from workbench.session.review_events import happenings
+from workbench.session.review_view import START, Opened, ReviewView
+
+log = logging.getLogger(__name__)
+
+MOST_COMPARED = 4
+"""Recordings that are drawn over each other; more cannot be told apart."""
+MOST_OPEN = 64
+SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
+_LOOK_EVERY = 2.0
+"""Seconds between two looks at whether the files are still what was read."""
+
+
+class Row(Protocol):
+    """What is asked of a row of the library."""
+
+    @property
+    def id(self) -> str: ...
+    @property
+    def name(self) -> str: ...
+    @property
+    def paths(self) -> tuple[Path, ...]: ...
+    @property
+    def kind(self) -> str: ...
+    @property
+    def trajectory(self) -> str | None: ...
+
+
+class Shelf(Protocol):
+    """What is asked of the library."""
+
+    def rows(self) -> Sequence[Row]: ...
+
+
+def read_row(row: Row) -> Episode:
+    """The recording of a row. Raises as `read_episode`."""
+    if row.trajectory is not None:
+        return read_maniskill(row.paths[0], row.trajectory)
+    return read_episode(row.paths[0])
+
+
+class SceneMaker(Protocol):
+    """Makes the scenes of recordings that have none (`recorded_scene.SceneProcess`)."""
+
+    def __call__(
+        self,
+        episodes: Mapping[int, Episode],
+        stop: Callable[[], bool],
+        on_progress: Callable[[int, str], None],
+        on_end: Callable[[int, Episode | SceneError, tuple[str, ...]], None],
+    ) -> None: ...
+
+
+@dataclass
+class _Walk:
+    """Where playing began."""
+
+    position: int
+    at: float
+
+
+class Review:
+    """Up to `MOST_OPEN` opened recordings and one position. All methods are thread-safe and return at once."""
+
+    def __init__(
+        self,
+        library: Shelf,
+        read: Callable[[Row], Episode] = read_row,
+        make_scene: SceneMaker | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """
+        Args:
+            library: knows recordings by their ids.
+            read: reads the recording of a row; raises OSError or UnreadableRecording with a sentence.
+            make_scene: for recordings without a scene; None leaves them without.
+            clock: seconds.
+        """
+        self._library, self._read, self._make_scene, self._clock = library, read, make_scene, clock
+        self._changed = threading.Condition()
+        self._view = ReviewView()
+        self._walk: _Walk | None = None
+        self._opening = 0
+        """Number of the newest opening: what an earlier one brings is dropped."""
+        self._thread: threading.Thread | None = None
+        self._files: dict[Path, tuple[str, tuple[int, int] | None]] = {}
+        """Of the opened ones: whose it is, and its size and time of change when it was read."""
+        self._unread: tuple[str, ...] = ()
+        self._looked = -math.inf
+
+    # --- what the page reads -------------------------------------------------------------------------
+
+    def view(self) -> ReviewView:
+        """A snapshot; cheap enough for every frame."""
+        with self._changed:
+            self._advance()
+            return self._view
+
+    def wait(self, seen: int, timeout: float) -> int:
+        """Sleep until the view is newer than `seen`, at most `timeout` seconds; returns the newest serial."""
+        deadline = time.monotonic() + timeout
+        with self._changed:
+            while True:
+                self._advance()
+                left = deadline - time.monotonic()
+                if self._view.serial != seen or left <= 0:
+                    return self._view.serial
+                self._changed.wait(min(left, self._next_position_in()))
+
+    # --- opening -------------------------------------------------------------------------------------
+
+    def open(self, ids: Sequence[str], state: int | None = None) -> None:
+        """Show these recordings instead of what is open.
+
+        Args:
+            ids: rows of the library; more than `MOST_OPEN` are left out, and that is said.
+            state: of the first one, to begin at.
+        """
+        rows = {row.id: row for row in self._library.rows()}
+        wanted = [rows[id] for id in dict.fromkeys(ids) if id in rows]
+        missing = len(dict.fromkeys(ids)) - len(wanted)
+        said: list[str] = []
+        if missing:
+            said.append(
+                "A recording that was asked for is not in the folder any more."
+                if missing == 1
+                else f"{missing} recordings that were asked for are not in the folder any more."
+            )
+        if len(wanted) > MOST_OPEN:
+            said.append(f"At most {MOST_OPEN} recordings can be open at once; the first {MOST_OPEN} are.")
+            wanted = wanted[:MOST_OPEN]
+        with self._changed:
+            self._opening += 1
+            number = self._opening
+            if not wanted:
+                self._change(problems=tuple(said), loading="")
+                return
+            self._change(loading=_opening_words(wanted, 0), problems=tuple(said))
+            self._thread = threading.Thread(
+                target=self._open, args=(number, wanted, said, state), name="review-open", daemon=True
+            )
+            self._thread.start()
+
+    def close_one(self, index: int) -> None:
+        """Take one of the opened recordings away."""
+        with self._changed:
+            if 0 <= index < len(self._view.opened):
+                kept = [o for number, o in enumerate(self._view.opened) if number != index]
+                selected = self._view.selected - (self._view.selected > index)
+                self._opening += 1
+                self._put(kept, min(selected, max(len(kept) - 1, 0)), self._view.align)
+
+    def close(self) -> None:
+        """Nothing is opened any more; returns when the thread that opens has ended."""
+        with self._changed:
+            self._opening += 1
+            thread = self._thread
+        if thread is not None:
+            thread.join(timeout=10.0)
+
+    def _open(self, number: int, rows: list[Row], said: list[str], state: int | None) -> None:
+        opened: list[Opened] = []
+        files: dict[Path, tuple[str, tuple[int, int] | None]] = {}
+        for done, row in enumerate(rows):
+            with self._changed:
+                if number != self._opening:
+                    return
+                self._change(loading=_opening_words(rows, done))
+            stamps = {path: (row.name, _stamp(path)) for path in row.paths}
+            try:
+                episode = self._read(row)
+                opened.append(Opened(row.id, row.name, episode, happenings(episode)))
+                files.update(stamps)
+            except (OSError, UnreadableRecording) as error:
+                said.append(f"{row.name}: {error}")
+            except Exception as error:
+                # A page that stays on "opening" says nothing; and the file is whatever somebody put there.
+                log.exception("%s could not be opened.", row.name)
+                said.append(f"{row.name} could not be opened ({type(error).__name__}: {error}).")
+        with self._changed:
+            if number != self._opening:
+                return
+            self._unread = tuple(said)
+            if opened:
+                self._files = files
+                self._put(opened, 0, START)
+                if state is not None:
+                    self._seek(state)
+            self._change(loading="", problems=self._unread)
+        self._give_scenes(number, {index: one for index, one in enumerate(opened) if not one.has_scene})
+
+    def _give_scenes(self, number: int, without: Mapping[int, Opened]) -> None:
+        def say(index: int, words: str, making: bool = True) -> None:
+            self._replace_opened(number, index, lambda now: replace(now, scene=words, making=making))
+
+        def end(index: int, made: Episode | SceneError, missed: tuple[str, ...]) -> None:
+            if isinstance(made, SceneError):
+                say(index, str(made), False)
+                return
+            words = f"Not put back: {'; '.join(missed)}." if missed else ""
+            self._replace_opened(
+                number, index, lambda now: replace(now, episode=made, scene=words, making=False)
+            )
+
+        wanted = {index: one.episode for index, one in without.items() if one.episode.env_states}
+        for index in without:
+            if index not in wanted or self._make_scene is None:
+                say(index, "This recording holds no scene to draw.", False)
+            else:
+                say(index, "its scene is made next")
+        if wanted and self._make_scene is not None:
+            try:
+                self._make_scene(wanted, lambda: number != self._opening, say, end)
+            except OSError as error:
+                for index in wanted:
+                    say(index, f"The process that makes its scene could not be started: {error}.", False)
+
+    def _replace_opened(self, number: int, index: int, change: Callable[[Opened], Opened]) -> None:
+        with self._changed:
+            if number == self._opening:
+                opened = list(self._view.opened)
+                got_scene = not opened[index].has_scene
+                opened[index] = change(opened[index])
+                got_scene &= opened[index].has_scene
+                self._change(opened=tuple(opened), opened_serial=self._view.opened_serial + got_scene)
+
+    def _put(self, opened: Sequence[Opened], selected: int, align: str) -> None:
+        """Show these; under the lock."""
+        self._walk = None
+        names = dict.fromkeys(h.name for o in opened for h in o.happenings if h.style != "reset")
+        alignments = (START, *(f"first {name}" for name in names))
+        self._change(
+            opened=tuple(opened),
+            opened_serial=self._view.opened_serial + 1,
+            selected=selected,
+            alignments=alignments,
+            playing=False,
+        )
+        self._align(align if align in alignments else START, position=None)
+
+    # --- the position --------------------------------------------------------------------------------
+
+    def seek(self, position: int) -> None:
+        """To a position, or the nearest that there is."""
+        with self._changed:
+            self._seek(position)
+
+    def seek_by(self, steps: int) -> None:
+        """Some states on, or back; that is frame by frame, and stops playing."""
+        with self._changed:
+            self._advance()
+            self._pause()
+            self._seek(self._view.position + steps)
+
+    def seek_event(self, direction: int) -> None:
+        """To the next (1) or last (-1) event of any opened recording, of the selected one where there are many."""
+        with self._changed:
+            self._advance()
+            view = self._view
+            several = range(len(view.opened)) if len(view.opened) <= MOST_COMPARED else (view.selected,)
+            places = {
+                h.state - view.anchors[index]
+                for index in several
+                if view.opened
+                for h in view.opened[index].happenings
+            }
+            places |= {view.last} if view.opened else set()
+            ahead = [p for p in places if (p - view.position) * direction > 0]
+            if ahead:
+                self._pause()
+                self._seek(min(ahead, key=lambda place: abs(place - view.position)))
+
+    def to_first(self) -> None:
+        with self._changed:
+            self._seek(self._view.first)
+
+    def to_last(self) -> None:
+        with self._changed:
+            self._pause()
+            self._seek(self._view.last)
+
+    def show(self, index: int, state: int) -> None:
+        """That state of that recording, and that recording selected."""
+        with self._changed:
+            if 0 <= index < len(self._view.opened):
+                self._pause()
+                self._change(selected=index)
+                self._seek(state - self._view.anchors[index])
+
+    def select(self, index: int) -> None:
+        with self._changed:
+            if 0 <= index < len(self._view.opened):
+                self._change(selected=index)
+
+    def align(self, how: str) -> None:
+        """At one of `ReviewView.alignments`. What is shown of the selected recording stays.
+
+        Raises:
+            ValueError: it is none of them.
+        """
+        with self._changed:
+            if how not in self._view.alignments:
+                raise ValueError("That is not one of the moments to align at.")
+            self._advance()
+            view = self._view
+            kept = view.states[view.selected] if view.opened else None
+            self._align(how, position=kept)
+
+    # --- playing -------------------------------------------------------------------------------------
+
+    def toggle_play(self) -> None:
+        with self._changed:
+            self._advance()
+            if self._view.playing:
+                self._pause()
+            elif self._view.opened and self._view.last > self._view.first:
+                at_end = self._view.position >= self._view.last
+                position = self._view.first if at_end else self._view.position
+                self._walk = _Walk(position, self._clock())
+                self._change(playing=True, position=position)
+
+    def set_speed(self, speed: float) -> None:
+        """Times real time.
+
+        Raises:
+            ValueError: it is no number above 0.
+        """
+        if not 0 < speed < 1000:
+            raise ValueError("The speed is a number above 0.")
+        with self._changed:
+            self._advance()
+            self._restart_walk()
+            self._change(speed=speed)
+
+    def set_loop(self, loop: bool) -> None:
+        with self._changed:
+            self._change(loop=loop)
+
+    # --- files ---------------------------------------------------------------------------------------
+
+    def look_at_files(self) -> None:
+        """Say of files that were deleted or changed since they were read; often called, and seldom done."""
+        with self._changed:
+            if self._clock() - self._looked < _LOOK_EVERY:
+                return
+            self._looked = self._clock()
+            files, said = dict(self._files), dict.fromkeys(self._unread)
+        for path, (name, stamp) in files.items():
+            now = _stamp(path)
+            if now is None and stamp is not None:
+                said[f"{path.name} was deleted since it was opened; what was read of it is still shown."] = (
+                    None
+                )
+            elif now != stamp:
+                said[
+                    f"{path.name} has changed since it was opened; open {name} again to see what is in it now."
+                ] = None
+        with self._changed:
+            if tuple(said) != self._view.problems and files == self._files and not self._view.loading:
+                self._change(problems=tuple(said))
+
+    # --- under the lock ------------------------------------------------------------------------------
+
+    def _change(self, **values: object) -> None:
+        self._view = replace(self._view, serial=self._view.serial + 1, **values)  # type: ignore[arg-type]
+        self._changed.notify_all()
+
+    def _align(self, how: str, position: int | None) -> None:
+        """`position`: a state of the selected recording to stay at; None goes to the first position."""
+        opened = self._view.opened
+        name = how.removeprefix("first ")
+        anchors = tuple(0 if how == START else (o.first(name) or 0) for o in opened)
+        first = -max(anchors, default=0)
+        last = max((o.length - a for o, a in zip(opened, anchors, strict=True)), default=0)
+        at = first if position is None else position - anchors[self._view.selected]
+        self._change(align=how, anchors=anchors, first=first, last=last, position=min(max(at, first), last))
+        self._restart_walk()
+
+    def _seek(self, position: int) -> None:
+        position = min(max(position, self._view.first), self._view.last)
+        if position != self._view.position:
+            self._change(position=position)
+        self._restart_walk()
+
+    def _pause(self) -> None:
+        self._walk = None
+        if self._view.playing:
+            self._change(playing=False)
+
+    def _restart_walk(self) -> None:
+        if self._walk is not None:
+            self._walk = _Walk(self._view.position, self._clock())
+
+    def _rate(self) -> float:
+        """Positions a second."""
+        chosen = self._view.chosen
+        return self._view.speed / max(chosen.episode.info.control_dt, 1e-4) if chosen is not None else 0.0
+
+    def _advance(self) -> None:
+        """To where playing has come by now."""
+        walk, view = self._walk, self._view
+        if walk is None:
+            return
+        position = walk.position + int((self._clock() - walk.at) * self._rate() + 1e-6)
+        if position > view.last:
+            if view.loop:
+                # Its last state is shown for as long as any other.
+                self._walk = _Walk(view.first, self._clock())
+                self._change(position=view.first)
+            else:
+                self._walk = None
+                self._change(position=view.last, playing=False)
+        elif position != view.position:
+            self._change(position=position)
+
+    def _next_position_in(self) -> float:
+        if self._walk is None:
+            return 3600.0
+        steps = (self._clock() - self._walk.at) * self._rate()
+        return max((int(steps + 1e-6) + 1 - steps) / self._rate(), 1e-3)
+
+
+def _opening_words(rows: Sequence[Row], done: int) -> str:
+    return (
+        f"opening {rows[done].name}"
+        if len(rows) == 1
+        else f"opening {done + 1} of {len(rows)}: {rows[done].name}"
+    )
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    """Size and time of change; None if it is not there."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_size, found.st_mtime_ns

@@ -1,0 +1,215 @@
+"""What the rows of the library say, which of them are shown, and in which order.
+
+Pure functions of rows, so that what a person reads can be checked without a browser. Rows without a value in a column
+come last whichever way it is sorted, and ties keep the newest first, which is the order that the table begins with.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from workbench.recording.library_row import LibraryRow
+
+Column = Literal["task", "date", "seed", "steps", "return", "success", "version", "tags", "note", "name"]
+COLUMNS: tuple[Column, ...] = ("task", "date", "seed", "steps", "return", "success", "version")
+"""Of a row's first line."""
+SECOND_LINE: tuple[Column, ...] = ("tags", "note", "name")
+HINTS: dict[Column, str] = {
+    "task": "Env id of the task",
+    "date": "When it was recorded",
+    "seed": "Seed of the reset that began it",
+    "steps": "Control steps",
+    "return": "Sum of the rewards",
+    "success": "At the last step; 'once' if only at a step before",
+    "version": "Hash of the task's source; orange where it is not that of the newest recording of the task",
+    "tags": "Tags",
+    "note": "Note",
+    "name": "Name of its files",
+}
+Outcome = Literal["all", "success", "failed", "broken"]
+OUTCOMES: tuple[Outcome, ...] = ("all", "success", "failed", "broken")
+MEANS: dict[Outcome, str] = {
+    "all": "Every recording",
+    "success": "Success at the last step",
+    "failed": "No success at the last step",
+    "broken": "Something is wrong with the files",
+}
+HASH = 7
+"""Characters of a source hash that are shown."""
+_DESCENDING_FIRST: tuple[Column, ...] = ("date", "steps", "return", "success")
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The text of a row."""
+
+    task: str
+    date: str
+    when: str
+    """The date in full."""
+    seed: str
+    steps: str
+    total: str
+    outcome: str
+    """``success``, ``once``, ``fail``, ``no``, or empty where it is not known."""
+    version: str
+    other_version: bool
+    """Not that of the newest recording of its task."""
+    tags: tuple[str, ...]
+    note: str
+    name: str
+    about: str
+    """What is said when the pointer rests on the row."""
+    problem: str
+    remark: str
+    """``cut short``, or which kind of file it is where it is not one of ours."""
+
+
+def newest_sources(rows: Iterable[LibraryRow]) -> dict[str, str]:
+    """Source hash of the newest recording of each task that has one."""
+    newest: dict[str, tuple[float, str]] = {}
+    for row in rows:
+        if row.source_hash and row.facts.written is not None:
+            newest[row.task] = max(newest.get(row.task, (-1.0, "")), (row.facts.written, row.source_hash))
+    return {task: source for task, (_, source) in newest.items()}
+
+
+def has_outcome(row: LibraryRow, outcome: Outcome) -> bool:
+    if outcome == "success":
+        return row.success is True
+    if outcome == "failed":
+        return row.success is False
+    if outcome == "broken":
+        return row.problem is not None
+    return True
+
+
+def has_words(row: LibraryRow, words: Sequence[str]) -> bool:
+    """Whether each of these lower-case words is somewhere in its task, tags, note, name or source hash; ``seed:3``
+    means that seed."""
+    said = "\n".join((row.task, *row.tags, row.note, row.name, row.source_hash, row.problem or "")).lower()
+    return all(
+        row.seed is not None and word == f"seed:{row.seed}" if word.startswith("seed:") else word in said
+        for word in words
+    )
+
+
+def chosen(
+    rows: Iterable[LibraryRow], words: str = "", outcome: Outcome = "all", task: str | None = None
+) -> list[LibraryRow]:
+    """The rows that a filter lets through.
+
+    Args:
+        words: parted by spaces; each must be found.
+        task: None for all.
+    """
+    wanted = words.lower().split()
+    return [
+        row
+        for row in rows
+        if (task is None or row.task == task) and has_outcome(row, outcome) and has_words(row, wanted)
+    ]
+
+
+def begins_descending(column: Column) -> bool:
+    """Whether the first press on a column puts the largest first."""
+    return column in _DESCENDING_FIRST
+
+
+def ordered(rows: Iterable[LibraryRow], column: Column, descending: bool) -> list[LibraryRow]:
+    newest_first = sorted(rows, key=lambda row: (-(row.facts.written or 0.0), row.name))
+    known = [row for row in newest_first if _key(row, column) is not None]
+    unknown = [row for row in newest_first if _key(row, column) is None]
+    known.sort(key=lambda row: _key(row, column), reverse=descending)  # type: ignore[arg-type,return-value]
+    return known + unknown
+
+
+def _key(row: LibraryRow, column: Column) -> float | str | None:
+    """What a row is sorted by; None for no value."""
+    if column == "date":
+        return row.facts.written
+    if column == "seed":
+        return row.seed
+    if column == "steps":
+        return row.length
+    if column == "return":
+        return row.total_reward
+    if column == "success":
+        return {"success": 3.0, "once": 2.0, "no": 1.0, "fail": 0.0}.get(_outcome(row))
+    texts = {"task": row.task, "version": row.source_hash, "note": row.note, "name": row.name}
+    text = " ".join(sorted(row.tags)) if column == "tags" else texts[column]
+    return text.lower() or None
+
+
+def cells(row: LibraryRow, newest: dict[str, str], now: datetime.datetime) -> Cells:
+    """
+    Args:
+        newest: of `newest_sources`.
+        now: with the zone that dates are shown in.
+    """
+    when = None if row.date is None else row.date.astimezone(now.tzinfo)
+    total = row.total_reward
+    task = row.task or ("?" if row.problem else "")
+    about = [row.name, f"{_bytes(row.size)}", row.facts.control_mode]
+    if row.facts.env_index is not None:
+        about.insert(1, f"env {row.facts.env_index}")
+    return Cells(
+        task=task,
+        date="" if when is None else _short_date(when, now),
+        when="" if when is None else f"{when:%Y-%m-%d %H:%M:%S}",
+        seed="" if row.seed is None else str(row.seed),
+        steps="" if row.length is None else str(row.length),
+        total="" if total is None else f"{total:.4g}",
+        outcome=_outcome(row),
+        version=row.source_hash[:HASH],
+        other_version=bool(row.source_hash) and newest.get(row.task, row.source_hash) != row.source_hash,
+        tags=row.tags,
+        note=row.note,
+        name=row.name,
+        about=", ".join(part for part in about if part),
+        problem=row.problem or "",
+        remark="cut short"
+        if row.facts.recovered
+        else {"workbench": "", "maniskill": "ManiSkill", "rrd only": ".rrd only"}[row.kind],
+    )
+
+
+def _outcome(row: LibraryRow) -> str:
+    if row.success:
+        return "success"
+    if row.facts.fail:
+        return "fail"
+    if row.success is None:
+        return ""
+    return "once" if row.facts.success_once else "no"
+
+
+def _short_date(when: datetime.datetime, now: datetime.datetime) -> str:
+    if when.date() == now.date():
+        return f"{when:%H:%M:%S}"
+    if when.year == now.year:
+        return f"{when.day} {when:%b %H:%M}"
+    return f"{when.day} {when:%b %Y}"
+
+
+def _bytes(size: float) -> str:
+    for unit in ("B", "KB", "MB"):
+        if size < 1000:
+            return f"{size:.3g} {unit}"
+        size /= 1000
+    return f"{size:.3g} GB"
+
+
+def in_words(rows: Sequence[LibraryRow]) -> str:
+    """``3 recordings (9 files, 1.2 MB)``."""
+    files = {path for row in rows for path in row.paths}
+    by_files = {row.paths: row.size for row in rows}
+    what = "1 recording" if len(rows) == 1 else f"{len(rows)} recordings"
+    return f"{what} ({len(files)} file{'' if len(files) == 1 else 's'}, {_bytes(sum(by_files.values()))})"
+
+
+def size_in_words(size: int) -> str:
+    return _bytes(size)

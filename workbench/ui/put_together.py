@@ -1,0 +1,98 @@
+"""The two pages of the program and what they need, put together: ``workbench open`` and ``workbench review`` share it.
+
+A folder of recordings is looked through only when somebody wants to see it: the library and the review begin with
+the first review page, and live until the program ends, so that what is open there is still open after a while at the
+live env.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import viser
+
+from workbench.recording.library import Library
+from workbench.session.recorded_scene import SceneProcess
+from workbench.session.review import Review
+from workbench.session.session import Session
+from workbench.ui.page import Page
+from workbench.ui.pages import Pages
+from workbench.ui.review_page import ReviewOffers, ReviewPage
+
+
+@dataclass(frozen=True)
+class Shelf:
+    """The recordings of a folder, and those that are open."""
+
+    library: Library
+    review: Review
+
+
+class Workplace:
+    """Both pages over one server.
+
+    Args:
+        server: Of viser, already behind its door.
+        recordings: The folder that is recorded to and reviewed.
+        session: The live env, if there is one.
+        tasks: Task files in which envs of foreign recordings may be found.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        recordings: Path,
+        session: Session | None = None,
+        tasks: tuple[Path, ...] = (),
+    ) -> None:
+        self._server, self._recordings, self._tasks = server, recordings, tasks
+        self._shelf: Shelf | None = None
+        self._lock = threading.Lock()
+        self._offers: Callable[[Workplace, ReviewOffers], ReviewOffers] = lambda _, offers: offers
+        self.session = session
+        self.pages = Pages(server, {"review": self._review_page})
+        if session is not None:
+            self.go_live_with(session)
+
+    @property
+    def shelf(self) -> Shelf:
+        """Looks into the folder when it is first asked for."""
+        with self._lock:
+            if self._shelf is None:
+                library = Library(self._recordings)
+                library.watch()
+                self._shelf = Shelf(library, Review(library, make_scene=SceneProcess(self._tasks)))
+            return self._shelf
+
+    def go_live_with(self, session: Session) -> None:
+        """From now on there is a live page, of this session. It is not shown yet."""
+        self.session = session
+        self.pages.offer("live", self._live_page)
+
+    def offer(self, add: Callable[[Workplace, ReviewOffers], ReviewOffers]) -> None:
+        """Let `add` put more into what the review page offers; it is asked whenever that page is built."""
+        before = self._offers
+        self._offers = lambda place, offers: add(place, before(place, offers))
+
+    def close(self) -> None:
+        """Stop the pages and what they read from; the session is its owner's to close."""
+        self.pages.stop()
+        with self._lock:
+            if self._shelf is not None:
+                self._shelf.review.close()
+                self._shelf.library.close()
+
+    def _live_page(self, dark: bool) -> Page:
+        assert self.session is not None, "a live page is offered with its session"
+        return Page(self._server, self.session, dark, on_review=lambda: self.pages.show("review"))
+
+    def _review_page(self, dark: bool) -> ReviewPage:
+        shelf = self.shelf
+        shelf.library.look_soon()
+        offers = ReviewOffers(
+            on_back=(lambda: self.pages.show("live")) if self.pages.can_show("live") else None
+        )
+        return ReviewPage(self._server, shelf.review, shelf.library, self._offers(self, offers), dark)

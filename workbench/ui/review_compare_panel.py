@@ -1,0 +1,135 @@
+"""The Compare tab: where the first recording and another one part, entry by entry, and the lines that changed.
+
+A row is pressed to go there: both recordings then show the first state at which that entry differs.
+"""
+
+from __future__ import annotations
+
+import viser
+
+from workbench.session.review import Review
+from workbench.session.review_compare import (
+    TOLERANCES,
+    USUAL_TOLERANCE,
+    Difference,
+    Parting,
+    difference,
+    metres,
+)
+from workbench.session.review_view import Opened, ReviewView
+from workbench.session.reward_terms import PREFIX
+from workbench.ui.changed import fill, show
+from workbench.ui.checked import checked_choice
+from workbench.ui.fragments import render
+from workbench.ui.presses import Presses
+from workbench.ui.review_scene import COLOURS, letter
+
+TOLERANCE_NAMES = {metres(way): way for way in TOLERANCES}
+MOST_ROWS = 30
+
+
+class ReviewComparePanel:
+    def __init__(self, server: viser.ViserServer, review: Review) -> None:
+        self._review = review
+        gui = server.gui
+        self._other: viser.GuiDropdownHandle = gui.add_dropdown(
+            "A against", ("B",), initial_value="B", visible=False
+        )
+        self._tolerance = gui.add_dropdown(
+            "Moved from",
+            tuple(TOLERANCE_NAMES),
+            initial_value=metres(USUAL_TOLERANCE),
+            visible=False,
+            hint="How far a body must be away to count as elsewhere.",
+        )
+        self._html = gui.add_html("")
+        self._presses = Presses(server)
+        self._drawn: object = None
+        self._places: dict[int, int] = {}
+        """What a row of the table goes to: its position."""
+
+    def draw(self, view: ReviewView) -> None:
+        several = len(view.opened) > 1
+        letters = tuple(letter(index) for index in range(1, len(view.opened)))
+        if several and self._other.options != letters:
+            before = self._other.value
+            self._other.options = letters
+            self._other.value = before if before in letters else letters[0]
+        show(self._other, len(letters) > 1)
+        show(self._tolerance, several)
+        if not several:
+            self._drawn = None
+            fill(self._html, render("note", text="Open two recordings, and this says where they part."))
+            return
+        other = 1 + letters.index(checked_choice(self._other.value, letters, "recording"))
+        tolerance = TOLERANCE_NAMES[checked_choice(self._tolerance.value, TOLERANCE_NAMES, "distance")]
+        wanted = (view.opened_serial, view.anchors, other, tolerance)
+        if wanted == self._drawn:
+            return
+        self._drawn = wanted
+        a, b = view.opened[0], view.opened[other]
+        found = difference(a.episode, b.episode, (view.anchors[0], view.anchors[other]), tolerance)
+        fill(self._html, self._content(view, a, b, other, found))
+
+    def _content(self, view: ReviewView, a: Opened, b: Opened, other: int, found: Difference) -> str:
+        partings = [*([found.bodies] if found.bodies else []), *found.numbers]
+        differing = [p for p in partings if p.position is not None]
+        same = [p for p in partings if p.position is None and not p.first]
+        one_sided = [f"{p.name} ({p.first})" for p in partings if p.position is None and p.first]
+        rows = [self._row(number, parting, view) for number, parting in enumerate(differing[:MOST_ROWS])]
+        return render(
+            "review_compare",
+            a=("A", COLOURS[0], a.name),
+            b=(letter(other), COLOURS[other % 4], b.name),
+            headline=headline(found),
+            notes=notes(a, b, found),
+            totals=next((p.whole for p in found.numbers if p.name == "reward"), ""),
+            rows=rows,
+            more=len(differing) - len(rows),
+            same=", ".join(p.name.removeprefix(PREFIX) for p in same),
+            one_sided=", ".join((*one_sided, *found.not_in_both)),
+            source=found.source,
+            source_is_same=found.same_source,
+        )
+
+    def _row(self, number: int, parting: Parting, view: ReviewView) -> dict[str, object]:
+        assert parting.position is not None
+        self._places[number] = parting.position
+        press = self._presses.id_of(number, lambda _, number=number: self._go(number))
+        step = parting.position if view.align == "start" else f"{parting.position:+d}"
+        return {
+            "name": parting.name,
+            "step": step,
+            "first": parting.first,
+            "most": parting.most,
+            "press": press,
+        }
+
+    def _go(self, number: int) -> None:
+        if number in self._places:
+            self._review.seek(self._places[number])
+
+
+def headline(found: Difference) -> str:
+    if not found.compared:
+        return "As they are aligned, the two have no state at the same place."
+    if found.bodies is None:
+        return "One of them has no scene, so only numbers are compared."
+    if found.bodies.position is None:
+        return f"All bodies stay together, {found.bodies.most} apart at most."
+    return (
+        f"They part at step {found.bodies.position}: {found.bodies.first} apart. At most {found.bodies.most}."
+    )
+
+
+def notes(a: Opened, b: Opened, found: Difference) -> list[str]:
+    said = []
+    if a.episode.info.task != b.episode.info.task:
+        said.append("They are of different tasks.")
+    elif not found.same_seed:
+        said.append("They are of different seeds, so they differ from the start.")
+    if a.length != b.length:
+        said.append(f"{a.length} and {b.length} steps; {found.compared} states are compared.")
+    if abs(a.episode.info.control_dt - b.episode.info.control_dt) > 1e-9:
+        said.append("A step is not the same time in both.")
+    return said

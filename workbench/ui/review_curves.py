@@ -1,0 +1,228 @@
+"""The Curves tab of a review: the selected recording's numbers, and curves of all that are compared.
+
+One chart holds one entry with a line for each recording, over each other as they are aligned; the reward always, and
+one that is chosen. An action or the terms of a reward have many lines of their own, so those are drawn of the
+selected recording alone. A line at the position would have to be sent with every frame; a dot on the first line is.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+import numpy as np
+import viser
+import viser.uplot as uplot
+from numpy.typing import NDArray
+
+from workbench.session.review import MOST_COMPARED
+from workbench.session.review_events import ACTION, REWARD, TERMS, curves
+from workbench.session.review_view import ReviewView, column_at
+from workbench.ui.changed import fill, show
+from workbench.ui.checked import checked_choice
+from workbench.ui.curves_panel import CURSOR, LONGEST, value_span
+from workbench.ui.fragments import render
+from workbench.ui.numbers_table import number_rows
+from workbench.ui.review_as_session import step_of
+from workbench.ui.review_scene import COLOURS, letter
+from workbench.ui.terms_panel import COLOURS as LINE_COLOURS
+
+REDRAW_EVERY = 0.15
+_NUMBERS_EVERY = 0.12
+Lines = dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
+
+
+class ReviewCurves:
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._numbers = server.gui.add_html("")
+        self._numbers_drawn: object = None
+        self._charts_folder = server.gui.add_folder(None)
+        self._entry: viser.GuiDropdownHandle = server.gui.add_dropdown(
+            "Also", ("-",), initial_value="-", visible=False
+        )
+        self._entry.on_update(lambda _: self._choose())
+        self._charts: dict[str, viser.GuiUplotHandle] = {}
+        self._drawn: object = None
+        self._drawn_at = self._numbers_at = 0.0
+        self._found: dict[str, dict[str, Lines]] = {}
+        self._wish = ""
+        """The entry that was last chosen, kept while recordings without it are open."""
+
+    def draw(self, view: ReviewView) -> None:
+        self._draw_numbers(view)
+        wanted = (
+            view.opened_serial,
+            view.selected,
+            view.position,
+            view.anchors,
+            self._wish,
+            len(view.opened),
+        )
+        if wanted == self._drawn or time.monotonic() - self._drawn_at < REDRAW_EVERY:
+            return
+        self._drawn, self._drawn_at = wanted, time.monotonic()
+        # By the recording's id: what gets its scene later is the same recording.
+        self._found = {one.id: self._found.get(one.id) or curves(one.episode) for one in view.opened}
+        shown = shown_together(view)
+        self._offer(view, shown)
+        self._draw_entry("reward", REWARD, view, shown)
+        self._draw_entry("also", self._entry.value if self._entry.visible else "", view, shown)
+        self._draw_lines("terms", TERMS, view)
+        self._draw_lines("action", ACTION, view)
+
+    # --- numbers -------------------------------------------------------------------------------------
+
+    def _draw_numbers(self, view: ReviewView) -> None:
+        wanted = (view.opened_serial, view.selected, view.position, view.anchors)
+        if wanted == self._numbers_drawn or time.monotonic() - self._numbers_at < _NUMBERS_EVERY:
+            return
+        self._numbers_drawn, self._numbers_at = wanted, time.monotonic()
+        chosen = view.chosen
+        if chosen is None:
+            fill(self._numbers, render("note", text="Numbers and curves appear when a recording is open."))
+            return
+        steps = [step_of(view.opened[i].episode, view.states[i]) for i in shown_together(view)]
+        own = step_of(chosen.episode, view.states[view.selected])
+        rows = number_rows(own, 0, chosen.length)
+        others = [{row.name: known(row.selected) for row in number_rows(step, 0, None)} for step in steps]
+        heads = [letter(i) for i in shown_together(view)] if len(steps) > 1 else ["value"]
+        table = [
+            {
+                "name": row.name,
+                "mood": row.mood,
+                "values": [o.get(row.name, "—") for o in others] if len(steps) > 1 else [known(row.selected)],
+            }
+            for row in rows
+        ]
+        colours = [COLOURS[i % 4] for i in shown_together(view)] if len(steps) > 1 else [""]
+        fill(
+            self._numbers,
+            render("review_numbers", rows=table, heads=list(zip(heads, colours, strict=True))),
+        )
+
+    # --- charts --------------------------------------------------------------------------------------
+
+    def _choose(self) -> None:
+        value = self._entry.value
+        if value in self._entry.options:
+            self._wish = value
+
+    def _offer(self, view: ReviewView, shown: Sequence[int]) -> None:
+        names = dict.fromkeys(
+            name
+            for index in shown
+            for name, lines in self._found[view.opened[index].id].items()
+            if name not in (REWARD, TERMS, ACTION)
+            for name in ([name] if len(lines) == 1 else [f"{name}: {line}" for line in lines])
+        )
+        for index in shown:
+            for group in (TERMS, ACTION):
+                names |= dict.fromkeys(
+                    f"{group}: {line}" for line in self._found[view.opened[index].id].get(group, {})
+                )
+        options = tuple(names)
+        show(self._entry, bool(options))
+        if options and options != self._entry.options:
+            wish = self._wish if self._wish in options else "success" if "success" in options else options[0]
+            self._entry.options = options
+            self._entry.value = checked_choice(wish, options, "entry")
+
+    def _draw_entry(self, chart: str, entry: str, view: ReviewView, shown: Sequence[int]) -> None:
+        """One entry of all that are compared."""
+        group, _, line = entry.partition(": ")
+        drawn: list[tuple[str, str, NDArray[np.float64]]] = []
+        axis = axis_of(view)
+        for index in shown:
+            one = view.opened[index]
+            lines = self._found[one.id].get(group if line else entry)
+            if lines is None or (line and line not in lines):
+                continue
+            states, values = lines[line] if line else next(iter(lines.values()))
+            name = f"{letter(index)}" if len(view.opened) > 1 else entry
+            drawn.append((name, COLOURS[index % 4], column_at(states, values, view.anchors[index], axis)))
+        cursor = next((i for i, index in enumerate(shown) if index == view.selected), 0)
+        self._put(chart, entry, axis, drawn, view.position, cursor if cursor < len(drawn) else 0)
+
+    def _draw_lines(self, chart: str, entry: str, view: ReviewView) -> None:
+        """An entry with several lines, of the selected recording."""
+        chosen, axis = view.chosen, axis_of(view)
+        lines = {} if chosen is None else self._found[chosen.id].get(entry, {})
+        drawn = [
+            (name, colour, column_at(states, values, view.anchors[view.selected], axis))
+            for (name, (states, values)), colour in zip(lines.items(), LINE_COLOURS, strict=False)
+        ]
+        whose = f", {letter(view.selected)}" if len(view.opened) > 1 else ""
+        self._put(chart, f"{entry}{whose}", axis, drawn, None, 0)
+
+    def _put(
+        self,
+        chart: str,
+        title: str,
+        axis: NDArray[np.int64],
+        drawn: list[tuple[str, str, NDArray[np.float64]]],
+        position: int | None,
+        cursor: int,
+    ) -> None:
+        handle = self._charts.get(chart)
+        known = [d for d in drawn if np.isfinite(d[2]).any()]
+        if not known or len(axis) < 2:
+            if handle is not None:
+                show(handle, False)
+            return
+        stride = max(1, -(-len(axis) // LONGEST))
+        x = axis[::stride].astype(np.float64)
+        data: tuple[NDArray[np.float64], ...] = (x, *(d[2][::stride] for d in drawn))
+        series = [uplot.Series(label="step")]
+        series += [
+            uplot.Series(label=name, stroke=colour, width=1.7, points={"show": False})
+            for name, colour, _ in drawn
+        ]
+        if position is not None:
+            dot = np.full(len(x), np.nan)
+            at = min(int(round((position - axis[0]) / stride)), len(x) - 1)
+            dot[at] = drawn[cursor][2][position - int(axis[0])]
+            data, series = (*data, dot), [*series, CURSOR]
+        # uPlot finds no range for data with NaN in it.
+        scales = {"x": uplot.Scale(time=False), "y": uplot.Scale(range=value_span(data[1:]))}
+        if handle is None:
+            with self._charts_folder:
+                self._charts[chart] = self._server.gui.add_uplot(
+                    data,
+                    tuple(series),
+                    title=title,
+                    scales=scales,
+                    axes=(uplot.Axis(size=30), uplot.Axis(size=46)),
+                    legend=uplot.Legend(show=True),
+                    height=150 if chart != "action" else 190,
+                    padding=(6, 12, 0, 0),
+                    order=ORDER[chart],
+                )
+            return
+        if handle.title != title:
+            handle.title = title
+        if handle.series != tuple(series) or handle.scales != scales:
+            # The data must fit the series in every state that the browser may see.
+            with self._server.atomic():
+                handle.series, handle.scales = tuple(series), scales
+                handle.data = data
+        else:
+            handle.data = data
+        show(handle, True)
+
+
+ORDER = {"reward": 1.0, "also": 2.0, "terms": 3.0, "action": 4.0}
+
+
+def known(number: str) -> str:
+    """A number as it is said in the table: an entry that the state lacks is kept as NaN."""
+    return "—" if number == "nan" else number
+
+
+def shown_together(view: ReviewView) -> tuple[int, ...]:
+    """Which recordings have lines in one chart: all, or the selected one where they are too many."""
+    return tuple(range(len(view.opened))) if len(view.opened) <= MOST_COMPARED else (view.selected,)
+
+
+def axis_of(view: ReviewView) -> NDArray[np.int64]:
+    return np.arange(view.first, view.last + 1)

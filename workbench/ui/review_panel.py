@@ -1,0 +1,193 @@
+"""The Review tab: play, which recordings are open, how they lie to each other, and what is known of the selected one.
+
+Play, speed and loop are at the top as on the live page. With one recording there is nothing to compare, and the
+controls for that are not there.
+"""
+
+from __future__ import annotations
+
+import datetime
+import shlex
+from collections.abc import Callable
+
+import viser
+
+from workbench.session.review import MOST_COMPARED, SPEEDS, Review
+from workbench.session.review_events import success_words
+from workbench.session.review_view import Opened, ReviewView
+from workbench.ui.changed import fill, show
+from workbench.ui.checked import checked_choice
+from workbench.ui.controls import Control
+from workbench.ui.fragments import render
+from workbench.ui.presses import Presses
+from workbench.ui.review_scene import COLOURS, letter
+
+SPEED_NAMES = {f"{speed:g} ×": speed for speed in SPEEDS}
+GHOSTS, GRID = "over each other", "side by side"
+GO_LIVE = "Go on live from here"
+
+
+class ReviewPanel:
+    """
+    Args:
+        server: The page.
+        review: What is shown and asked.
+        on_step_back: Called with the id of the selected recording and the state that is shown, when a person wants to
+            go on from there live; None leaves the button out.
+    """
+
+    def __init__(
+        self, server: viser.ViserServer, review: Review, on_step_back: Callable[[str, int], None] | None
+    ) -> None:
+        self._review, self._on_step_back = review, on_step_back
+        gui = server.gui
+        self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY, visible=False)
+        self._play.on_click(lambda _: review.toggle_play())
+        self._live = gui.add_button(
+            GO_LIVE,
+            icon=viser.Icon.PLAYER_TRACK_NEXT,
+            color="gray",
+            visible=False,
+            hint="Restores the state that is shown in the live env, with today's code (G).",
+        )
+        self._live.on_click(lambda _: self.step_back())
+        self._speed = Control(
+            gui.add_dropdown("Speed", tuple(SPEED_NAMES), initial_value="1 ×", visible=False),
+            read=lambda value: SPEED_NAMES[checked_choice(value, SPEED_NAMES, "speed")],
+            send=review.set_speed,
+            shown=lambda speed: next((n for n, known in SPEED_NAMES.items() if known == speed), "1 ×"),
+        )
+        self._loop = Control(
+            gui.add_checkbox("Loop", False, visible=False),
+            read=lambda value: checked_choice(value, (True, False), "choice"),
+            send=review.set_loop,
+        )
+        self._problems = gui.add_html("")
+        self._list = gui.add_html("")
+        self._arrange = gui.add_dropdown(
+            "Draw them", (GHOSTS, GRID), initial_value=GHOSTS, visible=False, hint="The O key changes it."
+        )
+        align: viser.GuiDropdownHandle = gui.add_dropdown(
+            "Align at", ("start",), initial_value="start", visible=False
+        )
+        self._align = Control(
+            align,
+            read=lambda value: checked_choice(value, review.view().alignments, "moment"),
+            send=review.align,
+        )
+        self._never = gui.add_html("")
+        self._facts = gui.add_html("")
+        self._presses = Presses(server)
+
+    @property
+    def ghosts(self) -> bool:
+        """Whether the recordings are drawn over each other, as far as there are few enough of them."""
+        return self._arrange.value == GHOSTS and len(self._review.view().opened) <= MOST_COMPARED
+
+    def toggle_arrangement(self) -> None:
+        self._arrange.value = GRID if self._arrange.value == GHOSTS else GHOSTS
+
+    def step_back(self) -> None:
+        view = self._review.view()
+        if self._on_step_back is not None and view.chosen is not None:
+            self._on_step_back(view.chosen.id, view.states[view.selected])
+
+    def select_neighbour(self, step: int) -> None:
+        """The next (1) or previous (-1) opened recording, round the end."""
+        view = self._review.view()
+        if view.opened:
+            self._review.select((view.selected + step) % len(view.opened))
+
+    def draw(self, view: ReviewView) -> None:
+        there = bool(view.opened)
+        for handle in (self._play, self._speed.handle, self._loop.handle):
+            show(handle, there)
+        show(self._live, there and self._on_step_back is not None)
+        label = "Pause" if view.playing else "Play"
+        if self._play.label != label:
+            self._play.label = label
+            self._play.icon = viser.Icon.PLAYER_PAUSE if view.playing else viser.Icon.PLAYER_PLAY
+        self._speed.show(view.speed)
+        self._loop.show(view.loop)
+        fill(self._problems, render("review_problems", problems=view.problems, loading=view.loading))
+        fill(self._list, self._list_html(view))
+        show(self._arrange, 1 < len(view.opened) <= MOST_COMPARED)
+        show(self._align.handle, len(view.opened) > 1 and len(view.alignments) > 1)
+        if self._align.handle.options != view.alignments:
+            self._align.handle.options = view.alignments
+        self._align.show(view.align)
+        fill(self._never, render("note", text=never_words(view)) if never_words(view) else "")
+        chosen = view.chosen
+        fill(self._facts, "" if chosen is None else render("review_facts", rows=facts(chosen)))
+
+    def _list_html(self, view: ReviewView) -> str:
+        if not view.opened and view.loading:
+            return ""
+        rows = []
+        for index, one in enumerate(view.opened):
+            words, mood = success_words(one.episode)
+            rows.append(
+                {
+                    "letter": letter(index),
+                    "colour": COLOURS[index % len(COLOURS)],
+                    "task": one.episode.info.task,
+                    "seed": "" if one.episode.info.seed < 0 else one.episode.info.seed,
+                    "steps": one.length,
+                    "total": f"{float(one.episode.reward.sum()):.2f}",
+                    "ended": words,
+                    "mood": mood,
+                    "scene": one.scene,
+                    "name": one.name,
+                    "selected": index == view.selected,
+                    "press": self._presses.id_of(
+                        ("select", index), lambda _, index=index: self._review.select(index)
+                    ),
+                    "close": self._presses.id_of(
+                        ("close", index), lambda _, index=index: self._review.close_one(index)
+                    ),
+                }
+            )
+        return render("review_opened", rows=rows)
+
+
+def never_words(view: ReviewView) -> str:
+    """Which recordings have no moment to be aligned at."""
+    name = view.align.removeprefix("first ")
+    without = [letter(i) for i, one in enumerate(view.opened) if one.first(name) is None]
+    if view.align == "start" or not without:
+        return ""
+    verb = "has" if len(without) == 1 else "have"
+    return f"{', '.join(without)} {verb} no {name}, and {'is' if len(without) == 1 else 'are'} aligned at the start."
+
+
+def facts(one: Opened) -> list[tuple[str, str, str]]:
+    """Name, value, and what to show when the pointer rests there."""
+    info = one.episode.info
+    rows = [("file", one.name, one.name), ("recorded", local_time(info.written_at), info.written_at)]
+    if info.seed >= 0:
+        rows.append(("seed", str(info.seed), "of the episode"))
+    if info.reset_options:
+        rows.append(("reset options", short(info.reset_options), short(info.reset_options, 2000)))
+    if info.source_hash:
+        rows.append(("source", info.source_hash, info.source_file or ""))
+    rows.append(("ran on", info.backend, ", ".join(f"{k} {v}" for k, v in info.versions.items())))
+    if info.control_mode:
+        rows.append(("control mode", info.control_mode, ""))
+    kwargs = {k: v for k, v in info.env_kwargs.items() if k != "control_mode"}
+    if kwargs:
+        rows.append(("made with", short(kwargs), short(kwargs, 2000)))
+    if info.recovered:
+        rows.append(("cut short", "its writer ended in the middle", ""))
+    return rows
+
+
+def short(values: dict[str, object], longest: int = 120) -> str:
+    text = ", ".join(f"{name}={shlex.quote(str(value))}" for name, value in values.items())
+    return text if len(text) <= longest else text[: longest - 1] + "…"
+
+
+def local_time(written: str) -> str:
+    try:
+        return datetime.datetime.fromisoformat(written).astimezone().strftime("%Y-%m-%d %H:%M:%S")
+    except ValueError:
+        return written

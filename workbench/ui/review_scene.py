@@ -1,0 +1,154 @@
+"""Opened recordings as one scene: over each other, the later ones tinted and see-through, or side by side.
+
+The view draws envs of one scene. Recordings are made into that: each is an env, their bodies go by name, and what
+looks the same in several is one shape with several wearers, so four recordings of a task cost what four envs do.
+
+Drawn over each other, the first keeps its looks and each other one is the same shapes in its colour, half
+see-through, for as long as they are elsewhere than the first one's. What stands at the same place in both for the whole time (the table, the floor) is drawn once: a tint
+over all of it would say nothing and hide the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.core.geometry import BodyKind, Material, SceneGeometry, Visual
+from workbench.session.review_compare import distances
+from workbench.session.review_view import Opened
+from workbench.ui.env_layout import EnvLayout, lay_out
+from workbench.ui.meshes_as_glb import fingerprint
+
+COLOURS = ("#228be6", "#f08c00", "#2f9e44", "#be4bdb")
+"""Of the recordings that are compared, in legends, curves and the view."""
+SEE_THROUGH = 0.45
+"""Alpha of a ghost. Less vanishes over a white table, more hides what is behind."""
+APART = 5e-4
+"""Metres from which on a ghost is drawn beside the body that it is a ghost of."""
+_SAME_PLACE = 1e-5
+
+
+@dataclass(frozen=True, eq=False)
+class ReviewScene:
+    """What the view draws of some opened recordings."""
+
+    geometry: SceneGeometry
+    layout: EnvLayout
+    ghosts: bool
+    _poses: tuple[NDArray[np.float32], ...]
+    """Of each recording (T + 1, its bodies, 7)."""
+    _bodies: tuple[NDArray[np.int64], ...]
+    """Of each recording: where its bodies are among all."""
+
+    def poses(self, states: Sequence[int]) -> NDArray[np.float32]:
+        """(N, B, 7) at that state of each recording; NaN for what a recording lacks."""
+        found = _side_by_side(self._poses, self._bodies, len(self.geometry.body_names), states)
+        if self.ghosts:
+            for ghost in found[1:]:
+                # Two skins at one place make a pattern of patches; one sees better where they part.
+                ghost[distances(found[0], ghost) < APART] = np.nan
+        return found
+
+
+def letter(index: int) -> str:
+    """What a recording is called on the page: A to D, then numbers."""
+    return "ABCD"[index] if index < 4 else str(index + 1)
+
+
+def review_scene(opened: Sequence[Opened], ghosts: bool) -> ReviewScene | None:
+    """The scene of these recordings; None if none of them has one."""
+    if not any(one.has_scene for one in opened):
+        return None
+    names: dict[str, BodyKind] = {}
+    hidden: dict[str, bool] = {}
+    for one in opened:
+        if one.episode.geometry is not None:
+            own = one.episode.geometry
+            for name, kind, is_hidden in zip(own.body_names, own.body_kinds, own.body_hidden, strict=True):
+                names.setdefault(name, kind)
+                hidden.setdefault(name, is_hidden)
+    rows = {name: row for row, name in enumerate(names)}
+    poses, bodies = [], []
+    shapes: dict[tuple[str, int, int], tuple[Visual, list[int]]] = {}
+    first: Opened | None = None
+    for index, one in enumerate(opened):
+        geometry, track = one.episode.geometry, one.episode.poses
+        if geometry is None or track is None:
+            poses.append(np.zeros((one.length + 1, 0, 7), np.float32))
+            bodies.append(np.zeros(0, np.int64))
+            continue
+        poses.append(track)
+        bodies.append(np.array([rows[name] for name in geometry.body_names], np.int64))
+        ghost = ghosts and first is not None
+        left_out = bodies_at_rest(first, one) if ghost and first is not None else frozenset()
+        first = first or one
+        for visual in geometry.visuals:
+            for body in visual.bodies:
+                name = geometry.body_names[int(body)]
+                if name in left_out:
+                    continue
+                worn = (
+                    replace(visual, material=tinted(visual.material, COLOURS[index % 4])) if ghost else visual
+                )
+                looks = fingerprint((worn,))
+                number = 0
+                # The same shape twice on one body, at the same place: two visuals, as in the recording.
+                while (looks, rows[name], number) in shapes and index in shapes[looks, rows[name], number][1]:
+                    number += 1
+                shapes.setdefault((looks, rows[name], number), (worn, []))[1].append(index)
+    visuals = tuple(
+        Visual(
+            name=f"{visual.name} {number}",
+            mesh=visual.mesh,
+            material=visual.material,
+            envs=np.array(envs, np.int32),
+            bodies=np.full(len(envs), row, np.int32),
+        )
+        for number, ((_, row, _), (visual, envs)) in enumerate(shapes.items())
+    )
+    geometry = SceneGeometry(
+        len(opened), tuple(names), tuple(names.values()), tuple(hidden.values()), visuals
+    )
+    layout = lay_out(geometry, _side_by_side(poses, bodies, len(names), [0] * len(opened)))
+    if ghosts:
+        layout = replace(layout, offsets=np.zeros_like(layout.offsets))
+    return ReviewScene(geometry, layout, ghosts, tuple(poses), tuple(bodies))
+
+
+def bodies_at_rest(first: Opened, other: Opened) -> frozenset[str]:
+    """Bodies that stand at one and the same place in both for the whole time."""
+    found = []
+    a, b = first.episode, other.episode
+    if a.geometry is None or b.geometry is None or a.poses is None or b.poses is None:
+        return frozenset()
+    places = {name: a.poses[:, row] for row, name in enumerate(a.geometry.body_names)}
+    for row, name in enumerate(b.geometry.body_names):
+        if name in places:
+            here, there = places[name], b.poses[:, row]
+            if np.all(np.abs(here - here[0]) < _SAME_PLACE) and np.all(np.abs(there - here[0]) < _SAME_PLACE):
+                found.append(name)
+    return frozenset(found)
+
+
+def tinted(material: Material, colour: str) -> Material:
+    """Mostly that colour, half see-through, and without texture: the shape is what is compared."""
+    tint = np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]) ** 2.2
+    own = np.array(material.base_color[:3])
+    red, green, blue = (float(c) for c in 0.75 * tint + 0.25 * own)
+    return Material((red, green, blue, SEE_THROUGH * material.base_color[3]), 0.0, 1.0)
+
+
+def _side_by_side(
+    poses: Sequence[NDArray[np.float32]],
+    bodies: Sequence[NDArray[np.int64]],
+    count: int,
+    states: Sequence[int],
+) -> NDArray[np.float32]:
+    found = np.full((len(states), count, 7), np.nan, np.float32)
+    for index, state in enumerate(states):
+        if len(bodies[index]):
+            found[index, bodies[index]] = poses[index][state]
+    return found
