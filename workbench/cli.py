@@ -244,6 +244,57 @@ def review(
 
 
 @app.command
+def rescore(
+    places: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    /,
+    task: str | None = None,
+    recorded_source: bool = False,
+    use_env_states: bool = False,
+    num_envs: int = 16,
+    backend: Backend = "auto",
+    csv: Path | None = None,
+    json: Path | None = None,
+) -> int:
+    """Judge recorded episodes again with today's reward and evaluate, and say what is otherwise.
+
+    Args:
+        places: recordings (.json, .h5 or .rrd of the workbench, .h5 of ManiSkill's RecordEpisode) and folders of them.
+        task: a task file, file.py:ClassName or id to judge all of them with, in place of the one each names.
+        recorded_source: judge each by the text that it was recorded with.
+        use_env_states: put every recorded state in after its step, so that nothing drifts from the record.
+        num_envs: episodes to run at once.
+        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (gpu if it works).
+        csv: also write the table to this file, as CSV.
+        json: also write the table to this file, as JSON.
+    """
+    from workbench.rescore_command import run_rescore
+
+    if task is not None and recorded_source:
+        return _refuse("--task and --recorded-source name two versions to judge with: give one of them")
+    for table in (csv, json):
+        if table is not None and not table.resolve().parent.is_dir():
+            return _refuse(f"there is no folder {table.resolve().parent} to write {table.name} into")
+    try:
+        base = _task_options(num_envs, backend, 0, ())
+    except ValueError as error:
+        return _refuse(str(error))
+    _use_private_driver()
+    from workbench.authoring.problem import TaskError
+    from workbench.session.rescore_all import RescoreOptions
+
+    what = RescoreOptions(places, task, recorded_source, use_env_states, num_envs, base)
+    try:
+        return run_rescore(what, out, err, csv, json)
+    except TaskError as error:
+        _print_problem(error.problem)
+        return 1
+    except (OSError, ValueError) as error:
+        return _refuse(str(error))
+    except KeyboardInterrupt:
+        return _refuse("interrupted")
+
+
+@app.command
 def view(files: Annotated[tuple[Path, ...], tyro.conf.Positional], /, web: bool = False) -> int:
     """Open recordings in rerun's own viewer: a window, or a page where there is no screen.
 

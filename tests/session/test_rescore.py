@@ -13,7 +13,7 @@ import pytest
 from tests.session.recorded_runs import Recorded, opened, reaching, record
 from workbench.core.recorded_run import RecordedRun
 from workbench.recording.episode import Episode, EpisodeInfo
-from workbench.session.rescore import Verdict
+from workbench.session.rescore_messages import Verdict
 from workbench.session.rescore_run import rescore
 
 TASKS = Path(__file__).parents[2] / "tasks"

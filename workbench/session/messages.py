@@ -25,6 +25,7 @@ from workbench.session.camera_messages import (
     CameraQuestion,
     Searching,
 )
+from workbench.session.rescore_messages import Rescore, Rescored
 
 Backend = Literal["auto", "cpu", "gpu"]
 ActionSource = Literal["hold", "zero", "random", "sliders", "policy"]
@@ -288,6 +289,7 @@ Request = (
     | WarmUp
     | Inspect
     | JudgeMoments
+    | Rescore
     | Quit
 )
 
@@ -459,6 +461,7 @@ Event = (
     | PastPictures
     | Inspection
     | Judged
+    | Rescored
     | Status
     | WarmedUp
 )

@@ -7,12 +7,14 @@ record. Envs that have none left stand still.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.authoring.problem import TaskError
 from workbench.core.recorded_run import RecordedRun
 from workbench.core.recorded_state import apart, read_states, write_states
 from workbench.core.stand_still import only_these_move
@@ -20,8 +22,12 @@ from workbench.core.step import StepResult
 from workbench.recording.read_episode import UnreadableRecording
 from workbench.session.open_task import OpenedTask, blamed, step_checked
 from workbench.session.relive import Beginning, begin_again, why_not_lived_through
-from workbench.session.rescore import EpisodeFile, Heard, Verdict, verdict_of
+from workbench.session.rescore import Heard, verdict_of
+from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored, Verdict
 from workbench.session.step_back import run_of
+
+_TELL_EVERY = 0.2
+"""Seconds."""
 
 
 @dataclass
@@ -82,6 +88,28 @@ def rescore(
             seat = seats.pop(env)
             verdict = verdict_of(seat.file, seat.run, seat.task, seat.heard)
             yield replace(verdict, begins_otherwise=seat.beginning.otherwise, missed=seat.beginning.missed)
+
+
+def answer(opened: OpenedTask, request: Rescore, send: Callable[[Rescored], None]) -> None:
+    """Carry out `request` in a worker, telling how far it is a few times a second."""
+    told, steps = time.monotonic(), 0
+    ready: list[Verdict] = []
+
+    def tell(now: int) -> None:
+        nonlocal told, steps
+        steps = now
+        if time.monotonic() - told > _TELL_EVERY:
+            told = time.monotonic()
+            send(Rescored(tuple(ready), steps, False))
+            ready.clear()
+
+    try:
+        for verdict in rescore(opened, request.files, use_env_states=request.use_env_states, on_steps=tell):
+            ready.append(verdict)
+    except TaskError as error:
+        send(Rescored(tuple(ready), steps, True, error.problem))
+        return
+    send(Rescored(tuple(ready), steps, True))
 
 
 def _ready(opened: OpenedTask, file: EpisodeFile, use_env_states: bool) -> tuple[str, RecordedRun] | Verdict:
