@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from workbench.gym_env import make as make
+    from workbench.recorder import Recorder as Recorder
 
 __version__ = "0.1.0"
 
@@ -17,4 +18,8 @@ def __getattr__(name: str) -> Any:
         from workbench.gym_env import make
 
         return make
+    if name == "Recorder":
+        from workbench.recorder import Recorder
+
+        return Recorder
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

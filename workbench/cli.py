@@ -130,66 +130,51 @@ def open_page(
 def record(
     task: Task,
     /,
-    episodes: int = 4,
+    episodes: int | None = None,
+    successes: int | None = None,
+    tries: int | None = None,
     num_envs: int = 4,
+    workers: int = 1,
     seed: int = 0,
     actions: str = "random",
+    use_env_states: bool = False,
     out: Path = Path("recordings"),
     pictures: bool = True,
     max_steps: int | None = None,
     backend: Backend = "auto",
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
 ) -> int:
-    """Record episodes of a task, one .rrd file each, without a page.
+    """Record episodes of a task without a page: for each an .rrd, and ManiSkill's own .h5 with its .json.
 
     Args:
         task: a task file, file.py:ClassName, or a registered env id such as PickCube-v1.
-        episodes: how many, over all envs.
-        num_envs: environments to run at once.
+        episodes: how many, over all envs; 4, or as many as a file of actions has.
+        successes: go on until so many episodes succeeded, and keep no others.
+        tries: give up after so many episodes where successes are wanted; 100 for each.
+        num_envs: environments to run at once, over all workers.
+        workers: processes, each with its share of the envs; the episodes are the same with any number.
         seed: seed of the first episode; each further one counts up.
-        actions: random, zero, hold, or a policy as module:function or file.py:function.
+        actions: random, zero, hold; a policy as module:function or file.py:function; or a file: .npy or .npz with
+            actions, or .h5 with ManiSkill's demonstrations, which begin from their own seeds.
+        use_env_states: put every env state of a demonstration back after its step.
         out: folder for the files.
         pictures: record what every camera sees (--no-pictures is much faster).
         max_steps: longest episode; else the task's own limit.
         backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (gpu if it works).
         env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
     """
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
     _use_private_driver()
-    from workbench.authoring.problem import TaskError
+    from workbench.record_command import record_in_terminal
     from workbench.session.record import RecordOptions
-    from workbench.session.record import record as record_episodes
 
     try:
         options = _task_options(num_envs, backend, seed, env)
     except ValueError as error:
         return _refuse(str(error))
-    what = RecordOptions(task, out, episodes, actions, pictures, max_steps, options)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    try:
-        with Progress(*columns, console=err) as bar:
-            row = bar.add_task("opening", total=episodes)
-            written = record_episodes(
-                what,
-                on_activity=lambda activity: bar.update(row, description=activity),
-                on_progress=lambda now: bar.update(
-                    row, completed=now.episodes, description=f"recording, step {now.steps}"
-                ),
-            )
-            bar.update(row, completed=len(written), description="recorded")
-    except TaskError as error:
-        _print_problem(error.problem)
-        return 1
-    except (OSError, ValueError) as error:
-        return _refuse(str(error))
-    except KeyboardInterrupt:
-        return _refuse("interrupted; episodes that had ended are kept")
-    for episode in written:
-        ended = {None: "", True: "success", False: "no success"}[episode.success]
-        print(f"{episode.path}  {episode.steps} steps  return {episode.total_reward:.3f}  {ended}".rstrip())
-    print(f"Open one with: workbench view {written[0].path}")
-    return 0
+    what = RecordOptions(
+        task, out, episodes, successes, tries, actions, use_env_states, pictures, max_steps, workers, options
+    )
+    return record_in_terminal(what, err, _print_problem, _refuse)
 
 
 @app.command

@@ -31,7 +31,7 @@ DEATH = Death("was killed by SIGSEGV", False, False, "stepping", "", False)
 
 
 def view(state: LiveState) -> SessionView:
-    recording = RecordingStatus(False, (), 0, 0, "recordings", None, None)
+    recording = RecordingStatus(folder="recordings")
     return state.view(
         recording=recording, printed=NOTHING_PRINTED, vitals=Vitals(), judgement=JudgementView()
     )

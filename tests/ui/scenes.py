@@ -132,7 +132,7 @@ EMPTY = SessionView(
     sliders=(),
     steps_per_second=0.0,
     real_time_factor=0.0,
-    recording=RecordingStatus(False, (), 0, 0, "recordings", None, None),
+    recording=RecordingStatus(folder="recordings"),
     printed=NOTHING_PRINTED,
 )
 """A session that has just begun."""

@@ -258,12 +258,23 @@ def _refused(message: str, file: Path | None = None) -> TaskError:
 # --- the class -----------------------------------------------------------------------------------
 
 
-def _registered(env_id: str) -> LoadedTask:
+def task_of_class(cls: type[BaseEnv], env_id: str) -> LoadedTask:
+    """What is known of a class that is there already, under whatever id it goes.
+
+    If it came from a file that `load_task` read, with the texts that were executed; else with those on disk.
+    """
     spec = registry.environment(env_id)
-    assert spec is not None
+    limit, kwargs = (None, {}) if spec is None else (spec.max_episode_steps, dict(spec.default_kwargs))
+    for load in _loads.values():
+        if vars(sys.modules.get(load.finder.main, object)).get(cls.__name__) is cls:
+            fields = _source_fields(load.finder)
+            return LoadedTask(
+                cls, env_id, cls.__name__, load.finder.file, **fields, max_episode_steps=limit,
+                default_kwargs=kwargs, followed=True,
+            )  # fmt: skip
     source: dict[str, str] = {}
     try:
-        name = inspect.getsourcefile(spec.cls)
+        name = inspect.getsourcefile(cls)
     except (TypeError, OSError):  # a class made without a file: in a notebook, or by type()
         name = None
     if name is not None:
@@ -274,17 +285,23 @@ def _registered(env_id: str) -> LoadedTask:
             name = None
     files = tuple(Path(path) for path in source)
     return LoadedTask(
-        cls=spec.cls,
+        cls=cls,
         env_id=env_id,
-        class_name=spec.cls.__name__,
+        class_name=cls.__name__,
         file=files[0] if files else None,
         source_files=files,
         source=source,
         source_hash=source_hash(source, files[0].parent if files else Path()),
-        max_episode_steps=spec.max_episode_steps,
-        default_kwargs=dict(spec.default_kwargs),
+        max_episode_steps=limit,
+        default_kwargs=kwargs,
         followed=False,
     )
+
+
+def _registered(env_id: str) -> LoadedTask:
+    spec = registry.environment(env_id)
+    assert spec is not None
+    return dataclasses.replace(task_of_class(spec.cls, env_id), followed=False)
 
 
 def _choose(

@@ -26,7 +26,7 @@ from workbench.core import seams
 from workbench.core.contact_list import Contact
 from workbench.core.inspection import Inspection, JointReadings, Leaf, Section, Touching
 from workbench.core.snapshot import restore_memory, take_memory
-from workbench.core.task_env import TaskEnv, to_numpy
+from workbench.core.task_env import TaskEnv, flat_entries, to_numpy
 
 MOST_VALUES = 64
 """Numbers of one array that are sent; a joint vector has fewer, a picture has more."""
@@ -73,9 +73,9 @@ def inspect_env(task: TaskEnv, env: int, sections: Collection[Section]) -> Inspe
 def read_observation(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
     """The last observation; a flattened one (N, D) taken apart by the names of what it was made of."""
     leaves: list[Leaf] = []
-    for name, value in _flat(_tree(task.obs)):
+    for name, value in flat_entries(_tree(task.obs)):
         # "state" is what ManiSkill calls the flattened part beside the pictures.
-        names = _names_of_flat(task, value) if name in ("", "state") else None
+        names = names_of_flat(task, value) if name in ("", "state") else None
         if names is None:
             leaves.append(_leaf(name or "observation", _row(value, env, task.num_envs)))
             continue
@@ -97,7 +97,7 @@ def read_state(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
             rows[f"{group}/{struct.name}"] = struct
     leaves: list[Leaf] = []
     state: Any = task.env.get_state_dict()
-    for name, value in _flat(state):
+    for name, value in flat_entries(state):
         struct = rows.get(name)
         if struct is None:
             leaves.append(_leaf(name, _row(value, env, task.num_envs)))
@@ -196,7 +196,7 @@ _layouts: WeakKeyDictionary[Any, tuple[type, int, list[tuple[str, tuple[int, ...
 )
 
 
-def _names_of_flat(task: TaskEnv, flat: Any) -> list[tuple[str, tuple[int, ...], str]] | None:
+def names_of_flat(task: TaskEnv, flat: Any) -> list[tuple[str, tuple[int, ...], str]] | None:
     """Name, shape and dtype of each part of a flattened observation (N, D), or None if they cannot be told."""
     env = task.env
     if not isinstance(flat, torch.Tensor) or flat.ndim != 2 or not env.obs_mode_struct.state:
@@ -218,7 +218,7 @@ def _find_names(task: TaskEnv, width: int) -> list[tuple[str, tuple[int, ...], s
     finally:
         restore_memory(env, memory, every, every, whole=True)
     parts = []
-    for name, value in _flat(obs):
+    for name, value in flat_entries(obs):
         if isinstance(value, torch.Tensor) and value.nelement():
             made: Any = common.flatten_state_dict({"value": value}, use_torch=True, device=env.device)
             shape = tuple(value.shape[1:]) if np.prod(value.shape[1:], dtype=int) == made.shape[-1] else None
@@ -231,14 +231,6 @@ def _tree(obs: Any) -> Mapping[str, Any]:
     if obs is None:
         return {}
     return obs if isinstance(obs, Mapping) else {"": obs}
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}/")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def _row(value: Any, env: int, num_envs: int) -> NDArray:

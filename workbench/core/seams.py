@@ -230,6 +230,16 @@ def keep_observation(env: BaseEnv, obs: Any) -> None:
     env._last_obs = obs
 
 
+def last_observation(env: BaseEnv) -> Any:
+    """What ``reset`` or ``step`` observed last, before any wrapper: ``_last_obs``."""
+    return env._last_obs
+
+
+def task_class(env: BaseEnv) -> type[BaseEnv]:
+    """The author's class, without what the CPU core puts in front of it."""
+    return getattr(type(env), "_workbench_task", type(env))
+
+
 def episode_generators(env: BaseEnv) -> dict[str, list[np.random.RandomState]]:
     """Each env's numpy generators: of its episodes, and of the seeds of its episodes."""
     return {"episode": env._batched_episode_rng.rngs, "main": env._batched_main_rng.rngs}

@@ -8,7 +8,7 @@ GPU simulation, and the caller need not know which.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -29,6 +29,7 @@ from workbench.core.seams import (
     episode_seeds,
     flatten_observation,
     keep_observation,
+    last_observation,
     set_episode_seeds,
 )
 from workbench.core.snapshot import (
@@ -269,6 +270,26 @@ class TaskEnv:
             self._check(info, given)
         return self._result(info, reward, self._terminated(info), action)
 
+    def result_of(
+        self,
+        info: Mapping[str, Any],
+        reward: Any,
+        terminated: Any,
+        truncated: Any,
+        action: NDArray[np.float32] | None,
+    ) -> StepResult:
+        """What somebody else's ``env.step`` (or ``env.reset``: no action) gave, who went past this object."""
+        self._refresh_if_rebuilt()
+        self.obs = last_observation(self.env)
+        info = {key: value for key, value in info.items() if key != "reconfigure"}
+        result = self._result(
+            info,
+            _batch(to_numpy(reward).astype(np.float32), self.num_envs),
+            _batch(to_numpy(terminated).astype(bool), self.num_envs),
+            action,
+        )
+        return replace(result, truncated=_batch(to_numpy(truncated).astype(bool), self.num_envs))
+
     @property
     def observes_pictures(self) -> bool:
         """Whether every step draws the scene for the observation."""
@@ -306,7 +327,9 @@ class TaskEnv:
         elapsed = to_numpy(self.env.elapsed_steps).astype(np.int32)
         limit = self.max_episode_steps
         truncated = np.zeros(self.num_envs, bool) if limit is None else elapsed >= limit
-        evaluate = {k: _batch(to_numpy(v), self.num_envs) for k, v in _flat(info) if k != "elapsed_steps"}
+        evaluate = {
+            k: _batch(to_numpy(v), self.num_envs) for k, v in flat_entries(info) if k != "elapsed_steps"
+        }
         return StepResult(
             elapsed_steps=elapsed,
             reward=reward,
@@ -327,10 +350,11 @@ def _seed_list(seed: int | Sequence[int] | None, count: int) -> list[int] | None
     return seeds
 
 
-def _flat(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flat_entries(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The leaves of a nested dict, named by the keys that lead to them, joined by ``/``."""
     for key, value in info.items():
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{key}/")
+            yield from flat_entries(value, f"{prefix}{key}/")
         else:
             yield f"{prefix}{key}", value
 

@@ -454,6 +454,11 @@ class CameraStudio:
             self._writing.failed_to_load()
         self._note()
 
+    def placed_cameras(self) -> tuple[PlaceCamera, ...]:
+        """What is to be asked of another worker, so that its cameras stand where they are placed."""
+        with self._lock:
+            return tuple(PlaceCamera(key, settings) for key, settings in self._placements.all_moved.items())
+
     def placed(self, event: Placed) -> None:
         """The worker's answer to a placement."""
         requests: list[PlaceCamera] = []

@@ -1,97 +1,221 @@
-"""From the stream of steps of a batch to finished episodes, one env at a time.
+"""From the stream of steps of a batch to episodes, one env at a time.
 
-The page's Record button and ``workbench record`` gather the same way: an env's episode begins with a
-reset and ends when it terminates, is truncated, or is reset; whoever gathers gets it as columns.
+The page's Record button, ``workbench record`` and `workbench.Recorder` gather the same way: an env's episode begins
+with a reset and ends when it terminates, is truncated, or is reset. What comes is a step of all envs; what is written
+is a file an env. So each env has a writer of its own, which gets that env's row of every step; whoever gathers gets
+the writer when the episode is over, and says whether it becomes files (`EpisodeWriter.finish` takes a fraction of a
+second, and may be done on another thread) or is forgotten.
+
+It is also the place where a broken stream is noticed. `elapsed_steps` of a real episode counts 0, 1, 2 ...; a step that
+was lost, or a reset that went by unseen, would otherwise become a file that looks right and is not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, Literal
 
-from workbench.core.pictures import CameraInfo, CameraKind, Picture
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.core.pictures import Picture
+from workbench.core.state_names import named_states_of, observation_of, states_of
 from workbench.core.step import StepResult
-from workbench.recording.columns import EpisodeBuilder
-from workbench.recording.episode import Episode, EpisodeInfo
+from workbench.recording.episode import EpisodeInfo
+from workbench.recording.episode_writer import EpisodeWriter
+from workbench.recording.row import EpisodeRow
 from workbench.session.messages import Stepped, TaskDescription
 
 _PACKAGES = ("maniskill-workbench", "mani_skill", "sapien", "torch", "rerun-sdk")
 
 
-def recorded_pictures(cameras: Iterable[CameraInfo]) -> tuple[tuple[str, CameraKind, tuple[str, ...]], ...]:
-    """What an episode keeps: of a sensor what a policy may see, of a human camera colour."""
-    asked = []
-    for camera in cameras:
-        wanted = ("rgb", "depth", "segmentation") if camera.kind == "sensor" else ("rgb",)
-        kept = tuple(modality for modality in wanted if modality in camera.modalities)
-        asked.append((camera.name, camera.kind, kept))
-    return tuple(asked)
+@dataclass
+class GatheredEpisode:
+    """An episode that is over, and not on the disk yet but for its journal."""
+
+    writer: EpisodeWriter
+    env: int
+    seed: int
+    """Below 0 where it is not known."""
+    steps: int = 0
+    total_reward: float = 0.0
+    success: bool | None = None
+    """At its last state; None for a task that says nothing of it."""
+    state_names: frozenset[str] = frozenset()
+    """Of the env states that its first row has."""
 
 
 class EpisodeGatherer:
-    """Gathers the episodes of some envs of one task; `on_episode` gets each when it ends."""
+    """Gathers the episodes of some envs of one task."""
 
     def __init__(
-        self, task: TaskDescription, env_idx: Sequence[int], on_episode: Callable[[Episode], None]
+        self,
+        task: TaskDescription,
+        env_idx: Sequence[int],
+        folder: Path,
+        on_episode: Callable[[GatheredEpisode], None],
+        *,
+        ends: Literal["over", "reset"] = "over",
+        one_each: bool = False,
+        reset_options: Mapping[str, Any] | None = None,
     ) -> None:
-        self._task = task
-        self._on_episode = on_episode
-        self._builders: dict[int, EpisodeBuilder | None] = {int(env): None for env in env_idx}
+        """
+        Args:
+            on_episode: gets each episode when it is over, and its writer with it.
+            ends: ``over`` ends an episode also where it terminates or is truncated, ``reset`` only where its env is
+                reset: for who goes on after that.
+            one_each: only the next episode of each env.
+        """
+        self._task, self._folder, self._on_episode = task, folder, on_episode
+        self._ends, self._one_each = ends, one_each
+        self.reset_options: Mapping[str, Any] = reset_options or {}
+        """Of the resets that come next."""
+        self._episodes: dict[int, GatheredEpisode | None] = {int(env): None for env in env_idx}
 
     @property
-    def steps(self) -> int:
-        """Steps gathered of the episodes under way, over all envs."""
-        return sum(len(builder) for builder in self._builders.values() if builder is not None)
+    def env_idx(self) -> tuple[int, ...]:
+        """The envs that are still gathered."""
+        return tuple(self._episodes)
+
+    @property
+    def under_way(self) -> tuple[GatheredEpisode, ...]:
+        """The episodes that have begun."""
+        return tuple(episode for episode in list(self._episodes.values()) if episode is not None)
 
     def take(self, stepped: Stepped) -> None:
-        """The next reset or step of the batch."""
-        for env in self._builders:
+        """The next reset or step of the batch.
+
+        Raises:
+            ValueError: it does not follow from the one before, or holds what no file can; what came before can still
+                be finished.
+            RecordingError: the disk does not take it.
+        """
+        for env in list(self._episodes):
             if stepped.reset_mask[env]:
                 self.end(env)
-                if stepped.step.elapsed_steps[env] != 0:
-                    continue  # somebody went back into an episode: no seed starts one there
-                seed = int(stepped.seeds[env]) if stepped.seeds is not None else -1
-                self._begin(env, stepped.step, seed, stepped.captured)
+                # Somebody may have gone back into an episode: no seed starts one there.
+                if env in self._episodes and stepped.step.elapsed_steps[env] == 0:
+                    self._begin(env, stepped)
             elif stepped.step.action is not None:
-                self._append(env, stepped.step, stepped.captured)
+                self._append(env, stepped)
 
     def finish(self) -> None:
         """End the episodes under way where they are."""
-        for env in self._builders:
+        for env in list(self._episodes):
             self.end(env)
 
     def end(self, env: int) -> None:
         """End the episode of `env` where it is; it must have a step to be kept."""
-        builder, self._builders[env] = self._builders[env], None
-        if builder is not None and len(builder) > 0:
-            self._on_episode(builder.finish())
-
-    def _begin(self, env: int, step: StepResult, seed: int, pictures: Iterable[Picture]) -> None:
-        task = self._task
-        info = EpisodeInfo(
-            task=task.env_id,
-            env_index=env,
-            seed=seed,
-            source_file=task.file,
-            source_hash=task.source_hash,
-            source=task.source,
-            control_dt=task.control_dt,
-            control_mode=task.control_mode,
-            backend=task.backend,
-            versions=package_versions(),
-        )
-        names = [dimension.name for dimension in task.actions]
-        builder = EpisodeBuilder(info, task.geometry, task.segmentation, names, task.cameras)
-        builder.start(step, env, pictures)
-        self._builders[env] = builder
-
-    def _append(self, env: int, step: StepResult, pictures: Iterable[Picture]) -> None:
-        builder = self._builders[env]
-        if builder is None:
+        episode = self._episodes.get(env)
+        if episode is None:
             return
-        builder.append(step, env, pictures)
-        if step.terminated[env] or step.truncated[env]:
+        self._episodes[env] = None
+        if episode.steps == 0:
+            episode.writer.discard()
+            return
+        if self._one_each:
+            del self._episodes[env]
+        self._on_episode(episode)
+
+    def drop(self, env: int) -> None:
+        """Forget the episode of `env`, if it has one."""
+        episode = self._episodes.get(env)
+        if episode is not None:
+            self._episodes[env] = None
+            episode.writer.discard()
+
+    def _begin(self, env: int, stepped: Stepped) -> None:
+        task = self._task
+        seed = int(stepped.seeds[env]) if stepped.seeds is not None else -1
+        writer = EpisodeWriter(
+            self._folder,
+            episode_info(task, env, seed, self.reset_options),
+            task.geometry,
+            task.segmentation,
+            [dimension.name for dimension in task.actions],
+            task.cameras,
+        )
+        try:
+            row = first_row(stepped.step, env, stepped.columns, stepped.captured)
+            writer.append(row)
+        except BaseException:
+            writer.discard()
+            raise
+        self._episodes[env] = GatheredEpisode(writer, env, seed, state_names=frozenset(row.env_states))
+
+    def _append(self, env: int, stepped: Stepped) -> None:
+        episode, step = self._episodes[env], stepped.step
+        if episode is None:
+            return
+        elapsed = int(step.elapsed_steps[env])
+        if elapsed != episode.steps + 1:
+            raise ValueError(
+                f"env {env}: step {episode.steps + 1} was expected and step {elapsed} came; a step was lost or the env "
+                "was reset unseen"
+            )
+        episode.writer.append(next_row(step, env, stepped.columns, stepped.captured, episode.state_names))
+        episode.steps = elapsed
+        episode.total_reward += float(step.reward[env])
+        success = step.evaluate.get("success")
+        episode.success = None if success is None else bool(np.any(success[env]))
+        if self._ends == "over" and (step.terminated[env] or step.truncated[env]):
             self.end(env)
+
+
+def first_row(
+    step: StepResult, env: int, columns: Mapping[str, NDArray], pictures: Iterable[Picture]
+) -> EpisodeRow:
+    """One env after a reset; `pictures` may hold those of other envs."""
+    return EpisodeRow(
+        poses=step.poses[env],
+        evaluate={name: values[env] for name, values in step.evaluate.items()},
+        env_states=states_of(columns, env),
+        obs=observation_of(columns, env),
+        pictures=tuple(picture for picture in pictures if picture.env == env),
+    )
+
+
+def next_row(
+    step: StepResult,
+    env: int,
+    columns: Mapping[str, NDArray],
+    pictures: Iterable[Picture],
+    state_names: Collection[str],
+) -> EpisodeRow:
+    """One env after a control step; `state_names` are those of its first row."""
+    assert step.action is not None
+    return replace(
+        first_row(step, env, columns, pictures),
+        env_states=named_states_of(columns, env, state_names),
+        action=step.action[env].reshape(-1),
+        reward=float(step.reward[env]),
+        terminated=bool(step.terminated[env]),
+        truncated=bool(step.truncated[env]),
+    )
+
+
+def episode_info(
+    task: TaskDescription, env: int, seed: int, reset_options: Mapping[str, Any] | None = None
+) -> EpisodeInfo:
+    """What is needed to make an episode of this task again."""
+    return EpisodeInfo(
+        task=task.env_id,
+        env_index=env,
+        seed=seed,
+        source_file=task.file,
+        source_hash=task.source_hash,
+        source=task.source,
+        control_dt=task.control_dt,
+        control_mode=task.control_mode,
+        backend=task.backend,
+        versions=package_versions(),
+        env_kwargs=dict(task.env_kwargs),
+        reset_options=dict(reset_options or {}),
+        max_episode_steps=task.max_episode_steps,
+    )
 
 
 def package_versions() -> dict[str, str]:

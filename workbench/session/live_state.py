@@ -14,6 +14,7 @@ from workbench.authoring.problem import Problem
 from workbench.authoring.reference import named_file
 from workbench.core.inspection import Inspection
 from workbench.core.pictures import CameraKind, Picture
+from workbench.core.snapshot_bytes import WholeSnapshot
 from workbench.core.step import StepResult
 from workbench.session.env_table import EnvTable
 from workbench.session.judge import JudgementView
@@ -32,6 +33,7 @@ from workbench.session.messages import (
     LoadLevel,
     PastPictures,
     Pictures,
+    PlaceCamera,
     Placed,
     ReloadReport,
     Request,
@@ -46,6 +48,7 @@ from workbench.session.messages import (
     WatchCameras,
 )
 from workbench.session.past import Past
+from workbench.session.past_episodes import PastEpisode, WhatToKeep, episode_round, moments_of
 from workbench.session.printed import Printed
 from workbench.session.recovery import Wanted
 from workbench.session.reward_terms import TermHistory
@@ -359,6 +362,26 @@ class LiveState:
             return None
         shown, history = self.timeline.shown, self.timeline.history
         return history.stretch_at(self.selected_env, history.last if shown is None else shown.serial)
+
+    def what_to_keep(
+        self, env_idx: tuple[int, ...] | None, load: Load | None, placed: tuple[PlaceCamera, ...]
+    ) -> WhatToKeep | str:
+        """See `Session.keep_past`; in a sentence why there is nothing to keep."""
+        if self.task is None or self.timeline is None or load is None:
+            return "no task is loaded"
+        history, shown = self.timeline.history, self.timeline.shown
+        envs = range(self.task.num_envs) if env_idx is None else env_idx
+        found = {env: episode_round(history, env, None if shown is None else shown.serial) for env in envs}
+        episodes = tuple(episode for episode in found.values() if isinstance(episode, PastEpisode))
+        if not episodes:
+            env, why = next(iter(found.items()))
+            return f"nothing was kept of env {env}: {why}"
+        snapshots: dict[int, WholeSnapshot] = {}
+        for moment, _ in moments_of(episodes):
+            whole = history.whole_at(moment.serial)
+            assert whole is not None, "an episode of the past has a snapshot of every moment"
+            snapshots[moment.serial] = whole
+        return WhatToKeep(self.task, load, placed, episodes, snapshots)
 
     def view(
         self, *, recording: RecordingStatus, printed: Printed, vitals: Vitals, judgement: JudgementView

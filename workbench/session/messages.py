@@ -93,6 +93,8 @@ class TaskDescription:
     can_render: bool
     others: tuple[str, ...] = ()
     """Further task classes in the file."""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """Keywords of ``gym.make`` that make such an env, as far as JSON can say them."""
 
 
 # --- requests: server to worker ------------------------------------------------------------------
@@ -187,10 +189,13 @@ class PlaceCamera:
 
 @dataclass(frozen=True)
 class SetCapture:
-    """While on, every step comes back with the pictures of all cameras of these envs, to be recorded."""
+    """While on, every step comes back with the state columns of the batch, and with the pictures of all cameras of
+    these envs, to be recorded."""
 
     env_idx: tuple[int, ...]
     """Empty turns it off."""
+    from_reset: bool = False
+    """Of each of these envs from its next reset on: until then a picture would be made for nobody."""
 
 
 @dataclass(frozen=True)
@@ -266,6 +271,25 @@ class JudgeMoments:
 
 
 @dataclass(frozen=True)
+class MomentToCapture:
+    """A moment of the past of which some envs are to be recorded after the fact."""
+
+    snapshot: bytes
+    """A pickled `core.snapshot.Snapshot` of the whole batch."""
+    env_idx: tuple[int, ...]
+    """Those whose pictures are wanted."""
+
+
+@dataclass(frozen=True)
+class CaptureMoments:
+    """Put the envs back to these moments, and say what a recording would have kept; the answer is `Captured`. Only for a
+    worker that does not play."""
+
+    moments: tuple[MomentToCapture, ...]
+    pictures: bool
+
+
+@dataclass(frozen=True)
 class Quit:
     pass
 
@@ -290,6 +314,7 @@ Request = (
     | Inspect
     | JudgeMoments
     | Rescore
+    | CaptureMoments
     | Quit
 )
 
@@ -384,6 +409,9 @@ class Stepped:
     number: int = 0
     """Counts these events since the worker began; `Pictures.numbers` refers to it."""
     restored: Restored | None = None
+    columns: dict[str, NDArray] = field(default_factory=dict)
+    """(N, ...) each, as `core.state_columns` names them: ``state/actors/cube``, ``obs/agent/qpos``. Only while
+    capturing."""
 
 
 @dataclass(frozen=True)
@@ -432,6 +460,17 @@ class Judged:
 
 
 @dataclass(frozen=True)
+class Captured:
+    """The answer to `CaptureMoments`."""
+
+    columns: tuple[dict[str, NDArray], ...]
+    """As `Stepped.columns`, one for each moment."""
+    pictures: tuple[tuple[Picture, ...], ...]
+    not_carried: dict[str, str]
+    """What could not be put back, and why."""
+
+
+@dataclass(frozen=True)
 class Status:
     playing: bool
     steps_per_second: float
@@ -462,6 +501,7 @@ Event = (
     | Inspection
     | Judged
     | Rescored
+    | Captured
     | Status
     | WarmedUp
 )

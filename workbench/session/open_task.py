@@ -21,6 +21,7 @@ from workbench.authoring.problem import Problem, TaskError, problem_from_excepti
 from workbench.authoring.returns import check_step_returns, problem_from_return
 from workbench.core import actions
 from workbench.core.backends import find_renderer
+from workbench.core.env_kwargs import env_kwargs
 from workbench.core.scene_geometry import read_geometry
 from workbench.core.snapshot import RestoreReport, Snapshot
 from workbench.core.step import StepResult
@@ -97,7 +98,7 @@ def build_task(
         clock.lap("reset")
         on_activity("reading the shapes")
         loaded = with_late_imports(loaded)
-        description = describe(loaded, task)
+        description = describe(loaded, task, options.env_kwargs, loaded.max_episode_steps)
         clock.lap("geometry")
     except BaseException:
         env.close()
@@ -139,8 +140,10 @@ def restore_checked(
         return task.restore(snapshot, env_idx, source)
 
 
-def describe(loaded: LoadedTask, task: TaskEnv) -> TaskDescription:
-    """What the page must know of the task, as plain data."""
+def describe(
+    loaded: LoadedTask, task: TaskEnv, given: Mapping[str, Any], max_episode_steps: int | None
+) -> TaskDescription:
+    """What the page must know of the task, as plain data; `given` are the keywords that it was made with."""
     env = task.env
     dimensions = [
         ActionDimension(name, float(low), float(high))
@@ -161,7 +164,7 @@ def describe(loaded: LoadedTask, task: TaskEnv) -> TaskDescription:
         backend=simulation,
         device=f"{env.device}" + (f", pictures on {renderer.name}" if renderer else ", no pictures"),
         num_envs=task.num_envs,
-        max_episode_steps=loaded.max_episode_steps,
+        max_episode_steps=max_episode_steps,
         obs_mode=env.obs_mode,
         reward_mode=env.reward_mode,
         control_mode=control_mode,
@@ -172,6 +175,7 @@ def describe(loaded: LoadedTask, task: TaskEnv) -> TaskDescription:
         segmentation=segmentation_names(env, task.table),
         can_render=can_render,
         others=loaded.others if loaded.followed else (),
+        env_kwargs=env_kwargs(env, {**loaded.default_kwargs, **given}),
     )
 
 

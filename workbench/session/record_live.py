@@ -1,7 +1,12 @@
-"""Recording while the page runs: gather on the session's thread, write on a thread of its own.
+"""Recording while the page runs: rows are gathered on one thread, files are made on another.
 
-Writing an episode takes a fraction of a second, in which no event of the worker may wait; and a file
-that cannot be written must be said and must not stop the simulation.
+A row is encoded and put into the journal in a millisecond or less, but the disk may take its time over it, and
+making the files of an episode takes a fraction of a second and more for a long one. No event of the worker may wait
+for either. So the session's thread only hands the steps over. What waits is bounded: a disk that is slower than the
+simulation for long ends the recording with a sentence, since the alternatives are to lose steps unsaid or to fill
+the memory.
+
+A file that cannot be written is said and stops nothing but the recording.
 """
 
 from __future__ import annotations
@@ -9,90 +14,188 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
-from workbench.recording.episode import Episode
-from workbench.recording.rrd import episode_filename, write_rrd
-from workbench.session.episodes import EpisodeGatherer
+from workbench.recording.recover import recover
+from workbench.recording.rrd import RecordingError
+from workbench.session.episode_files import EpisodeFinisher
+from workbench.session.episodes import EpisodeGatherer, GatheredEpisode
 from workbench.session.messages import Stepped, TaskDescription
 from workbench.session.view import RecordingStatus
+
+_MOST_WAITING = 256 * 1024**2
+"""Bytes of steps that the disk has not taken."""
+
+
+@dataclass(frozen=True)
+class _Start:
+    task: TaskDescription
+    env_idx: tuple[int, ...]
+    one_each: bool
+
+
+@dataclass(frozen=True)
+class _Stop:
+    pass
 
 
 class LiveRecorder:
     """Start and stop as often as wanted; `close` waits for what is still being written."""
 
-    def __init__(self, folder: Path, on_change: Callable[[], None]) -> None:
+    def __init__(
+        self, folder: Path, on_change: Callable[[], None], on_envs: Callable[[tuple[int, ...]], None]
+    ) -> None:
+        """
+        Args:
+            on_change: called when `status` has something new, from any thread.
+            on_envs: called when an env needs to be captured no longer, with those that do; from a thread of its own.
+        """
         self._folder = folder
-        self._on_change = on_change
+        self._on_change, self._on_envs = on_change, on_envs
         self._lock = threading.Lock()
-        self._gatherer: EpisodeGatherer | None = None
         self._env_idx: tuple[int, ...] = ()
-        self._written = 0
-        self._last_file: str | None = None
+        self._gatherer: EpisodeGatherer | None = None
+        self._recovered = 0
         self._problem: str | None = None
-        self._queue: queue.Queue[Episode | None] = queue.Queue()
-        self._thread = threading.Thread(target=self._write_all, name="episode-writer", daemon=True)
+        self._waiting_bytes = 0
+        self._ends_by_itself = False
+        self._queue: queue.Queue[Stepped | _Start | _Stop | None] = queue.Queue()
+        self.finisher = EpisodeFinisher(on_change, self._recover)
+        """Makes the files, of other episodes too."""
+        self._thread = threading.Thread(target=self._gather_all, name="recorder", daemon=True)
         self._thread.start()
 
-    def start(self, task: TaskDescription, env_idx: Sequence[int]) -> None:
-        self.stop()
+    # --- the session's side ----------------------------------------------------------------------------
+
+    def start(self, task: TaskDescription, env_idx: Sequence[int], one_each: bool = False) -> None:
+        """From each env's next reset on; of each only the next episode if `one_each`."""
         with self._lock:
-            self._env_idx = tuple(env_idx)
-            self._gatherer = EpisodeGatherer(task, env_idx, self._queue.put)
-            self._problem = None
+            self._env_idx, self._problem, self._ends_by_itself = tuple(env_idx), None, one_each
+        self._queue.put(_Start(task, tuple(env_idx), one_each))
 
     def stop(self) -> None:
         """End the episodes under way; what was gathered of them is written."""
         with self._lock:
-            gatherer, self._gatherer = self._gatherer, None
             self._env_idx = ()
-        if gatherer is not None:
-            self._guarded(gatherer.finish)
+        self._queue.put(_Stop())
 
     def take(self, stepped: Stepped) -> None:
-        """The next reset or step; a step that no episode can hold ends the recording, and is told."""
-        gatherer = self._gatherer
-        if gatherer is not None and not self._guarded(lambda: gatherer.take(stepped)):
-            with self._lock:
-                self._gatherer, self._env_idx = None, ()
-            self._guarded(gatherer.finish)
+        """The next reset or step."""
+        size = _size(stepped)
+        with self._lock:
+            if not self._env_idx:
+                return
+            if self._waiting_bytes + size > _MOST_WAITING:
+                self._env_idx = ()
+                self._problem = (
+                    "the recording ended: the disk is slower than the simulation. Record fewer envs, or choose "
+                    "another folder"
+                )
+                self._queue.put(_Stop())
+                return
+            self._waiting_bytes += size
+        self._queue.put(stepped)
 
-    def _guarded(self, do: Callable[[], None]) -> bool:
-        try:
-            do()
-        except ValueError as error:  # an entry of evaluate() that is no number, a step that was lost
-            with self._lock:
-                self._problem = f"the recording ended: {error}"
-            return False
-        return True
+    @property
+    def recording(self) -> tuple[int, ...]:
+        """The envs that are recorded, whether or not their episodes have begun."""
+        with self._lock:
+            return self._env_idx
+
+    @property
+    def one_each(self) -> bool:
+        """Whether it ends by itself."""
+        with self._lock:
+            return self._ends_by_itself
 
     def status(self) -> RecordingStatus:
         with self._lock:
-            steps = self._gatherer.steps if self._gatherer is not None else 0
+            under_way = self._gatherer.under_way if self._gatherer is not None and self._env_idx else ()
+            finished = self.finisher.finished
             return RecordingStatus(
-                active=self._gatherer is not None,
+                active=bool(self._env_idx),
                 env_idx=self._env_idx,
-                steps=steps,
-                episodes_written=self._written,
+                waiting=len(self._env_idx) - len(under_way) if self._env_idx else 0,
+                steps=sum(episode.steps for episode in under_way),
+                bytes_written=finished.bytes_written + sum(e.writer.bytes_written for e in under_way),
+                episodes_written=finished.count,
+                being_written=self.finisher.waiting,
+                recovered=self._recovered,
                 folder=str(self._folder),
-                last_file=self._last_file,
-                problem=self._problem,
+                last_file=None if finished.last is None else str(finished.last.rrd),
+                problem=self._problem or finished.problem,
             )
 
     def close(self) -> None:
         self.stop()
         self._queue.put(None)
         self._thread.join()
+        self.finisher.close()
 
-    def _write_all(self) -> None:
-        while (episode := self._queue.get()) is not None:
-            path = self._folder / episode_filename(episode.info)
-            try:
-                written = write_rrd(episode, path)
-            except (OSError, ValueError, RuntimeError) as error:
+    # --- the recorder's thread -------------------------------------------------------------------------
+
+    def _gather_all(self) -> None:
+        while (what := self._queue.get()) is not None:
+            if isinstance(what, Stepped):
                 with self._lock:
-                    self._problem = f"{path.name} could not be written: {error}"
-            else:
+                    self._waiting_bytes -= _size(what)
+                self._take(what)
+                continue
+            self._end()
+            if isinstance(what, _Start):
+                gatherer = EpisodeGatherer(
+                    what.task, what.env_idx, self._folder, self._over, one_each=what.one_each
+                )
                 with self._lock:
-                    self._written, self._last_file = self._written + 1, str(written)
+                    self._gatherer = gatherer
             self._on_change()
+
+    def _take(self, stepped: Stepped) -> None:
+        gatherer = self._gatherer
+        if gatherer is None:
+            return
+        before = gatherer.env_idx
+        try:
+            gatherer.take(stepped)
+        except (RecordingError, ValueError) as error:
+            # A disk that is full, an entry of evaluate() that is no number, a step that was lost.
+            self._end()
+            with self._lock:
+                self._env_idx, self._problem = (), f"the recording ended: {error}"
+        left = () if self._gatherer is None else gatherer.env_idx
+        if left != before:
+            with self._lock:
+                self._env_idx = tuple(env for env in self._env_idx if env in left)
+            self._on_envs(left)
+            self._on_change()
+
+    def _end(self) -> None:
+        with self._lock:
+            gatherer, self._gatherer = self._gatherer, None
+        if gatherer is not None:
+            gatherer.finish()
+
+    def _over(self, episode: GatheredEpisode) -> None:
+        self.finisher.finish(episode)
+
+    def _recover(self) -> None:
+        """What a server before this one left behind; on the finisher's thread, before all else."""
+        if not self._folder.is_dir():
+            return
+        try:
+            recovered = len(recover(self._folder))
+        except RecordingError as error:
+            with self._lock:
+                self._problem = f"what an earlier recording left could not be mended: {error}"
+        else:
+            with self._lock:
+                self._recovered = recovered
+        self._on_change()
+
+
+def _size(stepped: Stepped) -> int:
+    arrays = [*stepped.columns.values(), stepped.step.poses]
+    for picture in stepped.captured:
+        arrays += [a for a in (picture.rgb, picture.depth, picture.segmentation) if a is not None]
+    return sum(array.nbytes for array in arrays)

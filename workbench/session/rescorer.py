@@ -215,7 +215,7 @@ class Rescorer:
         """
         while self._job is job:
             event = process.receive(timeout=_LOOK)
-            if isinstance(event, (kind, Failed)):
+            if event is not None and isinstance(event, (kind, Failed)):
                 return event
         raise _Stopped
 

@@ -26,6 +26,7 @@ from workbench.session.camera_studio import CameraStudio
 from workbench.session.env_table import EnvRows
 from workbench.session.judge import FILE_SAVED, Judge, what_a_load_means
 from workbench.session.judgement import JudgedCurve, Judgement
+from workbench.session.keep_past import PastKeeper
 from workbench.session.kept_worker import Death, KeptWorker, WorkerOptions
 from workbench.session.last_words import Busy
 from workbench.session.live_state import LiveState, scene_kept
@@ -110,7 +111,10 @@ class Session:
             own_files=self._own_files,
             output=self._printed.feed,
         )
-        self._recorder = LiveRecorder(recordings, self._note)
+        self._recorder = LiveRecorder(
+            recordings, self._note, lambda envs: self._send(SetCapture(envs, from_reset=True))
+        )
+        self._keeper = PastKeeper(recordings, self._recorder.finisher, self._note)
         self._judge = Judge(self._note)
         self.studio = CameraStudio(self._send, self._note, self._shown_moment, self._same_version)
         """Cameras placed by hand."""
@@ -122,7 +126,7 @@ class Session:
 
     def view(self) -> SessionView:
         """A snapshot; cheap enough for every frame."""
-        recording = self._recorder.status()
+        recording = replace(self._recorder.status(), keeping=self._keeper.status())
         printed, vitals = self._printed.view(), self._worker.vitals
         with self._lock:
             view = self._state.view(
@@ -262,16 +266,21 @@ class Session:
         if (before == 0) != (count == 0):
             self._watch()
 
-    def start_recording(self, env_idx: tuple[int, ...] | None = None) -> None:
-        """Record from a fresh episode on: the envs (all if None) are reset, and capturing begins."""
+    def start_recording(self, env_idx: tuple[int, ...] | None = None, next_episode: bool = False) -> None:
+        """Record these envs (all if None): from a reset on that is made now, until it is stopped.
+
+        Args:
+            next_episode: reset nothing, and record of each env only the episode that begins with its next reset.
+        """
         with self._lock:
             task = self._state.task
         if task is None:
             return
         envs = tuple(range(task.num_envs)) if env_idx is None else env_idx
-        self._recorder.start(task, envs)
-        self._send(SetCapture(envs))
-        self.reset(None if env_idx is None else envs)
+        self._recorder.start(task, envs, one_each=next_episode)
+        self._send(SetCapture(envs, from_reset=True))
+        if not next_episode:
+            self.reset(None if env_idx is None else envs)
         self._note()
 
     def stop_recording(self) -> None:
@@ -279,6 +288,25 @@ class Session:
         self._send(SetCapture(()))
         self._recorder.stop()
         self._note()
+
+    def keep_past(self, env_idx: tuple[int, ...] | None = None) -> None:
+        """Record after the fact: the episode of each of these envs (of all if None) round the moment that is shown.
+
+        Live, that is the episode that runs, or the one before if that has no step yet. `SessionView.recording` says how
+        far it is and what came of it.
+        """
+        load = self._same_version()
+        placed = self.studio.placed_cameras()
+        with self._lock:
+            what = self._state.what_to_keep(env_idx, load, placed)
+        if isinstance(what, str):
+            self._keeper.refuse(what)
+        else:
+            self._keeper.keep(what)
+
+    def stop_keeping(self) -> None:
+        """Give up what `keep_past` began; nothing of it is kept."""
+        self._keeper.stop()
 
     # --- the past ------------------------------------------------------------------------------------
 
@@ -382,6 +410,7 @@ class Session:
         self._worker.stop()
         self._judge.close()
         self.studio.close()
+        self._keeper.close()
         self._recorder.close()
 
     # --- what the worker says, on the session's thread -------------------------------------------
@@ -451,7 +480,7 @@ class Session:
 
     def _on_loaded(self, event: Loaded) -> None:
         self._worker.ran()
-        recording = self._recorder.status()
+        recording, one_each = self._recorder.recording, self._recorder.one_each
         if not scene_kept(event) or (event.reload is not None and event.reload.level != "same"):
             # Episodes of the version before end here: their steps and the new ones do not belong together.
             self._recorder.stop()
@@ -475,23 +504,23 @@ class Session:
         self._watch()
         for request in placements:
             self._send(request)
-        if recording.active:
-            self._record_on(event, recording.env_idx)
+        if recording:
+            self._record_on(event, recording, one_each)
         with self._lock:
             step_in, self._step_in = self._step_in, None
         if step_in is not None:
             self.step_back(*step_in)
 
-    def _record_on(self, event: Loaded, env_idx: tuple[int, ...]) -> None:
+    def _record_on(self, event: Loaded, env_idx: tuple[int, ...], one_each: bool) -> None:
         """A version came in while these envs were recorded."""
         if not scene_kept(event):
-            self.start_recording(env_idx)
-        elif not self._recorder.status().active:
+            self.start_recording(env_idx, next_episode=one_each)
+        elif not self._recorder.recording:
             # The moment is not to be lost: recording goes on with each env's next episode.
             with self._lock:
                 task = self._state.task
             if task is not None:
-                self._recorder.start(task, env_idx)
+                self._recorder.start(task, env_idx, one_each)
 
     def _on_stepped(self, event: Stepped) -> None:
         with self._lock:

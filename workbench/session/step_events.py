@@ -1,8 +1,8 @@
 """What the server is told of every reset, control step and restore: the result, and all it takes to come back.
 
 The server never asks the worker for the past: with each event it gets a snapshot of the batch, packed so that what
-did not change is sent once (`core.snapshot_parts`), and while somebody records the pictures of exactly this step.
-The newest snapshot stays here as well, for a step that is left half done.
+did not change is sent once (`core.snapshot_parts`), and while somebody records the state columns of exactly this step
+(`core.state_columns`) and its pictures. The newest snapshot stays here as well, for a step that is left half done.
 """
 
 from __future__ import annotations
@@ -15,19 +15,21 @@ from numpy.typing import NDArray
 from workbench.core.pictures import Picture
 from workbench.core.snapshot import Snapshot
 from workbench.core.snapshot_parts import PackedSnapshot, SnapshotPacker
+from workbench.core.state_columns import read_state_columns
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import take_pictures
-from workbench.session.episodes import recorded_pictures
 from workbench.session.messages import Restored, Stepped
 from workbench.session.open_task import OpenedTask
+from workbench.session.recorded_pictures import recorded_pictures
 
 
 class StepEvents:
     """Makes the events, and counts them."""
 
     def __init__(self) -> None:
-        self.captured_envs: tuple[int, ...] = ()
-        """Those whose pictures come with each event; no other pictures may be under way then."""
+        self._captured: set[int] = set()
+        self._armed: set[int] = set()
+        self._columns_fail = False
         self.moment: Snapshot | None = None
         """The batch as the newest event left it; None for a task whose state cannot be kept."""
         self.number = 0
@@ -35,8 +37,21 @@ class StepEvents:
 
     def new_scene(self) -> None:
         """Another env takes over: nothing that was sent before is of use for it."""
-        self.captured_envs = ()
+        self.capture((), from_reset=False)
         self._packer = SnapshotPacker()
+        self._columns_fail = False
+
+    def capture(self, env_idx: tuple[int, ...], from_reset: bool) -> None:
+        """As `messages.SetCapture`; an env that is captured already stays so, whenever it is to begin."""
+        begun = self._captured & set(env_idx) if from_reset else set(env_idx)
+        self._captured, self._armed = begun, set(env_idx) - begun
+
+    def pictures_due(self, step: StepResult, reset_mask: NDArray[np.bool_]) -> bool:
+        """Whether the event of this step draws: no other pictures may be under way then."""
+        begun = {env for env in self._armed if reset_mask[env] and step.elapsed_steps[env] == 0}
+        self._captured |= begun
+        self._armed -= begun
+        return bool(self._captured)
 
     def event(
         self,
@@ -49,9 +64,12 @@ class StepEvents:
         """See `Stepped` for what the arguments become."""
         self.number += 1
         captured: tuple[Picture, ...] = ()
-        wanted = recorded_pictures(opened.description.cameras) if self.captured_envs else []
-        for env in self.captured_envs:
-            captured += take_pictures(opened.env.env, env, wanted)
+        columns: dict[str, NDArray] = {}
+        if self.pictures_due(step, reset_mask):
+            columns = self._state_columns(opened)
+            wanted = recorded_pictures(opened.description.cameras)
+            for env in sorted(self._captured):
+                captured += take_pictures(opened.env.env, env, wanted)
         packed = self._packed_snapshot(opened)
         return Stepped(
             step,
@@ -63,7 +81,20 @@ class StepEvents:
             packed.new_parts,
             self.number,
             restored,
+            columns,
         )
+
+    def _state_columns(self, opened: OpenedTask) -> dict[str, NDArray]:
+        """Those of this moment; none for a task whose own ``get_state_dict`` raises, which is said once."""
+        try:
+            return {} if self._columns_fail else read_state_columns(opened.env)
+        except Exception as error:
+            self._columns_fail = True
+            print(
+                f"Recorded without env states and observations: {type(error).__name__}: {error}",
+                file=sys.stderr,
+            )
+            return {}
 
     def _packed_snapshot(self, opened: OpenedTask) -> PackedSnapshot:
         """The batch as it is; empty for a task whose state cannot be kept, which is said once."""

@@ -17,6 +17,7 @@ from workbench.core.inspection import Inspection
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.step import StepResult
 from workbench.session.judge import JudgementView
+from workbench.session.keep_status import KeepStatus
 from workbench.session.kept_worker import Vitals
 from workbench.session.last_words import Busy
 from workbench.session.messages import ActionSource, EpisodeEnd, ReloadReport, TaskDescription
@@ -46,15 +47,26 @@ class Curves:
 
 @dataclass(frozen=True)
 class RecordingStatus:
-    active: bool
-    env_idx: tuple[int, ...]
-    steps: int
+    """What is recorded now, and what came of it."""
+
+    active: bool = False
+    env_idx: tuple[int, ...] = ()
+    waiting: int = 0
+    """Envs of these whose episode has not begun: their next reset is waited for."""
+    steps: int = 0
     """Steps captured of the episodes under way."""
-    episodes_written: int
-    folder: str
-    last_file: str | None
-    problem: str | None
-    """Why the last file could not be written."""
+    bytes_written: int = 0
+    """Of this session's episodes, those under way too."""
+    episodes_written: int = 0
+    being_written: int = 0
+    """Episodes that are over, and whose files are being made."""
+    recovered: int = 0
+    """Episodes that an earlier server left half written, and that were mended at the start."""
+    folder: str = ""
+    last_file: str | None = None
+    problem: str | None = None
+    """Why the recording ended, or the last file could not be written."""
+    keeping: KeepStatus = field(default_factory=KeepStatus)
 
 
 @dataclass(frozen=True)

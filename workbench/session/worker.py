@@ -48,10 +48,12 @@ from workbench.session.camera_messages import (
     JudgeCamera,
     SuggestCameras,
 )
+from workbench.session.capture_moments import capture_moments
 from workbench.session.interrupts import Interrupted, Interrupts
 from workbench.session.judge_moments import judge_moments
 from workbench.session.messages import (
     SCENE_KEPT,
+    CaptureMoments,
     DrawPast,
     EpisodeEnd,
     Event,
@@ -147,6 +149,7 @@ class Worker:
             Inspect: self._inspect,
             JudgeMoments: self._judge_moments,
             Rescore: self._rescore,
+            CaptureMoments: self._capture_moments,
             Quit: self._stop,
         }
 
@@ -392,7 +395,7 @@ class Worker:
         self._place_cameras()
 
     def _set_capture(self, request: SetCapture) -> None:
-        self._steps.captured_envs = request.env_idx
+        self._steps.capture(request.env_idx, request.from_reset)
 
     def _restore(self, request: Restore) -> None:
         self._guarded(lambda opened: self._restore_envs(opened, request))
@@ -424,6 +427,13 @@ class Worker:
     def _rescore(self, request: Rescore) -> None:
         if self._opened is not None:
             rescore_run.answer(self._opened, request, self._send)
+
+    def _capture_moments(self, request: CaptureMoments) -> None:
+        def capture(opened: OpenedTask) -> None:
+            self._settle()  # the same scene is about to be drawn
+            self._send(capture_moments(opened, request))
+
+        self._guarded(capture)
 
     def _stop(self, request: Quit) -> None:
         self._quit = True
@@ -518,7 +528,7 @@ class Worker:
     ) -> None:
         assert self._opened is not None
         self._last = step
-        if self._steps.captured_envs:
+        if self._steps.pictures_due(step, reset_mask):
             self._settle()  # the same scene is about to be drawn
         event = self._steps.event(self._opened, step, reset_mask, seeds, restored)
         self._pictures.scene_changed(event.number)

@@ -119,7 +119,7 @@ class Page:
         with tabs.add_tab("Inspect", viser.Icon.ZOOM_IN):
             self._inspect = InspectPanel(server, session)
         with tabs.add_tab("Episodes", viser.Icon.MOVIE):
-            self._record = RecordPanel(server, session.start_recording, session.stop_recording)
+            self._record = RecordPanel(server, session)
             self._on_review = on_review
             if on_review is not None:
                 review = server.gui.add_button("Review recordings", icon=viser.Icon.LIST_DETAILS)
@@ -376,6 +376,7 @@ class Page:
             Command("Show all envs or the selected one", self._view_panel.toggle_only_selected, "O"),
             Command("Frame what is shown", lambda: self.frame(session.view()), "F"),
             Command("Start or stop recording", self._record.toggle, "C"),
+            Command("Keep what I just saw", self._record.keep, "C", "shift"),
             Command("Load the file again", session.reload, "L"),
             Command("Interrupt what the task is doing", session.interrupt, "I"),
             Command("Restart the worker", session.restart_worker, "L", "shift"),

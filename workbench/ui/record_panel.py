@@ -1,76 +1,148 @@
-"""The Episodes tab: start and stop recording, what is being written, and how to open it."""
+"""The Episodes tab: record, keep what was just seen, and how both stand.
+
+Three wishes, three buttons: *record from now on* (a fresh episode is begun, since one without its reset could not be
+made again), *record the next episode* and disturb nothing, and *keep what I just saw*, which makes a recording of the
+past. Each can be stopped where it was begun, and what each is doing stands under them in words.
+"""
 
 from __future__ import annotations
 
 import shlex
+from typing import Protocol
 
 import viser
 
+from workbench.session.keep_status import KeepStatus
+from workbench.session.session import Session
 from workbench.session.view import RecordingStatus, SessionView
+from workbench.ui.changed import fill, show
 from workbench.ui.fragments import render
 
 THIS_ENV, ALL_ENVS = "the selected env", "all envs"
+RECORD, NEXT, KEEP = "Record", "Record the next episode", "Keep what I just saw"
+STOP, STOP_WAITING, STOP_KEEPING = "Stop recording", "Stop waiting", "Stop keeping"
+
+
+class _Disabled(Protocol):
+    disabled: bool
 
 
 class RecordPanel:
-    """A button that records, and its state.
-
-    Args:
-        server: The page.
-        start: Asks the session to record these envs; None records all.
-        stop: Asks the session to stop.
-    """
-
-    def __init__(self, server: viser.ViserServer, start, stop) -> None:
-        self._start, self._stop = start, stop
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._session = session
         self._selected_env = 0
-        self._active = False
-        self._html_drawn = ""
-        self._which = server.gui.add_dropdown("Record", (THIS_ENV, ALL_ENVS), initial_value=THIS_ENV)
-        self._button = server.gui.add_button("Record", icon=viser.Icon.PLAYER_RECORD, color="red")
+        self._active = self._keeping = False
+        self._which = server.gui.add_dropdown("Envs", (THIS_ENV, ALL_ENVS), initial_value=THIS_ENV)
+        self._button = server.gui.add_button(
+            RECORD,
+            icon=viser.Icon.PLAYER_RECORD,
+            color="red",
+            hint="Reset and record every episode until it is stopped (C)",
+        )
+        self._next = server.gui.add_button(
+            NEXT,
+            icon=viser.Icon.PLAYER_TRACK_NEXT,
+            hint="Wait for the next reset and record that one episode",
+        )
+        self._keep = server.gui.add_button(
+            KEEP,
+            icon=viser.Icon.HISTORY,
+            hint="Record after the fact: the episode at the moment that is shown (shift+C)",
+        )
         self._status = server.gui.add_html("")
         self._button.on_click(lambda _: self.toggle())
+        self._next.on_click(lambda _: session.start_recording(self._envs, next_episode=True))
+        self._keep.on_click(lambda _: self.keep())
+
+    @property
+    def _envs(self) -> tuple[int, ...] | None:
+        return None if self._which.value == ALL_ENVS else (self._selected_env,)
 
     def toggle(self) -> None:
         """Start if nothing is recorded, stop if something is."""
         if self._active:
-            self._stop()
-        elif self._which.value == ALL_ENVS:
-            self._start(None)
+            self._session.stop_recording()
         else:
-            self._start((self._selected_env,))
+            self._session.start_recording(self._envs)
+
+    def keep(self) -> None:
+        """Keep what was just seen, or give that up."""
+        if self._keeping:
+            self._session.stop_keeping()
+        else:
+            self._session.keep_past(self._envs)
 
     def draw(self, view: SessionView) -> None:
-        recording = view.recording
-        self._selected_env, self._active = view.selected_env, recording.active
-        label = "Stop recording" if recording.active else "Record"
-        if self._button.label != label:
-            self._button.label = label
-            self._button.icon = viser.Icon.PLAYER_STOP if recording.active else viser.Icon.PLAYER_RECORD
+        recording, keeping = view.recording, view.recording.keeping
+        self._selected_env, self._active, self._keeping = (
+            view.selected_env,
+            recording.active,
+            keeping.active,
+        )
+        waits = recording.active and recording.waiting == len(recording.env_idx)
+        _label(self._button, STOP_WAITING if waits else STOP if recording.active else RECORD)
+        _icon(self._button, viser.Icon.PLAYER_STOP if recording.active else viser.Icon.PLAYER_RECORD)
+        _label(self._keep, STOP_KEEPING if keeping.active else KEEP)
+        _icon(self._keep, viser.Icon.PLAYER_STOP if keeping.active else viser.Icon.HISTORY)
         can_record = view.task is not None and view.state != "stopped"
-        self._button.disabled = not can_record and not recording.active
-        self._which.disabled = recording.active or not can_record
-        self._which.visible = view.task is None or view.task.num_envs > 1
-        html = recording_html(recording)
-        if html != self._html_drawn:
-            self._html_drawn = html
-            self._status.content = html
+        _disable(self._button, not can_record and not recording.active)
+        _disable(self._next, not can_record)
+        show(self._next, not recording.active)
+        _disable(self._keep, view.timeline.moments == 0 and not keeping.active)
+        _disable(self._which, not can_record)
+        show(self._which, view.task is None or view.task.num_envs > 1)
+        fill(self._status, recording_html(recording))
 
 
 def recording_html(recording: RecordingStatus) -> str:
-    envs = ""
-    if recording.active:
-        numbers = ", ".join(str(env) for env in recording.env_idx[:6])
-        more = f" and {len(recording.env_idx) - 6} more" if len(recording.env_idx) > 6 else ""
-        envs = f"env{'s' if len(recording.env_idx) != 1 else ''} {numbers}{more}"
+    last = recording.last_file
     return render(
         "recording",
         active=recording.active,
-        envs=envs,
+        envs=_envs_in_words(recording.env_idx),
+        one=len(recording.env_idx) == 1,
+        waiting=recording.waiting,
+        all_wait=recording.waiting == len(recording.env_idx),
         steps=recording.steps,
         written=recording.episodes_written,
+        being_written=recording.being_written,
+        recovered=recording.recovered,
+        size=size_in_words(recording.bytes_written),
         folder=recording.folder,
-        last_file=recording.last_file,
-        command=None if recording.last_file is None else f"rerun {shlex.quote(recording.last_file)}",
+        command=None if last is None else f"workbench view {shlex.quote(last)}",
         problem=recording.problem,
+        keeping=recording.keeping,
+        percent=_percent(recording.keeping),
     )
+
+
+def size_in_words(count: int) -> str:
+    """``0.4 MB``, ``23 MB``, ``1.2 GB``"""
+    if count < 1e9:
+        return f"{count / 1e6:.1f} MB" if count < 1e7 else f"{count / 1e6:.0f} MB"
+    return f"{count / 1e9:.1f} GB"
+
+
+def _envs_in_words(env_idx: tuple[int, ...]) -> str:
+    numbers = ", ".join(str(env) for env in env_idx[:6])
+    more = f" and {len(env_idx) - 6} more" if len(env_idx) > 6 else ""
+    return f"env{'s' if len(env_idx) != 1 else ''} {numbers}{more}"
+
+
+def _percent(keeping: KeepStatus) -> int:
+    return round(100 * keeping.done / keeping.total) if keeping.total else 0
+
+
+def _label(button: viser.GuiButtonHandle, label: str) -> None:
+    if button.label != label:
+        button.label = label
+
+
+def _icon(button: viser.GuiButtonHandle, icon: viser.IconName) -> None:
+    if button.icon != icon:
+        button.icon = icon
+
+
+def _disable(handle: _Disabled, disabled: bool) -> None:
+    if handle.disabled != disabled:
+        handle.disabled = disabled

@@ -67,7 +67,7 @@ def as_session_view(
         sliders=(),
         steps_per_second=0.0,
         real_time_factor=0.0,
-        recording=RecordingStatus(False, (), 0, 0, "", None, None),
+        recording=RecordingStatus(),
         printed=NOTHING_PRINTED,
     )
 

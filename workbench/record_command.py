@@ -1,0 +1,121 @@
+"""``workbench record`` in a terminal: a bar with rate and time left, an end by Ctrl-C that keeps what is over, a list."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable
+from types import FrameType
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.progress import Progress as Bar
+
+from workbench.authoring.problem import Problem, TaskError
+from workbench.recording.recover import recover
+from workbench.session.record import Progress, Recorded, RecordOptions, record, with_given_actions
+
+
+class _StopAtInterrupt:
+    """Ctrl-C while episodes are made ends the recording in good order; before that, or a second time, at once."""
+
+    def __init__(self) -> None:
+        self.asked = self.making = False
+
+    def __enter__(self) -> _StopAtInterrupt:
+        self._before = signal.signal(signal.SIGINT, self._on_signal)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        signal.signal(signal.SIGINT, self._before)
+
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        if self.asked or not self.making:
+            raise KeyboardInterrupt
+        self.asked = True
+
+
+def record_in_terminal(
+    what: RecordOptions,
+    console: Console,
+    say_problem: Callable[[Problem], None],
+    refuse: Callable[[str], int],
+) -> int:
+    """Record, and say what came of it; returns the exit code."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+    )
+    try:
+        asked, _ = with_given_actions(what)
+        mended = recover(what.out) if what.out.is_dir() else []
+        if mended:
+            console.print(f"{_episodes(len(mended))} that an earlier recording left half written: mended")
+        with _StopAtInterrupt() as interrupt, Bar(*columns, console=console) as bar:
+            row = bar.add_task("opening", total=asked.successes or asked.episodes)
+            rate = _Rate(bar, row, interrupt)
+            recorded = record(
+                what,
+                lambda activity: bar.update(row, description=activity),
+                rate.show,
+                lambda: interrupt.asked,
+            )
+            bar.update(row, completed=len(recorded.written), description="recorded")
+    except TaskError as error:
+        say_problem(error.problem)
+        return 1
+    except (OSError, ValueError) as error:
+        return refuse(str(error))
+    except KeyboardInterrupt:
+        return refuse("interrupted; episodes that had ended are kept")
+    return _say(asked, recorded, refuse)
+
+
+class _Rate:
+    def __init__(self, bar: Bar, row: TaskID, interrupt: _StopAtInterrupt) -> None:
+        self._bar, self._row, self._interrupt = bar, row, interrupt
+        self._began = time.monotonic()
+
+    def show(self, now: Progress) -> None:
+        if not self._interrupt.making:
+            self._interrupt.making = True
+            self._began = time.monotonic()
+        seconds = max(time.monotonic() - self._began, 1e-3)
+        words = f"recording, {now.steps / seconds:.0f} steps a second"
+        self._bar.update(self._row, completed=now.kept, description=words)
+
+
+def _say(asked: RecordOptions, recorded: Recorded, refuse: Callable[[str], int]) -> int:
+    for episode in recorded.written:
+        ended = {None: "", True: "success", False: "no success"}[episode.success]
+        print(f"{episode.path}  {episode.steps} steps  return {episode.total_reward:.3f}  {ended}".rstrip())
+    kept = len(recorded.written)
+    if asked.successes is not None:
+        print(f"{kept} of {recorded.tried} episodes succeeded and were kept.")
+    if recorded.put_right:
+        count = _episodes(recorded.put_right)
+        print(
+            f"{count} began elsewhere than recorded with the recorded seed, and were put to the recorded first state."
+        )
+    if recorded.written:
+        print(f"Open one with: workbench view {recorded.written[0].path}")
+    if recorded.stopped:
+        return refuse("interrupted; episodes that had ended are kept")
+    if asked.successes is not None and kept < asked.successes:
+        return refuse(f"{asked.successes} successes were asked for; given up after {recorded.tried} episodes")
+    return 0
+
+
+def _episodes(count: int) -> str:
+    return f"{count} episode{'' if count == 1 else 's'}"

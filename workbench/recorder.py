@@ -1,0 +1,180 @@
+"""``workbench.Recorder``: record whatever runs an env that `workbench.make` gave.
+
+    env = workbench.make("PickCube-v1", num_envs=16)
+    env = workbench.Recorder(env, "recordings/")
+    env = ManiSkillVectorEnv(env, auto_reset=True)  # goes around it: training, evaluation, anything
+    env.reset(seed=0)
+    for _ in range(200):
+        env.step(policy(obs))
+    env.close()  # waits for the files
+
+The same files come out as from the page and from ``workbench record``, one set an episode: .rrd, .h5 and .json. An episode of an env
+begins with its reset and ends with its next one, so partial resets and auto-resets bear it, and so does a wrapper that
+goes on after success. What is recorded is the env's own state, observation and reward, so it must be put right around
+what `make` gave, inside all wrappers that change actions.
+
+A loop that trains must not end because a disk is full: what goes wrong with the files is said once, as a warning, the
+recording ends, and `problem` keeps it.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from mani_skill.envs.sapien_env import BaseEnv
+
+from workbench.authoring.load import task_of_class
+from workbench.core import actions
+from workbench.core.open_env import open_env
+from workbench.core.pictures import Picture
+from workbench.core.seams import task_class
+from workbench.core.state_columns import read_state_columns
+from workbench.core.step import StepResult
+from workbench.core.take_pictures import take_pictures
+from workbench.core.task_env import TaskEnv
+from workbench.recording.recover import recover
+from workbench.recording.rrd import RecordingError
+from workbench.session.episode_files import EpisodeFinisher
+from workbench.session.episodes import EpisodeGatherer, GatheredEpisode
+from workbench.session.messages import Stepped, TaskDescription
+from workbench.session.open_task import describe
+from workbench.session.recorded_pictures import recorded_pictures
+
+
+class Recorder(gym.Wrapper):
+    """See the module's text."""
+
+    def __init__(
+        self,
+        env: gym.Env,
+        folder: str | Path,
+        *,
+        env_idx: Sequence[int] | None = None,
+        pictures: bool = False,
+    ) -> None:
+        """
+        Args:
+            env: as `workbench.make` gives it.
+            folder: made if it is missing. What an earlier recording left half written there is mended.
+            env_idx: which envs; None for all.
+            pictures: record what every camera sees at every step: some 25 to 50 ms a picture without a GPU.
+
+        Raises:
+            TypeError: `env` is no ManiSkill env, or wrapped for vectors already.
+            IndexError: there is no such env.
+            RecordingError: `folder` cannot be written to.
+        """
+        if not isinstance(env, gym.Env) or isinstance(env, gym.vector.VectorEnv):
+            raise TypeError(
+                f"Recorder goes around the env that workbench.make gives, inside a vector env: not {type(env).__name__}"
+            )
+        super().__init__(env)
+        base: BaseEnv = open_env(env)
+        chosen = list(range(base.num_envs)) if env_idx is None else [int(i) for i in env_idx]
+        if any(not 0 <= i < base.num_envs for i in chosen):
+            raise IndexError(f"env_idx {chosen} is out of range for {base.num_envs} envs")
+        self._folder, self._envs, self._pictures = Path(folder), chosen, pictures
+        if self._folder.is_dir():
+            recover(self._folder)
+        self._task = TaskEnv(base)
+        self._finisher = EpisodeFinisher()
+        self._gatherer: EpisodeGatherer | None = None
+        self._scene: Any = None
+        self._description: TaskDescription | None = None
+        self._closed = False
+        self.problem: str | None = None
+        """Why the recording ended, if it did."""
+
+    @property
+    def episodes_written(self) -> int:
+        return self._finisher.finished.count
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        obs, info = self.env.reset(seed=seed, options=options)
+        count = self._task.num_envs
+        mask = np.zeros(count, bool)
+        chosen = (options or {}).get("env_idx")
+        mask[slice(None) if chosen is None else np.asarray([int(i) for i in chosen])] = True
+        step = self._task.result_of(info, np.zeros(count), np.zeros(count, bool), np.zeros(count, bool), None)
+        if self._scene is not self._task.env.scene:
+            self._begin()
+        if self._gatherer is not None:
+            kept = {k: v for k, v in (options or {}).items() if k != "env_idx"}
+            self._gatherer.reset_options = kept
+        self._take(step, mask)
+        return obs, info
+
+    def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        task = self._task
+        made = actions.to_flat_action(task.env, task.parts, action) if task.parts else None
+        given = self.env.step(action)
+        if self._gatherer is not None:
+            obs, reward, terminated, truncated, info = given
+            if made is None:
+                made = np.zeros((task.num_envs, 0), np.float32)
+            step = task.result_of(info, reward, terminated, truncated, made)
+            self._take(step, np.zeros(task.num_envs, bool))
+        return given  # type: ignore[return-value]
+
+    def close(self) -> None:
+        """End the episodes under way, wait for the files, and close the env."""
+        if not self._closed:
+            self._closed = True
+            self._finish()
+            self._finisher.close()
+            self._say_what_failed()
+        super().close()
+
+    def _begin(self) -> None:
+        """A scene is there that was not before."""
+        self._finish()
+        base = self._task.env
+        self._scene = base.scene
+        spec = base.spec
+        env_id = type(base).__name__ if spec is None else spec.id
+        loaded = task_of_class(task_class(base), env_id)
+        limit = None if self.spec is None else self.spec.max_episode_steps
+        given = {} if spec is None else dict(spec.kwargs)
+        self._description = describe(loaded, self._task, given, limit)
+        if self.problem is None:
+            self._gatherer = EpisodeGatherer(
+                self._description, self._envs, self._folder, self._over, ends="reset"
+            )
+
+    def _take(self, step: StepResult, reset_mask: np.ndarray) -> None:
+        gatherer, task = self._gatherer, self._task
+        if gatherer is None or self._description is None:
+            return
+        pictures: tuple[Picture, ...] = ()
+        if self._pictures:
+            wanted = recorded_pictures(self._description.cameras)
+            for env in self._envs:
+                pictures += take_pictures(task.env, env, wanted)
+        columns = read_state_columns(task)
+        try:
+            gatherer.take(Stepped(step, reset_mask, pictures, task.episode_seeds, columns=columns))
+        except (RecordingError, ValueError) as error:
+            self._finish()
+            self._gatherer, self.problem = None, str(error)
+            warnings.warn(f"the recording ended: {error}", stacklevel=3)
+        self._say_what_failed()
+
+    def _over(self, episode: GatheredEpisode) -> None:
+        self._finisher.finish(episode)
+
+    def _finish(self) -> None:
+        gatherer, self._gatherer = self._gatherer, None
+        if gatherer is not None:
+            gatherer.finish()
+
+    def _say_what_failed(self) -> None:
+        problem = self._finisher.finished.problem
+        if problem is not None and self.problem is None:
+            self.problem = problem
+            self._gatherer = None
+            warnings.warn(f"the recording ended: {problem}", stacklevel=4)

@@ -1,0 +1,105 @@
+"""Actions that are known before: from a NumPy file, or demonstrations in ManiSkill's own ``.h5``.
+
+A file of actions is a program for the robot, so it is done to its end: an episode of it does not stop at success or at
+the time limit, as ManiSkill's ``replay_trajectory`` does not. A demonstration also says how its episode began (its
+seed) and how it went (its env states), which is how a replay is put right where the same actions lead elsewhere:
+another machine, another version, a batch that was seeded as one on a GPU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.recording.read_episode import read_maniskill, trajectories
+
+SUFFIXES = (".npy", ".npz", ".h5")
+
+
+@dataclass(frozen=True)
+class GivenEpisode:
+    """What one episode is to do."""
+
+    actions: NDArray[np.float32]
+    """(T, A)"""
+    seed: int | None = None
+    """None where the file does not say."""
+    states: dict[str, NDArray] = field(default_factory=dict)
+    """(T + 1, D) env states by name; empty where the file has none."""
+
+
+@dataclass(frozen=True)
+class GivenEpisodes:
+    name: str
+    """Of the file."""
+    episodes: Sequence[GivenEpisode]
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """What of the env's keywords the file asks for: the control mode that its actions are of, the robot."""
+
+    def __len__(self) -> int:
+        return len(self.episodes)
+
+    def of(self, index: int) -> GivenEpisode:
+        """The one that episode `index` does; a file with a single one has it for all."""
+        return self.episodes[0] if len(self.episodes) == 1 else self.episodes[index]
+
+
+def read_given(path: Path) -> GivenEpisodes:
+    """Read a file of actions.
+
+    ``.npy``: (T, A) for every episode, or (E, T, A), one for each. ``.npz``: an array (T, A) for each episode. ``.h5``:
+    trajectories of ManiSkill, or a recording of the workbench.
+
+    Raises:
+        FileNotFoundError: it is not there.
+        ValueError: it does not hold such; the message says what it holds.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}")
+    if path.suffix == ".h5":
+        return _demonstrations(path)
+    try:
+        loaded = np.load(path, allow_pickle=False)
+        arrays = [loaded[name] for name in loaded.files] if path.suffix == ".npz" else [loaded]
+    except (ValueError, OSError, EOFError) as error:
+        raise ValueError(f"{path} cannot be read as a NumPy file of numbers: {error}") from error
+    if path.suffix == ".npy" and arrays[0].ndim == 3:
+        arrays = list(arrays[0])
+    for array in arrays:
+        if array.ndim != 2 or array.shape[0] == 0 or array.dtype.kind not in "fiub":
+            raise ValueError(
+                f"{path} holds {array.dtype} of shape {array.shape}; actions are numbers of shape (steps, dimensions), in a "
+                ".npy also (episodes, steps, dimensions)"
+            )
+    if not arrays:
+        raise ValueError(f"{path} holds no array")
+    return GivenEpisodes(path.name, [GivenEpisode(_finite(path, array)) for array in arrays])
+
+
+def _demonstrations(path: Path) -> GivenEpisodes:
+    episodes, kwargs = [], {}
+    for name in trajectories(path):
+        episode = read_maniskill(path, name)
+        if episode.length == 0:
+            continue
+        seed = episode.info.seed if episode.info.seed >= 0 else None
+        episodes.append(GivenEpisode(_finite(path, episode.action), seed, dict(episode.env_states)))
+        given: Mapping[str, Any] = episode.info.env_kwargs
+        kwargs = {key: given[key] for key in ("robot_uids", "control_mode") if given.get(key) is not None}
+        if episode.info.control_mode is not None:
+            kwargs["control_mode"] = episode.info.control_mode
+    if not episodes:
+        raise ValueError(f"{path} holds no trajectory with actions")
+    return GivenEpisodes(path.name, episodes, kwargs)
+
+
+def _finite(path: Path, actions: NDArray) -> NDArray[np.float32]:
+    actions = np.asarray(actions, np.float32)
+    if not np.isfinite(actions).all():
+        raise ValueError(f"{path} holds actions that are NaN or infinite")
+    return actions

@@ -1,0 +1,193 @@
+"""Keep what I just saw: an episode of the past becomes a recording after the fact.
+
+Nobody presses Record before the run that is worth keeping. But the history has it all: of every moment the poses, the
+action, the reward and what ``evaluate`` returned, as they were said then; and a snapshot. What a recording holds
+beyond that (env states, observations, pictures of every camera) is read off the envs when they are put back to
+the snapshot. That happens in a process of its own, so playing goes on, and the result is the file that recording it
+live would have given. It takes some seconds for the process to start, and then about as long as its pictures take.
+
+If the file was edited since, env states, observations and pictures are those that today's code gives for that state; the
+rest is as it was said then.
+"""
+
+from __future__ import annotations
+
+import pickle
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+from workbench.recording.episode_writer import EpisodeWriter
+from workbench.recording.rrd import RecordingError
+from workbench.session.episode_files import EpisodeFinisher
+from workbench.session.episodes import GatheredEpisode, episode_info, first_row, next_row
+from workbench.session.keep_status import KeepStatus
+from workbench.session.lane import Job, JobFailed, Lane, Stopped
+from workbench.session.messages import (
+    Captured,
+    CaptureMoments,
+    Failed,
+    Load,
+    Loaded,
+    MomentToCapture,
+    PlaceCamera,
+    Placed,
+    Request,
+)
+from workbench.session.past_episodes import PastEpisode, WhatToKeep, moments_of
+from workbench.session.process import WorkerProcess, describe_exit, start_in_background
+
+_IDLE_SECONDS = 60.0
+"""How long the process stays when nothing is kept: it holds some 0.75 GB."""
+_LOOK = 0.05
+_Answer = TypeVar("_Answer", Captured, Loaded, Placed)
+
+
+class PastKeeper:
+    """Keeps episodes, one job at a time."""
+
+    def __init__(self, folder: Path, finisher: EpisodeFinisher, on_change: Callable[[], None]) -> None:
+        self._folder, self._finisher, self._on_change = folder, finisher, on_change
+        self._lock = threading.Lock()
+        self._said, self._failed = "", False
+        self._process: WorkerProcess | None = None
+        self._loaded: tuple[Load, tuple[PlaceCamera, ...]] | None = None
+        self._lane = Lane("keep-past", on_change, self._fail, _IDLE_SECONDS, self._end_process)
+
+    def keep(self, what: WhatToKeep) -> None:
+        """Begin; what was under way is given up."""
+        self._say("")
+        self._lane.start("starting a process to draw it with", lambda job: self._work(job, what))
+
+    def stop(self) -> None:
+        """Give up; nothing of it is kept."""
+        self._lane.stop()
+        self._say("stopped; nothing was kept")
+
+    def refuse(self, why: str) -> None:
+        """Say why nothing can be kept."""
+        self._fail(why)
+        self._on_change()
+
+    def status(self) -> KeepStatus:
+        progress = self._lane.progress
+        with self._lock:
+            if progress is None:
+                return KeepStatus(said=self._said, failed=self._failed)
+        return KeepStatus(True, progress.what, progress.done, progress.total)
+
+    def close(self) -> None:
+        self._lane.close()
+
+    # --- on the lane's thread --------------------------------------------------------------------------
+
+    def _work(self, job: Job, what: WhatToKeep) -> None:
+        self._have_loaded(job, what)
+        writers: dict[int, GatheredEpisode] = {}
+        try:
+            self._capture_all(job, what, writers)
+        except (RecordingError, ValueError) as error:
+            _discard(writers)
+            raise JobFailed(f"it could not be kept: {error}") from error
+        except BaseException:
+            _discard(writers)
+            raise
+        job.tell(1, 1, "writing the files")
+        made = [self._finisher.finish(episode) for episode in writers.values()]
+        kept = sum(future.result() is not None for future in made)
+        steps = sum(episode.steps for episode in what.episodes)
+        if kept < len(made):
+            raise JobFailed(self._finisher.finished.problem or "its files could not be written")
+        self._say(f"kept {kept} episode{'' if kept == 1 else 's'}, {steps} steps")
+
+    def _capture_all(self, job: Job, what: WhatToKeep, writers: dict[int, GatheredEpisode]) -> None:
+        names = [dimension.name for dimension in what.task.actions]
+        moments = moments_of(what.episodes)
+        rows: dict[int, dict[int, list[tuple[PastEpisode, bool]]]] = {}
+        for episode in what.episodes:
+            for index, (moment, env) in enumerate(episode.moments):
+                rows.setdefault(moment.serial, {}).setdefault(env, []).append((episode, index == 0))
+        for done, (moment, envs) in enumerate(moments):
+            job.tell(done, len(moments), "drawing it again")
+            snapshot = pickle.dumps(what.snapshots[moment.serial])
+            answer = self._ask(
+                job, CaptureMoments((MomentToCapture(snapshot, envs),), what.task.can_render), Captured
+            )
+            columns, pictures, step = answer.columns[0], answer.pictures[0], moment.as_recorded
+            for env in envs:
+                for episode, is_first in rows[moment.serial][env]:
+                    if is_first:
+                        row = first_row(step, env, columns, pictures)
+                        writer = EpisodeWriter(
+                            self._folder,
+                            episode_info(what.task, episode.env, episode.seed),
+                            what.task.geometry,
+                            what.task.segmentation,
+                            names,
+                            what.task.cameras,
+                        )
+                        gathered = GatheredEpisode(
+                            writer, episode.env, episode.seed, state_names=frozenset(row.env_states)
+                        )
+                        writers[episode.env] = gathered
+                        writer.append(row)
+                        continue
+                    gathered = writers[episode.env]
+                    gathered.writer.append(next_row(step, env, columns, pictures, gathered.state_names))
+                    gathered.steps += 1
+
+    def _have_loaded(self, job: Job, what: WhatToKeep) -> None:
+        if self._loaded is not None and self._loaded[1] != what.placed:
+            self._end_process()  # a camera that was put back to the file would stay where it was placed
+        if self._process is None:
+            try:
+                self._process = start_in_background()
+            except OSError as error:
+                raise JobFailed(f"no process could be started to draw it with: {error}") from error
+        if self._loaded == (what.load, what.placed):
+            return
+        job.tell(0, 0, "building the envs to draw it with")
+        self._loaded = None
+        self._ask(job, what.load, Loaded)
+        for request in what.placed:
+            self._ask(job, request, Placed)
+        self._loaded = what.load, what.placed
+
+    def _ask(self, job: Job, request: Request, kind: type[_Answer]) -> _Answer:
+        process = self._process
+        assert process is not None
+        process.send(request)
+        try:
+            while not job.stopped:
+                event = process.receive(timeout=_LOOK)
+                if isinstance(event, kind):
+                    return event
+                if isinstance(event, Failed):
+                    where = "" if event.problem.line is None else f" (line {event.problem.line})"
+                    raise JobFailed(f"it could not be drawn again: {event.problem.message}{where}")
+        except EOFError:
+            code = process.exit_code()
+            self._end_process()
+            raise JobFailed(f"the process that draws it {describe_exit(code)}") from None
+        self._end_process()  # what it was asked for last belongs to nobody
+        raise Stopped
+
+    def _end_process(self) -> None:
+        process, self._process, self._loaded = self._process, None, None
+        if process is not None:
+            process.stop(grace=0.0)
+
+    def _fail(self, why: str) -> None:
+        with self._lock:
+            self._said, self._failed = why, True
+
+    def _say(self, words: str) -> None:
+        with self._lock:
+            self._said, self._failed = words, False
+        self._on_change()
+
+
+def _discard(writers: dict[int, GatheredEpisode]) -> None:
+    for episode in writers.values():
+        episode.writer.discard()
