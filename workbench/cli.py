@@ -12,7 +12,7 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
@@ -25,8 +25,10 @@ import workbench
 
 if TYPE_CHECKING:
     from workbench.authoring.problem import Problem
+    from workbench.session.kept_worker import WorkerOptions
     from workbench.session.messages import Event, TaskOptions
     from workbench.ui.door import Door
+    from workbench.ui.put_together import Workplace
 
 Task = Annotated[str, tyro.conf.Positional]
 """A task file, ``file.py:ClassName``, or a registered env id such as ``PickCube-v1``."""
@@ -113,6 +115,7 @@ def open_page(
         on_line=_echo,
     )
     place = Workplace(door.server, recordings, session)
+    leave_recordings = _go_back_in(place, recordings, WorkerOptions(worker.memory_limit))
     end.at_signals()
     try:
         place.pages.start("live")
@@ -121,6 +124,7 @@ def open_page(
     finally:
         out.print("closing")
         place.close()
+        leave_recordings()
         session.close()
         door.close()
     _leave(end.code)
@@ -208,6 +212,8 @@ def review(
         door = open_door(DoorOptions(host=host, port=port, token=token), label="Recordings")
     except (ValueError, DoorError) as error:
         return _refuse(str(error))
+    from workbench.session.kept_worker import WorkerOptions
+    from workbench.session.memory_limit import parse_memory
     from workbench.ui.put_together import Workplace
 
     _use_private_driver()
@@ -216,6 +222,7 @@ def review(
             err.print(f"[yellow]{escape(line)}[/]")
     end = _End()
     place = Workplace(door.server, folder, tasks=task)
+    leave_recordings = _go_back_in(place, folder, WorkerOptions(parse_memory("auto")))
     end.at_signals()
     try:
         place.pages.start("review")
@@ -224,6 +231,7 @@ def review(
     finally:
         out.print("closing")
         place.close()
+        leave_recordings()
         door.close()
     _leave(end.code)
 
@@ -331,6 +339,17 @@ def _use_private_driver() -> None:
     from workbench.machine.software_vulkan import ensure_render_device
 
     os.environ.update(ensure_render_device(install=False).env)
+
+
+def _go_back_in(place: Workplace, recordings: Path, worker: WorkerOptions) -> Callable[[], None]:
+    """Let the review go on live, and judge again; returns what ends that."""
+    from workbench.session.session import Session
+    from workbench.ui.step_in import offer_going_back_in
+
+    def open_task(task: str, options: TaskOptions) -> Session:
+        return Session(task, options, recordings=recordings, worker=worker, on_event=_say, on_line=_echo)
+
+    return offer_going_back_in(place, open_task)
 
 
 class _End:
