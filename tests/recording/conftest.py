@@ -13,13 +13,12 @@ import pytest
 import rerun as rr
 from numpy.typing import NDArray
 
+from tests.recording.made import Made, Track
 from workbench.core.body_table import BodyTable, build_body_table, read_poses
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
-from workbench.core.pictures import CameraInfo, Picture
+from workbench.core.pictures import CameraInfo
 from workbench.core.scene_geometry import read_geometry
-from workbench.core.step import StepResult
-from workbench.recording.columns import EpisodeBuilder
-from workbench.recording.episode import Episode, EpisodeInfo
+from workbench.recording.episode import EpisodeInfo
 
 STEPS = 8
 SEED = 3
@@ -30,7 +29,7 @@ SIZE = 96
 class Recorded:
     """An episode, and what ManiSkill itself said of its cameras at each of the T + 1 states."""
 
-    episode: Episode
+    episode: Made
     extrinsic_cv: dict[str, NDArray[np.float32]]
     """Camera name to (T + 1, 3, 4)."""
     intrinsic_cv: dict[str, NDArray[np.float32]]
@@ -54,12 +53,12 @@ def recorded() -> Recorded:
 
 
 @pytest.fixture(scope="session")
-def make_episode() -> Callable[..., Episode]:
+def make_episode() -> Callable[..., Made]:
     """A small episode made by hand, for the cases that no simulation gives; fields can be replaced."""
     return _make_episode
 
 
-def _make_episode(steps: int = 3, **fields: Any) -> Episode:
+def _make_episode(steps: int = 3, **fields: Any) -> Made:
     poses = np.zeros((steps + 1, 2, 7), dtype=np.float32)
     poses[..., 3] = 1
     poses[:, 1, 0] = np.arange(steps + 1)
@@ -96,11 +95,11 @@ def _make_episode(steps: int = 3, **fields: Any) -> Episode:
         "evaluate": {},
         "cameras": [],
     }
-    return Episode(**{**values, **fields})
+    return Made(**{**values, **fields})
 
 
 def record_stock(task: str, size: int = SIZE, steps: int = STEPS, **kwargs: Any) -> Recorded:
-    """`steps` random steps of a stock single env, through `EpisodeBuilder`."""
+    """`steps` random steps of a stock single env."""
     env = gym.make(
         task,
         num_envs=1,
@@ -120,8 +119,34 @@ def _play(env: gym.Env, task: str, steps: int) -> Recorded:
     obs, _ = env.reset(seed=SEED)
     table = build_body_table(base)
     seen = [obs]
-    builder = EpisodeBuilder(
-        EpisodeInfo(
+    states = [_state(base, table)]
+    outcomes: list[tuple[NDArray, float, bool, bool]] = []
+    env.action_space.seed(SEED)
+    for _ in range(steps):
+        action = env.action_space.sample()
+        obs, reward, ended, cut, _ = env.step(action)
+        seen.append(obs)
+        states.append(_state(base, table))
+        outcomes.append((action, float(reward), bool(ended), bool(cut)))
+
+    def of_cameras(group: str, key: str) -> dict[str, NDArray]:
+        return {name: np.stack([o[group][name][key][0].numpy() for o in seen]) for name in base._sensors}
+
+    rgb, depth, ids = (of_cameras("sensor_data", key) for key in ("rgb", "depth", "segmentation"))
+    tracks = [
+        Track(
+            _camera_info(name, sensor, obs),
+            np.arange(steps + 1),
+            np.stack([state["camera poses"][name] for state in states]),
+            rgb[name],
+            (depth[name][..., 0] / np.float32(1000)).astype(np.float32),
+            ids[name][..., 0].astype(np.int32),
+        )
+        for name, sensor in base._sensors.items()
+    ]
+    actions, rewards, ended, cut = zip(*outcomes)
+    episode = Made(
+        info=EpisodeInfo(
             task=task,
             env_index=0,
             seed=SEED,
@@ -132,65 +157,55 @@ def _play(env: gym.Env, task: str, steps: int) -> Recorded:
             control_mode=base.control_mode,
             backend="cpu",
             versions={"mani_skill": "3.0.1", "rerun-sdk": "0.41.0"},
+            env_kwargs={"robot_uids": "panda_wristcam"},
+            max_episode_steps=50,
         ),
-        read_geometry(base, table),
-        {int(key): body.name for key, body in base.segmentation_id_map.items()},
-        [f"action{index}" for index in range(len(env.action_space.sample()))],
-        [_camera_info(name, sensor, obs) for name, sensor in base._sensors.items()],
+        geometry=read_geometry(base, table),
+        segmentation={int(key): body.name for key, body in base.segmentation_id_map.items()},
+        poses=np.stack([state["poses"] for state in states]),
+        action=np.stack(actions).astype(np.float32),
+        action_names=tuple(f"action{index}" for index in range(len(actions[0]))),
+        reward=np.array(rewards, dtype=np.float32),
+        terminated=np.array(ended),
+        truncated=np.array(cut),
+        evaluate=_stacked([state["evaluate"] for state in states]),
+        cameras=tracks,
+        env_states=_stacked([state["env_states"] for state in states]),
+        obs=_stacked([_flat({"agent": o["agent"], "extra": o["extra"]}) for o in seen]),
     )
-    env.action_space.seed(SEED)
-    builder.start(_state(base, table), 0, _pictures(base, obs))
-    for _ in range(steps):
-        action = env.action_space.sample()
-        obs, reward, ended, cut, _ = env.step(action)
-        seen.append(obs)
-        builder.append(
-            _state(base, table, action, float(reward), bool(ended), bool(cut)), 0, _pictures(base, obs)
-        )
-
-    def of_cameras(group: str, key: str) -> dict[str, NDArray]:
-        return {name: np.stack([o[group][name][key][0].numpy() for o in seen]) for name in base._sensors}
-
     return Recorded(
-        episode=builder.finish(),
+        episode=episode,
         extrinsic_cv=of_cameras("sensor_param", "extrinsic_cv"),
         intrinsic_cv=of_cameras("sensor_param", "intrinsic_cv"),
-        depth_mm={name: depth[..., 0] for name, depth in of_cameras("sensor_data", "depth").items()},
+        depth_mm={name: values[..., 0] for name, values in depth.items()},
     )
 
 
-def _state(
-    base: Any,
-    table: BodyTable,
-    action: NDArray | None = None,
-    reward: float = 0.0,
-    ended: bool = False,
-    cut: bool = False,
-) -> StepResult:
-    return StepResult(
-        elapsed_steps=base.elapsed_steps.numpy().astype(np.int32).reshape(1),
-        reward=np.array([reward], dtype=np.float32),
-        terminated=np.array([ended]),
-        truncated=np.array([cut]),
-        evaluate={key: value.numpy().copy() for key, value in base.evaluate().items()},
-        poses=read_poses(base, table),
-        action=None if action is None else action.astype(np.float32)[None],
-    )
+def _state(base: Any, table: BodyTable) -> dict[str, Any]:
+    return {
+        "poses": read_poses(base, table)[0].copy(),
+        "evaluate": {key: value[0].numpy().copy() for key, value in base.evaluate().items()},
+        "env_states": _flat(base.get_state_dict()),
+        "camera poses": {
+            name: sensor.camera.get_global_pose().raw_pose[0].numpy().copy()
+            for name, sensor in base._sensors.items()
+        },
+    }
 
 
-def _pictures(base: Any, obs: dict[str, Any]) -> list[Picture]:
-    return [
-        Picture(
-            camera=name,
-            kind="sensor",
-            env=0,
-            pose=base._sensors[name].camera.get_global_pose().raw_pose[0].numpy().copy(),
-            rgb=images["rgb"][0].numpy(),
-            depth=images["depth"][0, ..., 0].numpy().astype(np.float32) / 1000,
-            segmentation=images["segmentation"][0, ..., 0].numpy().astype(np.int32),
-        )
-        for name, images in obs["sensor_data"].items()
-    ]
+def _flat(nested: dict[str, Any], prefix: str = "") -> dict[str, NDArray]:
+    """Env 0 of nested tensors (1, ...)."""
+    flat: dict[str, NDArray] = {}
+    for name, value in nested.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{name}/")
+        else:
+            flat[prefix + name] = value[0].numpy().copy()
+    return flat
+
+
+def _stacked(rows: list[dict[str, NDArray]]) -> dict[str, NDArray]:
+    return {name: np.stack([row[name] for row in rows]) for name in rows[0]}
 
 
 def _camera_info(name: str, sensor: Any, obs: dict[str, Any]) -> CameraInfo:

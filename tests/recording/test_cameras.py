@@ -11,12 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from workbench.recording.layout import optical_pose
 from workbench.recording.read import Column, read_rrd
-from workbench.recording.rrd import write_rrd
 
 
 @pytest.fixture(scope="module")
 def entities(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, Column]]:
-    return read_rrd(write_rrd(recorded.episode, tmp_path_factory.mktemp("recordings") / "episode.rrd"))
+    return read_rrd(recorded.episode.write(tmp_path_factory.mktemp("recordings")).rrd)
 
 
 def at(column: Column, state: int) -> NDArray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import io
+import json
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -17,21 +18,36 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 from PIL import Image
 
+from tests.recording.made import Made, Track
 from workbench.core.geometry import Visual
 from workbench.core.pictures import CameraInfo
-from workbench.recording.episode import CameraTrack, Episode
+from workbench.recording.episode import Episode
 from workbench.recording.layout import body_entities
 from workbench.recording.read import Column, read_properties, read_rrd
-from workbench.recording.rrd import write_rrd
+from workbench.recording.read_episode import read_episode
 from workbench.recording.verify import verify_rrd
 
 Entities = dict[str, dict[str, Column]]
 
 
 @pytest.fixture(scope="module")
-def written(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Episode, Path, Entities]:
-    path = write_rrd(recorded.episode, tmp_path_factory.mktemp("recordings") / "episode.rrd")
+def written(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Made, Path, Entities]:
+    path = recorded.episode.write(tmp_path_factory.mktemp("recordings")).rrd
     return recorded.episode, path, read_rrd(path)
+
+
+def assert_same(found: Episode, made: Made) -> None:
+    """All arrays of `found` but its meshes and pictures are those of `made`, type by type."""
+    assert found.poses is not None
+    np.testing.assert_array_equal(found.poses, made.poses)
+    for name in ("action", "reward", "terminated", "truncated"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(made, name))
+    for field in ("evaluate", "env_states", "obs"):
+        expected = getattr(made, field)
+        assert getattr(found, field).keys() == expected.keys()
+        for name, values in getattr(found, field).items():
+            assert values.dtype == expected[name].dtype
+            np.testing.assert_array_equal(values, expected[name])
 
 
 def scalars(entities: Entities, entity: str) -> tuple[NDArray, NDArray]:
@@ -40,11 +56,11 @@ def scalars(entities: Entities, entity: str) -> tuple[NDArray, NDArray]:
     return column.steps, np.stack(column.values)
 
 
-def test_rerun_itself_finds_nothing_wrong(written: tuple[Episode, Path, Entities]) -> None:
+def test_rerun_itself_finds_nothing_wrong(written: tuple[Made, Path, Entities]) -> None:
     assert verify_rrd(written[1]) is None
 
 
-def test_a_damaged_file_is_found_out(written: tuple[Episode, Path, Entities], tmp_path: Path) -> None:
+def test_a_damaged_file_is_found_out(written: tuple[Made, Path, Entities], tmp_path: Path) -> None:
     broken = tmp_path / "broken.rrd"
     broken.write_bytes(written[1].read_bytes()[:-2000])
     assert verify_rrd(broken)
@@ -52,7 +68,7 @@ def test_a_damaged_file_is_found_out(written: tuple[Episode, Path, Entities], tm
         verify_rrd(tmp_path / "none.rrd")
 
 
-def test_every_body_has_its_poses(written: tuple[Episode, Path, Entities]) -> None:
+def test_every_body_has_its_poses(written: tuple[Made, Path, Entities]) -> None:
     episode, _, entities = written
     moved = 0
     for body, entity in enumerate(body_entities(episode.geometry)):
@@ -73,7 +89,7 @@ def test_every_body_has_its_poses(written: tuple[Episode, Path, Entities]) -> No
     assert moved > 8, "the robot did not move, so this test compared nothing"
 
 
-def test_every_mesh_lies_under_its_body(written: tuple[Episode, Path, Entities]) -> None:
+def test_every_mesh_lies_under_its_body(written: tuple[Made, Path, Entities]) -> None:
     episode, _, entities = written
     paths = body_entities(episode.geometry)
     expected: dict[str, list[Visual]] = {}
@@ -94,7 +110,48 @@ def test_every_mesh_lies_under_its_body(written: tuple[Episode, Path, Entities])
                 assert pixels == visual.material.texture[..., :3].tobytes()
 
 
-def test_numbers_are_exact(written: tuple[Episode, Path, Entities]) -> None:
+def test_all_of_it_is_read_back(written: tuple[Made, Path, Entities], recorded: Any) -> None:
+    made, path, _ = written
+    found = read_episode(path)
+    assert_same(found, made)
+    assert found.action_names == made.action_names and found.segmentation == made.segmentation
+    assert dataclasses.replace(found.info, source={}, source_file=None) == dataclasses.replace(
+        made.info, source={}, source_file=None
+    )
+    assert found.info.source_file == "task.py"
+    assert found.info.source == {"task.py": "class Task: ...\n", "parts.py": "SIZE = 2\n"}
+    assert found.geometry is not None
+    assert found.geometry.body_names == made.geometry.body_names
+    assert found.geometry.body_hidden == made.geometry.body_hidden
+    by_name = {visual.name: visual for visual in found.geometry.visuals}
+    assert by_name.keys() == {visual.name for visual in made.geometry.visuals}
+    for visual in made.geometry.visuals:
+        again = by_name[visual.name]
+        np.testing.assert_array_equal(again.mesh.vertices, visual.mesh.vertices)
+        np.testing.assert_array_equal(again.mesh.faces, visual.mesh.faces)
+        np.testing.assert_array_equal(np.sort(again.bodies), np.sort(visual.bodies))
+        np.testing.assert_allclose(again.material.base_color, visual.material.base_color, rtol=1e-6)
+        if visual.mesh.normals is not None:
+            np.testing.assert_array_equal(again.mesh.normals, visual.mesh.normals)
+        if visual.mesh.uvs is not None and visual.material.texture is not None:
+            np.testing.assert_array_equal(again.mesh.uvs, visual.mesh.uvs)
+            assert again.material.texture is not None
+            np.testing.assert_array_equal(again.material.texture[..., :3], visual.material.texture[..., :3])
+    for track, again in zip(made.cameras, found.cameras, strict=True):
+        assert again.info.key == track.info.key and again.info.mount == track.info.mount
+        np.testing.assert_array_equal(again.info.intrinsic, track.info.intrinsic)
+        np.testing.assert_array_equal(again.frame, track.frame)
+        np.testing.assert_allclose(again.pose, track.pose, atol=1e-7)
+        assert again.rgb is not None and again.depth is not None and again.segmentation is not None
+        assert track.rgb is not None and track.segmentation is not None
+        for state in track.frame:
+            assert np.abs(again.rgb[state].astype(int) - track.rgb[state]).mean() < 6
+            millimetres = np.rint(again.depth[state] * 1000).astype(int)
+            np.testing.assert_array_equal(millimetres, recorded.depth_mm[track.info.name][state])
+            np.testing.assert_array_equal(again.segmentation[state], track.segmentation[state])
+
+
+def test_numbers_are_exact(written: tuple[Made, Path, Entities]) -> None:
     episode, _, entities = written
     after = np.arange(1, len(episode.poses))
     for entity, expected in (("/action", episode.action), ("/reward", episode.reward[:, None])):
@@ -110,7 +167,28 @@ def test_numbers_are_exact(written: tuple[Episode, Path, Entities]) -> None:
     np.testing.assert_array_equal(scalars(entities, "/episode/success")[1][:, 0], episode.evaluate["success"])
 
 
-def test_sim_time_is_the_step_in_seconds(written: tuple[Episode, Path, Entities]) -> None:
+def test_observations_and_parts_of_the_reward_have_places_of_their_own(
+    written: tuple[Made, Path, Entities], make_episode: Callable[..., Made], tmp_path: Path
+) -> None:
+    episode, _, entities = written
+    assert episode.obs.keys() == {
+        "agent/qpos",
+        "agent/qvel",
+        "extra/is_grasped",
+        "extra/tcp_pose",
+        "extra/goal_pos",
+    }
+    for name, expected in episode.obs.items():
+        steps, values = scalars(entities, f"/observation/state/{name}")
+        np.testing.assert_array_equal(steps, np.arange(len(episode.poses)))
+        np.testing.assert_array_equal(values, expected.reshape(len(expected), -1))
+    terms = make_episode(evaluate={"reward_terms/reach": np.arange(4.0), "success": np.zeros(4, bool)})
+    entities = read_rrd(terms.write(tmp_path).rrd)
+    np.testing.assert_array_equal(scalars(entities, "/reward/reach")[1][:, 0], np.arange(4.0))
+    assert entities["/reward/reach"]["SeriesLines:names"].values[0] == ["reach"]
+
+
+def test_sim_time_is_the_step_in_seconds(written: tuple[Made, Path, Entities]) -> None:
     from rerun.chunk import RrdReader
 
     for chunk in RrdReader(written[1]).stream():
@@ -121,7 +199,7 @@ def test_sim_time_is_the_step_in_seconds(written: tuple[Episode, Path, Entities]
     pytest.fail("/reward is not there")
 
 
-def test_pictures_come_back(written: tuple[Episode, Path, Entities], recorded: Any) -> None:
+def test_pictures_come_back(written: tuple[Made, Path, Entities], recorded: Any) -> None:
     episode, _, entities = written
     assert [track.info.name for track in episode.cameras] == ["base_camera", "hand_camera"]
     for track in episode.cameras:
@@ -148,13 +226,15 @@ def test_pictures_come_back(written: tuple[Episode, Path, Entities], recorded: A
     assert labels == {0: "background", **episode.segmentation}
 
 
-def test_properties_tell_the_episode(written: tuple[Episode, Path, Entities]) -> None:
+def test_properties_tell_the_episode(written: tuple[Made, Path, Entities]) -> None:
     episode, path, _ = written
     properties = read_properties(path)
     told = properties["episode"]
     assert told["return"] == pytest.approx(float(episode.reward.sum()), rel=1e-6)
     assert told["written_at"].endswith("+00:00")
-    del told["return"], told["written_at"]
+    assert told["id"] == episode.info.id and json.loads(told["env_kwargs"]) == episode.info.env_kwargs
+    for name in ("return", "written_at", "id", "env_kwargs"):
+        del told[name]
     assert told == {
         "task": "PickCube-v1",
         "seed": 3,
@@ -169,6 +249,9 @@ def test_properties_tell_the_episode(written: tuple[Episode, Path, Entities]) ->
         "backend": "cpu",
         "source_file": "task.py",
         "source_hash": "0123456789ab",
+        "max_episode_steps": 50,
+        "recovered": False,
+        "reset_options": "{}",
     }
     assert properties["versions"] == {"mani_skill": "3.0.1", "rerun-sdk": "0.41.0"}
     assert properties["source"] == {
@@ -178,7 +261,7 @@ def test_properties_tell_the_episode(written: tuple[Episode, Path, Entities]) ->
     assert properties[""]["name"] == "PickCube-v1 seed 3 env 0: no success, 8 steps"
 
 
-def test_events_name_the_moments(make_episode: Callable[..., Episode], tmp_path: Path) -> None:
+def test_events_name_the_moments(make_episode: Callable[..., Made], tmp_path: Path) -> None:
     episode = make_episode(
         5,
         evaluate={
@@ -188,7 +271,7 @@ def test_events_name_the_moments(make_episode: Callable[..., Episode], tmp_path:
         terminated=np.array([0, 1, 0, 0, 0], dtype=bool),
         truncated=np.array([0, 0, 0, 0, 1], dtype=bool),
     )
-    path = write_rrd(episode, tmp_path / "e.rrd")
+    path = episode.write(tmp_path).rrd
     log = read_rrd(path)["/logs/events"]
     steps, texts = log["TextLog:text"].steps, [value[0] for value in log["TextLog:text"].values]
     assert steps is not None
@@ -204,7 +287,7 @@ def test_events_name_the_moments(make_episode: Callable[..., Episode], tmp_path:
     assert (told["success"], told["success_once"], told["fail"], told["fail_once"]) == (True,) * 4
 
 
-def test_only_what_this_env_wears_is_written(make_episode: Callable[..., Episode], tmp_path: Path) -> None:
+def test_only_what_this_env_wears_is_written(make_episode: Callable[..., Made], tmp_path: Path) -> None:
     episode = make_episode()
     (visual,) = episode.geometry.visuals
     elsewhere = dataclasses.replace(visual, envs=np.array([0, 1], dtype=np.int32))
@@ -214,7 +297,7 @@ def test_only_what_this_env_wears_is_written(make_episode: Callable[..., Episode
         (("/world/floor", "/world/robot/hand"), ("/world/robot/hand", "/world/floor"))
     ):
         episode.info = dataclasses.replace(episode.info, env_index=env)
-        entities = read_rrd(write_rrd(episode, tmp_path / f"{env}.rrd"))
+        entities = read_rrd(episode.write(tmp_path).rrd)
         assert f"{bare}/0" not in entities
         # Body 1 is one that the env lacks (NaN throughout): it gets neither pose nor mesh.
         assert (f"{worn}/0" in entities) == (worn == "/world/floor")
@@ -231,10 +314,10 @@ EVALUATE = st.dictionaries(
 )
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data(), steps=st.integers(0, 6), entries=EVALUATE, lost=st.integers(0, 9))
 def test_any_episode_comes_back(
-    make_episode: Callable[..., Episode], data: st.DataObject, steps: int, entries: Any, lost: int
+    make_episode: Callable[..., Made], data: st.DataObject, steps: int, entries: Any, lost: int
 ) -> None:
     evaluate = {
         name: data.draw(hnp.arrays(dtype, (steps + 1, *shape)), label=name)
@@ -244,7 +327,9 @@ def test_any_episode_comes_back(
     episode.poses[lost : lost + 2, 1] = np.nan
     episode.reward[:] = data.draw(hnp.arrays(np.float32, steps), label="reward")
     with tempfile.TemporaryDirectory() as folder:
-        entities = read_rrd(write_rrd(episode, Path(folder, "e.rrd")))
+        path = episode.write(Path(folder)).rrd
+        entities, again = read_rrd(path), read_episode(path)
+    assert_same(again, episode)
     if np.isnan(episode.poses[:, 1]).all():
         assert "/world/robot/hand" not in entities
     else:
@@ -264,19 +349,19 @@ def test_any_episode_comes_back(
         np.testing.assert_array_equal(read, values.reshape(steps + 1, -1).astype(np.float64))
 
 
-def test_cameras_of_one_name_and_far_depths(make_episode: Callable[..., Episode], tmp_path: Path) -> None:
-    def track(kind: Any, ids: NDArray[np.int32]) -> CameraTrack:
+def test_cameras_of_one_name_and_far_depths(make_episode: Callable[..., Made], tmp_path: Path) -> None:
+    def track(kind: Any, ids: NDArray[np.int32]) -> Track:
         info = CameraInfo("eye", kind, 2, 2, 1.0, 0.01, 100.0, np.eye(3, dtype=np.float32), None, ("depth",))
         pose = np.array([[0, 0, 0, 1, 0, 0, 0]], dtype=np.float32)
         depth = np.array([[[np.nan, np.inf], [-1.0, 70.0]]], dtype=np.float32)
-        return CameraTrack(info, np.array([2]), pose, None, depth, ids)
+        return Track(info, np.array([2]), pose, None, depth, ids)
 
     negative = np.array([[[-1, 0], [1, 70_000]]], dtype=np.int32)
     small = np.array([[[0, 0], [1, 65_535]]], dtype=np.int32)
     episode = make_episode(
         cameras=[track("human", negative), track("sensor", small)], segmentation={70_000: "far"}
     )
-    entities = read_rrd(write_rrd(episode, tmp_path / "e.rrd"))
+    entities = read_rrd(episode.write(tmp_path).rrd)
     depth = entities["/world/cameras/eye/depth"]["EncodedDepthImage:blob"]
     np.testing.assert_array_equal(depth.steps, [2])
     np.testing.assert_array_equal(

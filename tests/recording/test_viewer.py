@@ -20,14 +20,14 @@ from playwright.sync_api import Request, sync_playwright
 from rerun.experimental import ViewerClient
 
 from workbench.recording import viewer
-from workbench.recording.rrd import write_rrd
 from workbench.recording.verify import quiet_environment, rerun_command, verify_rrd
 from workbench.recording.viewer import Viewer, has_screen, open_in_rerun
 
 
 @pytest.fixture(scope="module")
 def file(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_rrd(recorded.episode, tmp_path_factory.mktemp("recordings") / "PickCube ä.rrd")
+    written = recorded.episode.write(tmp_path_factory.mktemp("recordings"))
+    return written.rrd.rename(written.rrd.with_name("PickCube ä.rrd"))
 
 
 @pytest.fixture(scope="module")

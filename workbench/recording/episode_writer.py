@@ -58,6 +58,7 @@ class EpisodeWriter:
         }
         self._given: dict[int, tuple[Modality, ...]] = {}
         self._states = 0
+        self._written = False
         self._finished: EpisodeFiles | None = None
         path = self._folder / FOLDER / f"{info.id}.arrow"
         self._scene = path.with_suffix(SCENE_SUFFIX)
@@ -110,13 +111,13 @@ class EpisodeWriter:
                 journal.add("layout", number, layout.encode())
             journal.add("row", number, packed)
             journal.commit()
-        except ValueError:
+        except (ValueError, OSError) as error:
             journal.rollback()
             if layout is not None:
                 self._packer.forget(number)
+            if isinstance(error, OSError):
+                raise self._failed(error) from error
             raise
-        except OSError as error:
-            raise self._failed(error) from error
         self._given |= given
         self._states += 1
 
@@ -125,21 +126,28 @@ class EpisodeWriter:
 
         Raises:
             ValueError: there is no state yet.
-            RecordingError: they cannot be written; the journal stays for `recover`, nothing else does.
+            RecordingError: they cannot be written; the journal stays for `recover`, nothing else does. `close` when
+                there is no second try.
         """
         if self._finished is not None:
             return self._finished
+        if not self._written:
+            try:
+                self._journal.finish()
+            except OSError as error:
+                raise self._failed(error) from error
+            self._written = True
         try:
-            self._journal.finish()
             self._finished = make_files(self._journal.path, self._header, self._folder, self._states)
-        except RecordingError:
-            self._journal.close()
+        except Exception:
+            self.close()
             raise
-        except OSError as error:
-            self._journal.close()
-            raise self._failed(error) from error
         self.discard()
         return self._finished
+
+    def close(self) -> None:
+        """Let go of the episode as it is; `recover` finds what was written of it."""
+        self._journal.close()
 
     def discard(self) -> None:
         """Forget the episode: nothing of it stays on the disk, but for the files that `finish` has made."""

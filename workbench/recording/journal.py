@@ -24,6 +24,7 @@ import fcntl
 import os
 import threading
 import time
+import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -52,6 +53,7 @@ class Journal:
         """Begin the journal `path`, which must not exist; its folder is made. Raises OSError."""
         self.path = path
         self._descriptor = _create(path)
+        self._closer = weakref.finalize(self, os.close, self._descriptor)
         self._size = 0
         self._pending: list[Entry] = []  # the owner's alone
         self._waiting: list[Entry] = []
@@ -80,9 +82,11 @@ class Journal:
         """What was added belongs together from here on, and will be on the disk soon.
 
         Raises:
-            OSError: something that was committed before could not be written.
+            OSError: something that was committed before could not be written; this is not kept then.
         """
-        added = sum(len(entry.value) + len(entry.kind) + 8 for entry in self._pending)
+        if self._error is not None:
+            raise self._error
+        added = sum(map(_size, self._pending))
         with self._lock:
             self._waiting += self._pending
             self._waiting_bytes += added
@@ -103,7 +107,8 @@ class Journal:
             with self._lock:
                 entries, self._waiting = self._waiting, []
                 self._waiting_bytes = 0
-            if not entries or self._error is not None or self._descriptor < 0:
+            if not entries or self._error is not None or not self._closer.alive:
+                self._wait_again(entries)
                 return
             batch = pa.record_batch(
                 [
@@ -117,12 +122,18 @@ class Journal:
                 self._put(batch.serialize())
             except OSError as error:
                 self._error = error
+                self._wait_again(entries)
+
+    def _wait_again(self, entries: list[Entry]) -> None:
+        with self._lock:
+            self._waiting = entries + self._waiting
+            self._waiting_bytes += sum(map(_size, entries))
 
     def sync(self) -> None:
         """Write what was committed and make it last, also through a power cut. An error is raised by the next `commit`."""
         self.write()
         with self._writing:
-            if self._error is not None or self._descriptor < 0:
+            if self._error is not None or not self._closer.alive:
                 return
             try:
                 os.fsync(self._descriptor)
@@ -133,8 +144,12 @@ class Journal:
                 self._error = error
 
     def finish(self) -> None:
-        """Write everything and stop writing; the file stays locked until `close`. Raises OSError as `commit`."""
+        """Write everything and stop writing; the file stays locked until `close`.
+
+        What could not be written before is tried again. Raises OSError where something still cannot.
+        """
         _keeper.forget(self)
+        self._error = None
         self.sync()
         if self._error is not None:
             raise self._error
@@ -143,9 +158,7 @@ class Journal:
         """Let go of the file."""
         _keeper.forget(self)
         with self._writing:
-            descriptor, self._descriptor = self._descriptor, -1
-        if descriptor >= 0:
-            os.close(descriptor)
+            self._closer()
 
     def remove(self) -> None:
         """Close, and take the file away."""
@@ -164,6 +177,10 @@ class Journal:
             os.lseek(self._descriptor, self._size, os.SEEK_SET)
             raise
         self._size += written
+
+
+def _size(entry: Entry) -> int:
+    return len(entry.value) + len(entry.kind) + 8
 
 
 def _create(path: Path) -> int:

@@ -125,8 +125,8 @@ class Log:
 
     def scalars(self, entity: str, steps: NDArray[np.int64], values: NDArray) -> None:
         """`values` (len(steps), ...), all of a step as one batch."""
-        flat = np.asarray(values, dtype=np.float64).reshape(len(steps), -1)
-        if flat.size:
+        if np.size(values):
+            flat = np.asarray(values, dtype=np.float64).reshape(len(steps), -1)
             columns = rr.Scalars.columns(scalars=flat.reshape(-1))
             self.columns(entity, steps, columns.partition([flat.shape[1]] * len(flat)))
 

@@ -67,8 +67,16 @@ class H5Writer:
         def add(path: str, column: str, from_state: int, dtype: Any = None) -> None:
             *folders, leaf = path.split("/")
             parent: Any = group
-            for folder in folders:
+            while folders:
+                folder = folders.pop(0)
+                if isinstance(
+                    parent.get(folder), h5py.Dataset
+                ):  # something is called "a", and something "a/b"
+                    leaf = "_".join([folder, *folders, leaf])
+                    break
                 parent = parent[folder] if folder in parent else parent.create_group(folder, track_order=True)
+            while leaf in parent:
+                leaf += "_"
             what = survey.columns[column]
             shape = (length + 1 - from_state, *what.shape)
             self.datasets.append(

@@ -45,7 +45,7 @@ def trajectories(path: Path) -> tuple[str, ...]:
     """
     try:
         with h5py.File(path, "r") as file:
-            return tuple(sorted((name for name in file if name.startswith("traj_")), key=_number))
+            return tuple(sorted((name for name in map(str, file) if name.startswith("traj_")), key=_number))
     except (OSError, RuntimeError) as error:
         raise UnreadableRecording(f"{Path(path).name} is no .h5 that can be read: {error}") from error
 

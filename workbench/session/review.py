@@ -61,7 +61,8 @@ class Shelf(Protocol):
 def read_row(row: Row) -> Episode:
     """The recording of a row. Raises as `read_episode`."""
     if row.trajectory is not None:
-        return read_maniskill(row.paths[0], row.trajectory)
+        # The library opens it by its .json, which is where the words are.
+        return read_maniskill(row.paths[0].with_suffix(".h5"), row.trajectory)
     return read_episode(row.paths[0])
 
 

@@ -11,16 +11,20 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import viser
 
 from workbench.recording.library import Library
 from workbench.session.recorded_scene import SceneProcess
 from workbench.session.review import Review
-from workbench.session.session import Session
-from workbench.ui.page import Page
 from workbench.ui.pages import Pages
 from workbench.ui.review_page import ReviewOffers, ReviewPage
+
+if TYPE_CHECKING:
+    # What a live env needs is not needed for looking at recordings.
+    from workbench.session.session import Session
+    from workbench.ui.page import Page
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,8 @@ class Workplace:
                 self._shelf.library.close()
 
     def _live_page(self, dark: bool) -> Page:
+        from workbench.ui.page import Page
+
         assert self.session is not None, "a live page is offered with its session"
         return Page(self._server, self.session, dark, on_review=lambda: self.pages.show("review"))
 

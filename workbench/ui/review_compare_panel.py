@@ -98,7 +98,7 @@ class ReviewComparePanel:
         press = self._presses.id_of(number, lambda _, number=number: self._go(number))
         step = parting.position if view.align == "start" else f"{parting.position:+d}"
         return {
-            "name": parting.name,
+            "name": parting.name.removeprefix(PREFIX),
             "step": step,
             "first": parting.first,
             "most": parting.most,

@@ -53,6 +53,8 @@ FRAME = 1 / 30
 """Seconds, as the live page's."""
 PANEL_WIDTH = 340
 LIBRARY_WIDTH = 520
+NARROW = 700
+"""Pixels of the view beside the library, from which on there is room for both."""
 BACK = "Back to the live env"
 
 
@@ -124,7 +126,7 @@ class ReviewPage:
         self._framed: object = None
         self._labels: list[viser.LabelHandle] = []
         self._labelled: object = None
-        self._had_opened = False
+        self._had_opened = tuple(one.id for one in review.view().opened)
         self._built_for = 0
         """How many triangles the scene was built for."""
 
@@ -140,7 +142,7 @@ class ReviewPage:
         server.gui.add_html(style_sheet())
         self._status = server.gui.add_html("")
         if offers.on_back is not None:
-            go_back = server.gui.add_button(BACK, icon=viser.Icon.ARROW_BACK_UP)
+            go_back = server.gui.add_button(BACK, icon=viser.Icon.ARROW_BACK_UP, color="gray")
             go_back.on_click(lambda _: offers.on_back() if offers.on_back else None)
         tabs = server.gui.add_tab_group()
         review_tab = tabs.add_tab("Review", viser.Icon.PLAYER_PLAY)
@@ -171,6 +173,8 @@ class ReviewPage:
             self._library_window.dock_left()
             self._library_window.set_width(LIBRARY_WIDTH)
         self._library_open = True
+        if self._had_opened:
+            self._show_library(False)
         places = Places(review_tab, compare_tab, share_tab, tabs, self._library)
         made = [part(server, places) for part in offers.parts]
         self._parts = tuple(part for part in made if part is not None)
@@ -255,10 +259,13 @@ class ReviewPage:
             part.draw(view)
 
     def _make_way_for_the_first(self, view: ReviewView) -> None:
-        """The library takes half of a small screen: once a recording is open it is a strip at the edge."""
-        if bool(view.opened) != self._had_opened:
-            self._had_opened = bool(view.opened)
-            self._show_library(not view.opened)
+        """The library takes half of a small screen: once a recording is open it is a strip at the edge there."""
+        ids = tuple(one.id for one in view.opened)
+        if ids != self._had_opened:
+            self._had_opened = ids
+            widths = [client.camera.image_width for client in self._server.get_clients().values()]
+            if not ids or min((width for width in widths if width), default=0) < NARROW:
+                self._show_library(not ids)
 
     def _show_library(self, shown: bool) -> None:
         self._library_open = shown
@@ -446,6 +453,7 @@ def status_html(view: ReviewView) -> str:
         speed=f"{view.speed:g}",
         task=None if chosen is None else chosen.episode.info.task,
         name="" if chosen is None else chosen.name,
+        scene="" if chosen is None or not chosen.making else chosen.scene,
         ended=ended,
         mood=mood,
         where="" if chosen is None else f"step {view.states[view.selected]} / {chosen.length}",
