@@ -5,11 +5,14 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from workbench.session.lengths import length
 from workbench.session.rescore_messages import Verdict
@@ -31,6 +34,8 @@ def what_changed(verdict: Verdict) -> str:
 
 
 def returns(verdict: Verdict) -> str:
+    if math.isnan(verdict.returns[0]) and np.isnan(verdict.old_reward).all():
+        return f"none → {verdict.returns[1]:.4g}"
     was, now = (f"{value:.4g}" for value in verdict.returns)
     return was if was == now else f"{was} → {now}"
 
@@ -55,7 +60,7 @@ def summary(verdicts: Sequence[Verdict]) -> str:
     )
     if any(verdict.has_success for verdict in judged):
         was, now = (sum(verdict.success[k] is not None for verdict in judged) for k in (0, 1))
-        sentence += f"; with success {was}" + ("" if was == now else f" → {now}")
+        sentence += f"; successes: {was}" + ("" if was == now else f" → {now}")
     was, now = (f"{sum(v.returns[k] for v in judged) / len(judged):.4g}" for k in (0, 1))
     sentence += f"; mean return {was}" + ("" if was == now else f" → {now}")
     skipped = len(verdicts) - len(judged)
