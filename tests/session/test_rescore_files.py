@@ -233,12 +233,6 @@ def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path) -> Non
         assert view.steps == EPISODES * STEPS and all(verdict.differs for verdict in view.verdicts)
         assert words.summary(view.verdicts).startswith("3 of 3 episodes differ")
 
-        edit(author, REWARD, "import time; time.sleep(1000)")
-        rescorer.start(find_episodes((author / "recordings",)))
-        until(rescorer, "loading")
-        rescorer.stop()
-        until(rescorer, "stopped")
-
         edit(author, REWARD, "return 1 / 0")
         rescorer.start(find_episodes((author / "recordings",)))
         view = until(rescorer, "failed", "done")
@@ -246,5 +240,11 @@ def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path) -> Non
         rescorer.start(find_episodes((author / "recordings",)), recorded_source=True)
         view = until(rescorer, "done", "failed")
         assert view.why == "" and not any(verdict.differs for verdict in view.verdicts)
+
+        edit(author, REWARD, "import time; time.sleep(1000)")
+        rescorer.start(find_episodes((author / "recordings",)))
+        until(rescorer, "loading")
+        rescorer.stop()
+        until(rescorer, "stopped")
     finally:
         rescorer.close()

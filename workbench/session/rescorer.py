@@ -2,6 +2,7 @@
 
 One thread does all of it. It groups the episodes by the env that they are judged in, has the process load one after the
 other and judge its episodes, and gathers what it says. To stop is to end the process: what is known by then stays.
+Else it is kept for a while, since it takes seconds to start.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from workbench.session.step_back import CannotStepIn, write_source
 
 MOST_AT_ONCE = 16
 """Envs."""
+IDLE_SECONDS = 300.0
+"""How long the process is kept without work."""
 _LOOK = 0.1
 
 RescoreState = Literal["none", "loading", "judging", "done", "stopped", "failed"]
@@ -86,6 +89,8 @@ class Rescorer:
         self._waiting: _Job | None = None
         self._job: _Job | None = None
         self._closing = False
+        self._process: WorkerProcess | None = None
+        """The thread's own."""
         self._thread: threading.Thread | None = None
 
     @property
@@ -106,6 +111,13 @@ class Rescorer:
                 return
             self._waiting = _Job(tuple(files), base, recorded_source, use_env_states)
             self._job = None
+            self._view = RescoreView(
+                "loading",
+                self._view.serial + 1,
+                len(files),
+                recorded_source=recorded_source,
+                use_env_states=use_env_states,
+            )
             self._wake.notify_all()
             if self._thread is None:
                 self._thread = threading.Thread(target=self._run, name="rescore", daemon=True)
@@ -115,6 +127,9 @@ class Rescorer:
         """Go no further; what is known by now stays to be seen."""
         with self._wake:
             self._waiting = self._job = None
+            if self._view.state in ("loading", "judging"):
+                self._view = replace(self._view, state="stopped", serial=self._view.serial + 1)
+        self._on_change()
 
     def close(self) -> None:
         """End it all; returns when the thread has ended."""
@@ -129,48 +144,43 @@ class Rescorer:
 
     def _run(self) -> None:
         while (job := self._next()) is not None:
-            process: WorkerProcess | None = None
             try:
                 groups, unread = group_episodes(
                     job.files, MOST_AT_ONCE, job.base, recorded_source=job.recorded_source
                 )
                 self._tell(job, verdicts=tuple(unread), notes=tuple({g.note for g in groups if g.note}))
-                if groups:
-                    process = _start()
                 for group in groups:
-                    self._judge(job, process, group)
+                    self._judge(job, group)
                 self._tell(job, state="done")
             except _Stopped:
-                self._tell(job, state="stopped")
+                self._end_process()
             except EOFError:
-                code = None if process is None else process.exit_code()
+                code = None if self._process is None else self._process.exit_code()
+                self._end_process()
                 self._tell(job, state="failed", why=f"the process that judges {describe_exit(code)}")
             except _Failure as failure:
                 self._tell(job, state="failed", why=failure.why, problem=failure.problem)
-            finally:
-                if process is not None:
-                    process.stop(grace=0.0)
+        self._end_process()
 
     def _next(self) -> _Job | None:
         with self._wake:
-            self._wake.wait_for(lambda: self._waiting is not None or self._closing)
+            while self._waiting is None and not self._closing:
+                if not self._wake.wait(IDLE_SECONDS):
+                    self._end_process()
             if self._closing:
                 return None
             job, self._waiting = self._waiting, None
             self._job = job
-            assert job is not None
-            self._view = RescoreView(
-                "loading",
-                self._view.serial + 1,
-                len(job.files),
-                recorded_source=job.recorded_source,
-                use_env_states=job.use_env_states,
-            )
         self._on_change()
         return job
 
-    def _judge(self, job: _Job, process: WorkerProcess | None, group: Group) -> None:
-        assert process is not None
+    def _end_process(self) -> None:
+        process, self._process = self._process, None
+        if process is not None:
+            process.stop(grace=0.0)
+
+    def _judge(self, job: _Job, group: Group) -> None:
+        process = self._process = self._process or _start()
         folder: Path | None = None
         reference = group.reference
         try:
@@ -178,7 +188,8 @@ class Rescorer:
                 folder, reference = write_source(group.info)
             shown = group.info.task + (" as it was recorded" if job.recorded_source else "")
             self._tell(job, state="loading", task=shown)
-            process.send(Load(reference, group.options))
+            # Never patched into what the last episodes were judged in.
+            process.send(Load(reference, group.options, level="rebuilt"))
             told = self._answer(job, process, Loaded)
             if isinstance(told, Failed):
                 raise _Failure(f"{group.info.task} could not be opened to judge with", told.problem)
@@ -221,10 +232,9 @@ class Rescorer:
 
     def _tell(self, job: _Job, **values: object) -> None:
         with self._wake:
-            if self._job is not job and values.get("state") != "stopped":
+            if self._job is not job:
                 return
-            if self._waiting is None:
-                self._view = replace(self._view, serial=self._view.serial + 1, **values)  # type: ignore[arg-type]
+            self._view = replace(self._view, serial=self._view.serial + 1, **values)  # type: ignore[arg-type]
         self._on_change()
 
 
