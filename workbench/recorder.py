@@ -27,6 +27,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils.gym_utils import find_max_episode_steps_value
 
 from workbench.authoring.load import task_of_class
 from workbench.core import actions
@@ -35,7 +36,7 @@ from workbench.core.pictures import Picture
 from workbench.core.seams import task_class
 from workbench.core.state_columns import read_state_columns
 from workbench.core.step import StepResult
-from workbench.core.take_pictures import take_pictures
+from workbench.core.step_pictures import step_pictures
 from workbench.core.task_env import TaskEnv
 from workbench.recording.recover import recover
 from workbench.recording.rrd import RecordingError
@@ -55,14 +56,15 @@ class Recorder(gym.Wrapper):
         folder: str | Path,
         *,
         env_idx: Sequence[int] | None = None,
-        pictures: bool = False,
+        pictures: bool | Sequence[str] = False,
     ) -> None:
         """
         Args:
             env: as `workbench.make` gives it.
             folder: made if it is missing. What an earlier recording left half written there is mended.
             env_idx: which envs; None for all.
-            pictures: record what every camera sees at every step: some 25 to 50 ms a picture without a GPU.
+            pictures: record what every camera sees at every step, or those of these names. Sensors that the env
+                observes are there already; any other picture takes 25 to 50 ms without a GPU.
 
         Raises:
             TypeError: `env` is no ManiSkill env, or wrapped for vectors already.
@@ -86,7 +88,7 @@ class Recorder(gym.Wrapper):
         self._gatherer: EpisodeGatherer | None = None
         self._scene: Any = None
         self._description: TaskDescription | None = None
-        self._closed = False
+        self._finished = False
         self.problem: str | None = None
         """Why the recording ended, if it did."""
 
@@ -101,7 +103,7 @@ class Recorder(gym.Wrapper):
         chosen = (options or {}).get("env_idx")
         mask[slice(None) if chosen is None else np.asarray([int(i) for i in chosen])] = True
         step = self._task.result_of(info, np.zeros(count), np.zeros(count, bool), np.zeros(count, bool), None)
-        if self._scene is not self._task.env.scene:
+        if self._scene is not self._task.env.scene and not self._finished:
             self._begin()
         if self._gatherer is not None:
             kept = {k: v for k, v in (options or {}).items() if k != "env_idx"}
@@ -121,26 +123,29 @@ class Recorder(gym.Wrapper):
             self._take(step, np.zeros(task.num_envs, bool))
         return given  # type: ignore[return-value]
 
-    def close(self) -> None:
-        """End the episodes under way, wait for the files, and close the env."""
-        if not self._closed:
-            self._closed = True
-            self._finish()
+    def finish(self) -> None:
+        """End the recording: the episodes under way end here, and their files are waited for. The env goes on."""
+        if not self._finished:
+            self._finished = True
+            self._end()
             self._finisher.close()
             self._say_what_failed()
+
+    def close(self) -> None:
+        """`finish`, and close the env."""
+        self.finish()
         super().close()
 
     def _begin(self) -> None:
         """A scene is there that was not before."""
-        self._finish()
+        self._end()
         base = self._task.env
         self._scene = base.scene
         spec = base.spec
         env_id = type(base).__name__ if spec is None else spec.id
         loaded = task_of_class(task_class(base), env_id)
-        limit = None if self.spec is None else self.spec.max_episode_steps
         given = {} if spec is None else dict(spec.kwargs)
-        self._description = describe(loaded, self._task, given, limit)
+        self._description = describe(loaded, self._task, given, find_max_episode_steps_value(self.env))
         if self.problem is None:
             self._gatherer = EpisodeGatherer(
                 self._description, self._envs, self._folder, self._over, ends="reset"
@@ -152,14 +157,17 @@ class Recorder(gym.Wrapper):
             return
         pictures: tuple[Picture, ...] = ()
         if self._pictures:
-            wanted = recorded_pictures(self._description.cameras)
+            cameras = self._description.cameras
+            if self._pictures is not True:
+                cameras = [camera for camera in cameras if camera.name in self._pictures]
+            wanted = recorded_pictures(cameras)
             for env in self._envs:
-                pictures += take_pictures(task.env, env, wanted)
+                pictures += step_pictures(task, env, wanted)
         columns = read_state_columns(task)
         try:
             gatherer.take(Stepped(step, reset_mask, pictures, task.episode_seeds, columns=columns))
         except (RecordingError, ValueError) as error:
-            self._finish()
+            self._end()
             self._gatherer, self.problem = None, str(error)
             warnings.warn(f"the recording ended: {error}", stacklevel=3)
         self._say_what_failed()
@@ -167,7 +175,7 @@ class Recorder(gym.Wrapper):
     def _over(self, episode: GatheredEpisode) -> None:
         self._finisher.finish(episode)
 
-    def _finish(self) -> None:
+    def _end(self) -> None:
         gatherer, self._gatherer = self._gatherer, None
         if gatherer is not None:
             gatherer.finish()

@@ -1,9 +1,12 @@
-"""``workbench record``: several envs at once, one file an episode."""
+"""``workbench record``: the same episodes on any number of envs and processes, from any source of actions."""
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -13,69 +16,243 @@ import numpy as np
 import pytest
 
 from workbench.authoring.problem import TaskError
-from workbench.recording.read import read_properties, read_rrd
+from workbench.recording.episode import Episode
+from workbench.recording.read_episode import read_episode
 from workbench.recording.verify import verify_rrd
 from workbench.session.messages import TaskOptions
-from workbench.session.record import Progress, RecordOptions, record
+from workbench.session.record import Progress, Recorded, RecordOptions, record
 
 TASKS = Path(__file__).parents[2] / "tasks"
+PUSHER = Path(__file__).parents[1] / "browser" / "pusher.py"
+PUSHED = {"control_mode": "pd_ee_delta_pos"}
+
+
+def read_all(recorded: Recorded) -> list[Episode]:
+    return [read_episode(episode.path) for episode in recorded.written]
+
+
+def assert_same(one: Episode, other: Episode) -> None:
+    """To the last bit."""
+    assert one.info.seed == other.info.seed
+    np.testing.assert_array_equal(one.action, other.action)
+    np.testing.assert_array_equal(one.reward, other.reward)
+    assert one.env_states.keys() == other.env_states.keys() and one.env_states
+    for name, values in one.env_states.items():
+        np.testing.assert_array_equal(values, other.env_states[name], err_msg=name)
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three short episodes on two envs, without pictures."""
-    out = tmp_path_factory.mktemp("recorded")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    """Three short episodes of random actions on two envs, without pictures."""
     seen: list[Progress] = []
-    what = RecordOptions(
-        "PushCube-v1", out, episodes=3, pictures=False, max_steps=5, options=TaskOptions(num_envs=2, seed=10)
+    out = tmp_path_factory.mktemp("recorded")
+    options = TaskOptions(num_envs=2, seed=10)
+    done = record(
+        RecordOptions("PushCube-v1", out, 3, pictures=False, max_steps=5, options=options),
+        on_progress=seen.append,
     )
-    episodes = record(what, on_progress=seen.append)
-    assert [episode.steps for episode in episodes] == [5, 5, 5]
-    assert seen[-1].episodes == 3
-    return out
+    assert [episode.steps for episode in done.written] == [5, 5, 5]
+    assert (seen[-1].steps, done.tried, done.stopped) == (15, 3, False)
+    return done
 
 
-def test_every_episode_is_a_file_that_rerun_verifies(written: Path) -> None:
-    files = sorted(written.iterdir())
-    assert [file.suffix for file in files] == [".rrd"] * 3
-    assert [verify_rrd(file) for file in files] == [None] * 3
+def test_every_episode_is_three_files_that_stand_alone(recorded: Recorded) -> None:
+    for episode in recorded.written:
+        assert verify_rrd(episode.path) is None
+        files = sorted(episode.path.parent.glob(f"{episode.path.stem}.*"))
+        assert [file.suffix for file in files] == [".h5", ".json", ".rrd"]
+    read = read_all(recorded)
+    assert {"articulations/panda", "actors/cube"} <= read[0].env_states.keys()
+    assert read[0].obs["agent/qpos"].shape == (6, 9)
+    assert read[0].info.env_kwargs == {
+        "obs_mode": "state",
+        "reward_mode": "normalized_dense",
+        "control_mode": "pd_joint_delta_pos",
+    }
 
 
-def test_an_episode_starts_as_the_stock_env_starts_with_its_seed(written: Path) -> None:
+def test_an_episode_starts_as_the_stock_env_starts_with_its_seed(recorded: Recorded) -> None:
     stock: Any = gym.make("PushCube-v1", num_envs=1, obs_mode="state", render_backend="none").unwrapped
-    seeds = set()
-    for file in sorted(written.iterdir()):
-        properties = str(read_properties(file))
-        seed = next(s for s in (10, 11, 12) if f"seed{s:04d}" in file.name)
-        seeds.add(seed)
-        assert "PushCube-v1" in properties
+    for seed, episode in zip((10, 11, 12), read_all(recorded), strict=True):
+        assert episode.info.seed == seed
         stock.reset(seed=seed)
-        columns = read_rrd(file)
-        cube = next(name for name in columns if name.rsplit("/", 1)[-1] == "cube")
-        start = np.asarray(columns[cube]["Transform3D:translation"].values[0]).reshape(-1)[:3]
-        assert np.allclose(start, stock.obj.pose.p[0].numpy(), atol=1e-6)
-    assert seeds == {10, 11, 12}
+        np.testing.assert_allclose(
+            episode.env_states["actors/cube"][0], stock.obj.get_state()[0].numpy(), atol=1e-6
+        )
     stock.close()
+
+
+@pytest.mark.parametrize(("num_envs", "workers"), [(1, 1), (3, 2)])
+def test_the_episodes_are_the_same_on_any_number_of_envs_and_processes(
+    recorded: Recorded, num_envs: int, workers: int, tmp_path: Path
+) -> None:
+    options = TaskOptions(num_envs=num_envs, seed=10)
+    what = RecordOptions(
+        "PushCube-v1", tmp_path, 3, pictures=False, max_steps=5, workers=workers, options=options
+    )
+    for one, other in zip(read_all(recorded), read_all(record(what)), strict=True):
+        assert_same(one, other)
+
+
+def test_successes_are_kept_and_nothing_else(tmp_path: Path) -> None:
+    lazy = tmp_path / "lazy.py"
+    lazy.write_text(
+        f"{PUSHER.read_text()}\n\ndef lazy(obs):\n    move = act(obs)\n    move[3] = 0.0\n    return move\n"
+    )
+    options = TaskOptions(num_envs=5, env_kwargs=PUSHED)
+    what = RecordOptions(
+        str(TASKS / "push_cube.py"),
+        tmp_path / "out",
+        successes=4,
+        pictures=False,
+        actions=f"{lazy}:lazy",
+        options=options,
+    )
+    done = record(what)
+    assert [episode.index for episode in done.written] == [0, 1, 2, 4]
+    assert done.tried == 5
+    assert all(bool(episode.evaluate["success"][-1]) for episode in read_all(done))
+    assert len(list((tmp_path / "out").iterdir())) == 12
+
+
+def test_successes_that_do_not_come_are_given_up(tmp_path: Path) -> None:
+    what = RecordOptions(
+        "PushCube-v1",
+        tmp_path,
+        successes=1,
+        tries=2,
+        actions="hold",
+        pictures=False,
+        max_steps=2,
+        options=TaskOptions(num_envs=2),
+    )
+    done = record(what)
+    assert (done.written, done.tried) == ((), 2)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_actions_come_from_a_file_and_are_done_to_its_end(recorded: Recorded, tmp_path: Path) -> None:
+    actions = [episode.action for episode in read_all(recorded)]
+    np.savez(tmp_path / "actions.npz", *actions)
+    what = RecordOptions(
+        "PushCube-v1",
+        tmp_path / "out",
+        actions=str(tmp_path / "actions.npz"),
+        pictures=False,
+        options=TaskOptions(num_envs=2, seed=10),
+    )
+    for one, other in zip(read_all(recorded), read_all(record(what)), strict=True):
+        assert_same(one, other)
+
+
+@pytest.mark.parametrize("use_env_states", [False, True])
+def test_demonstrations_are_replayed_from_their_own_seeds(
+    recorded: Recorded, use_env_states: bool, tmp_path: Path
+) -> None:
+    demonstration = recorded.written[1].path.with_suffix(".h5")
+    what = RecordOptions(
+        "PushCube-v1",
+        tmp_path,
+        actions=str(demonstration),
+        use_env_states=use_env_states,
+        pictures=False,
+        options=TaskOptions(num_envs=2),
+    )
+    done = record(what)
+    (replayed,) = read_all(done)
+    assert done.put_right == 0
+    assert_same(replayed, read_all(recorded)[1])
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (np.zeros((4, 3), np.float32), "3 dimensions"),
+        (np.zeros(4), "shape"),
+        (np.full((4, 8), np.nan), "NaN"),
+        (b"no array", "cannot be read"),
+        (None, "there is no file"),
+    ],
+)
+def test_a_file_of_actions_that_does_not_fit_is_refused_in_a_sentence(
+    content: Any, says: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "actions.npy"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        np.save(path, content)
+    what = RecordOptions(
+        "PushCube-v1",
+        tmp_path / "out",
+        actions=str(path),
+        pictures=False,
+        options=TaskOptions(num_envs=1),
+    )
+    with pytest.raises((ValueError, FileNotFoundError), match=says):
+        record(what)
+    assert not list((tmp_path / "out").glob("*"))
+
+
+@pytest.mark.parametrize(
+    ("asked", "says"),
+    [
+        ({"episodes": 2, "successes": 1}, "name one"),
+        ({"workers": 0}, "--workers"),
+        ({"use_env_states": True}, "--use-env-states needs"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(asked: dict[str, Any], says: str, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=says):
+        record(RecordOptions("PushCube-v1", tmp_path, **asked))
 
 
 def test_pictures_of_every_camera_are_recorded(tmp_path: Path) -> None:
     what = RecordOptions(
-        str(TASKS / "push_cube.py"), tmp_path, episodes=1, max_steps=2, options=TaskOptions(num_envs=1)
+        str(TASKS / "push_cube.py"), tmp_path, 1, max_steps=2, options=TaskOptions(num_envs=1)
     )
-    (episode,) = record(what)
-    entities = read_rrd(episode.path)
-    for name in ("base_camera", "render_camera"):
-        assert any(name in entity and entity.endswith("rgb") for entity in entities), name
-    assert any(entity.endswith("depth") for entity in entities)
+    (episode,) = read_all(record(what))
+    cameras = {track.info.name: track for track in episode.cameras}
+    assert {"base_camera", "render_camera"} <= cameras.keys()
+    assert len(cameras["base_camera"].frame) == 3
+    depth = cameras["base_camera"].depth
+    assert depth is not None and depth[0].shape == (128, 128)
 
 
 def test_a_task_that_fails_while_recording_says_where(tmp_path: Path) -> None:
     broken = tmp_path / "broken.py"
     text = (TASKS / "minimal.py").read_text()
     broken.write_text(text + "\n\nraise RuntimeError('not today')\n")
-    with pytest.raises(TaskError, match="not today"):
-        record(RecordOptions(str(broken), tmp_path / "out", options=TaskOptions(num_envs=1)))
+    for workers in (1, 2):
+        what = RecordOptions(
+            str(broken), tmp_path / "out", workers=workers, options=TaskOptions(num_envs=workers)
+        )
+        with pytest.raises(TaskError, match="not today"):
+            record(what)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("workers", ["1", "2"])
+def test_ctrl_c_keeps_what_is_over(workers: str, tmp_path: Path) -> None:
+    command = [
+        *(sys.executable, "-m", "workbench.cli", "record", "PushCube-v1", "--no-pictures"),
+        *("--episodes", "100000", "--max-steps", "3", "--num-envs", "2", "--workers", workers),
+        *("--out", str(tmp_path)),
+    ]
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    deadline = time.monotonic() + 90
+    while not list(tmp_path.glob("*.json")) and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.05)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does it
+    said, errors = process.communicate(timeout=60)
+    assert process.returncode == 2 and "interrupted" in errors
+    assert "Traceback" not in errors
+    written = sorted(tmp_path.glob("*.json"))
+    assert len(said.splitlines()) == len(written) + 1
+    assert not (tmp_path / ".writing").exists()
+    assert all(verify_rrd(path.with_suffix(".rrd")) is None for path in written[-2:])
 
 
 @pytest.mark.parametrize(
@@ -86,6 +263,7 @@ def test_a_task_that_fails_while_recording_says_where(tmp_path: Path) -> None:
         (["open", "PickCub-v1", "--port", "0"], "PickCube-v1"),
         (["open", "nothing_here.py", "--port", "0"], "nothing_here.py"),
         (["record", "PickCube-v1", "--num-envs", "0"], "num-envs"),
+        (["record", "PickCube-v1", "--actions", "demo.h5"], "demo.h5"),
         (["view", "nothing_here.rrd"], "nothing_here.rrd"),
         (["open", "PickCube-v1", "--host", "0.0.0.0", "--no-token"], "token"),
         (["open", "PickCube-v1", "--env", "robot"], "name=value"),

@@ -43,8 +43,7 @@ def read_state_columns(task: TaskEnv) -> dict[str, NDArray]:
 
 def _env_states(task: TaskEnv) -> Iterator[tuple[str, torch.Tensor]]:
     env = task.env
-    # BaseEnv.get_state_dict asks the agent, which a task without a robot has not.
-    state: Any = env.scene.get_sim_state() if env.agent is None else env.get_state_dict()
+    state: Any = env.get_state_dict()
     registry = env.scene.state_dict_registry
     structs = {"actors": registry.actors, "articulations": registry.articulations}
     for name, value in flat_entries(state):

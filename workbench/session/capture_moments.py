@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from workbench.core.pictures import Picture
 from workbench.core.state_columns import read_state_columns
-from workbench.core.take_pictures import take_pictures
+from workbench.core.step_pictures import step_pictures
 from workbench.session.messages import Captured, CaptureMoments
 from workbench.session.open_task import OpenedTask, blamed
 from workbench.session.recorded_pictures import recorded_pictures
@@ -38,6 +38,6 @@ def capture_moments(opened: OpenedTask, request: CaptureMoments) -> Captured:
         missed |= report.not_carried
         drawn: tuple[Picture, ...] = ()
         for env in moment.env_idx:
-            drawn += take_pictures(opened.env.env, env, wanted)
+            drawn += step_pictures(opened.env, env, wanted)
         pictures.append(drawn)
     return Captured(tuple(columns), tuple(pictures), missed)

@@ -23,7 +23,7 @@ from workbench.core.recorded_state import apart, write_states
 from workbench.core.state_columns import read_state_columns
 from workbench.core.state_names import states_of
 from workbench.core.step import StepResult
-from workbench.core.take_pictures import take_pictures
+from workbench.core.step_pictures import step_pictures
 from workbench.recording.rrd import RecordingError
 from workbench.session.acting import Acting
 from workbench.session.dealer import Dealer
@@ -360,7 +360,7 @@ class _Share:
         task = self._opened.env
         pictures: tuple[Picture, ...] = ()
         for env in pictured:
-            pictures += take_pictures(task.env, env, self._wanted) if self._wanted else ()
+            pictures += step_pictures(task, env, self._wanted)
         with blamed("step", self._opened.loaded, task):
             columns = read_state_columns(task)
         return Stepped(step, reset_mask, pictures, task.episode_seeds, columns=columns)

@@ -1,0 +1,64 @@
+"""State columns against what ManiSkill's own RecordEpisode would keep of the same moment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mani_skill.envs  # noqa: F401  registers the ids
+import numpy as np
+import pytest
+import torch
+from mani_skill.utils import common
+
+from workbench.authoring import registry
+from workbench.core.state_columns import read_state_columns
+from workbench.core.state_names import observation_of, states_of
+from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+
+
+def made(env_id: str, num_envs: int = 3, **kwargs: Any) -> TaskEnv:
+    spec = registry.environment(env_id)
+    assert spec is not None
+    options = EnvOptions(num_envs=num_envs, backend="cpu", render=False, kwargs=kwargs)
+    task = TaskEnv(make_env(spec.cls, options, default_kwargs=dict(spec.default_kwargs)))
+    task.reset(seed=0)
+    task.step(None)
+    return task
+
+
+@pytest.mark.parametrize("obs_mode", ["state", "state_dict"])
+def test_columns_are_the_state_dict_and_the_observation(obs_mode: str) -> None:
+    task = made("PickCube-v1", obs_mode=obs_mode)
+    columns = read_state_columns(task)
+    state: Any = task.env.get_state_dict()
+    for group, structs in state.items():
+        for name, rows in structs.items():
+            np.testing.assert_array_equal(columns[f"state/{group}/{name}"], rows.numpy())
+    seen = {name: column for name, column in columns.items() if name.startswith("obs/")}
+    assert {"obs/agent/qpos", "obs/extra/is_grasped", "obs/extra/tcp_pose"} <= seen.keys()
+    flat = torch.cat([torch.from_numpy(c).reshape(3, -1).float() for c in seen.values()], dim=1)
+    observed: Any = task.obs
+    if obs_mode == "state_dict":
+        observed = common.flatten_state_dict(observed, use_torch=True)
+    assert torch.equal(flat, observed)
+    task.close()
+
+
+def test_columns_are_copies() -> None:
+    task = made("PushCube-v1")
+    before = read_state_columns(task)
+    kept = {name: column.copy() for name, column in before.items()}
+    task.step(np.ones((3, 8), np.float32))
+    for name, column in before.items():
+        np.testing.assert_array_equal(column, kept[name])
+    task.close()
+
+
+def test_what_an_env_does_not_have_is_left_out_of_its_states() -> None:
+    columns = {
+        "state/actors/mug": np.array([[np.nan] * 13, [0.5] * 13], np.float32),
+        "obs/agent/qpos": np.full((2, 2), np.nan),
+    }
+    assert states_of(columns, 0) == {}
+    assert list(states_of(columns, 1)) == ["actors/mug"]
+    assert list(observation_of(columns, 0)) == ["agent/qpos"]

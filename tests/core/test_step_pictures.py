@@ -1,0 +1,50 @@
+"""Pictures out of the observation are those that would be drawn."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.core.drawn_envs import batched
+from workbench.core import step_pictures as module
+from workbench.core.render_device import keep_render_device
+from workbench.core.step_pictures import step_pictures
+from workbench.core.take_pictures import take_pictures
+from workbench.core.task_env import TaskEnv
+
+ALL = ("rgb", "depth", "segmentation")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def render_device() -> None:
+    keep_render_device("cpu")
+
+
+def test_what_was_observed_is_not_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    task = TaskEnv(batched("PickCube-v1", obs_mode="rgb+depth+segmentation", robot_uids="panda_wristcam"))
+    task.reset(seed=1)
+    drawn: list[str] = []
+
+    def draw(env: Any, env_index: int, requests: Any) -> Any:
+        drawn.extend(name for name, _, _ in requests)
+        return take_pictures(env, env_index, requests)
+
+    monkeypatch.setattr(module, "take_pictures", draw)
+    task.step(np.ones((task.num_envs, 8), np.float32))
+    wanted = [
+        ("hand_camera", "sensor", ALL),
+        ("render_camera", "human", ("rgb",)),
+        ("base_camera", "sensor", ALL),
+    ]
+    for env in range(task.num_envs):
+        pictures = step_pictures(task, env, wanted)  # type: ignore[arg-type]
+        assert [picture.camera for picture in pictures] == ["hand_camera", "render_camera", "base_camera"]
+        for picture, again in zip(pictures, take_pictures(task.env, env, wanted), strict=True):  # type: ignore[arg-type]
+            assert (picture.kind, picture.env) == (again.kind, again.env)
+            np.testing.assert_array_equal(picture.pose, again.pose)
+            for modality in ALL:
+                np.testing.assert_array_equal(getattr(picture, modality), getattr(again, modality))
+    assert set(drawn) == {"render_camera"}
+    task.close()

@@ -1,0 +1,134 @@
+"""Recording while the page runs, from the next reset, and after the fact: the same files."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.session.conftest import TASKS, wait_until
+from workbench.recording.episode import Episode
+from workbench.recording.read_episode import read_episode
+from workbench.session.messages import TaskOptions
+from workbench.session.session import Session
+
+STEPS = 4
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+    folder = tmp_path_factory.mktemp("task")
+    shutil.copy(TASKS / "push_cube.py", folder)
+    options = TaskOptions(num_envs=2, seed=5)
+    session = Session(str(folder / "push_cube.py"), options, recordings=folder / "recordings")
+    wait_until(session, lambda view: view.state == "paused", "the first load")
+    yield session
+    session.close()
+
+
+def steps_made(session: Session, count: int) -> None:
+    """Make so many control steps of all envs, one by one."""
+    for _ in range(count):
+        then = session.view().step_serial + 1
+        session.step()
+        wait_until(session, lambda view, then=then: view.step_serial >= then, "a step")
+
+
+def written(session: Session, count: int) -> list[Episode]:
+    """The episodes that there are, oldest first, once there are so many."""
+    view = wait_until(session, lambda view: view.recording.episodes_written >= count, "the files")
+    paths = sorted(Path(view.recording.folder).glob("*.json"), key=lambda path: path.stat().st_mtime_ns)
+    assert len(paths) == count and view.recording.problem is None
+    return [read_episode(path) for path in paths]
+
+
+def assert_same(one: Episode, other: Episode) -> None:
+    """All of it, to the last bit, but for who and when."""
+    assert (one.info.seed, one.info.env_index) == (other.info.seed, other.info.env_index)
+    assert one.poses is not None and other.poses is not None
+    for name in ("poses", "action", "reward", "terminated", "truncated"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+    for group in ("env_states", "obs", "evaluate"):
+        ours, theirs = getattr(one, group), getattr(other, group)
+        assert ours.keys() == theirs.keys() and ours
+        for name, values in ours.items():
+            np.testing.assert_array_equal(values, theirs[name], err_msg=f"{group}/{name}")
+    assert len(one.cameras) == len(other.cameras) > 0
+    for track, again in zip(one.cameras, other.cameras, strict=True):
+        np.testing.assert_array_equal(track.pose, again.pose)
+        for modality in ("rgb", "depth", "segmentation"):
+            pictures, others = getattr(track, modality), getattr(again, modality)
+            assert (pictures is None) == (others is None)
+            for i in range(len(pictures or ())):
+                np.testing.assert_array_equal(pictures[i], others[i], err_msg=f"{modality} {i}")
+
+
+def test_what_was_kept_after_the_fact_is_what_recording_it_gave(session: Session) -> None:
+    session.start_recording()
+    wait_until(session, lambda view: view.recording.active and view.recording.waiting == 0, "the recording")
+    steps_made(session, STEPS)
+    view = wait_until(session, lambda view: view.recording.steps == 2 * STEPS, "the steps")
+    assert view.recording.bytes_written > 0
+    session.stop_recording()
+    live = written(session, 2)
+    session.keep_past()
+    wait_until(session, lambda view: bool(view.recording.keeping.said), "the keeping")
+    assert session.view().recording.keeping.said == f"kept 2 episodes, {2 * STEPS} steps"
+    every = written(session, 4)
+    kept = {episode.info.env_index: episode for episode in every[2:]}
+    assert kept.keys() == {0, 1}
+    for episode in live:
+        assert episode.length == STEPS
+        assert_same(episode, kept[episode.info.env_index])
+
+
+def test_the_next_episode_waits_for_its_reset_and_ends_with_it(session: Session) -> None:
+    before = session.view().recording.episodes_written
+    session.start_recording((1,), next_episode=True)
+    steps_made(session, 1)
+    view = wait_until(session, lambda view: view.recording.waiting == 1, "the waiting")
+    assert view.recording.active and view.recording.steps == 0
+    session.reset((1,))
+    wait_until(session, lambda view: view.recording.waiting == 0, "the reset")
+    steps_made(session, 2)
+    session.reset((1,))
+    wait_until(session, lambda view: not view.recording.active, "its end")
+    steps_made(session, 1)
+    assert written(session, before + 1)[-1].length == 2
+
+
+def test_a_moment_whose_beginning_is_gone_is_refused_in_a_sentence(session: Session) -> None:
+    session.reset()
+    wait_until(session, lambda view: view.step is not None and not view.step.elapsed_steps.any(), "a reset")
+    first = session.view().timeline.first
+    session.seek(session.view().timeline.last)
+    assert first == 0  # the history is whole, so what is refused is an episode without a step
+    session._state.timeline.history.limit = 1  # type: ignore[union-attr]
+    steps_made(session, 2)
+    session.keep_past((0,))
+    view = wait_until(session, lambda view: view.recording.keeping.failed, "the refusal")
+    assert "its beginning is no longer in memory" in view.recording.keeping.said
+    session._state.timeline.history.limit = 2**30  # type: ignore[union-attr]
+
+
+def test_a_folder_that_cannot_be_written_to_is_told_and_stops_nothing(
+    session: Session, tmp_path: Path
+) -> None:
+    view = session.view()
+    folder = Path(view.recording.folder)
+    aside = folder.rename(folder.with_name("aside"))
+    folder.write_text("in the way")
+    session.start_recording((0,))
+    view = wait_until(session, lambda view: view.recording.problem is not None, "the problem")
+    assert not view.recording.active and "is not a folder" in str(view.recording.problem)
+    steps_made(session, 2)
+    assert session.view().problem is None
+    folder.unlink()
+    aside.rename(folder)
+    session.start_recording((0,))
+    wait_until(session, lambda view: view.recording.active and view.recording.waiting == 0, "the recording")
+    assert session.view().recording.problem is None
+    session.stop_recording()

@@ -1,0 +1,85 @@
+"""`workbench.Recorder` around what `workbench.make` gives: partial resets, auto-resets, and files that fail."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from mani_skill.utils.wrappers.record import RecordEpisode
+from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
+
+import workbench
+from workbench.recording.episode import Episode
+from workbench.recording.read_episode import read_episode, read_maniskill, trajectories
+
+TASKS = Path(__file__).parents[1] / "tasks"
+OPTIONS: Any = {"backend": "cpu", "render_backend": "none"}
+
+
+def episodes_in(folder: Path) -> list[Episode]:
+    read = [read_episode(path) for path in folder.glob("*.json")]
+    return sorted(
+        read, key=lambda episode: (episode.info.env_index, episode.info.written_at, -episode.length)
+    )
+
+
+def test_auto_resets_end_an_episode_and_begin_the_next(tmp_path: Path) -> None:
+    env = workbench.make("PushCube-v1", 2, max_episode_steps=3, **OPTIONS)
+    env = ManiSkillVectorEnv(workbench.Recorder(env, tmp_path), ignore_terminations=True)
+    env.reset(seed=[7, 8])
+    for _ in range(4):
+        env.step(env.action_space.sample())
+    env.close()
+    read = episodes_in(tmp_path)
+    assert [(e.info.env_index, e.length) for e in read] == [(0, 3), (0, 1), (1, 3), (1, 1)]
+    assert [e.info.seed for e in read if e.length == 3] == [7, 8]
+    assert read[0].info.max_episode_steps == 3 and bool(read[0].truncated[-1])
+
+
+def test_it_keeps_what_maniskills_own_recorder_keeps(tmp_path: Path) -> None:
+    """The same run through both, RecordEpisode around ours: states, actions, rewards and flags are equal."""
+    env = workbench.make(str(TASKS / "push_cube.py"), 2, **OPTIONS)
+    ours = workbench.Recorder(env, tmp_path / "ours")
+    theirs_in = str(tmp_path / "theirs")
+    both = RecordEpisode(ours, theirs_in, save_video=False, trajectory_name="run")  # type: ignore[arg-type]
+    both.reset(seed=3)
+    for step in range(5):
+        both.step(torch.from_numpy(both.action_space.sample()))
+        if step == 2:
+            both.reset(options={"env_idx": torch.tensor([1])})
+    both.close()
+    path = tmp_path / "theirs" / "run.h5"
+    theirs = [read_maniskill(path, name) for name in trajectories(path)]
+    read = episodes_in(tmp_path / "ours")
+    assert sorted(e.length for e in read) == sorted(e.length for e in theirs) == [2, 3, 5]
+    for one in read:
+        (other,) = [e for e in theirs if e.length == one.length]
+        assert one.info.seed == other.info.seed
+        for name in ("action", "reward", "terminated", "truncated"):
+            np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
+        assert one.env_states.keys() == other.env_states.keys()
+        for name, values in one.env_states.items():
+            np.testing.assert_array_equal(values, other.env_states[name], err_msg=name)
+        flat = np.concatenate([v.reshape(one.length + 1, -1) for v in one.obs.values()], axis=1)
+        np.testing.assert_array_equal(flat, other.obs[""])
+
+
+def test_a_full_disk_warns_once_and_the_run_goes_on(tmp_path: Path) -> None:
+    in_the_way = tmp_path / "recordings"
+    in_the_way.write_text("no folder")
+    env = workbench.Recorder(workbench.make("PushCube-v1", 1, **OPTIONS), in_the_way)
+    with pytest.warns(UserWarning, match="is not a folder"):
+        env.reset(seed=0)
+    env.step(env.action_space.sample())
+    assert env.problem is not None and env.episodes_written == 0
+    env.close()
+
+
+def test_a_vector_env_is_refused(tmp_path: Path) -> None:
+    env = ManiSkillVectorEnv(workbench.make("PushCube-v1", 1, **OPTIONS))
+    with pytest.raises(TypeError, match="inside a vector env"):
+        workbench.Recorder(env, tmp_path)  # type: ignore[arg-type]
+    env.close()
