@@ -9,11 +9,11 @@ import trimesh
 
 from tests.ui.scenes import box_mesh, table_scene
 from workbench.core.geometry import Material, Mesh
+from workbench.core.shared_shapes import fingerprint
 from workbench.ui.meshes_as_glb import (
     LAYER,
     as_glb,
     face_limit,
-    fingerprint,
     group_by_wearers,
     lift_painted_layers,
 )

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import viser
 
 from tests.session.conftest import TASKS, wait_until
-from tests.session.recordings import made, write
+from tests.session.recordings import begin, made, write
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
 from workbench.ui.put_together import Workplace
@@ -68,6 +69,26 @@ def test_twenty_swaps_leave_nothing_and_the_session_lives_on(
     assert max(threads[4:]) <= max(threads[:4])
     before = session.view().step_serial
     wait_until(session, lambda view: view.step_serial > before, "a step of the env that plays on")
+
+
+def test_an_episode_whose_writer_was_killed_is_mended_and_said(
+    tmp_path: Path, server: viser.ViserServer
+) -> None:
+    begin(tmp_path, made(5, seed=8))
+    place = Workplace(server, tmp_path)
+    place.pages.start("review")
+    try:
+        until(lambda: "can be seen again" in " ".join(place.shelf.review.view().problems), "the word for it")
+        until(lambda: [row.seed for row in place.shelf.library.rows()] == [8], "its row")
+    finally:
+        place.close()
+
+
+def until(reached: Callable[[], bool], what: str) -> None:
+    deadline = time.monotonic() + 60
+    while not reached():
+        assert time.monotonic() < deadline, f"{what} did not come"
+        time.sleep(0.02)
 
 
 def test_what_is_open_in_the_review_is_open_when_one_comes_back(place: Workplace) -> None:

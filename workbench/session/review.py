@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
 
+from workbench.core.shared_shapes import SharedShapes
 from workbench.recording.episode import Episode
 from workbench.recording.read_episode import UnreadableRecording, read_episode, read_maniskill
 from workbench.session.recorded_scene import SceneError
@@ -64,6 +65,11 @@ def read_row(row: Row) -> Episode:
         # The library opens it by its .json, which is where the words are.
         return read_maniskill(row.paths[0].with_suffix(".h5"), row.trajectory)
     return read_episode(row.paths[0])
+
+
+def shared(episode: Episode, shapes: SharedShapes) -> Episode:
+    """The same recording, with shapes of others where they look the same."""
+    return episode if episode.geometry is None else replace(episode, geometry=shapes.share(episode.geometry))
 
 
 class SceneMaker(Protocol):
@@ -187,6 +193,7 @@ class Review:
 
     def _open(self, number: int, rows: list[Row], said: list[str], state: int | None) -> None:
         opened: list[Opened] = []
+        shapes = SharedShapes()
         files: dict[Path, tuple[str, tuple[int, int] | None]] = {}
         for done, row in enumerate(rows):
             with self._changed:
@@ -195,7 +202,7 @@ class Review:
                 self._change(loading=_opening_words(rows, done))
             stamps = {path: (row.name, _stamp(path)) for path in row.paths}
             try:
-                episode = self._read(row)
+                episode = shared(self._read(row), shapes)
                 opened.append(Opened(row.id, row.name, episode, happenings(episode)))
                 files.update(stamps)
             except (OSError, UnreadableRecording) as error:
@@ -214,9 +221,10 @@ class Review:
                 if state is not None:
                     self._seek(state)
             self._change(loading="", problems=self._unread)
-        self._give_scenes(number, {index: one for index, one in enumerate(opened) if not one.has_scene})
+        without = {index: one for index, one in enumerate(opened) if not one.has_scene}
+        self._give_scenes(number, without, shapes)
 
-    def _give_scenes(self, number: int, without: Mapping[int, Opened]) -> None:
+    def _give_scenes(self, number: int, without: Mapping[int, Opened], shapes: SharedShapes) -> None:
         def say(index: int, words: str, making: bool = True) -> None:
             self._replace_opened(number, index, lambda now: replace(now, scene=words, making=making))
 
@@ -224,6 +232,7 @@ class Review:
             if isinstance(made, SceneError):
                 say(index, str(made), False)
                 return
+            made = shared(made, shapes)
             words = f"Not put back: {'; '.join(missed)}." if missed else ""
             self._replace_opened(
                 number, index, lambda now: replace(now, episode=made, scene=words, making=False)
@@ -264,6 +273,12 @@ class Review:
             playing=False,
         )
         self._align(align if align in alignments else START, position=None)
+
+    def say(self, sentence: str) -> None:
+        """Let the page say this, until something is opened."""
+        with self._changed:
+            self._unread = (*self._unread, sentence)
+            self._change(problems=(*self._view.problems, sentence))
 
     # --- the position --------------------------------------------------------------------------------
 

@@ -9,7 +9,6 @@ that needs more than 128.
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -52,19 +51,6 @@ def group_by_wearers(geometry: SceneGeometry) -> tuple[WornTogether, ...]:
         WornTogether(name=group[0].name, visuals=tuple(group), envs=group[0].envs, bodies=group[0].bodies)
         for group in groups.values()
     )
-
-
-def fingerprint(visuals: tuple[Visual, ...]) -> str:
-    """The same for visuals that look the same, also when another load made them anew."""
-    digest = hashlib.blake2b(digest_size=16)
-    for visual in visuals:
-        mesh, material = visual.mesh, visual.material
-        for array in (mesh.vertices, mesh.faces, mesh.normals, mesh.uvs, material.texture):
-            if array is not None:
-                digest.update(np.ascontiguousarray(array).data)
-            digest.update(b"|")
-        digest.update(repr((material.base_color, material.metallic, material.roughness)).encode())
-    return digest.hexdigest()
 
 
 def face_limit(visuals: tuple[Visual, ...], shown_envs: int, num_envs: int, budget: int) -> int:

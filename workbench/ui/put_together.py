@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import viser
 
 from workbench.recording.library import Library
+from workbench.recording.recover import recover
 from workbench.session.recorded_scene import SceneProcess
 from workbench.session.review import Review
 from workbench.ui.pages import Pages
@@ -55,6 +56,7 @@ class Workplace:
         self._server, self._recordings, self._tasks = server, recordings, tasks
         self._shelf: Shelf | None = None
         self._lock = threading.Lock()
+        self._mending: threading.Thread | None = None
         self._offers: Callable[[Workplace, ReviewOffers], ReviewOffers] = lambda _, offers: offers
         self.session = session
         self.pages = Pages(server, {"review": self._review_page})
@@ -69,7 +71,25 @@ class Workplace:
                 library = Library(self._recordings)
                 library.watch()
                 self._shelf = Shelf(library, Review(library, make_scene=SceneProcess(self._tasks)))
+                if self.session is None:
+                    # A live env's recorder has done it, and is writing.
+                    self._mending = threading.Thread(
+                        target=self._mend, args=(self._shelf,), name="mend", daemon=True
+                    )
+                    self._mending.start()
             return self._shelf
+
+    def _mend(self, shelf: Shelf) -> None:
+        """Make episodes of what a writer left that was killed."""
+        try:
+            mended = len(recover(self._recordings))
+        except OSError as error:
+            shelf.review.say(str(error))
+            return
+        if mended:
+            what = "An episode that was" if mended == 1 else f"{mended} episodes that were"
+            shelf.review.say(f"{what} left half written by a program that was killed can be seen again.")
+            shelf.library.look_soon()
 
     def go_live_with(self, session: Session) -> None:
         """From now on there is a live page, of this session. It is not shown yet."""
@@ -86,6 +106,8 @@ class Workplace:
         self.pages.stop()
         with self._lock:
             if self._shelf is not None:
+                if self._mending is not None:
+                    self._mending.join(timeout=10.0)
                 self._shelf.review.close()
                 self._shelf.library.close()
 

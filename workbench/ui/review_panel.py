@@ -78,6 +78,8 @@ class ReviewPanel:
         self._never = gui.add_html("")
         self._facts = gui.add_html("")
         self._presses = Presses(server)
+        self._listed: object = None
+        """What the list was made of."""
 
     @property
     def ghosts(self) -> bool:
@@ -110,7 +112,11 @@ class ReviewPanel:
         self._speed.show(view.speed)
         self._loop.show(view.loop)
         fill(self._problems, render("review_problems", problems=view.problems, loading=view.loading))
-        fill(self._list, self._list_html(view))
+        listed = (view.opened, view.selected, bool(view.loading))
+        if self._listed != listed:
+            # Not at every position: with many recordings it would be most of what a frame costs.
+            self._listed = listed
+            fill(self._list, self._list_html(view))
         show(self._arrange, 1 < len(view.opened) <= MOST_COMPARED)
         show(self._align.handle, len(view.opened) > 1 and len(view.alignments) > 1)
         if self._align.handle.options != view.alignments:

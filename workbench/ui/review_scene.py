@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.geometry import BodyKind, Material, SceneGeometry, Visual
+from workbench.core.shared_shapes import fingerprint
 from workbench.session.review_compare import distances
 from workbench.session.review_view import Opened
 from workbench.ui.env_layout import EnvLayout, lay_out
-from workbench.ui.meshes_as_glb import fingerprint
 
 COLOURS = ("#228be6", "#f08c00", "#2f9e44", "#be4bdb")
 """Of the recordings that are compared, in legends, curves and the view."""
@@ -73,6 +73,7 @@ def review_scene(opened: Sequence[Opened], ghosts: bool) -> ReviewScene | None:
     rows = {name: row for row, name in enumerate(names)}
     poses, bodies = [], []
     shapes: dict[tuple[str, int, int], tuple[Visual, list[int]]] = {}
+    known: dict[tuple[int, int, int], str] = {}
     first: Opened | None = None
     for index, one in enumerate(opened):
         geometry, track = one.episode.geometry, one.episode.poses
@@ -93,7 +94,11 @@ def review_scene(opened: Sequence[Opened], ghosts: bool) -> ReviewScene | None:
                 worn = (
                     replace(visual, material=tinted(visual.material, COLOURS[index % 4])) if ghost else visual
                 )
-                looks = fingerprint((worn,))
+                # Recordings share their shapes (`SharedShapes`), and each is looked at once.
+                object_ = (id(visual.mesh), id(visual.material), index if ghost else -1)
+                if object_ not in known:
+                    known[object_] = fingerprint((worn,))
+                looks = known[object_]
                 number = 0
                 # The same shape twice on one body, at the same place: two visuals, as in the recording.
                 while (looks, rows[name], number) in shapes and index in shapes[looks, rows[name], number][1]:

@@ -1,0 +1,150 @@
+"""The review in a real Chromium: open from the library, play, step, compare; and over to it from the live page."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+from tests.browser.opened import launch, new_page, open_workbench, until
+from tests.session.recordings import made, write
+
+pytestmark = pytest.mark.browser
+expect.set_options(timeout=60_000)
+LATE = "Tried to update non-existent component"
+"""What viser's page says in its console when a thing goes that was written to in the same moment."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("recordings")
+    write(folder, made(20, success_from=15, seed=1))
+    write(folder, made(12, seed=2, speed=0.03, source_hash="1" * 12, source={"push.py": "reward = 2\n"}))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def address(folder: Path) -> Iterator[str]:
+    """Of ``workbench review``, which ends with Ctrl-C's signal."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "workbench.cli", "review", str(folder), "--port", "0"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "COLUMNS": "200", "PYTHONUNBUFFERED": "1"},
+    )
+    assert process.stdout is not None
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if re.search(r"page +http", line):
+            break
+    else:
+        raise AssertionError("".join(lines))
+    yield lines[-1].split()[-1]
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=20) == 0, process.stdout.read()
+
+
+@pytest.fixture(scope="module")
+def browser(chromium_path: str) -> Iterator[Browser]:
+    with sync_playwright() as playwright:
+        browser = launch(playwright, chromium_path)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def desk(address: str, browser: Browser) -> tuple[Page, list[str]]:
+    page, errors = new_page(browser)
+    page.goto(address)
+    return page, errors
+
+
+def row(page: Page, seed: int) -> None:
+    page.get_by_text(re.compile(f"seed000{seed}")).first.click()
+
+
+def says(page: Page, text: str) -> None:
+    expect(page.locator(".wb-timeline").get_by_text(re.compile(text)).first).to_be_visible()
+
+
+def cubes(page: Page) -> list[float]:
+    """x of every cube that the view draws."""
+    return page.evaluate(
+        """() => Object.entries(window.__viserSceneTree.getState())
+            .filter(([name, node]) => name.startsWith('/envs') && name.includes('cube')
+                && (node.effectiveVisibility ?? node.visibility ?? true))
+            .flatMap(([, node]) => {
+                const p = node.message.props.batched_positions;
+                const f = new Float32Array(p.buffer.slice(p.byteOffset, p.byteOffset + p.byteLength));
+                return Array.from(f).filter((_, i) => i % 3 === 0);
+            })"""
+    )
+
+
+def test_opens_from_the_library_and_walks_with_the_keys(desk: tuple[Page, list[str]]) -> None:
+    page, errors = desk
+    expect(page.get_by_text("No recording is open")).to_be_visible()
+    row(page, 1)
+    page.keyboard.press("Enter")
+    says(page, "step 0 / 20")
+    for _ in range(3):
+        page.keyboard.press("ArrowRight")
+        time.sleep(0.3)
+    says(page, "step 3 / 20")
+    until(lambda: any(abs(x - 0.03) < 1e-4 for x in cubes(page)), "the cube at its place")
+    page.keyboard.press("Shift+ArrowRight")
+    says(page, "step 15 / 20")
+    expect(page.locator(".wb-status").get_by_text("success", exact=True)).to_be_visible()
+    page.keyboard.press("Home")
+    says(page, "step 0 / 20")
+    page.keyboard.press("Space")
+    says(page, "step 20 / 20")
+    page.get_by_role("tab", name="Cameras").click()
+    expect(page.locator('img[src^="blob:"]').first).to_be_visible()
+    assert errors == []
+
+
+def test_compares_two_and_says_where_they_part(desk: tuple[Page, list[str]]) -> None:
+    page, errors = desk
+    page.get_by_role("tab", name="Review").click()
+    page.keyboard.press("b")
+    row(page, 1)
+    page.keyboard.down("Control")
+    row(page, 2)
+    page.keyboard.up("Control")
+    page.keyboard.press("Enter")
+    expect(page.locator(".wb-opened-list .wb-letter")).to_have_count(2)
+    page.get_by_role("tab", name="Compare").click()
+    expect(page.get_by_text(re.compile("They part at step 1"))).to_be_visible()
+    page.locator("tr", has=page.get_by_text("bodies", exact=True)).click()
+    says(page, "step 1 /")
+    assert [e for e in errors if LATE not in e] == []
+
+
+def test_from_the_live_page_to_the_recordings_and_back(folder: Path, browser: Browser) -> None:
+    """The env is there as it was."""
+    task = Path(__file__).parents[2] / "tasks" / "minimal.py"
+    arguments = (str(task), "--num-envs", "1", "--no-spare", "--recordings", str(folder))
+    with open_workbench(*arguments, cwd=folder) as opened:
+        page, errors = new_page(browser, 900, 600)
+        page.goto(opened.url)
+        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
+        page.get_by_role("tab", name="Episodes").click()
+        page.get_by_role("button", name="Review recordings").click()
+        expect(page.get_by_text("No recording is open")).to_be_visible()
+        page.get_by_role("button", name="Back to the live env").click()
+        expect(page.get_by_role("tab", name="Studio")).to_be_visible()
+        page.keyboard.press("s")
+        expect(page.locator(".wb-status").get_by_text(re.compile("step 1"))).to_be_visible()
+        assert [e for e in errors if LATE not in e] == []
+        page.close()

@@ -1,0 +1,83 @@
+"""A long episode with cameras takes no more memory than a short one, neither while it happens nor when its files are made."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from workbench.recording.verify import verify_rrd
+
+CHILD = """
+import json, resource, sys, time
+from pathlib import Path
+import numpy as np
+from workbench.core.geometry import SceneGeometry
+from workbench.core.pictures import CameraInfo, Picture
+from workbench.recording.episode import EpisodeInfo
+from workbench.recording.episode_writer import EpisodeWriter
+from workbench.recording.row import EpisodeRow
+
+def peak():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+folder, steps = Path(sys.argv[1]), int(sys.argv[2])
+bodies, size = 15, 128
+geometry = SceneGeometry(1, tuple(f"body{b}" for b in range(bodies)), ("dynamic",) * bodies, (False,) * bodies, ())
+cameras = [
+    CameraInfo(f"eye{c}", "sensor", size, size, 1.0, 0.01, 10.0, np.eye(3, dtype=np.float32), None, ("rgb", "depth"))
+    for c in range(4)
+]
+chance = np.random.default_rng(0)
+grid = np.linspace(0, 1, size)
+colours = [np.repeat((np.outer(grid, grid) * 200 + k * 5).astype(np.uint8)[..., None], 3, 2) for k in range(8)]
+depths = [(np.outer(grid, grid) + 1 + k / 8).astype(np.float32) for k in range(8)]
+pose = np.array([0, 0, 0, 1, 0, 0, 0], np.float32)
+
+def row(k):
+    pictures = tuple(
+        Picture(camera.name, "sensor", 0, pose, rgb=colours[(k + c) % 8], depth=depths[(k + c) % 8])
+        for c, camera in enumerate(cameras)
+    )
+    return EpisodeRow(
+        chance.normal(size=(bodies, 7)).astype(np.float32),
+        {"success": np.bool_(False), "distance": np.float32(k)},
+        {f"actors/{b}": chance.normal(size=13).astype(np.float32) for b in range(bodies)},
+        {"agent/qpos": chance.normal(size=9).astype(np.float32)},
+        None if k == 0 else chance.normal(size=8).astype(np.float32),
+        float(k),
+        pictures=pictures,
+    )
+
+info = EpisodeInfo("Long-v1", 0, 0, None, "", {}, 0.05, None, "cpu")
+writer = EpisodeWriter(folder, info, geometry, {}, [f"a{i}" for i in range(8)], cameras)
+began = time.perf_counter()
+for k in range(steps + 1):
+    writer.append(row(k))
+appended, taken = peak(), time.perf_counter() - began
+began = time.perf_counter()
+files = writer.finish()
+finished = time.perf_counter() - began
+sizes = [path.stat().st_size for path in (files.rrd, files.h5, files.json)]
+print(json.dumps(dict(appended=appended, finished=peak(), files=sizes, rrd=str(files.rrd), seconds=[taken, finished])))
+"""
+
+
+def peaks(folder: Path, steps: int) -> dict:
+    child = subprocess.run(
+        [sys.executable, "-c", CHILD, str(folder), str(steps)], check=True, capture_output=True, text=True
+    )
+    return json.loads(child.stdout)
+
+
+@pytest.mark.slow
+def test_ten_thousand_steps_at_four_cameras_do_not_grow_the_process(tmp_path: Path) -> None:
+    short, long = peaks(tmp_path / "short", 500), peaks(tmp_path / "long", 10_000)
+    print(short, long)
+    assert sum(long["files"]) > 100e6, "too little was recorded for this to say anything"
+    assert long["appended"] - short["appended"] < 40
+    assert long["finished"] - short["finished"] < 120
+    assert verify_rrd(Path(long["rrd"]), timeout=300) is None
