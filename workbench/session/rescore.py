@@ -177,6 +177,11 @@ def judging_options(options: TaskOptions) -> tuple[TaskOptions, str]:
     return replace(options, env_kwargs=kwargs), note
 
 
+def with_renderer(options: TaskOptions) -> TaskOptions:
+    """For a task that cannot be built without one: PushT-v1 makes materials of SAPIEN's renderer for its shapes."""
+    return replace(options, env_kwargs={k: v for k, v in options.env_kwargs.items() if k != "render_backend"})
+
+
 def _episodes_in(file: Path) -> Iterator[EpisodeFile]:
     said = _said(file.with_suffix(".json"))
     if isinstance(said.get("workbench"), dict):

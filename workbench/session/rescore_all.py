@@ -9,9 +9,10 @@ from pathlib import Path
 
 import torch
 
+from workbench.authoring.problem import TaskError
 from workbench.session.messages import TaskOptions
-from workbench.session.open_task import open_task
-from workbench.session.rescore import find_episodes, group_episodes
+from workbench.session.open_task import OpenedTask, open_task
+from workbench.session.rescore import find_episodes, group_episodes, with_renderer
 from workbench.session.rescore_messages import Verdict
 from workbench.session.rescore_run import rescore
 from workbench.session.step_back import write_source
@@ -61,7 +62,7 @@ def rescore_all(
         if what.recorded_source:
             folder, reference = write_source(group.info)
         try:
-            opened = open_task(reference, group.options, on_activity=on_activity)
+            opened = _open(reference, group.options, on_activity)
             before = steps
 
             def tell(now: int, before: int = before) -> None:
@@ -83,3 +84,10 @@ def rescore_all(
     place = {file.id: number for number, file in enumerate(files)}
     verdicts.sort(key=lambda verdict: place[verdict.file.id])
     return verdicts, tuple(dict.fromkeys(group.note for group in groups if group.note))
+
+
+def _open(reference: str, options: TaskOptions, on_activity: Callable[[str], None]) -> OpenedTask:
+    try:
+        return open_task(reference, options, on_activity=on_activity)
+    except TaskError:
+        return open_task(reference, with_renderer(options), on_activity=on_activity)

@@ -18,7 +18,7 @@ from typing import Literal
 from workbench.authoring.problem import Problem
 from workbench.session.messages import Event, Failed, Load, Loaded, TaskOptions
 from workbench.session.process import WorkerProcess, describe_exit, start_in_background
-from workbench.session.rescore import Group, group_episodes
+from workbench.session.rescore import Group, group_episodes, with_renderer
 from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored, Verdict
 from workbench.session.step_back import CannotStepIn, write_source
 
@@ -191,6 +191,9 @@ class Rescorer:
             # Never patched into what the last episodes were judged in.
             process.send(Load(reference, group.options, level="rebuilt"))
             told = self._answer(job, process, Loaded)
+            if isinstance(told, Failed):
+                process.send(Load(reference, with_renderer(group.options), level="rebuilt"))
+                told = self._answer(job, process, Loaded)
             if isinstance(told, Failed):
                 raise _Failure(f"{group.info.task} could not be opened to judge with", told.problem)
             self._tell(job, state="judging")
