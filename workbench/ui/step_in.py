@@ -98,10 +98,15 @@ class StepIn:
         return self._first is not None and self._place.session is not self._first
 
     def go_home(self) -> None:
-        """Back to the session that was opened first."""
-        if self._first is not None:
-            self._place.go_live_with(self._first)
-            self._place.pages.show("live")
+        """Back to the session that was opened first; the other ends."""
+        if self._first is None:
+            return
+        self._place.go_live_with(self._first)
+        self._place.pages.show("live")
+        with self._lock:
+            before, self._own = self._own, None
+        if before is not None:
+            threading.Thread(target=_end, args=before, name="end-session", daemon=True).start()
 
     def close(self) -> None:
         """End what was opened here; the pages must be stopped."""
