@@ -7,6 +7,10 @@ spare worker warm. For each way the task is put into it by a single step; until 
 is used again and again (*next env*) and the time until the page shows the next env is taken, inside
 the page. What cannot be left by *Interrupt* is ended by *Restart*. *Back* is the time from the death of the
 process (or the click) until the page says that the last good version is back, or that it was interrupted.
+
+A round trip has two parts. The *answer* is the time from the message that leaves by the page's websocket until the
+changed value arrives there: the server, and the way to it. What remains is the browser's own: here it has no
+graphics card, and shares the cores with the server, the worker and this script.
 """
 
 from __future__ import annotations
@@ -32,14 +36,47 @@ from workbench.machine.chromium import find_chromium, how_to_get_chromium
 HANGS = {"loop": "Interrupt", "slow": "Interrupt", "catch": "Restart", "native": "Restart"}
 DEATHS = ("exit", "segfault", "abort", "kill", "children", "memory")
 OTHERS = ("flood", "read")
-NEXT_ENV = """() => new Promise((done) => {
+SOCKET_TIMES = """
+// viser's page has its websocket in a worker that it makes of a text: this is put before that text.
+const inWorker = () => {
+    const told = new BroadcastChannel('socket times'), now = () => performance.timeOrigin + performance.now();
+    const Socket = self.WebSocket, post = self.postMessage.bind(self);
+    let arrived = 0;
+    self.WebSocket = class extends Socket {
+        constructor(...all) { super(...all); this.addEventListener('message', () => { arrived = now(); }); }
+        send(message) { told.postMessage({sent: now()}); super.send(message); }
+    };
+    self.postMessage = (message, moved) => {
+        const changed = message.type === 'message_batch' && message.messages
+            .some((m) => m.type === 'GuiUpdateMessage' && typeof m.updates.value === 'number');
+        if (changed) told.postMessage({arrived});
+        post(message, moved);
+    };
+};
+const Plain = window.Blob;
+window.Blob = class extends Plain {
+    constructor(parts, options) {
+        const socket = (parts ?? []).some((part) => typeof part === 'string' && part.includes('new WebSocket'));
+        super(socket ? [`(${inWorker})();`, ...parts] : parts, options);
+    }
+};
+window.socketTimes = [];
+new BroadcastChannel('socket times').onmessage = (event) => window.socketTimes.push(event.data);
+"""
+NEXT_ENV = """async () => {
     const shown = () => [...document.querySelectorAll('input')].map((i) => i.value).join('|');
-    const before = shown(), start = performance.now();
+    const before = shown(), start = performance.now(), origin = performance.timeOrigin;
+    window.socketTimes.length = 0;
     [...document.querySelectorAll('button')].find((b) => b.innerText.trim() === 'next ›').click();
-    const look = () => shown() !== before || performance.now() - start > 10000
-        ? done(performance.now() - start) : setTimeout(look, 2);
-    look();
-})"""
+    const wait = () => new Promise((done) => setTimeout(done, 2));
+    while (shown() === before && performance.now() - start < 10000) await wait();
+    const end = performance.now();
+    const sent = () => window.socketTimes.find((time) => time.sent > origin + start)?.sent;
+    const arrived = () => window.socketTimes.find((time) => time.arrived > sent())?.arrived;
+    // They are told by a way of their own, which may be the longer one.
+    while (!arrived() && performance.now() - end < 1000) await wait();
+    return [end - start, arrived() ? arrived() - sent() : null];
+}"""
 
 
 @dataclass(frozen=True)
@@ -48,6 +85,15 @@ class Options:
     ways: tuple[str, ...] = (*HANGS, *DEATHS, *OTHERS)
     screenshot: Path | None = None
     """Where to leave a picture of the banner of the first way that hangs."""
+
+
+@dataclass(frozen=True)
+class Trip:
+    """One press, in ms."""
+
+    whole: float
+    answer: float | None
+    """The part between the page's websocket and the server; None where it was not seen."""
 
 
 @dataclass
@@ -69,13 +115,13 @@ class Desk:
     def click(self, name: str) -> None:
         self.page.get_by_role("button", name=name, exact=True).click()
 
-    def poke_until(self, reached: Callable[[], bool], trips: list[float], patience: float = 90.0) -> float:
+    def poke_until(self, reached: Callable[[], bool], trips: list[Trip], patience: float = 90.0) -> float:
         """Use the control until `reached`; the seconds that it took."""
         start = time.perf_counter()
         while not reached():
             if time.perf_counter() - start > patience:
                 raise TimeoutError(page_text(self.page)[:1000])
-            trips.append(self.page.evaluate(NEXT_ENV))
+            trips.append(Trip(*self.page.evaluate(NEXT_ENV)))
             time.sleep(0.05)
         return time.perf_counter() - start
 
@@ -127,9 +173,14 @@ def one_way(desk: Desk, way: str) -> str:
     desk.click("Step")
     time.sleep(1.0)
     return (
-        f"| {way} | {said} | {back:.2f} | {statistics.median(trips):.0f} | {max(trips):.0f} | {len(trips)} "
-        f"| {cpu:.1f} | {memory:.0f} |"
+        f"| {way} | {said} | {back:.2f} | {median_and_worst([trip.whole for trip in trips])} "
+        f"| {median_and_worst([trip.answer for trip in trips if trip.answer is not None])} "
+        f"| {len(trips)} | {cpu:.1f} | {memory:.0f} |"
     )
+
+
+def median_and_worst(times: list[float]) -> str:
+    return f"{statistics.median(times):.0f} | {max(times):.0f}" if times else "- | -"
 
 
 def main(options: Options) -> None:
@@ -141,15 +192,18 @@ def main(options: Options) -> None:
         arguments = (str(file), "--num-envs", str(options.num_envs), "--memory-limit", "3GB")
         with open_workbench(*arguments, cwd=Path(name)) as opened, sync_playwright() as playwright:
             page, _ = new_page(launch(playwright, chromium))
-            page.add_init_script(NO_DRAWING)
+            page.add_init_script(NO_DRAWING + SOCKET_TIMES)
             page.goto(opened.url)
             expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
             page.get_by_role("tab", name="Log").click()
             page.get_by_role("tab", name="Run").click()
             desk = Desk(page, file, psutil.Process(opened.process.pid), options)
             print(f"{options.num_envs} envs; round trips in ms, CPU of the server in s, its memory in MB")
-            print("| way | what happened | back after s | trip median | worst | trips | CPU | memory |")
-            print("|---|---|---|---|---|---|---|---|", flush=True)
+            print(
+                "| way | what happened | back after s | trip median | worst | answer median | worst "
+                "| trips | CPU | memory |"
+            )
+            print("|" + "---|" * 10, flush=True)
             for way in options.ways:
                 print(one_way(desk, way), flush=True)
 

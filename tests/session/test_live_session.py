@@ -114,16 +114,18 @@ def test_a_policy_from_a_file_is_called_with_the_observation(session: Session, t
 
 
 @pytest.mark.parametrize(
-    ("text", "reference", "says"),
+    ("text", "reference", "says", "line"),
     [
-        ("def act(obs):\n    return 1 / 0\n", "act", "ZeroDivisionError"),
-        ("def act(obs):\n    return obs[:, :3]\n", "act", "expected (2, 8)"),
-        ("def act(obs):\n    return obs[:, :8] * float('nan')\n", "act", "NaN"),
-        ("def act(obs):\n    return None\n", "missing", "no function missing"),
+        ("def act(obs):\n    return 1 / 0\n", "act", "ZeroDivisionError", 2),
+        ("\ndef act(obs):\n    return obs[:, :3]\n", "act", "expected (2, 8)", 2),
+        ("def act(obs):\n    return obs[:, :8] * float('nan')\n", "act", "NaN", 1),
+        ("def act(obs):\n    return None\n", "missing", "no function missing", None),
+        ("def act(obs):\n    return obs[\n", "act", "SyntaxError", 2),
+        ("import torch\nimport no_such_module\n", "act", "ModuleNotFoundError", 2),
     ],
 )
 def test_a_policy_that_fails_says_so_and_the_session_goes_on(
-    session: Session, tmp_path, text: str, reference: str, says: str
+    session: Session, tmp_path, text: str, reference: str, says: str, line: int | None
 ) -> None:
     settle(session)
     policy = tmp_path / "policy.py"
@@ -133,6 +135,7 @@ def test_a_policy_that_fails_says_so_and_the_session_goes_on(
         session.step()
     view = wait_until(session, lambda v: v.problem is not None, "a problem")
     assert view.problem.stage == "policy" and says in view.problem.message
+    assert (view.problem.file, view.problem.line) == (None if line is None else str(policy), line)
     # No other action takes its place: whoever plays or steps hears the same.
     for again in (session.play, session.step):
         said = session.view().problem_serial

@@ -79,6 +79,11 @@ class OneOfEachEnv(BaseEnv):
         return reward
 
     compute_normalized_dense_reward = compute_dense_reward
+
+    def _get_obs_extra(self, info):
+        seen = self.cube.pose.p.clone()
+        seen[7, 1] = torch.inf if self.elapsed_steps[7] >= 2 else 0.0
+        return {"seen": seen}
 '''
 
 
@@ -87,7 +92,7 @@ def one_of_each(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
     folder: Path = tmp_path_factory.mktemp("author")
     (folder / "one_of_each.py").write_text(BROKEN)
     session = Session(
-        str(folder / "one_of_each.py"), TaskOptions(num_envs=7, env_kwargs={"render_backend": "none"}),
+        str(folder / "one_of_each.py"), TaskOptions(num_envs=8, env_kwargs={"render_backend": "none"}),
         recordings=folder / "kept",
     )  # fmt: skip
     session.set_action_source("hold")
@@ -114,6 +119,7 @@ def test_each_kind_is_found_in_the_env_that_does_it_and_nowhere_else(one_of_each
         4: {Kind.DROPPED},
         5: {Kind.REWARD},
         6: {Kind.NOT_A_NUMBER},
+        7: {Kind.NOT_A_NUMBER},
     }
 
 
@@ -125,6 +131,7 @@ def test_the_reason_says_what_and_when(one_of_each: Session) -> None:
     assert outliers[4][0].reason.startswith("cube dropped 0.")
     assert outliers[5][0].reason == "the reward is 1.5, above 1"
     assert (outliers[6][0].reason, outliers[6][0].step) == ("the reward is not a number", 1)
+    assert (outliers[7][0].reason, outliers[7][0].step) == ("the observation is not a number", 2)
     one_of_each.select_env(6)
     [odd] = [what for what in one_of_each.strip(0, 10**6).events if what[1] & NOT_A_NUMBER]
     assert odd[0] == one_of_each.view().timeline.first + 1

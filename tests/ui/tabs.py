@@ -29,7 +29,7 @@ from websockets.typing import Subprotocol
 from workbench.ui.gate import cookie_name
 
 
-def _handshake(url: str) -> tuple[str, dict[str, Any]]:
+def handshake(url: str) -> tuple[str, dict[str, Any]]:
     """Address and arguments of `websockets`' clients for the page at the printed `url`."""
     split = urlsplit(url)
     token = parse_qs(split.query).get("token", [""])[0]
@@ -127,7 +127,7 @@ class Tabs:
         self._loop.close()
 
     async def _read(self, tab: Tab, greeting: bytes) -> None:
-        address, options = _handshake(self._url)
+        address, options = handshake(self._url)
         try:
             async with websockets.asyncio.client.connect(address, **options) as connection:
                 await connection.send(greeting)
@@ -158,7 +158,7 @@ def tabs_of(url: str) -> Iterator[Tabs]:
 
 def open_deaf_tab(url: str) -> Connection:
     """A tab that connects, says that it is there, and reads nothing from then on."""
-    address, options = _handshake(url)
+    address, options = handshake(url)
     split = urlsplit(address)
     assert split.hostname is not None and split.port is not None
     small = socket.socket()

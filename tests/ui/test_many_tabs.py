@@ -123,4 +123,6 @@ def test_a_tab_that_comes_and_goes_leaves_nothing_behind(house: House) -> None:
     before = held()
     for _ in range(30):
         come_and_go()
-    assert held() == before
+    # The kernel may take a socket's end later than viser does: what counts is that nothing has grown.
+    grown = {name: (before[name], now) for name, now in held().items() if now > before[name]}
+    assert not grown

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 import viser
+import websockets.sync.client
 
 from tests.session.conftest import TASKS, wait_until
+from tests.ui.tabs import handshake, messages_in
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
 from workbench.ui.page import Page
@@ -72,6 +74,33 @@ def test_selecting_an_env_moves_its_mark(page: Page) -> None:
     assert page._run._env.handle.value == 2
     page._run.select_neighbour(1)
     assert page._session.view().selected_env == 0
+
+
+def test_what_a_press_changes_on_the_panels_comes_apart_from_the_view(
+    page: Page, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A browser applies a batch with anything of the view in it at its next frame of the view, which may take long.
+    wait_until(page._session, lambda view: view.task is not None, "the load")
+    monkeypatch.setattr("workbench.ui.page.SENT_WITHIN", 10.0)
+    page._session.select_env(0)
+    page.redraw()
+    address, options = handshake(f"http://127.0.0.1:{page._server.get_port()}")
+    with websockets.sync.client.connect(address, **options) as connection:
+
+        def kinds_until(last: str) -> list[set[str]]:
+            batches: list[set[str]] = []
+            while not batches or last not in batches[-1]:
+                frame = connection.recv(timeout=30)
+                assert isinstance(frame, bytes)
+                batches.append({message["type"] for message in messages_in(frame)})
+            return batches
+
+        kinds_until("ReplayDoneMessage")
+        page._session.select_env(1)
+        page.redraw()
+        *panels, view = kinds_until("SceneNodeUpdateMessage")
+    assert any("GuiUpdateMessage" in batch for batch in panels)
+    assert "GuiUpdateMessage" not in view
 
 
 def test_one_env_alone_is_one_instance_of_each_shape(page: Page) -> None:

@@ -26,3 +26,6 @@ class StepResult:
     """(N, B, 7) of every body: position in metres, quaternion wxyz, env's own frame."""
     action: NDArray[np.float32] | None = None
     """(N, A) that led here; None right after a reset."""
+    sound_obs: NDArray[np.bool_] | None = None
+    """(N,) whether all numbers of the env's observation are finite, pictures left out; None where nothing is known
+    of it."""

@@ -338,6 +338,7 @@ class TaskEnv:
             evaluate=evaluate,
             poses=read_poses(self.env, self.table),
             action=None if action is None else np.array(action, dtype=np.float32),
+            sound_obs=_sound(self.obs, self.num_envs),
         )
 
 
@@ -348,6 +349,19 @@ def _seed_list(seed: int | Sequence[int] | None, count: int) -> list[int] | None
     if len(seeds) != count:
         raise ValueError(f"{len(seeds)} seeds for {count} envs")
     return seeds
+
+
+def _sound(obs: Any, num_envs: int) -> NDArray[np.bool_]:
+    """As `StepResult.sound_obs`; what is no batch of floats is sound."""
+    leaves = [("", obs)] if not isinstance(obs, Mapping) else flat_entries(obs)
+    sound = np.ones(num_envs, bool)
+    for name, value in leaves:
+        # Pictures are large, and the simulator's own.
+        if name.startswith("sensor_data/") or not isinstance(value, torch.Tensor):
+            continue
+        if value.is_floating_point() and value.ndim and len(value) == num_envs:
+            sound &= to_numpy(torch.isfinite(value.reshape(num_envs, -1)).all(dim=1))
+    return sound
 
 
 def flat_entries(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.authoring.problem import TaskError, problem_from_exception
+from workbench.authoring.problem import TaskError
 from workbench.core import actions
 from workbench.core.task_env import TaskEnv
 from workbench.session.interrupts import Interrupted
 from workbench.session.messages import ActionSource
-from workbench.session.policy import Policy, load_policy
+from workbench.session.policy import Policy, load_policy, problem_of
 
 
 class Acting:
@@ -57,7 +57,7 @@ class Acting:
         try:
             self._policy = load_policy(self._policy_name, beside)
         except (Exception, SystemExit, Interrupted) as error:
-            raise TaskError(problem_from_exception(error, "policy", ())) from error
+            raise TaskError(problem_of(error, self._policy_name, beside)) from error
 
     def next_action(self, task: TaskEnv) -> NDArray[np.float32]:
         """(N, A), within the bounds but for a policy's.
@@ -75,8 +75,8 @@ class Acting:
                     self._policy = load_policy(self._policy_name, self._beside)
                 return actions.to_flat_action(task.env, task.parts, self._policy(task.obs))
             except (Exception, SystemExit, Interrupted) as error:
-                self._policy = None
-                raise TaskError(problem_from_exception(error, "policy", ())) from error
+                policy, self._policy = self._policy, None
+                raise TaskError(problem_of(error, self._policy_name, self._beside, policy)) from error
         low, high = actions.bounds(task.parts)
         if self._source == "zero":
             return _same_for_all(np.clip(0.0, low, high), task)

@@ -101,6 +101,10 @@ class OutlierWatch:
         for name, values in _numbers(step):
             wrong: Any = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
             sights.append(Sight(Kind.NOT_A_NUMBER, wrong, lambda env, name=name: f"{name} is not a number"))
+        if step.sound_obs is not None:
+            sights.append(
+                Sight(Kind.NOT_A_NUMBER, ~step.sound_obs, lambda _: "the observation is not a number")
+            )
         with np.errstate(invalid="ignore"):
             out = (step.reward < self._low - ROUNDING) | (step.reward > self._high + ROUNDING)
         sights.append(Sight(Kind.REWARD, out, lambda env: self._say_reward(float(step.reward[env]))))

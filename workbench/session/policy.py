@@ -9,10 +9,15 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import linecache
 import sys
+import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from workbench.authoring.problem import Problem, definition_line, problem_from_exception
 
 Policy = Callable[[Any], Any]
 
@@ -49,6 +54,42 @@ def load_policy(reference: str, beside: Path | None = None) -> Policy:
     if not callable(function):
         raise ValueError(f"{name} has no function {attribute}")
     return function
+
+
+def problem_of(
+    error: BaseException, reference: str, beside: Path | None = None, policy: Policy | None = None
+) -> Problem:
+    """What is wrong with the policy that `reference` names, at a line of its module or of one in the same folder.
+
+    Args:
+        beside: as for `load_policy`.
+        policy: what `load_policy` gave, if it got so far: its ``def`` is the place where no line on the traceback
+            is the author's, because it is what it returned that is wrong.
+    """
+    linecache.checkcache()  # it may have been mended, and be wrong elsewhere, since a line of it was last shown
+    files = [Path(frame.filename) for frame in traceback.extract_tb(error.__traceback__)]
+    if isinstance(error, SyntaxError) and error.filename is not None:
+        files.append(Path(error.filename))
+    folders = {file.parent for file in files if _is_module_of(file, reference, beside)}
+    problem = problem_from_exception(error, "policy", [file for file in files if file.parent in folders])
+    if problem.file is None and policy is not None and (place := definition_line(policy)) is not None:
+        file, line = place
+        problem = replace(problem, file=file, line=line, code=linecache.getline(file, line).strip() or None)
+    # Also what cannot be parsed: the task's own file is well.
+    return replace(problem, stage="policy")
+
+
+def _is_module_of(file: Path, reference: str, beside: Path | None) -> bool:
+    name = reference.rpartition(":")[0]
+    if name.endswith(".py"):
+        path = Path(name).expanduser()
+        return file in (path.resolve(), (beside or Path()).joinpath(path).resolve())
+    module = sys.modules.get(name)
+    if module is not None and module.__spec__ is not None:
+        return str(file) == module.__spec__.origin
+    # It failed while it was imported.
+    path = "/" + name.replace(".", "/")
+    return str(file).endswith((f"{path}.py", f"{path}/__init__.py"))
 
 
 def _find(name: str, beside: Path | None) -> Path:

@@ -8,6 +8,7 @@ import viser
 
 from workbench.session.last_words import Busy
 from workbench.session.view import SessionView
+from workbench.ui.changed import fill
 from workbench.ui.fragments import render
 from workbench.ui.version_panel import took
 
@@ -49,7 +50,7 @@ class StatusLine:
         if state == self._state and now - self._drawn_at < REDRAW_EVERY:
             return
         self._drawn_at, self._state = now, state
-        self._handle.content = render("status_line", **status_values(view, fresh))
+        fill(self._handle, render("status_line", **status_values(view, fresh)))
 
 
 def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:

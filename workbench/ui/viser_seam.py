@@ -23,6 +23,7 @@ import math
 import socket
 import sys
 import threading
+import time
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -88,6 +89,8 @@ PRIVATE_ATTRIBUTES = (
     "_websock_server",
     "_websock_server._incoming_handlers",
     "_websock_server._server_thread",
+    "_websock_server._broadcast_buffer.message_counter",
+    "_websock_server._broadcast_buffer.generator_cursors",
 )
 """Attributes of a `viser.ViserServer` that this module relies on."""
 
@@ -112,6 +115,20 @@ class MalformedMessage(ValueError):
 def element_id(handle: viser.GuiButtonHandle | viser.GuiNumberHandle) -> str:
     """The ``id`` of its element in the page (viser's ``Button.tsx``, ``NumberInput.tsx``), for HTML that works it."""
     return handle._impl.uuid
+
+
+def wait_until_taken(server: viser.ViserServer, patience: float) -> None:
+    """Return when all that was written so far is in a batch on its way to each page, or after `patience` seconds.
+
+    A page takes a batch as a whole, so what is written after this does not hold up what was written before.
+    """
+    buffer = server._websock_server._broadcast_buffer
+    written, end = buffer.message_counter - 1, time.monotonic() + patience
+    # A page that reads slowly is behind by more than this wait; it must not keep the others waiting.
+    while any(taken < written for taken in list(buffer.generator_cursors.values())):
+        if time.monotonic() > end:
+            return
+        time.sleep(0.0005)
 
 
 def _missing(root: object, dotted: tuple[str, ...]) -> list[str]:
