@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tests.ui.scenes import camera, table_scene
+from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import Picture
 from workbench.recording.episode import Episode, EpisodeInfo
 from workbench.recording.episode_writer import EpisodeWriter
@@ -54,6 +56,17 @@ def made(
     )
 
 
+def poses_of(episode: Episode) -> NDArray[np.float32]:
+    """Those of an episode that has some; to be written to."""
+    assert episode.poses is not None
+    return episode.poses
+
+
+def geometry_of(episode: Episode) -> SceneGeometry:
+    assert episode.geometry is not None
+    return episode.geometry
+
+
 def begin(folder: Path, episode: Episode) -> None:
     """All of it in a journal, as a writer leaves it that was killed before it made the files."""
     writer = _appended(folder, episode, pictures=False)
@@ -69,9 +82,8 @@ def write(folder: Path, episode: Episode, pictures: bool = True) -> Path:
 def _appended(folder: Path, episode: Episode, pictures: bool) -> EpisodeWriter:
     cameras = (camera(),) if pictures else ()
     writer = EpisodeWriter(
-        folder, episode.info, episode.geometry, episode.segmentation, episode.action_names, cameras
+        folder, episode.info, geometry_of(episode), episode.segmentation, episode.action_names, cameras
     )
-    assert episode.poses is not None
     for state in range(episode.length + 1):
         seen = Picture(
             "base_camera",
@@ -84,7 +96,7 @@ def _appended(folder: Path, episode: Episode, pictures: bool) -> EpisodeWriter:
         )
         writer.append(
             EpisodeRow(
-                poses=episode.poses[state],
+                poses=poses_of(episode)[state],
                 evaluate={name: values[state] for name, values in episode.evaluate.items()},
                 action=episode.action[state - 1] if state else None,
                 reward=float(episode.reward[state - 1]) if state else 0.0,

@@ -26,7 +26,7 @@ def recorded(
 ) -> tuple[Path, list[NDArray[np.float32]], tuple[str, ...]]:
     """The .h5 of two episodes, the poses of all bodies in each, and the names of the bodies."""
     folder = tmp_path_factory.mktemp("theirs")
-    env = gym.make("PushCube-v1", num_envs=1, sim_backend="physx_cpu", render_backend="none")
+    env: Any = gym.make("PushCube-v1", num_envs=1, sim_backend="physx_cpu", render_backend="none")
     env = RecordEpisode(env, str(folder), save_video=False, record_env_state=True)
     env.action_space.seed(0)
     base: Any = env.unwrapped

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.session.recordings import made, write
+from tests.session.recordings import made, poses_of, write
 from workbench.recording.episode import Episode
 from workbench.recording.library import Library
 from workbench.recording.read_episode import UnreadableRecording
@@ -198,11 +198,12 @@ def test_real_files_come_back_with_scene_pictures_and_numbers(tmp_path: Path) ->
     view = opened(review, library.rows()[0].id)
     one = view.opened[0]
     assert one.has_scene and one.length == 4 and one.first("success") == 3
-    assert np.allclose(one.episode.poses[:, 3, 0], np.arange(5) * 0.01)
+    assert np.allclose(poses_of(one.episode)[:, 3, 0], np.arange(5) * 0.01)
     reader = PictureReader()
     assert [camera.modalities for camera in reader.cameras(one.episode)] == [("rgb", "depth", "segmentation")]
     wanted = (CameraRequest("base_camera", "sensor", ("rgb", "depth")),)
     seen = reader.pictures(one.episode, 2, wanted, env=0)["sensor", "base_camera"]
+    assert seen.rgb is not None and seen.depth is not None
     assert abs(int(seen.rgb.mean()) - 40) <= 2 and np.allclose(seen.depth, 0.2) and seen.segmentation is None
     again = reader.pictures(one.episode, 2, wanted, env=0)["sensor", "base_camera"]
     assert again is seen, "the same state is not decoded again"
@@ -257,7 +258,7 @@ def test_a_line_over_positions_has_each_number_at_its_place(
 ) -> None:
     states = np.arange(length + 1)
     axis = np.arange(first, last + 1)
-    line = column_at(states, states * 1.5, anchor, axis)
+    line = column_at(states, states.astype(np.float64) * 1.5, anchor, axis)
     for place, value in zip(axis, line, strict=True):
         state = place + anchor
         assert value == state * 1.5 if 0 <= state <= length else np.isnan(value)

@@ -99,14 +99,14 @@ def test_a_tab_that_comes_and_goes_leaves_nothing_behind(house: House) -> None:
     def come_and_go() -> None:
         tab = house.tabs.open(server.initial_camera.position.tolist())
         until(
-            lambda: house.clients() and server.get_clients().keys() <= house.page._pointed.keys(),
+            lambda: house.clients() and server.get_clients().keys() <= house.page._framing.pointed,
             "the view",
         )
         house.tabs.close(tab)
         until(lambda: house.clients() == 0, "its end")
 
     def held() -> dict[str, int]:
-        until(lambda: not house.page._arrivals, "the page to notice")
+        until(lambda: not house.page._framing.followed, "the page to notice")
         gc.collect()
         handles = sum(isinstance(thing, viser.ClientHandle) for thing in gc.get_objects())
         this = psutil.Process()
@@ -115,7 +115,7 @@ def test_a_tab_that_comes_and_goes_leaves_nothing_behind(house: House) -> None:
             "threads": threading.active_count(),
             "files": this.num_fds(),
             "of viser's": len(server._websock_server._client_state_from_id),
-            "pointed": len(house.page._pointed),
+            "pointed": len(house.page._framing.pointed),
         }
 
     for _ in range(3):

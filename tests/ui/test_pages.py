@@ -14,7 +14,9 @@ from tests.session.conftest import TASKS, wait_until
 from tests.session.recordings import begin, made, write
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
+from workbench.ui.page import Page
 from workbench.ui.put_together import Workplace
+from workbench.ui.review_page import ReviewPage
 
 SWAPS = 20
 
@@ -58,7 +60,9 @@ def test_twenty_swaps_leave_nothing_and_the_session_lives_on(
         which = "review" if number % 2 == 0 else "live"
         place.pages.show(which)
         assert place.pages.wait_for(which, timeout=60)
-        place.pages._page.redraw()
+        page = place.pages._page
+        assert isinstance(page, (Page, ReviewPage))
+        page.redraw()
         seen[which].append(counts(server))
         threads.append(threading.active_count())
     for found in seen.values():

@@ -38,8 +38,13 @@ def page(folder: Path, server: viser.ViserServer) -> Iterator[ReviewPage]:
     library.close()
 
 
+def library_of(page: ReviewPage) -> Library:
+    assert page._library is not None
+    return page._library._library
+
+
 def open_seeds(page: ReviewPage, *seeds: int) -> None:
-    rows = {row.seed: row.id for row in page._library._library.rows()}
+    rows = {row.seed: row.id for row in library_of(page).rows()}
     page._review.open([rows[seed] for seed in seeds])
     deadline = time.monotonic() + 60
     while len(page._review.view().opened) != len(seeds) or page._review.view().loading:
@@ -112,7 +117,7 @@ def test_pressing_a_row_of_the_comparison_goes_there(page: ReviewPage) -> None:
 def test_a_name_with_markup_in_it_is_text(page: ReviewPage, folder: Path, tmp_path: Path) -> None:
     evil = made(3, seed=9, task="<script>alert(1)</script>")
     write(folder, evil)
-    page._library._library.refresh()
+    library_of(page).refresh()
     open_seeds(page, 9)
     for html in (page._panel._list, page._status, page._panel._facts, page._timeline._strip):
         assert "<script>alert" not in html.content
@@ -121,7 +126,7 @@ def test_a_name_with_markup_in_it_is_text(page: ReviewPage, folder: Path, tmp_pa
 def test_many_recordings_stand_side_by_side(page: ReviewPage, folder: Path) -> None:
     for seed in range(20, 26):
         write(folder, made(3, seed=seed), pictures=False)
-    page._library._library.refresh()
+    library_of(page).refresh()
     open_seeds(page, *range(20, 26))
     assert not page._panel.ghosts and not page._panel._arrange.visible
     (cubes,) = (h for h in page._scene.handles if "cube" in h.name)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from tests.session.recordings import BODY, made
+from tests.session.recordings import BODY, geometry_of, made, poses_of
 from workbench.recording.episode import Episode
 from workbench.session.review_events import happenings
 from workbench.session.review_view import Opened
@@ -28,7 +30,7 @@ def test_side_by_side_shares_shapes_and_has_places() -> None:
 
 def test_a_ghost_is_tinted_and_drawn_only_where_it_parts() -> None:
     a, b = made(10), made(10)
-    b.poses[5:, BODY["cube"], 1] += 0.1
+    poses_of(b)[5:, BODY["cube"], 1] += 0.1
     scene = review_scene(opened(a, b), ghosts=True)
     assert scene is not None and not scene.layout.offsets.any()
     ghosts = {int(v.bodies[0]): v.material for v in scene.geometry.visuals if 1 in v.envs}
@@ -41,13 +43,7 @@ def test_a_ghost_is_tinted_and_drawn_only_where_it_parts() -> None:
 
 def test_recordings_with_other_bodies_and_without_a_scene() -> None:
     a, b, c = made(3), made(3), made(3)
-    b.geometry = type(b.geometry)(
-        1,
-        ("ground", "table", "arm/hand", "box"),
-        b.geometry.body_kinds,
-        b.geometry.body_hidden,
-        b.geometry.visuals,
-    )
+    b.geometry = replace(geometry_of(b), body_names=("ground", "table", "arm/hand", "box"))
     c.geometry = c.poses = None
     scene = review_scene(opened(a, b, c), ghosts=False)
     assert scene is not None

@@ -36,26 +36,40 @@ class Framing:
             self._pointed = {number: at for number, at in self._pointed.items() if number in clients}
         return len(clients)
 
-    def frame(self, frame: Frame) -> None:
-        """Point every open page, and those to come."""
+    @property
+    def pointed(self) -> frozenset[int]:
+        """The open pages that were pointed at something."""
+        return frozenset(self._pointed)
+
+    @property
+    def followed(self) -> frozenset[int]:
+        """The open pages, as they were at the last look."""
+        return frozenset(self._arrivals)
+
+    def frame(self, frame: Frame, untouched_only: bool = False) -> None:
+        """Point every open page (or those whose view nobody has moved), and those to come."""
         usual = frame(USUAL_ASPECT, USUAL_HEIGHT)
         self._server.initial_camera.position = usual.position
         self._server.initial_camera.look_at = usual.look_at
         for client in self._server.get_clients().values():
-            self._point(client, frame)
+            if not untouched_only or self._is_untouched(client):
+                self._point(client, frame)
 
     def frame_arrivals(self, frame: Frame) -> None:
         """Frame anew what has just come and turns out to have another shape than it was framed for."""
         for number, client in self._server.get_clients().items():
             if time.monotonic() - self._arrivals.get(number, 0.0) > SETTLES:
                 continue
-            pointed = self._pointed.get(number)
-            aspect = USUAL_ASPECT if pointed is None else pointed[1]
-            usual = self._server.initial_camera.position if pointed is None else pointed[0]
+            _, aspect = self._pointed.get(number, (None, USUAL_ASPECT))
             # If it looks from somewhere else, it lost its connection and came back, or the person was quicker.
-            untouched = np.allclose(client.camera.position, usual, atol=0.02)
-            if untouched and abs(aspect_of(client) / aspect - 1) > 0.05:
+            if self._is_untouched(client) and abs(aspect_of(client) / aspect - 1) > 0.05:
                 self._point(client, frame)
+
+    def _is_untouched(self, client: viser.ClientHandle) -> bool:
+        """True while the page looks from where it was last pointed."""
+        pointed = self._pointed.get(client.client_id)
+        usual = self._server.initial_camera.position if pointed is None else pointed[0]
+        return np.allclose(client.camera.position, usual, atol=0.02)
 
     def _point(self, client: viser.ClientHandle, frame: Frame) -> None:
         viewpoint = frame(aspect_of(client), client.camera.image_height or USUAL_HEIGHT)

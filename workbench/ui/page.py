@@ -31,6 +31,7 @@ from workbench.ui.env_layout import EnvLayout, env_under_ray, lay_out
 from workbench.ui.env_panel import EnvPanel
 from workbench.ui.force_arrows import ForceArrows
 from workbench.ui.fragments import render, style_sheet
+from workbench.ui.framing import Framing
 from workbench.ui.inspect_panel import InspectPanel
 from workbench.ui.judgement_panel import JudgementPanel
 from workbench.ui.lights import light
@@ -47,7 +48,7 @@ from workbench.ui.timeline_panel import HEIGHT as TIMELINE_HEIGHT
 from workbench.ui.timeline_panel import TimelinePanel
 from workbench.ui.version_panel import VersionPanel
 from workbench.ui.view_panel import ViewPanel
-from workbench.ui.viewpoint import FOV, USUAL_ASPECT, USUAL_HEIGHT, Viewpoint, frame_all, frame_one
+from workbench.ui.viewpoint import FOV, Viewpoint, frame_all, frame_one
 from workbench.ui.viser_seam import wait_until_taken
 
 log = logging.getLogger(__name__)
@@ -58,8 +59,6 @@ SENT_WITHIN = 0.01
 """Seconds, of the time for a frame, that the view may wait for the panels to be on their way."""
 PANEL_WIDTH = 340
 ENVS_WIDTH = 520
-SETTLES = 4.0
-"""Seconds after a page has come in which its panels may still take their places."""
 
 
 class Page:
@@ -88,8 +87,8 @@ class Page:
         self._built: tuple[bool, int] | None = None
         self._framed: object = None
         self._waits_for_human = False
-        self._arrivals: dict[int, float] = {}
-        self._pointed: dict[int, tuple[np.ndarray, float]] = {}
+        self._framing = Framing(server)
+        self._clients = 0
 
         server.scene.set_up_direction("+z")
         light(server)
@@ -236,13 +235,11 @@ class Page:
             self._env_window.minimize()
 
     def _count_clients(self) -> int:
-        clients = self._server.get_clients()
-        if clients.keys() != self._arrivals.keys():
-            now = time.monotonic()
-            self._arrivals = {number: self._arrivals.get(number, now) for number in clients}
-            self._pointed = {number: at for number, at in self._pointed.items() if number in clients}
-            self._session.set_clients(len(clients))
-        return len(clients)
+        count = self._framing.follow()
+        if count != self._clients:
+            self._clients = count
+            self._session.set_clients(count)
+        return count
 
     # --- the 3-D view ----------------------------------------------------------------------------
 
@@ -292,48 +289,15 @@ class Page:
             # The human camera's place comes with its first picture, after the scene.
             self._waits_for_human = False
             self.frame(view, untouched_only=True)
-        self._frame_arrivals(view)
+        self._framing.frame_arrivals(lambda aspect, height: self._viewpoint(view, aspect, height))
 
     def frame(self, view: SessionView, untouched_only: bool = False) -> None:
         """Point every open page (or those whose view nobody has moved), and those to come, at the scene."""
-        viewpoint = self._viewpoint(view, USUAL_ASPECT, USUAL_HEIGHT)
-        if viewpoint is None:
-            return
-        self._server.initial_camera.position = viewpoint.position
-        self._server.initial_camera.look_at = viewpoint.look_at
-        for client in self._server.get_clients().values():
-            if not untouched_only or self._is_untouched(client):
-                self._point(client, view)
+        if self._layout is not None and view.task is not None:
+            self._framing.frame(lambda aspect, height: self._viewpoint(view, aspect, height), untouched_only)
 
-    def _is_untouched(self, client: viser.ClientHandle) -> bool:
-        """True while the page looks from where it was last pointed."""
-        pointed = self._pointed.get(client.client_id)
-        usual = self._server.initial_camera.position if pointed is None else pointed[0]
-        return np.allclose(client.camera.position, usual, atol=0.02)
-
-    def _frame_arrivals(self, view: SessionView) -> None:
-        """Frame the scene for the shape of a page that has just come, which is known only after a moment.
-
-        Not if it looks from somewhere else already: then it lost its connection and came back, or the
-        person was quicker, and the view is theirs.
-        """
-        for number, client in self._server.get_clients().items():
-            if time.monotonic() - self._arrivals.get(number, 0.0) > SETTLES:
-                continue
-            _, aspect = self._pointed.get(number, (None, USUAL_ASPECT))
-            if self._is_untouched(client) and abs(aspect_of(client) / aspect - 1) > 0.05:
-                self._point(client, view)
-
-    def _point(self, client: viser.ClientHandle, view: SessionView) -> None:
-        viewpoint = self._viewpoint(view, aspect_of(client), client.camera.image_height or USUAL_HEIGHT)
-        if viewpoint is not None:
-            self._pointed[client.client_id] = (viewpoint.position, aspect_of(client))
-            client.camera.position = viewpoint.position
-            client.camera.look_at = viewpoint.look_at
-
-    def _viewpoint(self, view: SessionView, aspect: float, height: float) -> Viewpoint | None:
-        if self._layout is None or view.task is None:
-            return None
+    def _viewpoint(self, view: SessionView, aspect: float, height: float) -> Viewpoint:
+        assert self._layout is not None and view.task is not None, "asked only where a scene is drawn"
         if self._view_panel.only_selected or view.task.num_envs == 1:
             human = next((p for (kind, _), p in view.pictures.items() if kind == "human"), None)
             return frame_one(self._layout, human, aspect, TIMELINE_HEIGHT / height)
@@ -394,11 +358,3 @@ class Page:
             Command("Dark or light", self._view_panel.toggle_dark, "D"),
             *self._studio.commands(),
         ]
-
-
-def aspect_of(client: viser.ClientHandle) -> float:
-    """Width over height of the view in this page."""
-    camera = client.camera
-    if not camera.image_height or not camera.image_width:
-        return USUAL_ASPECT
-    return camera.image_width / camera.image_height
