@@ -9,6 +9,7 @@ import os
 import re
 import resource
 import shutil
+import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -237,6 +238,40 @@ def test_a_disk_without_room_leaves_the_journal_or_nothing(
     assert [read_episode(files.rrd).length for files in recovered] == ([1] if room == 40_000 else [])
     assert len(left(tmp_path)) == 3 * len(recovered)
     assert read_episode(episode.write(tmp_path).rrd).length == 3
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A filesystem of 1 MB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(folder)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode != 0:
+        pytest.skip("no filesystem may be mounted here")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+@pytest.mark.parametrize("ballast", [850_000, 940_000])
+def test_a_full_disk_is_said_and_what_was_recorded_is_found_when_there_is_room(
+    make_episode: Maker, small_disk: Path, ballast: int
+) -> None:
+    (small_disk / "ballast").write_bytes(bytes(ballast))
+    episode = wide(make_episode, steps=12)
+    with pytest.raises(RecordingError, match="disk that holds .* is full. Make room there"):
+        writer = episode.writer(small_disk)
+        for row in episode.rows():
+            writer.append(row)
+        writer.finish()
+    writer.close()
+    assert set(os.listdir(small_disk)) <= {"ballast", FOLDER}
+    (small_disk / "ballast").unlink()
+    for files in recover(small_disk):
+        assert 0 < read_episode(files.json).length <= 12
+        assert verify_rrd(files.rrd) is None
+    assert not (small_disk / FOLDER).exists()
 
 
 def test_finishing_again_helps_once_there_is_room(make_episode: Maker, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -44,8 +45,9 @@ def stacked(rows: list[dict[str, NDArray]]) -> dict[str, NDArray]:
 
 def record_both(task: str, folder: Path, **kwargs: Any) -> tuple[Path, Path]:
     """The .h5 of one episode from ManiSkill's wrapper, and from ours."""
+    stock: Any = gym.make(task, num_envs=1, **kwargs)
     env: Any = RecordEpisode(
-        gym.make(task, num_envs=1, **kwargs),
+        stock,
         str(folder / "theirs"),
         trajectory_name="theirs",
         save_video=False,
@@ -129,6 +131,24 @@ def test_names_types_shapes_and_numbers_are_theirs(tmp_path: Path, task: str, ob
     with h5py.File(ours) as file:
         states = dict_to_list_of_dicts(file["traj_0/env_states"])
     assert len(states) == STEPS + 1
+
+
+def test_long_columns_are_packed_and_read_the_same(make_episode: Callable[..., Made], tmp_path: Path) -> None:
+    """Longer than a piece of the journal and than a chunk of the file."""
+    count = np.arange(3001, dtype=np.float32)
+    states = np.stack([count, np.sin(count), np.zeros_like(count)] * 10, axis=1)
+    files = make_episode(3000, env_states={"actors/cube": states}, reward=count[1:]).write(tmp_path)
+    with h5py.File(files.h5) as file:
+        group: Any = file["traj_0"]
+        assert group["env_states/actors/cube"].chunks[0] < 3001
+        np.testing.assert_array_equal(group["env_states/actors/cube"][:], states)
+        np.testing.assert_array_equal(group["rewards"][:], count[1:])
+    assert files.h5.stat().st_size < states.nbytes / 2
+    found = read_episode(files.rrd)
+    np.testing.assert_array_equal(found.env_states["actors/cube"], states)
+    np.testing.assert_array_equal(found.reward, count[1:])
+    assert found.poses is not None
+    np.testing.assert_array_equal(found.poses[:, 1, 0], np.arange(3001))
 
 
 def test_theirs_is_read_as_ours_is(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import shutil
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -178,14 +179,26 @@ def test_observations_and_parts_of_the_reward_have_places_of_their_own(
         "extra/tcp_pose",
         "extra/goal_pos",
     }
-    for name, expected in episode.obs.items():
-        steps, values = scalars(entities, f"/observation/state/{name}")
-        np.testing.assert_array_equal(steps, np.arange(len(episode.poses)))
-        np.testing.assert_array_equal(values, expected.reshape(len(expected), -1))
+    steps, values = scalars(entities, "/observation/state")
+    np.testing.assert_array_equal(steps, np.arange(len(episode.poses)))
+    expected = np.concatenate([one.reshape(len(one), -1) for one in episode.obs.values()], axis=1)
+    np.testing.assert_array_equal(values, expected)
+    names = entities["/observation/state"]["SeriesLines:names"].values[0]
+    assert names[:2] == ["agent/qpos[0]", "agent/qpos[1]"] and len(names) == expected.shape[1]
     terms = make_episode(evaluate={"reward_terms/reach": np.arange(4.0), "success": np.zeros(4, bool)})
     entities = read_rrd(terms.write(tmp_path).rrd)
     np.testing.assert_array_equal(scalars(entities, "/reward/reach")[1][:, 0], np.arange(4.0))
     assert entities["/reward/reach"]["SeriesLines:names"].values[0] == ["reach"]
+
+
+def test_an_rrd_that_somebody_was_sent_holds_all_but_the_states(
+    written: tuple[Made, Path, Entities], tmp_path: Path
+) -> None:
+    made, path, _ = written
+    alone = read_episode(Path(shutil.copy(path, tmp_path / "sent to me.rrd")))
+    assert_same(dataclasses.replace(alone, env_states=made.env_states), made)
+    assert alone.env_states == {}
+    assert alone.info == read_episode(path).info
 
 
 def test_sim_time_is_the_step_in_seconds(written: tuple[Made, Path, Entities]) -> None:

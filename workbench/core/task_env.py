@@ -8,7 +8,7 @@ GPU simulation, and the caller need not know which.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -282,13 +282,16 @@ class TaskEnv:
         self._refresh_if_rebuilt()
         self.obs = last_observation(self.env)
         info = {key: value for key, value in info.items() if key != "reconfigure"}
-        result = self._result(
-            info,
-            _batch(to_numpy(reward).astype(np.float32), self.num_envs),
-            _batch(to_numpy(terminated).astype(bool), self.num_envs),
-            action,
+        count = self.num_envs
+        return StepResult(
+            elapsed_steps=to_numpy(self.env.elapsed_steps).astype(np.int32),
+            reward=_batch(to_numpy(reward).astype(np.float32), count),
+            terminated=_batch(to_numpy(terminated).astype(bool), count),
+            truncated=_batch(to_numpy(truncated).astype(bool), count),
+            evaluate={k: _batch(to_numpy(v), count) for k, v in flat_entries(info) if k != "elapsed_steps"},
+            poses=read_poses(self.env, self.table),
+            action=action,
         )
-        return replace(result, truncated=_batch(to_numpy(truncated).astype(bool), self.num_envs))
 
     @property
     def observes_pictures(self) -> bool:

@@ -15,11 +15,11 @@ import rerun.blueprint as rrb
 from workbench.recording.layout import (
     EVENTS,
     REWARD_TERMS,
-    STEP,
     WORLD,
     camera_entities,
     evaluate_entity,
 )
+from workbench.recording.rerun_log import STEP
 from workbench.recording.survey import CameraSurvey, Survey
 
 MAX_SERIES = 32

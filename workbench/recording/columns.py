@@ -67,14 +67,17 @@ class RowPacker:
             for name, value in held.items():
                 names.append(prefix + name)
                 arrays.append(np.asarray(value))
-        key: _Key = tuple([(name, a.dtype, a.shape) for name, a in zip(names, arrays)])
-        number = self._layouts.get(key)
-        text = None
-        if number is None:
-            self._check(key)
-            text = layout_text(key)
-            number = self._layouts[key] = len(self._layouts)
+        number, text = self.number_of(tuple([(name, a.dtype, a.shape) for name, a in zip(names, arrays)]))
         return number, b"".join([array.tobytes() for array in arrays]), text
+
+    def number_of(self, key: _Key) -> tuple[int, str | None]:
+        """The layout of rows that were packed elsewhere, as `pack` gives it and raises."""
+        number = self._layouts.get(key)
+        if number is not None:
+            return number, None
+        self._check(key)
+        number = self._layouts[key] = len(self._layouts)
+        return number, layout_text(key)
 
     def forget(self, number: int) -> None:
         """Layout `number`, the last new one, was not kept."""

@@ -16,6 +16,7 @@ import numpy as np
 
 from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
+from workbench.recording.batch_rows import Layout
 from workbench.recording.columns import RowPacker
 from workbench.recording.encoded_pictures import MODALITIES, Modality, encode
 from workbench.recording.episode import EpisodeInfo
@@ -57,6 +58,7 @@ class EpisodeWriter:
             camera.key: index for index, camera in enumerate(self._header.cameras)
         }
         self._given: dict[int, tuple[Modality, ...]] = {}
+        self._shared: dict[Layout, int] = {}
         self._states = 0
         self._written = False
         self._finished: EpisodeFiles | None = None
@@ -103,10 +105,22 @@ class EpisodeWriter:
                 if self._states == 0
                 else f"step {self._states} has no action, so it cannot be replayed."
             )
+        self._append(*self._packer.pack(row), row.pictures)
+
+    def append_packed(self, layout: Layout, packed: bytes, pictures: Sequence[Picture] = ()) -> None:
+        """As `append`, with a row after the first that was packed together with those of other envs."""
+        if self._states == 0:
+            raise ValueError("the first row is the state after a reset, which no action led to.")
+        number, text = self._shared.get(layout), None
+        if number is None:
+            number, text = self._packer.number_of(layout.key)
+        self._append(number, packed, text, pictures)
+        self._shared[layout] = number
+
+    def _append(self, number: int, packed: bytes, layout: str | None, pictures: Sequence[Picture]) -> None:
         journal = self._journal
-        number, packed, layout = self._packer.pack(row)
         try:
-            given = self._add_pictures(row.pictures) if row.pictures else {}
+            given = self._add_pictures(pictures) if pictures else {}
             if layout is not None:
                 journal.add("layout", number, layout.encode())
             journal.add("row", number, packed)

@@ -4,7 +4,7 @@ A recording is read by people in the viewer and by programs, so where a thing li
 
 - ``/world`` right-handed, z up; ``/world/<body>`` its pose, ``/world/<body>/<n>`` its static meshes;
 - ``/world/cameras/<name>`` pose and pinhole, with children ``rgb``, ``depth`` and ``segmentation``;
-- ``/action``, ``/reward`` and ``/reward/<term>``, ``/evaluate/<entry>``, ``/observation/state/<entry>``,
+- ``/action``, ``/reward`` and ``/reward/<term>``, ``/evaluate/<entry>``, ``/observation/state``,
   ``/episode/{success,fail,terminated,truncated}`` as numbers, ``/logs/events`` as text.
 
 Two timelines index all of it: ``step``, the state's number, and ``sim_time``. Row k is what
@@ -18,10 +18,9 @@ z forward); ManiSkill has wxyz and x forward, y left, z up.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 import rerun as rr
@@ -31,104 +30,22 @@ from workbench.core.geometry import Material, Mesh, SceneGeometry
 from workbench.core.pictures import CameraInfo
 from workbench.recording.columns import EVALUATE, OBS, Column
 from workbench.recording.encoded_pictures import MILLIMETRES_PER_METRE, decode
+from workbench.recording.rerun_log import Log
 from workbench.recording.survey import CameraSurvey, Piece, Survey
 
-STEP = "step"
-SIM_TIME = "sim_time"
 WORLD = "/world"
 CAMERAS = "/world/cameras"
 EVENTS = "/logs/events"
+OBSERVATION = "/observation/state"
+"""All observations but pictures as one batch, as LeRobot has them: an entity each would be 5 kB a file and 40 B a step."""
 REWARD_TERMS = "reward_terms/"
 """What an entry of ``evaluate()`` begins with that is a part of the reward."""
 
 FRUSTUM_METRES = 0.12
 """How far in front of a camera its picture is drawn in the 3-D view."""
-SERIES_COLORS = (
-    (86, 180, 233),
-    (230, 159, 0),
-    (0, 158, 115),
-    (204, 121, 167),
-    (213, 94, 0),
-    (0, 114, 178),
-    (150, 150, 150),
-    (136, 100, 220),
-)
-"""Okabe and Ito's palette, which the colour-blind can tell apart, with grey and violet for its black and
-yellow: the viewer comes dark and light, and each of those vanishes on one of the two."""
-
 _OPTICAL_FROM_CAMERA = (0.5, -0.5, 0.5, -0.5)
 """wxyz of the OpenCV camera axes (x right, y down, z forward) within ManiSkill's (x forward, y left,
 z up): the rotation matrix [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]."""
-
-
-@dataclass(frozen=True)
-class Account:
-    """What was handed to rerun, for the finished file to be held against.
-
-    Rerun writes on threads of its own, and what those fail to write is at best a line on stderr.
-    """
-
-    rows: Counter[str] = field(default_factory=Counter)
-    """Entity to number of rows in time."""
-    statics: set[str] = field(default_factory=set)
-    """Entities that hold something static."""
-
-
-class Log:
-    """Rerun's two ways in, with an account of what went in."""
-
-    def __init__(self, recording: rr.RecordingStream, control_dt: float) -> None:
-        self._recording = recording
-        self._control_dt = control_dt
-        self.account = Account()
-
-    def static(self, entity: str, values: Any) -> None:
-        self._recording.log(entity, values, static=True)
-        self.account.statics.add(entity)
-
-    def columns(self, entity: str, steps: NDArray[np.int64], columns: Iterable[Any]) -> None:
-        if len(steps) == 0:
-            return
-        times = [
-            rr.TimeColumn(STEP, sequence=steps),
-            # Whole nanoseconds by rounding: rerun itself cuts off, and 3 * 0.05 s would be 149999999 ns.
-            rr.TimeColumn(
-                SIM_TIME, duration=np.rint(steps * self._control_dt * 1e9).astype("timedelta64[ns]")
-            ),
-        ]
-        self._recording.send_columns(entity, times, columns)
-        self.account.rows[entity] += len(steps)
-
-    def pose(
-        self,
-        entity: str,
-        steps: NDArray[np.int64],
-        translation: NDArray[np.float32],
-        xyzw: NDArray[np.float32],
-    ) -> None:
-        """`translation` (len(steps), 3) and `xyzw` (len(steps), 4)."""
-        self.columns(entity, steps, rr.Transform3D.columns(translation=translation, quaternion=xyzw))
-
-    def still(self, entity: str, translation: NDArray[np.float32], xyzw: NDArray[np.float32]) -> None:
-        """The one pose, (3,) and (4,), of what never moves."""
-        quaternion = rr.Quaternion(xyzw=xyzw)
-        self.static(entity, rr.Transform3D(translation=translation, quaternion=quaternion))
-
-    def series(self, entity: str, names: Sequence[str], first_color: int = 0) -> None:
-        """Name and colour of each number of the batched `scalars` of `entity`."""
-        if names:
-            # Left to itself rerun gives all series of an entity one colour, and entities of one folder much the same.
-            colors = [
-                SERIES_COLORS[(first_color + index) % len(SERIES_COLORS)] for index in range(len(names))
-            ]
-            self.static(entity, rr.SeriesLines(names=list(names), colors=colors))
-
-    def scalars(self, entity: str, steps: NDArray[np.int64], values: NDArray) -> None:
-        """`values` (len(steps), ...), all of a step as one batch."""
-        if np.size(values):
-            flat = np.asarray(values, dtype=np.float64).reshape(len(steps), -1)
-            columns = rr.Scalars.columns(scalars=flat.reshape(-1))
-            self.columns(entity, steps, columns.partition([flat.shape[1]] * len(flat)))
 
 
 class EpisodeLog:
@@ -165,8 +82,8 @@ class EpisodeLog:
         for camera, entity in zip(self._survey.cameras, self._cameras):
             begin, end = np.searchsorted(camera.frames, [states[0], states[-1] + 1])
             if begin < end and not camera.still:
-                translation, quaternion = optical_pose(np.stack(camera.poses[begin:end]))
-                self._log.pose(entity, np.array(camera.frames[begin:end]), translation, quaternion)
+                translation, quaternion = optical_pose(camera.poses[begin:end])
+                self._log.pose(entity, camera.frames[begin:end], translation, quaternion)
 
     def _take_numbers(self, piece: Piece) -> None:
         log, survey, states = self._log, self._survey, piece.states
@@ -179,6 +96,11 @@ class EpisodeLog:
                 log.scalars(entity, states, piece.columns[name])
         for name, values in survey.flags.items():
             log.scalars(f"/episode/{name}", states, values[states])
+        if observed := [piece.columns[OBS + name] for name in survey.named(OBS)]:
+            flat = [
+                np.asarray(v, dtype=np.float64).reshape(len(states), math.prod(v.shape[1:])) for v in observed
+            ]
+            log.scalars(OBSERVATION, states, np.concatenate(flat, axis=1))
 
 
 # --- names ----------------------------------------------------------------------------------------
@@ -221,10 +143,6 @@ def evaluate_entity(name: str) -> str:
     if name.startswith(REWARD_TERMS):
         return rr.new_entity_path(["reward", name[len(REWARD_TERMS) :] or "unnamed"])
     return rr.new_entity_path(["evaluate", name or "unnamed"])
-
-
-def observation_entity(name: str) -> str:
-    return rr.new_entity_path(["observation", "state", *(part for part in name.split("/") if part)])
 
 
 # --- scene ----------------------------------------------------------------------------------------
@@ -340,10 +258,9 @@ def _numbers(survey: Survey) -> list[tuple[str, str, list[str]]]:
         ("terminated", "/episode/terminated", ["terminated"]),
         ("truncated", "/episode/truncated", ["truncated"]),
     ]
-    for prefix, entity in ((EVALUATE, evaluate_entity), (OBS, observation_entity)):
-        for name, column in survey.named(prefix).items():
-            said = name.removeprefix(REWARD_TERMS) if prefix == EVALUATE else name or "obs"
-            found.append((prefix + name, entity(name), series_names(said, column)))
+    for name, column in survey.evaluate().items():
+        series = series_names(name.removeprefix(REWARD_TERMS), column)
+        found.append((EVALUATE + name, evaluate_entity(name), series))
     return found
 
 
@@ -355,8 +272,6 @@ def series_names(name: str, column: Column) -> list[str]:
 
 
 def _log_series(log: Log, survey: Survey) -> None:
-    if survey.length == 0:
-        return
     drawn: Counter[str] = Counter()
     for _, entity, series in _numbers(survey):
         folder = entity.split("/")[1]  # one view shows all entities of a folder
@@ -365,6 +280,8 @@ def _log_series(log: Log, survey: Survey) -> None:
         drawn[folder] += len(series)
     for name in survey.flags:
         log.series(f"/episode/{name}", [name])
+    observed = survey.named(OBS).items()
+    log.series(OBSERVATION, [one for name, column in observed for one in series_names(name or "obs", column)])
 
 
 def events(survey: Survey) -> list[tuple[int, str, str]]:

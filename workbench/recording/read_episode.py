@@ -10,6 +10,7 @@ Pictures stay as they lie in the file, encoded, until one is asked for.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from workbench.recording.columns import Column
 from workbench.recording.description import columns_from, info_from
 from workbench.recording.encoded_pictures import EncodedPictures, Modality
 from workbench.recording.episode import CameraTrack, Episode
-from workbench.recording.layout import body_entities, camera_entities, evaluate_entity
+from workbench.recording.layout import OBSERVATION, body_entities, camera_entities, evaluate_entity
 from workbench.recording.maniskill_h5 import TRAJECTORY
 from workbench.recording.read_maniskill import UnreadableRecording as UnreadableRecording
 from workbench.recording.read_maniskill import leaves
@@ -37,7 +38,7 @@ def read_episode(path: Path) -> Episode:
     """The episode of our own files; `path` is its .rrd, .h5 or .json, and the others are found beside it.
 
     What a missing file would have held is empty: without the .rrd no geometry, poses and pictures, without the .h5 no env
-    states and observations. The geometry is that of this env alone, as env 0 of 1.
+    states. The geometry is that of this env alone, as env 0 of 1.
 
     Raises:
         UnreadableRecording: what is there is no recording of ours, or broken; the message says which.
@@ -56,6 +57,8 @@ def read_episode(path: Path) -> Episode:
         episode = _episode(said, table, path.parent)
         if ".h5" in there:
             _add_states(episode, there[".h5"])
+        elif table is not None:
+            episode.obs = dict(_observations(table, columns_from(said["obs"]), episode.length + 1))
     except UnreadableRecording:
         raise
     except (OSError, RuntimeError, KeyError, TypeError, ValueError, IndexError) as error:
@@ -153,6 +156,18 @@ def _cameras(said: Sequence[dict[str, Any]], table: RerunTable, states: int) -> 
         yield CameraTrack(
             info, frame, pose, pictures.get("rgb"), pictures.get("depth"), pictures.get("segmentation")
         )
+
+
+def _observations(
+    table: RerunTable, columns: dict[str, Column], states: int
+) -> Iterator[tuple[str, NDArray]]:
+    begin = 0
+    together = Column(np.dtype(np.float64), (sum(math.prod(column.shape) for column in columns.values()),))
+    values = _column(table, OBSERVATION, together, 0, states)
+    for name, column in columns.items():
+        end = begin + math.prod(column.shape)
+        yield name, values[:, begin:end].astype(column.dtype).reshape(states, *column.shape)
+        begin = end
 
 
 def _add_states(episode: Episode, path: Path) -> None:

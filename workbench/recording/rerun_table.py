@@ -20,7 +20,7 @@ from rerun.chunk import RrdReader
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo
 from workbench.recording.encoded_pictures import EncodedPictures, Modality, encode
-from workbench.recording.layout import STEP
+from workbench.recording.rerun_log import STEP
 
 _PROPERTIES = "/__properties"
 

@@ -2,7 +2,7 @@
 
 Rerun works on threads of its own and turns most errors into warnings. So its strict mode is on, its bytes go
 through `recording_into` to a file that cannot fail it, and what lies there at the end is held against the account of what was handed over
-(`layout.Account`).
+(`rerun_log.Account`).
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from workbench.recording.description import describe
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.landing import RecordingError as RecordingError
 from workbench.recording.landing import SafeFile
-from workbench.recording.layout import Account, EpisodeLog
+from workbench.recording.layout import EpisodeLog
+from workbench.recording.rerun_log import Account
 from workbench.recording.rerun_seam import recording_into, release_streams
 from workbench.recording.survey import Piece, Survey
 

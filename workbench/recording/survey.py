@@ -99,15 +99,15 @@ def camera_from(words: Mapping[str, Any]) -> CameraInfo:
 @dataclass
 class CameraSurvey:
     info: CameraInfo
-    frames: list[int] = field(default_factory=list)
-    poses: list[NDArray[np.float32]] = field(default_factory=list)
-    modalities: tuple[Modality, ...] = ()
-    wide: bool = False
+    frames: NDArray[np.int64]
+    """(P,) state of each picture."""
+    poses: NDArray[np.float32]
+    """(P, 7)"""
+    still: bool
+    """It never moved."""
+    modalities: tuple[Modality, ...]
+    wide: bool
     """One of its segmentations has ids that 16 bits do not hold."""
-
-    @property
-    def still(self) -> bool:
-        return all(np.array_equal(pose, self.poses[0], equal_nan=True) for pose in self.poses)
 
 
 @dataclass
@@ -187,6 +187,26 @@ class _Raw:
         return found
 
 
+class _Seen:
+    """What a camera did, while it is being read."""
+
+    def __init__(self) -> None:
+        self.frames: list[int] = []
+        self.poses: list[bytes] = []
+        self.modalities: set[Modality] = set()
+        self.wide = False
+
+    def survey(self, info: CameraInfo) -> CameraSurvey:
+        return CameraSurvey(
+            info,
+            np.array(self.frames, np.int64),
+            np.frombuffer(b"".join(self.poses), np.float32).reshape(-1, 7),
+            len(set(self.poses)) == 1,
+            tuple(modality for modality in MODALITIES if modality in self.modalities),
+            self.wide,
+        )
+
+
 class JournalReader:
     """A journal, a piece at a time; `layouts` grows while `pieces` is read."""
 
@@ -241,7 +261,7 @@ class JournalReader:
         survey.present = np.zeros(header.bodies, np.bool_)
         survey.still = np.ones(header.bodies, np.bool_)
         counts: dict[np.dtype, int] = {}
-        cameras = {index: CameraSurvey(camera) for index, camera in enumerate(header.cameras)}
+        cameras = [_Seen() for _ in header.cameras]
         smalls: dict[str, list[NDArray]] = {"reward": [], "terminated": [], "truncated": []}
         flags: dict[str, list[NDArray[np.bool_]]] = {"success": [], "fail": []}
         samples: dict[str, bytes] = {}
@@ -262,17 +282,17 @@ class JournalReader:
                     parts.append(_flag(run, EVALUATE + name))
             for index, state, value in raw.poses:
                 cameras[index].frames.append(state)
-                cameras[index].poses.append(np.frombuffer(value, np.float32))
+                cameras[index].poses.append(value)
             for (index, modality), (_, blobs) in raw.pictures.items():
-                camera = cameras[index]
-                if modality not in camera.modalities:
-                    camera.modalities = tuple(m for m in MODALITIES if m in (*camera.modalities, modality))
+                cameras[index].modalities.add(modality)
                 if modality == "segmentation":
-                    camera.wide |= any(blob[25] == _PNG_RGBA for blob in blobs)
+                    cameras[index].wide |= any(blob[25] == _PNG_RGBA for blob in blobs)
                 if modality == "rgb":
-                    samples[camera.info.kind] = blobs[-1]
+                    samples[header.cameras[index].kind] = blobs[-1]
         survey.columns = merge(counts)
-        survey.cameras = [camera for camera in cameras.values() if camera.frames]
+        survey.cameras = [
+            seen.survey(info) for info, seen in zip(header.cameras, cameras, strict=True) if seen.frames
+        ]
         for name, parts in smalls.items():
             setattr(survey, name, np.concatenate(parts)[1:] if parts else getattr(survey, name))
         for name, parts in flags.items():

@@ -22,8 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.pictures import Picture
-from workbench.core.state_names import named_states_of, observation_of, states_of
+from workbench.core.state_names import STATE, named_states_of, observation_of, states_of
 from workbench.core.step import StepResult
+from workbench.recording.batch_rows import BatchPacker
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.episode_writer import EpisodeWriter
 from workbench.recording.row import EpisodeRow
@@ -74,6 +75,7 @@ class EpisodeGatherer:
         self.reset_options: Mapping[str, Any] = reset_options or {}
         """Of the resets that come next."""
         self._episodes: dict[int, GatheredEpisode | None] = {int(env): None for env in env_idx}
+        self._packer = BatchPacker()
 
     @property
     def env_idx(self) -> tuple[int, ...]:
@@ -93,14 +95,17 @@ class EpisodeGatherer:
                 be finished.
             RecordingError: the disk does not take it.
         """
-        for env in list(self._episodes):
-            if stepped.reset_mask[env]:
-                self.end(env)
-                # Somebody may have gone back into an episode: no seed starts one there.
-                if env in self._episodes and stepped.step.elapsed_steps[env] == 0:
-                    self._begin(env, stepped)
-            elif stepped.step.action is not None:
-                self._append(env, stepped)
+        step = stepped.step
+        reset = stepped.reset_mask.tolist()
+        if step.action is not None:
+            going_on = [e for e in self._episodes.values() if e is not None and not reset[e.env]]
+            for names in {episode.state_names for episode in going_on}:
+                self._append([e for e in going_on if e.state_names == names], names, stepped)
+        for env in [env for env in self._episodes if reset[env]]:
+            self.end(env)
+            # Somebody may have gone back into an episode: no seed starts one there.
+            if env in self._episodes and step.elapsed_steps[env] == 0:
+                self._begin(env, stepped)
 
     def finish(self) -> None:
         """End the episodes under way where they are."""
@@ -146,23 +151,49 @@ class EpisodeGatherer:
             raise
         self._episodes[env] = GatheredEpisode(writer, env, seed, state_names=frozenset(row.env_states))
 
-    def _append(self, env: int, stepped: Stepped) -> None:
-        episode, step = self._episodes[env], stepped.step
-        if episode is None:
-            return
-        elapsed = int(step.elapsed_steps[env])
-        if elapsed != episode.steps + 1:
-            raise ValueError(
-                f"env {env}: step {episode.steps + 1} was expected and step {elapsed} came; a step was lost or the env "
-                "was reset unseen"
-            )
-        episode.writer.append(next_row(step, env, stepped.columns, stepped.captured, episode.state_names))
-        episode.steps = elapsed
-        episode.total_reward += float(step.reward[env])
+    def _append(self, episodes: list[GatheredEpisode], state_names: frozenset[str], stepped: Stepped) -> None:
+        """The rows of envs that have the same states."""
+        step = stepped.step
+        elapsed, reward = step.elapsed_steps.tolist(), step.reward.tolist()
+        over = (step.terminated | step.truncated).tolist()
         success = step.evaluate.get("success")
-        episode.success = None if success is None else bool(np.any(success[env]))
-        if self._ends == "over" and (step.terminated[env] or step.truncated[env]):
-            self.end(env)
+        layout, rows = self._packer.pack(batch_columns(step, stepped.columns, state_names))
+        for episode in episodes:
+            env = episode.env
+            if elapsed[env] != episode.steps + 1:
+                raise ValueError(
+                    f"env {env}: step {episode.steps + 1} was expected and step {elapsed[env]} came; a step was lost or "
+                    "the env was reset unseen"
+                )
+            pictures = [p for p in stepped.captured if p.env == env] if stepped.captured else ()
+            episode.writer.append_packed(layout, rows[env], pictures)
+            episode.steps += 1
+            episode.total_reward += reward[env]
+            episode.success = None if success is None else bool(np.any(success[env]))
+            if over[env] and self._ends == "over":
+                self.end(env)
+
+
+def batch_columns(
+    step: StepResult, columns: Mapping[str, NDArray], state_names: frozenset[str]
+) -> list[tuple[str, NDArray]]:
+    """A control step of the batch, in the order in which `EpisodeRow` names what a row holds."""
+    assert step.action is not None
+    count = len(step.reward)
+    rows = [
+        ("poses", step.poses),
+        ("action", step.action.reshape(count, -1)),
+        ("reward", step.reward),
+        ("terminated", step.terminated),
+        ("truncated", step.truncated),
+    ]
+    rows += [("evaluate/" + name, values) for name, values in step.evaluate.items()]
+    rows += [
+        (name, values)
+        for name, values in columns.items()
+        if name[: len(STATE)] != STATE or name[len(STATE) :] in state_names
+    ]
+    return rows
 
 
 def first_row(

@@ -86,8 +86,9 @@ class RecordPanel:
         _icon(self._keep, viser.Icon.PLAYER_STOP if keeping.active else viser.Icon.HISTORY)
         can_record = view.task is not None and view.state != "stopped"
         _disable(self._button, not can_record and not recording.active)
-        _disable(self._next, not can_record)
-        show(self._next, not recording.active)
+        _disable(
+            self._next, not can_record or recording.active
+        )  # hidden, the next button would move under the pointer
         _disable(self._keep, view.timeline.moments == 0 and not keeping.active)
         _disable(self._which, not can_record)
         show(self._which, view.task is None or view.task.num_envs > 1)

@@ -12,7 +12,7 @@ import pytest
 from workbench.recording.verify import verify_rrd
 
 CHILD = """
-import json, resource, sys, time
+import json, sys, time
 from pathlib import Path
 import numpy as np
 from workbench.core.geometry import SceneGeometry
@@ -22,24 +22,25 @@ from workbench.recording.episode_writer import EpisodeWriter
 from workbench.recording.row import EpisodeRow
 
 def peak():
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    # Not getrusage, whose peak is that of the parent where this process was forked from a larger one.
+    (line,) = [line for line in open("/proc/self/status") if line.startswith("VmHWM")]
+    return int(line.split()[1]) / 1024
 
 folder, steps = Path(sys.argv[1]), int(sys.argv[2])
 bodies, size = 15, 128
 geometry = SceneGeometry(1, tuple(f"body{b}" for b in range(bodies)), ("dynamic",) * bodies, (False,) * bodies, ())
 cameras = [
-    CameraInfo(f"eye{c}", "sensor", size, size, 1.0, 0.01, 10.0, np.eye(3, dtype=np.float32), None, ("rgb", "depth"))
+    CameraInfo(f"eye{c}", "sensor", size, size, 1.0, 0.01, 10.0, np.eye(3, dtype=np.float32), None, ("rgb",))
     for c in range(4)
 ]
 chance = np.random.default_rng(0)
-grid = np.linspace(0, 1, size)
-colours = [np.repeat((np.outer(grid, grid) * 200 + k * 5).astype(np.uint8)[..., None], 3, 2) for k in range(8)]
-depths = [(np.outer(grid, grid) + 1 + k / 8).astype(np.float32) for k in range(8)]
+colours = chance.integers(0, 120, (32, size, size, 3), dtype=np.uint8)
+colours[:, :, 48:] //= 64
 pose = np.array([0, 0, 0, 1, 0, 0, 0], np.float32)
 
 def row(k):
     pictures = tuple(
-        Picture(camera.name, "sensor", 0, pose, rgb=colours[(k + c) % 8], depth=depths[(k + c) % 8])
+        Picture(camera.name, "sensor", 0, pose, rgb=np.roll(colours[(k + c) % 32], k % 50, 0))
         for c, camera in enumerate(cameras)
     )
     return EpisodeRow(
@@ -79,5 +80,5 @@ def test_ten_thousand_steps_at_four_cameras_do_not_grow_the_process(tmp_path: Pa
     print(short, long)
     assert sum(long["files"]) > 100e6, "too little was recorded for this to say anything"
     assert long["appended"] - short["appended"] < 40
-    assert long["finished"] - short["finished"] < 120
+    assert long["finished"] - short["finished"] < 60
     assert verify_rrd(Path(long["rrd"]), timeout=300) is None

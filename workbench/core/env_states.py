@@ -1,0 +1,127 @@
+"""``get_state_dict`` of a batch, flat and in a few calls.
+
+ManiSkill asks every actor and articulation in turn for pose and velocities, 75 us for the four of PickCube, and a
+recording asks at every step. All of it lies in three tensors, so which row belongs to whom is found once a scene. The
+numbers are those of ``get_state_dict``, to the last bit (tested). A task that has a ``get_state_dict`` of its own is asked itself, and so is
+an object that only some envs have; in the envs without it the row is NaN.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+
+from workbench.core import seams
+from workbench.core.task_env import flat_entries
+
+
+@dataclass
+class _Plan:
+    """Where the states lie. Names and row numbers only: ManiSkill's structs would keep the scene alive that this is kept for."""
+
+    bodies: list[str]
+    """Names, in the order of `rows`; actors first."""
+    actors: int
+    """How many of these are actors."""
+    rows: Any
+    """(N * bodies,) rows of ``cuda_rigid_body_data``, env by env."""
+    still: list[int]
+    """Which of `bodies` are moved by the task and have no velocity."""
+    joints: list[tuple[Any, int]]
+    """Of each articulation: its rows (N,) in the tensors of joints, and how many joints it has."""
+    others: list[str]
+    """Actors and articulations that not every env has."""
+
+
+_plans: WeakKeyDictionary[Any, _Plan] = WeakKeyDictionary()
+
+
+def env_states(env: BaseEnv) -> dict[str, Any]:
+    """(N, D) by name: ``actors/cube``, ``articulations/panda``, and ``controller/...`` where a controller has a state.
+
+    Tensors, or on the CPU arrays; copies of the simulation's own."""
+    if type(env).get_state_dict is not BaseEnv.get_state_dict or not env.scene.gpu_sim_enabled:
+        whole: Any = env.get_state_dict()
+        return dict(_widened(env, name, value) for name, value in flat_entries(whole))
+    plan = _plans.get(env.scene)
+    if plan is None:
+        plan = _plans[env.scene] = _planned(env)
+    scene: Any = env.scene
+    data, qpos, qvel = (
+        # numpy's calls on a few hundred numbers take a quarter of torch's.
+        tensor.numpy() if tensor.device.type == "cpu" else tensor
+        for tensor in (
+            scene.px.cuda_rigid_body_data.torch(),
+            scene.px.cuda_articulation_qpos.torch(),
+            scene.px.cuda_articulation_qvel.torch(),
+        )
+    )
+    data = data[plan.rows].reshape(env.num_envs, -1, 13)
+    if plan.still:
+        data[:, plan.still, 7:] = 0.0
+    states: dict[str, Any] = {}
+    actors = {actor.name: actor for actor in scene.state_dict_registry.actors.values()}
+    for k, name in enumerate(plan.bodies[: plan.actors]):
+        actor = actors[name.removeprefix("actors/")]
+        states[name] = actor.get_state() if actor.hidden else data[:, k]
+    for k, (rows, dof) in enumerate(plan.joints, plan.actors):
+        parts = [data[:, k], qpos[rows, :dof], qvel[rows, :dof]]
+        states[plan.bodies[k]] = (
+            np.concatenate(parts, axis=1) if isinstance(data, np.ndarray) else torch.cat(parts, dim=1)
+        )
+    for name in plan.others:
+        states[name] = _widened(env, name, _structs(scene)[name].get_state())[1]
+    if env.agent is not None:
+        controllers: Any = env.agent.get_controller_state()
+        states.update(flat_entries(controllers, "controller/"))
+    return states
+
+
+def _structs(scene: Any) -> dict[str, Any]:
+    registry = scene.state_dict_registry
+    found = {f"actors/{a.name}": a for a in registry.actors.values() if a.px_body_type != "static"}
+    return found | {f"articulations/{a.name}": a for a in registry.articulations.values()}
+
+
+def _planned(env: BaseEnv) -> _Plan:
+    plan = _Plan([], 0, None, [], [], [])
+    every = list(range(env.num_envs))
+    rows: list[torch.Tensor] = []
+    for name, struct in _structs(env.scene).items():
+        if list(seams.envs_of(struct)) != every:
+            plan.others.append(name)
+        elif name.startswith("actors/"):
+            if struct.px_body_type != "dynamic":
+                plan.still.append(len(rows))
+            rows.append(seams.data_rows_of(struct))
+            plan.bodies.append(name)
+            plan.actors += 1
+        else:
+            rows.append(seams.data_rows_of(struct.root))
+            plan.bodies.append(name)
+            of_joints = _index(seams.data_rows_of_articulation(struct))
+            plan.joints.append((of_joints, int(struct.max_dof)))
+    none = torch.zeros(0, dtype=torch.long, device=env.device)
+    plan.rows = _index(torch.stack([row.long() for row in rows], dim=1).reshape(-1) if rows else none)
+    return plan
+
+
+def _index(rows: torch.Tensor) -> Any:
+    return rows.long().numpy() if rows.device.type == "cpu" else rows.long()
+
+
+def _widened(env: BaseEnv, name: str, value: torch.Tensor) -> tuple[str, torch.Tensor]:
+    """(N, ...) of rows for some envs only."""
+    if not isinstance(value, torch.Tensor) or len(value) == env.num_envs:
+        return name, value
+    struct = _structs(env.scene).get(name)
+    rows = None if struct is None else torch.as_tensor(seams.envs_of(struct), device=value.device)
+    whole = value.new_full((env.num_envs, *value.shape[1:]), torch.nan)
+    if rows is not None and len(rows) == len(value):
+        whole[rows] = value
+    return name, whole

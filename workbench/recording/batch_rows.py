@@ -1,0 +1,46 @@
+"""The rows of many envs packed at once: what `columns.RowPacker` does for one, in as many calls for sixty-four.
+
+Envs of a batch step together, and their rows are the same arrays with another index. Taken apart an env at a time that is fifty
+small arrays for each env and step, 75 us; here each array of the batch is looked at once, as bytes, and one call puts
+them side by side. A row is then a slice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """What the bytes of a row are; the same object for the same key, so that it is known by identity."""
+
+    key: tuple[tuple[str, np.dtype, tuple[int, ...]], ...]
+    """Name, type and shape of each array of a row."""
+
+
+class BatchPacker:
+    """Packs the rows of a batch, one step after the other."""
+
+    def __init__(self) -> None:
+        self._layouts: dict[object, Layout] = {}
+        self._last: Layout | None = None
+
+    def pack(self, columns: Sequence[tuple[str, NDArray]]) -> tuple[Layout, list[bytes]]:
+        """The layout and (N) rows of `columns`, each a name and an array (N, ...)."""
+        key = tuple([(name, values.dtype, values.shape[1:]) for name, values in columns])
+        layout = self._last
+        if layout is None or layout.key != key:
+            layout = self._last = self._layouts.setdefault(key, Layout(key))
+        count = len(columns[0][1])
+        rows = [
+            np.ascontiguousarray(values).reshape(count, -1).view(np.uint8)
+            for _, values in columns
+            if values.size
+        ]
+        packed = np.concatenate(rows, axis=1)
+        size, together = packed.shape[1], packed.tobytes()
+        return layout, [together[i : i + size] for i in range(0, count * size, size)]

@@ -1,0 +1,98 @@
+"""Rerun's two ways in, columns in time and static values, with an account of what went in.
+
+Rerun writes on threads of its own, and what those fail to write is at best a line on stderr. So what was handed over is
+counted, for the finished file to be held against.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+STEP = "step"
+SIM_TIME = "sim_time"
+SERIES_COLORS = (
+    (86, 180, 233),
+    (230, 159, 0),
+    (0, 158, 115),
+    (204, 121, 167),
+    (213, 94, 0),
+    (0, 114, 178),
+    (150, 150, 150),
+    (136, 100, 220),
+)
+"""Okabe and Ito's palette, which the colour-blind can tell apart, with grey and violet for its black and
+yellow: the viewer comes dark and light, and each of those vanishes on one of the two."""
+
+
+@dataclass(frozen=True)
+class Account:
+    """What was handed to rerun."""
+
+    rows: Counter[str] = field(default_factory=Counter)
+    """Entity to number of rows in time."""
+    statics: set[str] = field(default_factory=set)
+    """Entities that hold something static."""
+
+
+class Log:
+    """One recording's way in."""
+
+    def __init__(self, recording: rr.RecordingStream, control_dt: float) -> None:
+        self._recording = recording
+        self._control_dt = control_dt
+        self.account = Account()
+
+    def static(self, entity: str, values: Any) -> None:
+        self._recording.log(entity, values, static=True)
+        self.account.statics.add(entity)
+
+    def columns(self, entity: str, steps: NDArray[np.int64], columns: Iterable[Any]) -> None:
+        if len(steps) == 0:
+            return
+        times = [
+            rr.TimeColumn(STEP, sequence=steps),
+            # Whole nanoseconds by rounding: rerun itself cuts off, and 3 * 0.05 s would be 149999999 ns.
+            rr.TimeColumn(
+                SIM_TIME, duration=np.rint(steps * self._control_dt * 1e9).astype("timedelta64[ns]")
+            ),
+        ]
+        self._recording.send_columns(entity, times, columns)
+        self.account.rows[entity] += len(steps)
+
+    def pose(
+        self,
+        entity: str,
+        steps: NDArray[np.int64],
+        translation: NDArray[np.float32],
+        xyzw: NDArray[np.float32],
+    ) -> None:
+        """`translation` (len(steps), 3) and `xyzw` (len(steps), 4)."""
+        self.columns(entity, steps, rr.Transform3D.columns(translation=translation, quaternion=xyzw))
+
+    def still(self, entity: str, translation: NDArray[np.float32], xyzw: NDArray[np.float32]) -> None:
+        """The one pose, (3,) and (4,), of what never moves."""
+        quaternion = rr.Quaternion(xyzw=xyzw)
+        self.static(entity, rr.Transform3D(translation=translation, quaternion=quaternion))
+
+    def series(self, entity: str, names: Sequence[str], first_color: int = 0) -> None:
+        """Name and colour of each number of the batched `scalars` of `entity`."""
+        if names:
+            # Left to itself rerun gives all series of an entity one colour, and entities of one folder much the same.
+            colors = [
+                SERIES_COLORS[(first_color + index) % len(SERIES_COLORS)] for index in range(len(names))
+            ]
+            self.static(entity, rr.SeriesLines(names=list(names), colors=colors))
+
+    def scalars(self, entity: str, steps: NDArray[np.int64], values: NDArray) -> None:
+        """`values` (len(steps), ...), all of a step as one batch."""
+        if np.size(values):
+            flat = np.asarray(values, dtype=np.float64).reshape(len(steps), -1)
+            columns = rr.Scalars.columns(scalars=flat.reshape(-1))
+            self.columns(entity, steps, columns.partition([flat.shape[1]] * len(flat)))
