@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,7 @@ from workbench.core.camera_frames import axes_of
 from workbench.core.camera_search import SearchProgress, SearchSpace, score_of, suggest_cameras
 from workbench.core.camera_settings import CameraSettings
 from workbench.core.task_env import EnvOptions, make_env
-from workbench.core.visibility import Placement, judge_placement
+from workbench.core.visibility import Placement, judge_placement, objects_to_see
 
 N = 2
 LENS = CameraSettings((0, 0, 0), (1, 0, 0, 0), 0.9, None, 96, 64, 0.01, 100, "minimal")
@@ -97,3 +99,40 @@ def test_a_space_that_says_nothing_is_refused() -> None:
         SearchSpace(("cube",), HIGH, LOW, LENS)
     with pytest.raises(ValueError, match="at least one object"):
         SearchSpace((), LOW, HIGH, LENS)
+
+
+def test_a_camera_on_a_link_is_suggested_places_in_that_links_frame_that_keep_its_picture_upright(
+    env: Any,
+) -> None:
+    mount, low, high = "panda/panda_hand", (-0.12, -0.12, -0.05), (0.12, 0.12, 0.1)
+    # Its picture's top is towards the hand's x.
+    lens = replace(LENS, quaternion=(math.sqrt(0.5), 0, -math.sqrt(0.5), 0), fov=1.4)
+    assert np.allclose(axes_of(lens.quaternion)[0], [0, 0, 1])
+    space = SearchSpace(("cube",), low, high, lens, candidates=12, best=1, mount=mount)
+    (found,) = suggest_cameras(env, space, range(N))
+    eye = np.array(found.settings.position)
+    assert (eye >= low).all() and (eye <= high).all()
+    forward, left, up = axes_of(found.settings.quaternion)
+    assert abs(left @ axes_of(lens.quaternion)[2]) < 1e-6 and up @ axes_of(lens.quaternion)[2] > 0
+    assert np.allclose(np.cross(np.subtract(found.target, eye), forward), 0, atol=1e-6)
+    placement = Placement(found.settings, mount=mount)
+    again = judge_placement(env, placement, range(N), size=found.report.judged_size)
+    assert score_of(again, ("cube",)) == pytest.approx(found.score, abs=1e-6) and found.score > 0.1
+    with pytest.raises(ValueError, match="no body 'panda/tail'"):
+        suggest_cameras(env, replace(space, mount="panda/tail"), [0])
+
+
+def test_one_link_of_an_articulation_can_be_what_must_be_seen(env: Any) -> None:
+    assert {thing.name: thing.links for thing in objects_to_see(env)} == {"cube": (), "goal_region": ()}
+    with pytest.raises(ValueError, match="'panda/panda_hand' is the robot"):
+        suggest_cameras(env, SearchSpace(("panda/panda_hand",), LOW, HIGH, LENS), [0])
+    valves = make_env(REGISTERED_ENVS["RotateValveLevel0-v1"].cls, EnvOptions(num_envs=1, backend="cpu"))
+    try:
+        valves.reset(seed=1)
+        (valve,) = objects_to_see(valves)
+        assert valve.links == ("valve_station/mount", "valve_station/valve")
+        space = SearchSpace(valve.links[1:], (-0.5, -0.5, 0.1), (0.5, 0.5, 0.6), LENS, candidates=6, best=1)
+        (found,) = suggest_cameras(valves, space, [0])
+        assert [thing.name for thing in found.report.wanted_objects(space.objects)] == ["valve_station/valve"]
+    finally:
+        valves.close()

@@ -111,6 +111,29 @@ def test_size_and_lens_change_the_live_camera_and_the_observation(session: Sessi
     wait_until(session, lambda v: v.pictures_serial > serial + 1 and seen_from(BASE, other)(v), "it stayed")
 
 
+def test_a_quick_look_in_another_size_leaves_the_camera_and_the_observation_alone(session: Session) -> None:
+    start = camera(session, BASE).now
+    session.studio.select(BASE)
+    session.studio.set_quick_scale(0.25)
+    there = replace(start, position=(0.31, 0.02, 0.55))
+    session.studio.place(BASE, there)
+
+    def looked(view: SessionView) -> bool:
+        if view.studio.wants_quick:
+            session.studio.look()  # as the page does
+        picture = view.studio.quick
+        return picture is not None and np.allclose(picture.pose[:3], there.position, atol=1e-6)
+
+    view = wait_until(session, looked, "the look from there")
+    size = (start.width, start.height)
+    assert view.studio.quick.rgb.shape == (size[1] // 4, size[0] // 4, 3) and view.studio.quick.rgb.std() > 5
+    assert (camera(session, BASE).now.width, camera(session, BASE).info.width) == (size[0], size[0])
+    session.studio.set_quick_scale(1.0)
+    view = wait_until(session, seen_from(BASE, there), "the picture in its own size")
+    assert view.studio.quick is None and not view.studio.wants_quick
+    session.studio.select(None)
+
+
 def test_a_moment_of_the_past_is_drawn_again_when_the_camera_moves(session: Session) -> None:
     start = camera(session, BASE).now
     session.step()
@@ -191,6 +214,32 @@ def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved
     wait_until(session, seen_from(BASE, away), "the camera where it was placed, after the comparison")
 
 
+def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session: Session) -> None:
+    session.reset()
+    wait_until(session, lambda v: not v.step.elapsed_steps.any(), "a fresh episode")
+    for step in range(1, 5):
+        session.step()
+        wait_until(session, lambda v, step=step: v.step.elapsed_steps[0] == step, "a step")
+    session.studio.judge_steps(BASE)
+    studio = settled(session, lambda s: len(s.report_moments) == 5, "five moments")
+    assert [moment.step for moment in studio.report_moments] == [0, 1, 2, 3, 4]
+    assert {moment.env for moment in studio.report_moments} == {0} == set(studio.report.envs)
+    (cube,) = studio.report.wanted_objects(("cube",))
+    assert cube.summary().seen == 1.0
+    session.seek(studio.report_moments[2].serial)
+    assert session.view().step.elapsed_steps[0] == 2
+    session.studio.judge_steps(BASE, 2)
+    moments = settled(session, lambda s: len(s.report_moments) == 2, "its ends").report_moments
+    assert [moment.step for moment in moments] == [0, 4], (
+        "of the whole episode, also where a moment in it is shown"
+    )
+    session.reset()
+    wait_until(session, lambda v: not v.step.elapsed_steps.any() or v.timeline.shown is not None, "another")
+    session.seek(None)
+    session.studio.judge_steps(BASE)
+    settled(session, lambda s: len(s.report_moments) == 1, "the episode that has just begun")
+
+
 def test_a_picked_pixel_is_the_place_of_what_is_seen_there(session: Session) -> None:
     view = session.view()
     cube = view.step.poses[0, list(view.task.geometry.body_names).index("cube")]
@@ -235,6 +284,11 @@ def test_cameras_go_out_and_poses_come_in(session: Session) -> None:
         assert session.studio.export([BASE, PEOPLE], form)
     session.studio.import_pose(BASE, "1 0 0 5\n0 1 0 6\n0 0 1 7\n0 0 0 1", "camera_to_world", "maniskill")
     assert camera(session, BASE).now.position == (5.0, 6.0, 7.0)
+    in_millimetres = "1 0 0 500\n0 1 0 -60\n0 0 1 700\n0 0 0 1"
+    session.studio.import_pose(BASE, in_millimetres, "camera_to_world", "opencv", 0.001)
+    assert camera(session, BASE).now.position == pytest.approx((0.5, -0.06, 0.7))
+    session.studio.import_pose(BASE, text, None, None, 0.001)
+    assert not camera(session, BASE).moved, "our own file is in metres whatever is chosen"
     with pytest.raises(ValueError, match="no pose is in it"):
         session.studio.import_pose(BASE, "{}", None, None)
 
@@ -259,3 +313,33 @@ def test_placements_outlive_reloads_and_workers_until_the_file_says_otherwise(
     wait_until(session, lambda v: v.task_serial > serial, "another worker")
     wait_until(session, seen_from(BASE, there), "its camera where the last one's was")
     assert moved(session.view()) == {BASE, PEOPLE}
+
+
+def test_an_installed_task_is_copied_opened_and_the_placement_planned_in_the_copy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "push_cube.py").write_text("somebody's own")
+    options = TaskOptions(num_envs=1, env_kwargs={"obs_mode": "rgb"})
+    session = Session("PushCube-v1", options, recordings=tmp_path / "recordings")
+    try:
+        wait_until(session, lambda view: view.task is not None, "the first load")
+        start = camera(session, BASE).now
+        there = replace(start, position=(0.31, 0.02, 0.55))
+        session.studio.place(BASE, there)
+        session.studio.plan_write(BASE)
+        view = wait_until(session, said(lambda s: s.writing.stage == "refused"), "the refusal")
+        assert view.studio.writing.can_copy and "is installed" in view.studio.writing.message
+        session.studio.copy_task()
+        view = wait_until(session, said(lambda s: s.writing.stage == "planned"), "the plan in the copy")
+        file = tmp_path / "push_cube_2.py"
+        assert view.task.file == str(file) == view.studio.writing.edit.file
+        assert view.task.env_id == "MyPushCube2-v1" and view.reload.level == "rebuilt"
+        assert view.reload.reason == "push_cube_2.py was opened in place of PushCubeEnv"
+        assert moved(view) == {BASE}, "the placement is lost"
+        session.studio.write()
+        view = wait_until(session, said(lambda s: s.writing.stage in ("checked", "mismatch")), "the check")
+        assert view.studio.writing.stage == "checked", view.studio.writing.message
+        assert (tmp_path / "push_cube.py").read_text() == "somebody's own"
+    finally:
+        session.close()

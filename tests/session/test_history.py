@@ -9,6 +9,7 @@ import pytest
 
 from workbench.core.pictures import Picture
 from workbench.core.step import StepResult
+from workbench.session.episode_moments import moments_of_episode
 from workbench.session.history import FAIL, NOT_A_NUMBER, RESET, SUCCESS, TRUNCATED, WENT_BACK, History
 from workbench.session.judgement import Judgement
 from workbench.session.messages import PastPictures, Pictures, Restored, Stepped
@@ -199,3 +200,25 @@ def test_rows_stay_with_their_moments_however_many_there_are(count: int) -> None
     history = filled(count, 3_000_000)
     expected = [float(m.step.reward[0]) for m in history.between(0, count)]
     assert np.array_equal(history.rewards(0, 0, count), expected, equal_nan=True)
+
+
+def test_the_moments_of_an_episode_are_its_steps_through_what_it_was_put_back_to() -> None:
+    history = filled(6)  # a reset and steps 1 to 5
+    origin = 3
+    history.add(stepped(6, jumped=(0,), restored=Restored((0,), (1,), origin, None, {})), 6)
+    history.add(stepped(7), 7)
+    history.add(stepped(8, jumped=(2,)), 8)  # another env's reset is no step
+    history.add(stepped(9), 9)
+    lived = moments_of_episode(history, 0, 7, 100)
+    # Before it was put where env 1 was at moment 3, it was env 1.
+    assert [(moment.serial, moment.env) for moment in lived] == [
+        (0, 1),
+        (1, 1),
+        (2, 1),
+        (3, 1),
+        (7, 0),
+        (9, 0),
+    ]
+    assert [moment.serial for moment in moments_of_episode(history, 0, 7, 3)] == [0, 2, 9]
+    assert [moment.serial for moment in moments_of_episode(history, 1, 2, 100)] == [*range(6), 7, 9]
+    assert [moment.serial for moment in moments_of_episode(history, 2, 9, 100)] == [8, 9]

@@ -135,3 +135,10 @@ def test_a_picture_that_is_all_background_has_no_histogram() -> None:
     nothing = depth_of({}, 2)
     none = np.full(2, np.nan, np.float32)
     assert histogram(replace(nothing, farthest_object=none), near=0.01, far=100.0) is None
+
+
+def test_over_steps_it_is_said_when_each_object_is_seen() -> None:
+    report = report_of(seen("cube", [50, 0, 10, 40], [50, 20, 40, 40], cut=(3,), present=[True] * 4))
+    (row,) = object_rows(report, "steps")
+    assert row.moods == ("good", "bad", "warn", "warn")
+    assert headline(report, "steps") == "cube is not seen in 1 of 4 steps."

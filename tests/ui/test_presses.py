@@ -1,4 +1,4 @@
-"""Where in a picture somebody pressed, as one number of a page that may send anything."""
+"""Where in a picture, or on which row, somebody pressed, as one number of a page that may send anything."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from workbench.ui.presses import PARTS, place_of
+from workbench.ui.presses import NUMBERS, PARTS, number_of, place_of
 
 parts = st.integers(0, PARTS - 1)
 
@@ -24,3 +24,9 @@ def test_a_place_comes_back_from_its_number_whatever_the_running_part(
 @pytest.mark.parametrize("sent", [True, "12", None, -1, math.nan, math.inf, 2**60, 1e300, (1, 2)])
 def test_what_no_page_of_ours_sends_is_no_place(sent: object) -> None:
     assert place_of(sent) is None
+    assert number_of(sent) is None
+
+
+@given(st.integers(0, NUMBERS - 1), st.integers(0, 88))
+def test_a_number_comes_back_whatever_the_running_part(number: int, running: int) -> None:
+    assert number_of(float(running * NUMBERS + number)) == number

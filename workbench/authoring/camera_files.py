@@ -254,13 +254,13 @@ def camera_pose(
     Args:
         convention: how the calibration calls the camera's axes. Needed where the text does not say it.
         direction: which way its matrix goes. Needed likewise.
-        metres_per_unit: of its translation; 0.001 for millimetres.
+        metres_per_unit: of its translation; 0.001 for millimetres. Left alone where the text itself says what it is.
 
     Raises:
         ValueError: one of them is needed and missing, or the matrix is no rotation; says why.
     """
     if found.said is not None:
-        convention, direction = found.said
+        (convention, direction), metres_per_unit = found.said, 1.0
     if convention is None or direction is None:
         raise ValueError(
             "say which way the matrix goes, and how it calls the camera's axes: it does not say so"

@@ -24,6 +24,18 @@ ENOUGH_PIXELS = 100.0
 
 
 @dataclass(frozen=True)
+class ObjectToSee:
+    """One object of the task that a camera may be asked to see: neither robot nor scenery."""
+
+    name: str
+    """An actor's or an articulation's."""
+    hidden: bool
+    """The task hides it from the sensors (a goal marker): only cameras for people see it."""
+    links: tuple[str, ...] = ()
+    """Names of an articulation's bodies, if it has several: each may be asked for alone."""
+
+
+@dataclass(frozen=True)
 class ObjectSummary:
     """One object over all envs that have it; shares are 0..1, and NaN where there is nothing to share out."""
 

@@ -16,14 +16,23 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.body_table import BodyTable, build_body_table, read_poses
-from workbench.core.camera_frames import LookAt, intrinsic_of, pose_from_look_at, with_pose
+from workbench.core.camera_frames import (
+    LookAt,
+    axes_of,
+    compose,
+    intrinsic_of,
+    pose_from_look_at,
+    quaternion_from_axes,
+    rotation_matrix,
+    with_pose,
+)
 from workbench.core.camera_report import CameraReport
 from workbench.core.camera_settings import CameraSettings
 from workbench.core.pictures import CameraKind, Picture
@@ -47,6 +56,8 @@ ROOM = 0.1
 """Metres of free sight before the lens: what is nearer stands where the camera's own body would be."""
 FROM_THE_ROBOT = 0.2
 """Metres that an eye keeps from the origin of every link of a robot, as it stands in the envs that are searched."""
+FROM_ITS_MOUNT = 0.05
+"""The same of an eye that rides on a body, which is meant to be near one."""
 GOOD_ENOUGH = 0.995
 """Score from which nothing is gained by drawing again."""
 ROUNDS = 2
@@ -62,12 +73,12 @@ class SearchSpace:
     """What is looked for, and where."""
 
     objects: tuple[str, ...]
-    """Names of actors and articulations that must be seen."""
+    """Names of actors, articulations and single links (``cabinet/handle``) that must be seen."""
     low: tuple[float, float, float]
-    """Of the box for the eye, metres in the env's frame."""
+    """Of the box for the eye, metres in the frame of the mount, or the env's if there is none."""
     high: tuple[float, float, float]
     lens: CameraSettings
-    """Everything of the camera but its pose."""
+    """Everything of the camera but its pose; of that, where it is mounted, which way its picture is up."""
     kind: CameraKind = "sensor"
     candidates: int = 100
     """Placements that the first round draws."""
@@ -76,6 +87,8 @@ class SearchSpace:
     apart: float | None = None
     """Metres between the eyes of two that are offered; None for a seventh of the box's diagonal."""
     seed: int = 0
+    mount: str | None = None
+    """Name of the body that the camera rides on."""
 
     def __post_init__(self) -> None:
         box = np.array([self.low, self.high], np.float64)
@@ -109,9 +122,9 @@ class Suggestion:
     """One placement that is offered."""
 
     settings: CameraSettings
-    """In the env's frame."""
+    """In the frame of the mount, or the env's if there is none."""
     target: tuple[float, float, float]
-    """A point on its line of sight, for a look-at."""
+    """A point on its line of sight, for a look-at, in the same frame."""
     score: float
     """0..1; see `score_of`."""
     report: CameraReport
@@ -185,9 +198,11 @@ class _Search:
         self.env, self.space, self.envs, self.poses, self.table = env, space, envs, poses, table
         self.progress, self.cancelled = progress, cancelled
         every = list_objects(env, table)
-        self.wanted = [_wanted(every, name, space.kind) for name in space.objects]
+        self.wanted = [_wanted(every, name, space.kind, self.table) for name in space.objects]
         # Each is also looked at alone; the others are drawn, and hide what they hide.
-        self.objects = [thing for thing in every if thing.robot or thing in self.wanted]
+        self.objects = [*(thing for thing in every if thing.robot), *self.wanted]
+        self.mounts = self._mounts()
+        self.up = axes_of(space.lens.quaternion)[::2]
         self.size = small_size(space.lens.width, space.lens.height)
         self.rng = np.random.default_rng(space.seed)
         self.low, self.high = np.array(space.low, np.float64), np.array(space.high, np.float64)
@@ -268,10 +283,11 @@ class _Search:
         """
         measured: list[list[Measured]] = [[] for _ in candidates]
         placement = Placement(self.space.lens, self.space.kind)
-        poses = [pose_from_look_at(_look_at(candidate)) for candidate in candidates]
+        local = [self._pose(candidate) for candidate in candidates]
         for position, e in enumerate(self.envs):
             moment = None if self.poses is None else self.poses[e]
             robots = [x for thing in self.objects if thing.robot for x in entities_of(thing, e, self.table)]
+            poses = local if self.mounts is None else [compose(self.mounts[e], pose) for pose in local]
             with (
                 placed_camera(self.env, e, placement, self.size, moment) as view,
                 undrawn(robots if bare is None else []),
@@ -316,7 +332,8 @@ class _Search:
         return eye, self._apart_from(eye, centre[1] + self.rng.normal(0, 0.5, 3) * reach * self.spread)
 
     def _is_clear(self, eye: NDArray[np.float64]) -> bool:
-        return not len(self.links) or np.linalg.norm(self.links - eye, axis=1).min() >= FROM_THE_ROBOT
+        least = FROM_THE_ROBOT if self.mounts is None else FROM_ITS_MOUNT
+        return not len(self.links) or np.linalg.norm(self.links - eye, axis=1).min() >= least
 
     def _apart_from(self, eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
         # An eye right on its target looks nowhere; a box for the eye may hold the objects.
@@ -332,17 +349,48 @@ class _Search:
         return (low + high) / 2, np.maximum(high - low, 0.05)
 
     def _places(self, things: Sequence[SceneObject]) -> NDArray[np.float64]:
-        """(K, 3) where the bodies of some objects are, in all envs that have them."""
-        bodies = read_poses(self.env, self.table) if self.poses is None else self.poses
+        """(K, 3) where the bodies of some objects are, in all envs that have them; seen from the mount if there is one."""
+        bodies = self._bodies()
         columns = [body for thing in things for body in thing.bodies]
-        places = bodies[self.envs][:, columns, :3].reshape(-1, 3).astype(np.float64)
+        places = bodies[self.envs][:, columns, :3].astype(np.float64)
+        if self.mounts is not None:
+            for row, e in zip(places, self.envs, strict=True):
+                mount = self.mounts[e]
+                row[:] = (row - mount[:3]) @ rotation_matrix(mount[3:])
+        places = places.reshape(-1, 3)
         return places[np.isfinite(places).all(axis=1)]
 
+    def _bodies(self) -> NDArray[np.float32]:
+        return read_poses(self.env, self.table) if self.poses is None else self.poses
+
+    def _mounts(self) -> NDArray[np.float32] | None:
+        """(N, 7) where the mount is in each env; None for a camera that stands still."""
+        name = self.space.mount
+        if name is None:
+            return None
+        if name not in self.table.names:
+            raise ValueError(f"there is no body {name!r} to mount a camera on")
+        mounts = self._bodies()[:, self.table.names.index(name)]
+        if not np.isfinite(mounts[self.envs]).all():
+            raise ValueError(f"not every env has a body {name!r} to mount a camera on")
+        return mounts
+
+    def _pose(self, candidate: _Candidate) -> NDArray[np.float64]:
+        """(7,) of a candidate, in the frame that it is said in."""
+        if self.mounts is None:
+            return pose_from_look_at(_look_at(candidate))
+        # What is up in a link's frame means nothing: the picture stays the way up that it has now.
+        eye, target = candidate
+        forward, up = target - eye, self.up[1]
+        if abs(float(forward @ up)) > 0.999 * float(np.linalg.norm(forward)):
+            up = -self.up[0] * np.sign(forward @ up)
+        return np.concatenate([eye, quaternion_from_axes(forward, up)])
+
     def _suggestion(self, score: float, candidate: _Candidate, report: CameraReport) -> Suggestion:
-        settings = with_pose(self.space.lens, pose_from_look_at(_look_at(candidate)))
+        settings = with_pose(self.space.lens, self._pose(candidate))
         worst = report.worst_first(self.space.objects)[0]
         e = report.envs[worst]
-        placement = Placement(settings, self.space.kind)
+        placement = Placement(settings, self.space.kind, self.space.mount)
         moment = None if self.poses is None else self.poses[e]
         target = candidate[1]
         return Suggestion(
@@ -359,8 +407,12 @@ def _look_at(candidate: _Candidate) -> LookAt:
     return LookAt((ex, ey, ez), (tx, ty, tz))
 
 
-def _wanted(objects: Sequence[SceneObject], name: str, kind: CameraKind) -> SceneObject:
+def _wanted(objects: Sequence[SceneObject], name: str, kind: CameraKind, table: BodyTable) -> SceneObject:
     found = next((thing for thing in objects if thing.name == name), None)
+    if found is None and name in table.names:
+        body = table.names.index(name)
+        whole = next((thing for thing in objects if body in thing.bodies), None)
+        found = None if whole is None else replace(whole, name=name, bodies=(body,))
     there = ", ".join(thing.name for thing in objects if not (thing.robot or thing.name == "ground"))
     if found is None or found.name == "ground":
         raise ValueError(f"there is no object {name!r} to be seen; there are: {there}")

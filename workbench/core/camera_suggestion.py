@@ -14,7 +14,7 @@ class OfferedPlacement:
     """One of the best that a search found."""
 
     settings: CameraSettings
-    """In the env's frame."""
+    """In the frame of the camera's mount, or the env's if it has none."""
     target: tuple[float, float, float]
     """A point on its line of sight, for a look-at."""
     score: float

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from workbench.core import seams
 from workbench.core.body_table import BodyTable, build_body_table, read_poses
 from workbench.core.camera_frames import compose, intrinsic_of, make_pose, matrix3, scaled_intrinsic
-from workbench.core.camera_report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen
+from workbench.core.camera_report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen, ObjectToSee
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.take_pictures import body_name, cameras_of
@@ -93,6 +93,20 @@ def list_objects(env: Any, table: BodyTable | None = None) -> tuple[SceneObject,
     return tuple(found)
 
 
+def objects_to_see(env: Any, table: BodyTable | None = None) -> tuple[ObjectToSee, ...]:
+    """What of a scene a camera may be asked to see, as plain data."""
+    table = table or build_body_table(env)
+    return tuple(
+        ObjectToSee(
+            thing.name,
+            thing.hidden,
+            tuple(table.names[body] for body in thing.bodies) if len(thing.bodies) > 1 else (),
+        )
+        for thing in list_objects(env, table)
+        if not (thing.robot or thing.scenery)
+    )
+
+
 def judge_camera(
     env: Any,
     camera: CameraKey,
@@ -154,12 +168,17 @@ def judge_placement(
 
 
 def picture_of(
-    env: Any, e: int, placement: Placement, table: BodyTable, poses: NDArray[np.float32] | None = None
+    env: Any,
+    e: int,
+    placement: Placement,
+    table: BodyTable,
+    poses: NDArray[np.float32] | None = None,
+    size: tuple[int, int] | None = None,
 ) -> Picture:
-    """What a camera that does not exist sees of one env, in its own size; raises as `judge_placement`."""
+    """What a camera that does not exist sees of one env, in its own size or another; raises as `judge_placement`."""
     bodies = read_poses(env, table)[e] if poses is None else poses
     pose = pose_in_env(placement, bodies, table)
-    with placed_camera(env, e, placement, None, poses) as view:
+    with placed_camera(env, e, placement, size, poses) as view:
         segmentation, depth = view.look(pose)
         rgb = view.colours()
     return Picture("suggested", placement.kind, e, pose.astype(np.float32), rgb, depth, segmentation)

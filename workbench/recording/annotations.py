@@ -7,7 +7,7 @@ it goes. This is the one thing about a recording that changes after it was writt
 old one and takes its place in one step, and everything else in it stays.
 
 Files of others are not ours to write into (ManiSkill's recorder writes its ``.json`` anew after each episode, and a
-bare ``.rrd`` cannot be changed). Theirs lie in ``NAME.notes.json`` beside them, by trajectory, which ``mv NAME.*``
+bare ``.rrd`` cannot be changed). Theirs lie in ``NAME.notes`` beside them, by trajectory, which ``mv NAME.*``
 takes along.
 """
 
@@ -46,7 +46,7 @@ def read_json(path: Path) -> Any:
 
 
 def read_notes(path: Path) -> dict[str, tuple[tuple[str, ...], str]]:
-    """Tags and note of each trajectory ("" where the file has no trajectories) in a ``.notes.json``; what is not
+    """Tags and note of each trajectory ("" where the file has no trajectories) in a ``.notes``; what is not
     one holds none."""
     try:
         entries = read_json(path)[_NOTES]
@@ -59,7 +59,7 @@ def read_notes(path: Path) -> dict[str, tuple[tuple[str, ...], str]]:
 
 
 def write_notes(path: Path, trajectory: str | None, tags: tuple[str, ...], note: str) -> None:
-    """Put tags and note of one trajectory into a ``.notes.json``; without any left, the file goes.
+    """Put tags and note of one trajectory into a ``.notes``; without any left, the file goes.
 
     Raises:
         OSError: the folder cannot be written to.
@@ -101,7 +101,7 @@ def _replace(path: Path, content: bytes) -> None:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        with contextlib.suppress(OSError):  # a new .notes.json has no mode to keep
+        with contextlib.suppress(OSError):  # a new .notes has no mode to keep
             shutil.copymode(path, temporary)
         os.replace(temporary, path)
     finally:

@@ -23,7 +23,7 @@ from pathlib import Path
 from workbench.recording.annotations import write_into_description, write_notes
 from workbench.recording.library_index import Kept, LibraryIndex
 from workbench.recording.library_read import Entry, read_found
-from workbench.recording.library_row import Facts, LibraryRow, clean_note, clean_tags
+from workbench.recording.library_row import Facts, LibraryRow, clean_note, clean_tags, text
 from workbench.recording.library_scan import NOTES, Found, Scan, found_of, key_of, scan_folder
 from workbench.recording.trash import (
     Trash,
@@ -38,6 +38,7 @@ log = logging.getLogger(__name__)
 
 LOOK_EVERY = 1.0
 """Seconds between two looks at the folders' times."""
+LONGEST_PAUSE = 5.0
 LOOK_THOROUGHLY_EVERY = 30.0
 """Seconds between two looks at every file: a file that was written to in place leaves its folder's time alone."""
 PUBLISH_EVERY = 0.3
@@ -80,6 +81,7 @@ class Library:
         self._view = LibraryView(reading=(0, 0))
         self._places: dict[str, tuple[str, int]] = {}
         """Id to key and number of the row in what its files gave."""
+        self._by_id: dict[str, LibraryRow] = {}
         self._found: dict[str, Found] = {}
         self._scan = Scan(fresh=True)
         self._thorough_at = -1e9
@@ -99,7 +101,7 @@ class Library:
 
     def row(self, id: str) -> LibraryRow | None:
         """None for an id that is not in the table (any more)."""
-        return next((row for row in self._view.rows if row.id == id), None)
+        return self._by_id.get(id)
 
     def wait(self, seen: int, timeout: float) -> int:
         """Wait until the table's serial is not `seen`, at most `timeout` seconds; returns the serial."""
@@ -144,6 +146,7 @@ class Library:
 
     def _watch(self) -> None:
         while not self._stopping.is_set():
+            began = time.monotonic()
             try:
                 self.refresh(thorough=self._asked.is_set())
             except Exception:
@@ -151,7 +154,8 @@ class Library:
                 log.exception("The library in %s could not be read; trying again.", self.folder)
                 self._publish(problem="The library could not be read. The reason is in the terminal.")
             self._asked.clear()
-            self._asked.wait(LOOK_EVERY)
+            # Of a huge folder that is being written to, a tenth of the time goes into looking and not all of it.
+            self._asked.wait(min(max(LOOK_EVERY, 9 * (time.monotonic() - began)), LONGEST_PAUSE))
 
     def refresh(self, thorough: bool = True) -> None:
         """Read what has changed since the last look.
@@ -245,13 +249,15 @@ class Library:
             where = f"{found.key}#{facts.trajectory or ''}"
             id = f"at-{hashlib.blake2b(where.encode(errors='surrogateescape'), digest_size=10).hexdigest()}"
         name = found.key if facts.trajectory is None else f"{found.key}#{facts.trajectory}"
-        return LibraryRow(id, name, found.paths(self.folder), sum(found.sizes.values()), facts)
+        # A file's name may hold bytes that are no text, which no page can be sent.
+        return LibraryRow(id, text(name, 400), found.paths(self.folder), sum(found.sizes.values()), facts)
 
     def _publish(self, places: dict[str, tuple[str, int]] | None = None, **changes: object) -> None:
         with self._changed:
             view = replace(self._view, trash=look_into_trash(self.folder), **changes)  # type: ignore[arg-type]
             if places is not None:
                 self._places = places
+                self._by_id = {row.id: row for row in view.rows}
             if replace(view, serial=0) != replace(self._view, serial=0) or self._view.serial == 0:
                 self._view = replace(view, serial=self._view.serial + 1)
                 self._changed.notify_all()
@@ -306,15 +312,7 @@ class Library:
                 moved; the recordings before it were.
         """
         with self._changing:
-            wanted = set(ids)
-            keys = {self._there(id)[1].key for id in wanted}
-            for key in keys:
-                of_file = {id for id, (other, _) in self._places.items() if other == key}
-                if not wanted >= of_file:
-                    raise LibraryError(
-                        f"{key}.h5 holds {len(of_file)} recordings and is deleted only as a whole: "
-                        "select all of them."
-                    )
+            keys = self._keys_to_delete(ids)
             paths = [self._found[key].paths(self.folder) for key in sorted(keys)]
             try:
                 batch = put_into_trash(self.folder, paths)
@@ -325,6 +323,23 @@ class Library:
             if batch is None:
                 raise LibraryError("Those files were gone already.")
             return batch
+
+    def may_delete(self, ids: Iterable[str]) -> None:
+        """Raise LibraryError where `delete` would refuse them."""
+        with self._changing:
+            self._keys_to_delete(ids)
+
+    def _keys_to_delete(self, ids: Iterable[str]) -> set[str]:
+        wanted = set(ids)
+        keys = {self._there(id)[1].key for id in wanted}
+        for key in keys:
+            of_file = {id for id, (other, _) in self._places.items() if other == key}
+            if not wanted >= of_file:
+                raise LibraryError(
+                    f"{text(key, 400)}.h5 holds {len(of_file)} recordings and is deleted only as a whole: "
+                    "select all of them."
+                )
+        return keys
 
     def undo_delete(self, batch: str | None = None) -> None:
         """Bring back what one deletion took, or the last one.

@@ -76,7 +76,8 @@ class LibraryIndex:
 
     def store(self, read: Iterable[tuple[str, str, Sequence[Entry]]], gone: Iterable[str] = ()) -> None:
         """Keep what was read (key, signature, entries) and forget the keys that are gone."""
-        read, gone = list(read), list(gone)
+        # A name that is no text cannot be a key; its files are read every time.
+        read, gone = [one for one in read if _is_text(one[0])], [key for key in gone if _is_text(key)]
         try:
             with self._lock, self._transaction() as database:
                 keys = [(key,) for key in (*gone, *(key for key, _, _ in read))]
@@ -107,7 +108,7 @@ class LibraryIndex:
         found: dict[tuple[str, int], bytes] = {}
         try:
             with self._lock, self._transaction() as database:
-                for key, row in wanted:
+                for key, row in (place for place in wanted if _is_text(place[0])):
                     query = "SELECT jpeg FROM pictures WHERE key = ? AND row = ?"
                     for (jpeg,) in database.execute(query, (key, row)):
                         if isinstance(jpeg, bytes):
@@ -145,6 +146,14 @@ class LibraryIndex:
             if self._database is None:
                 self.path = None
                 self._database = _connect(":memory:")
+
+
+def _is_text(key: str) -> bool:
+    try:
+        key.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _in_cache(folder: Path) -> Path:

@@ -164,6 +164,8 @@ def text(value: object, longest: int = 200) -> str:
     """One line of printable characters; empty for what is no text."""
     if not isinstance(value, str):
         return ""
+    if len(value) <= longest and value.isprintable():
+        return value.strip()
     return "".join(c if c.isprintable() else " " for c in value[: 2 * longest]).strip()[:longest]
 
 

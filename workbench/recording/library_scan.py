@@ -18,8 +18,9 @@ from pathlib import Path
 
 SUFFIXES = (".json", ".h5", ".rrd")
 """In the order in which a recording is opened by them."""
-NOTES = ".notes.json"
-"""Ending of the file with tags and notes of recordings that are not ours to write into."""
+NOTES = ".notes"
+"""Ending of the file with tags and notes of recordings that are not ours to write into: JSON, but a ``.json`` would be
+taken for a recording's by whoever looks for those."""
 SETTLES = 3.0
 """Seconds in which a folder may change again within one tick of its time, and files of one recording come one by one."""
 MOST_ENTRIES = 500_000
@@ -44,7 +45,8 @@ class Found:
 
     @property
     def newest(self) -> int:
-        return max(self.times.values())
+        """When the recording was last written to, in nanoseconds. Notes are not the recording."""
+        return max(at for suffix, at in self.times.items() if suffix != NOTES)
 
     def path(self, folder: Path, suffix: str) -> Path:
         return folder / f"{self.key}{suffix}"
@@ -61,11 +63,7 @@ def found_of(key: str, signature: str) -> Found:
 
 def key_of(path: str) -> str:
     """Of a file, by its path below the library's folder."""
-    return path.removesuffix(suffix_of(path))
-
-
-def suffix_of(name: str) -> str:
-    return NOTES if name.endswith(NOTES) else os.path.splitext(name)[1]
+    return os.path.splitext(path)[0]
 
 
 @dataclass(frozen=True)
@@ -114,11 +112,11 @@ def scan_folder(folder: Path) -> Scan:
                         _add(names, below, entry)
         except FileNotFoundError:
             if not below:
-                problem = f"{folder} is not there."
+                problem = f"{_said(folder)} is not there."
         except OSError as error:
-            problem = f"{path} cannot be looked into: {error.strerror or error}."
+            problem = f"{_said(path)} cannot be looked into: {error.strerror or error}."
         if entries > MOST_ENTRIES:
-            problem = f"{folder} holds more than {MOST_ENTRIES:,} files; not all of them were looked at. Choose a folder with recordings in it."
+            problem = f"{_said(folder)} holds more than {MOST_ENTRIES:,} files; not all of them were looked at. Choose a folder with recordings in it."
             break
     found, waits = {}, False
     for key, stats in names.items():
@@ -134,7 +132,7 @@ def scan_folder(folder: Path) -> Scan:
 
 
 def _add(names: dict[str, dict[str, os.stat_result]], below: str, entry: os.DirEntry[str]) -> None:
-    suffix = suffix_of(entry.name)
+    suffix = os.path.splitext(entry.name)[1]
     try:
         found = entry.stat()
     except OSError:
@@ -151,3 +149,8 @@ def _group(key: str, stats: dict[str, os.stat_result]) -> Found | None:
         {suffix: stats[suffix].st_size for suffix in order},
         {suffix: stats[suffix].st_mtime_ns for suffix in order},
     )
+
+
+def _said(path: str | Path) -> str:
+    """A path as text that can be sent to a page."""
+    return os.fsencode(path).decode(errors="replace")

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from workbench.core.camera_search import SearchProgress, SearchSpace, suggest_cameras
 from workbench.core.camera_suggestion import OfferedPlacement, in_words
 from workbench.core.pictures import Picture
 from workbench.core.place_camera import PlacedCameras
 from workbench.core.take_pictures import take_pictures
-from workbench.core.visibility import judge_camera, small_size
+from workbench.core.visibility import Placement, judge_camera, picture_of, small_size
 from workbench.session.camera_messages import (
     CameraAnswer,
     CameraJudged,
@@ -28,6 +29,7 @@ from workbench.session.open_task import OpenedTask
 JUDGED_SIDE = 128
 """Pixels of the shorter side of what is judged, where the camera's own are more: an object that is lost in those is
 hardly to be called seen."""
+LARGEST_SCALE = 4.0
 _TELL_EVERY = 0.2
 
 
@@ -54,7 +56,26 @@ def answer(
         return CameraQuestionFailed(question.number, str(error))
 
 
+def _looked_at(opened: OpenedTask, question: DrawCamera) -> tuple[Picture, ...]:
+    """In another size than the env's camera has, which is left alone."""
+    settings, scale = question.settings, question.scale
+    if settings is None or not 0 < scale <= LARGEST_SCALE:
+        raise ValueError(f"a camera is looked through in up to {LARGEST_SCALE} times its size, not {scale}")
+    size = (max(1, round(settings.width * scale)), max(1, round(settings.height * scale)))
+    info = next((info for info in opened.description.cameras if info.key == question.key), None)
+    placement = Placement(settings, question.key[0], None if info is None else info.mount)
+    table = opened.env.table
+    made = []
+    for e in question.envs:
+        moment = None if question.poses is None else question.poses[e]
+        picture = picture_of(opened.env.env, e, placement, table, moment, size)
+        made.append(replace(picture, camera=question.key[1], depth=None, segmentation=None))
+    return tuple(made)
+
+
 def _drawn(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> tuple[Picture, ...]:
+    if question.scale != 1.0:
+        return _looked_at(opened, question)
     env, key = opened.env.env, question.key
     before = placed.settings(key)
     if question.settings is not None:
@@ -101,6 +122,7 @@ def _suggested(
     cancelled: Callable[[], bool],
 ) -> Suggested:
     told = 0.0
+    info = next((info for info in opened.description.cameras if info.key == question.key), None)
 
     def progress(at: SearchProgress) -> None:
         nonlocal told
@@ -110,7 +132,14 @@ def _suggested(
 
     found = suggest_cameras(
         opened.env.env,
-        SearchSpace(question.objects, question.low, question.high, question.settings, question.key[0]),
+        SearchSpace(
+            question.objects,
+            question.low,
+            question.high,
+            question.settings,
+            question.key[0],
+            mount=None if info is None else info.mount,
+        ),
         question.envs,
         table=opened.env.table,
         progress=progress,

@@ -40,9 +40,13 @@ Kind = TypeVar("Kind", bound=Event)
 class LiveAsker:
     """Asks the worker that plays."""
 
-    def __init__(self, send: Callable[[Request], None]) -> None:
+    def __init__(self, send: Callable[[Request], None], first: int = 1) -> None:
+        """
+        Args:
+            first: number of its first question.
+        """
         self._send = send
-        self._numbers = count(1)
+        self._numbers = count(first)
         self._condition = threading.Condition()
         self._answer: CameraAnswer | None = None
         self._awaited = 0

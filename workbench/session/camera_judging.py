@@ -8,7 +8,7 @@ episodes, of another in the background. There is one job of each kind at a time,
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,13 +29,16 @@ from workbench.session.camera_messages import (
     SuggestCameras,
     Suggested,
 )
+from workbench.session.episode_moments import EpisodeMoment
 from workbench.session.lane import Job, Lane
 from workbench.session.messages import Load, Request
-from workbench.session.studio_view import Picked, Progress
+from workbench.session.studio_view import JudgedMoment, Picked, Progress
 
 FIRST_SEED = 10_000
 """The same seeds for every judgement, so that two can be compared; others than people begin with."""
 _IDLE_SECONDS = 300.0
+_TELL_EVERY = 8
+"""Steps after which what is known so far is shown."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,7 @@ class Looked:
     report_settings: CameraSettings | None = None
     """How the camera stood when it was judged."""
     report_seeds: int = 0
+    report_moments: tuple[JudgedMoment, ...] = ()
     outdated: bool = False
     """The report is of a version that was."""
     suggestions: tuple[OfferedPlacement, ...] = ()
@@ -120,6 +124,24 @@ class CameraJudging:
             self._know_report(key, now, join_reports(reports), 0)
 
         self._live_lane.start(f"judging {key[1]} in all envs", work)
+
+    def judge_steps(
+        self, key: CameraKey, now: CameraSettings | None, moments: Sequence[EpisodeMoment]
+    ) -> None:
+        """Judge a camera as it stands at moments of the past; what is known so far can be seen all the while."""
+
+        def work(job: Job) -> None:
+            reports: list[CameraReport] = []
+            done: list[JudgedMoment] = []
+            for moment in moments:
+                job.tell(len(done), len(moments))
+                question = JudgeCamera(0, key, None, (moment.env,), moment.poses)
+                reports.append(self._live.ask(question, job, CameraJudged).report)
+                done.append(JudgedMoment(moment.serial, moment.env, moment.step))
+                if len(done) % _TELL_EVERY == 0 or len(done) == len(moments):
+                    self._know_report(key, now, join_reports(reports), 0, tuple(done))
+
+        self._live_lane.start(f"judging {key[1]} over {len(moments)} steps", work)
 
     def judge_seeds(
         self, key: CameraKey, now: CameraSettings | None, moved: bool, load: Load, seeds: int
@@ -184,7 +206,8 @@ class CameraJudging:
         """A picture of every env, as they come."""
         looked = self.looked
         order: tuple[int, ...] = tuple(range(moment.num_envs))
-        if looked.report is not None and (looked.report_of, looked.report_seeds) == (key, 0):
+        known = (looked.report_of, looked.report_seeds, looked.report_moments)
+        if looked.report is not None and known == (key, 0, ()):
             judged = [looked.report.envs[i] for i in looked.report.worst_first()]
             if sorted(judged) == list(order):
                 order = tuple(judged)
@@ -240,9 +263,21 @@ class CameraJudging:
         return self._live.ask(question, job, CameraPictures).pictures[0]
 
     def _know_report(
-        self, key: CameraKey, now: CameraSettings | None, report: CameraReport, seeds: int
+        self,
+        key: CameraKey,
+        now: CameraSettings | None,
+        report: CameraReport,
+        seeds: int,
+        moments: tuple[JudgedMoment, ...] = (),
     ) -> None:
-        self._know(report=report, report_of=key, report_settings=now, report_seeds=seeds, outdated=False)
+        self._know(
+            report=report,
+            report_of=key,
+            report_settings=now,
+            report_seeds=seeds,
+            report_moments=moments,
+            outdated=False,
+        )
 
     def _know(self, **values: object) -> None:
         with self._lock:

@@ -32,6 +32,9 @@ class DrawCamera:
     """Those that its shader does not give are left out."""
     poses: NDArray[np.float32] | None = None
     """(N, B, 7) of the bodies at a moment of the past; None for now."""
+    scale: float = 1.0
+    """Other than 1: colours alone, in a picture whose sides are so much of `settings`' (which must be given), by a
+    camera beside the env's, with the minimal shader."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +57,10 @@ class SuggestCameras:
     number: int
     key: CameraKey
     settings: CameraSettings
-    """Its lens; the pose does not matter."""
+    """Its lens; of the pose it matters only which way up a mounted camera's picture is."""
     objects: tuple[str, ...]
     low: tuple[float, float, float]
-    """Of the box for the eye, metres in the env's frame."""
+    """Of the box for the eye, metres in the frame of its mount, or the env's if it has none."""
     high: tuple[float, float, float]
     envs: tuple[int, ...]
 

@@ -15,6 +15,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -33,12 +34,15 @@ from workbench.core.pictures import CameraInfo
 from workbench.core.step import StepResult
 from workbench.session.camera_judging import CameraJudging, ShownMoment
 from workbench.session.camera_messages import CameraAnswer
-from workbench.session.camera_writing import CameraWriting, Wish, plan
+from workbench.session.camera_writing import CameraWriting, Wish, copy, plan
+from workbench.session.episode_moments import EpisodeMoment
 from workbench.session.messages import Load, PlaceCamera, Placed, ReloadLevel, Request, TaskDescription
 from workbench.session.placements import Placements
+from workbench.session.quick_look import QuickLook, Sight
 from workbench.session.studio_view import StudioCamera, StudioView
 
 MOST_SEEDS = 1000
+MOST_STEPS = 1000
 _ON_THE_GPU = "in GPU simulation cameras cannot be moved; open the task with --backend cpu to place them"
 
 
@@ -51,6 +55,8 @@ class CameraStudio:
         on_change: Callable[[], None],
         shown: Callable[[], ShownMoment],
         load: Callable[[], Load | None],
+        episode: Callable[[int], tuple[EpisodeMoment, ...]],
+        open_copy: Callable[[Path, str], None],
     ) -> None:
         """
         Args:
@@ -58,8 +64,13 @@ class CameraStudio:
             on_change: called, on any thread, when `view` has something new.
             shown: what the page shows now.
             load: how another worker gets the version that runs; None before there is one.
+            episode: so many moments at most of the selected env's episode at the shown moment.
+            open_copy: open this class of this file, in a folder of the user's, in place of the task.
         """
         self._send, self._on_change, self._shown, self._load = send, on_change, shown, load
+        self._episode, self._open_copy = episode, open_copy
+        self.folder = Path.cwd()
+        """Where a copy of a task goes: where the program was started."""
         self._lock = threading.Lock()
         self._thread = ThreadPoolExecutor(1, "studio")
         self._closing = False
@@ -70,6 +81,7 @@ class CameraStudio:
         self._placements = Placements()
         self._writing = CameraWriting()
         self._judging = CameraJudging(send, self._note)
+        self._quick = QuickLook(send, self._note)
         self._drawn: tuple[StepResult | None, int] = (None, 0)
         """What was shown last: the step and the selected env."""
 
@@ -147,17 +159,17 @@ class CameraStudio:
         self._plan(Wish("remove", key, None))
 
     def _plan(self, wish: Wish) -> None:
-        def work() -> None:
-            with self._lock:
-                task, info = self._task, self._info(wish.key)
-            if task is None:
-                return
-            writing = plan(task, info, wish)
-            with self._lock:
-                self._writing.planned(wish, writing)
-            self._note()
+        self._later(self._find_plan, wish)
 
-        self._later(work)
+    def _find_plan(self, wish: Wish) -> None:
+        with self._lock:
+            task, info = self._task, self._info(wish.key)
+        if task is None:
+            return
+        writing = plan(task, info, wish)
+        with self._lock:
+            self._writing.planned(wish, writing)
+        self._note()
 
     def write(self) -> None:
         """Make the planned edit; the file is reloaded, and the new camera compared with what was written."""
@@ -166,6 +178,25 @@ class CameraStudio:
     def undo_write(self) -> None:
         """Take the edit that was made last out of the file again."""
         self._later(self._write, self._writing.undo)
+
+    def copy_task(self) -> None:
+        """Copy the task's file into `folder` and open the copy; what was refused before is planned in it then.
+
+        Does nothing unless ``StudioView.writing.can_copy``. Nothing is written over.
+        """
+        self._later(self._copy)
+
+    def _copy(self) -> None:
+        with self._lock:
+            task, can = self._task, self._writing.view.can_copy
+        if task is None or not can:
+            return
+        file, view = copy(task, self.folder)
+        with self._lock:
+            self._writing.copied(file, view)
+        self._note()
+        if file is not None:
+            self._open_copy(file, task.class_name)
 
     def _write(self, do: Callable[[], bool]) -> None:
         with self._lock:  # the version with it must not come in before it is known to be awaited
@@ -193,6 +224,18 @@ class CameraStudio:
         elif known and (load := self._load()) is not None:
             self._judging.judge_seeds(key, now, moved, load, min(seeds, MOST_SEEDS))
 
+    def judge_steps(self, key: CameraKey, most: int = MOST_STEPS) -> None:
+        """Judge a camera as it is placed over the steps of the episode that the selected env is in.
+
+        Args:
+            most: how many of them, evenly spread.
+        """
+        with self._lock:
+            known, now = self._known(key), self._placements.now(key)
+        if known and (moments := self._episode(min(max(1, most), MOST_STEPS))):
+            self._judging.judge_steps(key, now, moments)
+        self._note()
+
     def suggest(
         self,
         key: CameraKey,
@@ -201,15 +244,15 @@ class CameraStudio:
         high: tuple[float, float, float],
         seeds: int,
     ) -> None:
-        """Search placements that see these objects over so many seeds, with the eye between two corners."""
+        """Search placements that see these objects over so many seeds, with the eye between two corners.
+
+        Args:
+            objects: names of objects, or of single links of them (``TaskDescription.objects``).
+            low, high: metres, in the frame of the camera's mount, or the env's if it has none.
+        """
         with self._lock:
-            known, lens, info = self._known(key), self._placements.now(key), self._info(key)
-            if known and info is not None and info.mount is not None:
-                self._problem = (
-                    f"{key[1]} rides on {info.mount}: places are searched for cameras that stand still."
-                )
-                known = False
-            elif known and lens is None:
+            known, lens = self._known(key), self._placements.now(key)
+            if known and lens is None:
                 self._problem = f"{key[1]} cannot be placed: {self._refusal(key)}."
         if known and lens is not None and (load := self._load()) is not None:
             self._judging.suggest(key, lens, tuple(objects), low, high, load, seeds)
@@ -247,6 +290,26 @@ class CameraStudio:
             known = self._known(key)
         if known:
             self._judging.make_sheet(key, self._shown())
+
+    def set_quick_scale(self, scale: float) -> None:
+        """Look through the chosen camera in a picture of so much of its own size; 1 for that itself. Never written."""
+        self._quick.set_scale(scale)
+        self._note()
+
+    def look(self) -> None:
+        """Take the quick look that `StudioView.wants_quick` tells of."""
+        with self._lock:
+            sight = self._sight()
+        if sight is not None and self._quick.wants(sight):
+            self._quick.look(sight, self._shown())
+
+    def _sight(self) -> Sight | None:
+        key = self._selected
+        now = None if key is None else self._placements.now(key)
+        if key is None or now is None or self._refusal(key) is not None:
+            return None
+        step, env = self._drawn
+        return Sight(key, now, env, step, self._quick.scale)
 
     def pick(self, key: CameraKey, u: float, v: float) -> None:
         """What is seen at a place of the picture: 0, 0 is its upper left corner, 1, 1 its lower right one."""
@@ -329,6 +392,7 @@ class CameraStudio:
         with self._lock:
             self._drawn = step, env
             infos = () if self._task is None else self._task.cameras
+            sight = self._sight()
             judged = None if looked.report_of is None else self._placements.now(looked.report_of)
             was = looked.report_settings
             # Not what is rounded away when it is written.
@@ -338,18 +402,22 @@ class CameraStudio:
                 report=looked.report,
                 report_of=looked.report_of,
                 report_seeds=looked.report_seeds,
+                report_moments=looked.report_moments,
                 report_stale=looked.report is not None and (moved or looked.outdated),
                 suggestions=looked.suggestions,
                 suggestions_of=looked.suggestions_of,
                 compared=looked.compared,
                 picked=looked.picked,
                 sheet=looked.sheet,
+                quick_scale=self._quick.scale,
+                quick=self._quick.picture(self._selected, env),
+                wants_quick=sight is not None and self._quick.wants(sight),
                 progress=progress,
                 selected=self._selected,
                 undo=self._placements.undo_words,
                 redo=self._placements.redo_words,
                 writing=self._writing.view,
-                problem=self._problem or looked.problem,
+                problem=self._problem or looked.problem or self._quick.problem,
                 serial=self._serial,
             )
 
@@ -407,6 +475,9 @@ class CameraStudio:
                 self._follow_the_file(wish)
                 self._writing.compare(task)
             dropped = self._placements.loaded(said, own)
+            refused = self._writing.wish_for(task)
+            if refused is not None and not self._closing:
+                self._submit(self._find_plan, refused)
             self._problem = ""
             if dropped:
                 names = " and ".join(key[1] for key in dropped)
@@ -443,10 +514,12 @@ class CameraStudio:
     def answered(self, answer: CameraAnswer) -> None:
         """The worker that plays answered a question about a camera."""
         self._judging.take(answer)
+        self._quick.take(answer)
 
     def interrupted(self) -> None:
         """The file was saved, or the worker is gone: what is under way is about what there was before."""
         self._judging.stop()
+        self._quick.stop()
 
     def failed_to_load(self) -> None:
         """A version does not load; the one before goes on."""
@@ -478,6 +551,7 @@ class CameraStudio:
         with self._lock:
             self._closing = True
         self._judging.close()
+        self._quick.close()
         self._thread.shutdown(wait=True, cancel_futures=True)
 
     # --- small things ----------------------------------------------------------------------------------
@@ -493,7 +567,10 @@ class CameraStudio:
     def _later(self, work: Callable[..., None], *args: object) -> None:
         with self._lock:
             if not self._closing:
-                self._thread.submit(work, *args).add_done_callback(self._worked)
+                self._submit(work, *args)
+
+    def _submit(self, work: Callable[..., None], *args: object) -> None:
+        self._thread.submit(work, *args).add_done_callback(self._worked)
 
     def _worked(self, future: Future[None]) -> None:
         error = None if future.cancelled() else future.exception()

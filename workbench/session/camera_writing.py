@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from workbench.authoring.copy_task import NoCopy, copy_task
 from workbench.authoring.modules import decode
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.core.pictures import CameraInfo
@@ -61,7 +62,7 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish) -> Writing:
         where = "" if task.file is None else f" ({task.file})"
         made = camera_source.Refusal(
             f"{task.class_name} is installed{where}, and an installed file is not to be edited: copy the task into a "
-            "file of your own and open that",
+            "folder of your own",
             text,
         )
     elif unread:
@@ -69,15 +70,40 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish) -> Writing:
     else:
         made = _made(task, texts, info, wish)
     if isinstance(made, camera_source.SourceEdit):
-        blocked = camera_source.not_writable(made.file)
+        blocked = next(
+            filter(None, (camera_source.not_writable(change.file) for change in made.changes)), None
+        )
         if blocked is not None:
             text = "" if wish.settings is None else camera_source.snippet(wish.result[1], wish.settings)
             made = camera_source.Refusal(blocked, text)
     if isinstance(made, camera_source.Refusal):
-        copy = " You can copy the text below into the file yourself." if made.snippet else ""
-        return Writing("refused", wish.result, None, made, f"Not written: {made.reason}.{copy}")
-    message = f"This is what changes in {Path(made.file).name}. Nothing is written yet."
+        can_copy = _could_be_copied(task)
+        ways = " You can copy the text below into the file yourself." if made.snippet and not can_copy else ""
+        return Writing("refused", wish.result, None, made, f"Not written: {made.reason}.{ways}", can_copy)
+    message = f"This is what changes in {made.names}. Nothing is written yet."
     return Writing("planned", wish.result, made, None, message)
+
+
+def _could_be_copied(task: TaskDescription) -> bool:
+    """Whether the task's file is one that is not to be edited, and is all that the task is made of."""
+    from workbench.authoring import camera_source
+
+    if task.file is None or len(task.source_files) > 1:
+        return False
+    return not task.source_files or camera_source.not_writable(task.file) is not None
+
+
+def copy(task: TaskDescription, folder: Path) -> tuple[Path | None, Writing]:
+    """Copy the task's file into a folder; the copy, or None, and what is said of it."""
+    if task.file is None:
+        return None, Writing("refused", message="Not copied: the task has no file.")
+    try:
+        made = copy_task(Path(task.file), folder)
+    except NoCopy as reason:
+        return None, Writing("refused", message=f"Not copied: {reason}.")
+    named = ", ".join(f"{new} for {old}" for old, new in made.ids)
+    ids = f" It registers {named}." if named else ""
+    return made.file, Writing(message=f"The task is copied to {made.file}, which is being opened.{ids}")
 
 
 def _made(task: TaskDescription, texts: dict[str, str], info: CameraInfo | None, wish: Wish) -> Plan:
@@ -126,20 +152,34 @@ class CameraWriting:
     def __init__(self) -> None:
         self.view = Writing()
         self.wish: Wish | None = None
+        self.copy: Path | None = None
+        """Of the task, which is being opened."""
 
     def planned(self, wish: Wish, view: Writing) -> None:
         self.wish, self.view = wish, view
 
     def drop(self) -> None:
-        self.wish, self.view = None, Writing()
+        self.wish, self.view, self.copy = None, Writing(), None
+
+    def copied(self, copy: Path | None, view: Writing) -> None:
+        """The task was copied, or not: the wish waits until its copy is there."""
+        self.copy = copy
+        self.view = view if copy is not None else replace(view, key=self.view.key)
+
+    def wish_for(self, task: TaskDescription) -> Wish | None:
+        """What was wanted of the task whose copy this is, if this is the one that is awaited."""
+        if self.copy is None or task.file != str(self.copy):
+            return None
+        self.copy = None
+        return self.wish
 
     def write(self) -> bool:
         """Make the planned edit. False if there is none, or it cannot be made."""
-        return self._apply("planned", "apply", "written", "Written to {file}; it is being loaded.")
+        return self._apply("planned", "apply", "written", "Written to {file}, being loaded now.")
 
     def undo(self) -> bool:
         """Take the edit that was made out of the file again."""
-        return self._apply(None, "revert", "undone", "{file} is as it was before; it is being loaded.")
+        return self._apply(None, "revert", "undone", "{file} {was} before, being loaded now.")
 
     def _apply(self, needs: str | None, how: str, stage: str, message: str) -> bool:
         from workbench.authoring import camera_source
@@ -150,19 +190,21 @@ class CameraWriting:
             return False
         do: Callable[[SourceEdit], Refusal | None] = getattr(camera_source, how)
         refusal = do(view.edit)
-        file = Path(view.edit.file).name
+        file = view.edit.names
         if refusal is not None:
             kept = view.stage if needs is None else "refused"
             self.view = replace(view, stage=kept, refusal=refusal, message=f"Not done: {refusal.reason}.")
             return False
-        self.view = replace(view, stage=stage, refusal=None, message=message.format(file=file))  # type: ignore[arg-type]
+        self.view = replace(
+            view, stage=stage, refusal=None, message=message.format(file=file, was=_was(view.edit))
+        )  # type: ignore[arg-type]
         return True
 
     @property
     def awaited(self) -> bool:
         """The edit was made or taken back, and the version with it has not come in yet."""
         return self.view.stage == "written" or (
-            self.view.stage == "undone" and self.view.message.endswith("loaded.")
+            self.view.stage == "undone" and self.view.message.endswith("loaded now.")
         )
 
     def is_in(self, task: TaskDescription) -> bool:
@@ -170,17 +212,20 @@ class CameraWriting:
         edit = self.view.edit
         if edit is None or not self.awaited:
             return False
-        wanted = edit.new_text if self.view.stage == "written" else edit.old_text
-        return task.source.get(edit.file) == wanted
+        written = self.view.stage == "written"
+        return all(
+            task.source.get(change.file) == (change.new_text if written else change.old_text)
+            for change in edit.changes
+        )
 
     def compare(self, task: TaskDescription) -> None:
         """The version that was awaited runs: does it have what was written?"""
         view, wish = self.view, self.wish
         assert view.edit is not None and wish is not None
         infos = {c.key: c for c in task.cameras}
-        file = Path(view.edit.file).name
+        file = view.edit.names
         if view.stage == "undone":
-            self.view = replace(view, message=f"{file} is as it was before.")
+            self.view = replace(view, message=f"{file} {_was(view.edit)} before.")
             return
         wrong = _mismatch(wish, infos, view.edit.settings)
         if wrong:
@@ -199,12 +244,21 @@ class CameraWriting:
         self.view = replace(view, stage="checked", message=done)
 
     def failed_to_load(self) -> None:
+        if self.copy is not None:
+            self.view = Writing(
+                "refused", message=f"{self.copy} was made, but does not load: mend or delete it."
+            )
         if self.awaited and self.view.edit is not None:
-            file = Path(self.view.edit.file).name
+            file = self.view.edit.names
             told = "the change is in it; take it back if that is the reason"
             if self.view.stage == "undone":
                 told = "the camera's change is out of it"
-            self.view = replace(self.view, message=f"{file} does not load: {told}.")
+            does = "does" if len(self.view.edit.changes) == 1 else "do"
+            self.view = replace(self.view, message=f"{file} {does} not load: {told}.")
+
+
+def _was(edit: SourceEdit) -> str:
+    return "is as it was" if len(edit.changes) == 1 else "are as they were"
 
 
 def _mismatch(wish: Wish, infos: dict[CameraKey, CameraInfo], wanted: CameraSettings | None) -> str:

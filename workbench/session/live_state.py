@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 from workbench.authoring.problem import Problem
 from workbench.authoring.reference import named_file
@@ -306,6 +307,10 @@ class LiveState:
             return False
         self.reference = f"{self.own_file}:{name}"
         return True
+
+    def open_file(self, file: Path, class_name: str) -> None:
+        """Ask for a class of another file."""
+        self.reference, self.own_file = f"{file}:{class_name}", file
 
     def seek(self, seek: Callable[[Timeline], None]) -> bool:
         """Show another moment. False if it was shown."""

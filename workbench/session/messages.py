@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.authoring.problem import Problem
+from workbench.core.camera_report import ObjectToSee
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.geometry import SceneGeometry
 from workbench.core.inspection import Inspection, Section
@@ -95,6 +96,8 @@ class TaskDescription:
     """Further task classes in the file."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keywords of ``gym.make`` that make such an env, as far as JSON can say them."""
+    objects: tuple[ObjectToSee, ...] = ()
+    """What a camera may be asked to see."""
 
 
 # --- requests: server to worker ------------------------------------------------------------------

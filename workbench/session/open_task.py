@@ -28,6 +28,7 @@ from workbench.core.step import StepResult
 from workbench.core.strict import BrokenRule, WrongReturn
 from workbench.core.take_pictures import list_cameras, segmentation_names
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+from workbench.core.visibility import objects_to_see
 from workbench.session.interrupts import Interrupted
 from workbench.session.messages import ActionDimension, TaskDescription, TaskOptions
 
@@ -176,6 +177,7 @@ def describe(
         can_render=can_render,
         others=loaded.others if loaded.followed else (),
         env_kwargs=env_kwargs(env, {**loaded.default_kwargs, **given}),
+        objects=objects_to_see(env, task.table),
     )
 
 

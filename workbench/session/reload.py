@@ -107,6 +107,8 @@ def _what_changed(
     if not loaded.followed:
         return Change("rebuilt", "it was asked for")
     if (before.file, before.class_name, before.env_id) != (loaded.file, loaded.class_name, loaded.env_id):
+        if loaded.file is not None and before.file != loaded.file:
+            return Change("rebuilt", f"{loaded.file.name} was opened in place of {before.class_name}")
         return Change("rebuilt", f"{loaded.class_name} is another task than {before.class_name}")
     if replace(running.request.options, seed=0) != replace(request.options, seed=0):
         return Change("rebuilt", "the options changed")

@@ -24,6 +24,7 @@ from workbench.session.camera_judging import ShownMoment
 from workbench.session.camera_messages import CameraAnswer
 from workbench.session.camera_studio import CameraStudio
 from workbench.session.env_table import EnvRows
+from workbench.session.episode_moments import EpisodeMoment, moments_of_episode
 from workbench.session.judge import FILE_SAVED, Judge, what_a_load_means
 from workbench.session.judgement import JudgedCurve, Judgement
 from workbench.session.keep_past import PastKeeper
@@ -116,7 +117,14 @@ class Session:
         )
         self._keeper = PastKeeper(recordings, self._recorder.finisher, self._note)
         self._judge = Judge(self._note)
-        self.studio = CameraStudio(self._send, self._note, self._shown_moment, self._same_version)
+        self.studio = CameraStudio(
+            self._send,
+            self._note,
+            self._shown_moment,
+            self._same_version,
+            self._episode_moments,
+            self.open_file,
+        )
         """Cameras placed by hand."""
         self._watcher = SourceWatcher(self._on_files_changed)
         self._follow((), {})
@@ -176,6 +184,13 @@ class Session:
             chosen = self._state.choose_class(name)
         if chosen:
             self.reload()
+
+    def open_file(self, file: Path, class_name: str) -> None:
+        """Open a task class of another file in place of the one that is open, and follow that file."""
+        with self._lock:
+            self._state.open_file(file, class_name)
+        self._follow((), {})
+        self.reload()
 
     def interrupt(self) -> None:
         """Have the author's code left where it is, if it is at work; its traceback becomes the problem."""
@@ -533,6 +548,15 @@ class Session:
             past = None if s.timeline is None else s.timeline.shown
             count = 0 if s.task is None else s.task.num_envs
             return ShownMoment(s.selected_env, count, None if past is None else past.step.poses)
+
+    def _episode_moments(self, most: int) -> tuple[EpisodeMoment, ...]:
+        with self._lock:
+            s = self._state
+            if s.timeline is None or not len(s.timeline.history):
+                return ()
+            history, shown = s.timeline.history, s.timeline.shown
+            at = history.last if shown is None else shown.serial
+            return moments_of_episode(history, s.selected_env, at, most)
 
     def _same_version(self) -> Load | None:
         """How another worker gets the version that runs."""

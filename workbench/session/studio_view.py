@@ -54,6 +54,8 @@ class Writing:
     refusal: Refusal | None = None
     message: str = ""
     """One sentence or two: what happened, and what to do next."""
+    can_copy: bool = False
+    """Refused since the file is not the user's to edit, and a copy of it would be: see `CameraStudio.copy_task`."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,16 @@ class Picked:
 
 
 @dataclass(frozen=True)
+class JudgedMoment:
+    """Which moment of which env's episode an entry of a report over steps is of."""
+
+    serial: int
+    env: int
+    step: int
+    """Control steps since the env's reset."""
+
+
+@dataclass(frozen=True)
 class StudioView:
     cameras: tuple[StudioCamera, ...] = ()
     selected: CameraKey | None = None
@@ -98,6 +110,8 @@ class StudioView:
     report_of: CameraKey | None = None
     report_seeds: int = 0
     """Fresh episodes that it is of; 0 for the envs at the moment that was shown."""
+    report_moments: tuple[JudgedMoment, ...] = ()
+    """Where it is of an episode's steps: which one each of ``report.envs`` is; empty for all others."""
     report_stale: bool = False
     """The camera was moved since."""
     suggestions: tuple[OfferedPlacement, ...] = ()
@@ -108,6 +122,12 @@ class StudioView:
     picked: Picked | None = None
     sheet: tuple[Picture, ...] = ()
     """The selected camera's picture in every env, worst first where it was judged."""
+    quick_scale: float = 1.0
+    """Other than 1: the chosen camera is looked through in a picture of so much of its own size."""
+    quick: Picture | None = None
+    """That picture, while there is one."""
+    wants_quick: bool = False
+    """There is something new to be looked at: see `CameraStudio.look`."""
     progress: Progress | None = None
     """None while nothing runs in the background."""
     problem: str = ""

@@ -22,7 +22,12 @@ from workbench.ui.checked import checked_choice
 from workbench.ui.fragments import render
 
 Form = Literal["json", "opencv", "ros"]
-CONVENTIONS: dict[str, Convention] = {"OpenCV": "opencv", "OpenGL": "opengl", "ManiSkill": "maniskill"}
+CONVENTIONS: dict[str, Convention] = {
+    "OpenCV, ROS optical": "opencv",
+    "OpenGL, Blender": "opengl",
+    "ManiSkill, ROS body": "maniskill",
+}
+"""ROS calls by x forward the frame of a camera's body, and by z forward its optical frame (REP 103)."""
 AXES = {
     "opencv": "x right, y down, z forward",
     "opengl": "x right, y up, z backward",
@@ -37,6 +42,8 @@ FORMS: dict[str, tuple[Form, str]] = {
     "OpenCV YAML": ("opencv", "yaml"),
     "ROS CameraInfo": ("ros", "yaml"),
 }
+UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001}
+"""Metres in one of them: calibrations are often in those of the board that was looked at."""
 THIS, ALL = "this camera", "all cameras"
 LONGEST = 20_000
 """Characters of a calibration that is pasted."""
@@ -69,6 +76,11 @@ class CameraExport:
                 multiline=True,
                 hint="Paste a matrix of 4 x 4 or 3 x 4 numbers, our JSON, or an OpenCV YAML. It is read in the "
                 "convention and direction chosen above.",
+            )
+            self._unit = server.gui.add_dropdown(
+                "Its lengths in",
+                tuple(UNITS),
+                hint="Of what is pasted. What is shown and downloaded, and our own JSON, is in metres.",
             )
             self._import = server.gui.add_button(
                 "Place the camera by it", icon=viser.Icon.FILE_IMPORT, color="gray"
@@ -114,7 +126,8 @@ class CameraExport:
                     "Paste a calibration into the field first: a matrix, our JSON, or an OpenCV YAML."
                 )
             convention, direction = self._choices()
-            self._session.studio.import_pose(camera.key, text, direction, convention)
+            metres = UNITS[checked_choice(self._unit.value, UNITS, "unit")]
+            self._session.studio.import_pose(camera.key, text, direction, convention, metres)
         except ValueError as error:
             event.client.add_notification("Not placed", str(error), color="orange", auto_close_seconds=12.0)
 

@@ -31,6 +31,8 @@ class ObjectRow:
     hidden: str = ""
     bad: tuple[str, ...] = ()
     """Which of ``seen cut hidden`` an author should look at."""
+    moods: tuple[str, ...] = ()
+    """How it is seen in each picture: ``good``, ``warn`` (cut, or much hidden), ``bad`` (not seen), ``none`` (absent)."""
 
 
 @dataclass(frozen=True)
@@ -63,14 +65,18 @@ def metres(value: float) -> str:
     return f"{value:.3g} m"
 
 
-def object_rows(report: CameraReport) -> list[ObjectRow]:
-    """Objects to be seen, the least seen first; then what the task hides. Scenery is left out."""
+def object_rows(report: CameraReport, unit: str = "envs") -> list[ObjectRow]:
+    """Objects to be seen, the least seen first; then what the task hides. Scenery is left out.
+
+    Args:
+        unit: what the report is over: envs, steps.
+    """
     rows = []
     wanted = report.wanted_objects()
     for thing in sorted(wanted, key=lambda thing: (thing.summary().seen, thing.name)):
         found = thing.summary()
         if not found.present:
-            rows.append(ObjectRow(thing.name, "in none of these envs"))
+            rows.append(ObjectRow(thing.name, f"in none of these {unit}"))
             continue
         bad = []
         if found.seen < 1:
@@ -81,7 +87,7 @@ def object_rows(report: CameraReport) -> list[ObjectRow]:
             bad.append("hidden")
         notes = []
         if found.present < len(report.envs):
-            notes.append(f"in {found.present} of {len(report.envs)} envs")
+            notes.append(f"in {found.present} of {len(report.envs)} {unit}")
         if found.covered > MOSTLY_HIDDEN:
             notes.append(f"{percent(found.covered)} behind other things")
         rows.append(
@@ -93,25 +99,26 @@ def object_rows(report: CameraReport) -> list[ObjectRow]:
                 percent(found.cut),
                 percent(found.hidden),
                 tuple(bad),
+                tuple(_mood(thing, i) for i in range(len(report.envs))),
             )
         )
     rows += [ObjectRow(t.name, "the task hides it from this camera") for t in report.objects if t.never_drawn]
     return rows
 
 
-def headline(report: CameraReport) -> str:
-    """One sentence: is all well."""
+def headline(report: CameraReport, unit: str = "envs") -> str:
+    """One sentence: is all well; `unit` as in `object_rows`."""
     wanted = [thing for thing in report.wanted_objects() if thing.present.any()]
     if not wanted:
-        return "There is no object to be seen in these envs."
+        return f"There is no object to be seen in these {unit}."
     lacking = {thing.name: int((thing.present & (thing.pixels == 0)).sum()) for thing in wanted}
     worst = max(lacking, key=lambda name: lacking[name])
     if lacking[worst]:
-        return f"{worst} is not seen in {lacking[worst]} of {len(report.envs)} envs."
+        return f"{worst} is not seen in {lacking[worst]} of {len(report.envs)} {unit}."
     cut = {thing.name: int((thing.present & thing.cut).sum()) for thing in wanted}
     worst = max(cut, key=lambda name: cut[name])
     if cut[worst]:
-        return f"Everything is seen; the border cuts {worst} in {cut[worst]} of {len(report.envs)} envs."
+        return f"Everything is seen; the border cuts {worst} in {cut[worst]} of {len(report.envs)} {unit}."
     return "Everything is seen, and nothing is cut."
 
 
@@ -164,6 +171,15 @@ def histogram(depth: DepthReport, near: float, far: float) -> Histogram | None:
         return float(at) - first
 
     return Histogram(bars, float(DEPTH_EDGES[first]), float(DEPTH_EDGES[last]), place(near), place(far))
+
+
+def _mood(thing: ObjectSeen, position: int) -> str:
+    if not thing.present[position]:
+        return "none"
+    if thing.pixels[position] == 0:
+        return "bad"
+    hindered = max(float(thing.hidden_share[position]), float(thing.covered_share[position]))
+    return "warn" if thing.cut[position] or hindered > 0.5 else "good"
 
 
 def _mark(thing: ObjectSeen, position: int) -> float:

@@ -1,8 +1,7 @@
 """Suggest placements: what must be seen, where the eye may be, and the best five with their pictures.
 
-The bounds are two corners of a box in the env's frame, and begin as a box round the eye. They follow the camera until
-somebody writes into them. The box is drawn in the view on demand. A camera that rides on a body has no such place to
-search for, and the folder says so.
+The bounds are two corners of a box in the env's frame, or in that of the body that the camera rides on, and begin as a
+box round the eye. They follow the camera until somebody writes into them. The box is drawn in the view on demand.
 """
 
 from __future__ import annotations
@@ -11,11 +10,13 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.core.camera_frames import rotation_matrix
 from workbench.core.camera_settings import CameraKey
 from workbench.core.camera_suggestion import OfferedPlacement
+from workbench.core.pictures import CameraKind
 from workbench.session.messages import TaskDescription
 from workbench.session.session import Session
-from workbench.session.studio_view import StudioCamera, StudioView
+from workbench.session.studio_view import StudioCamera
 from workbench.session.view import SessionView
 from workbench.ui.camera_work import WorkBar
 from workbench.ui.changed import fill, show
@@ -24,8 +25,10 @@ from workbench.ui.fragments import render
 from workbench.ui.inline_pictures import data_address
 from workbench.ui.presses import Presses
 
-ROOM = 0.3
-"""Metres from the eye to each side of the box that is first offered."""
+ROOM, ROOM_ON_MOUNT = 0.3, 0.1
+"""Metres from the eye to each side of the box that is first offered; less on a body, which has to carry it."""
+MOST_LINKS = 12
+"""An articulation with more offers none of them alone: a list that nobody reads."""
 FARTHEST = 1000.0
 """Metres: bounds beyond are a slip of the finger."""
 MOST_RESETS = 256
@@ -42,6 +45,8 @@ class CameraSuggest:
         self._session = session
         self._chosen: set[str] | None = None
         self._names: tuple[str, ...] = ()
+        self._first: frozenset[str] = frozenset()
+        """Which of them are chosen before somebody chooses."""
         self._of: CameraKey | None = None
         self._touched = False
         self._drawn: object = None
@@ -86,8 +91,7 @@ class CameraSuggest:
             self._show_box.value = True
 
     def _toggle(self, name: str) -> None:
-        chosen = set(self._names) if self._chosen is None else self._chosen
-        self._chosen = chosen ^ {name}
+        self._chosen = set(self._first if self._chosen is None else self._chosen) ^ {name}
 
     def _bounds(self) -> tuple[Corner, Corner]:
         """Raises ValueError with a sentence."""
@@ -104,7 +108,8 @@ class CameraSuggest:
         if key is None:
             return
         try:
-            wanted = tuple(n for n in self._names if self._chosen is None or n in self._chosen)
+            chosen = self._first if self._chosen is None else self._chosen
+            wanted = tuple(name for name in self._names if name in chosen)
             if not wanted:
                 raise ValueError("Choose at least one object that must be seen.")
             low, high = self._bounds()
@@ -126,9 +131,9 @@ class CameraSuggest:
         if self._search.disabled == able:
             self._search.disabled = not able
         self._bar.draw(studio.progress)
-        self._draw_controls(camera)
+        self._draw_mounted(camera)
         self._draw_bounds(camera)
-        self._draw_names(view, studio)
+        self._draw_names(view)
         wanted = (id(studio.suggestions), studio.selected, None if camera is None else camera.now)
         if wanted == self._drawn:
             return
@@ -139,16 +144,12 @@ class CameraSuggest:
             content = self._offers_html(studio.suggestions, camera)
             fill(self._offers, content)
 
-    def _draw_controls(self, camera: StudioCamera | None) -> None:
+    def _draw_mounted(self, camera: StudioCamera | None) -> None:
         mount = None if camera is None else camera.info.mount
-        for handle in (self._objects, self._low, self._high, self._show_box, self._resets, self._search):
-            show(handle, mount is None)
         show(self._mounted, mount is not None)
         if mount is not None:
-            content = render(
-                "note", text=f"It rides on {mount}: places are searched for cameras that stand still."
-            )
-            fill(self._mounted, content)
+            text = f"It rides on {mount}: the box is in that body's frame, which is looked from as it is after a reset."
+            fill(self._mounted, render("note", text=text))
 
     def _draw_bounds(self, camera: StudioCamera | None) -> None:
         if camera is None or camera.now is None:
@@ -157,17 +158,21 @@ class CameraSuggest:
             self._of, self._touched, self._chosen = camera.key, False, None
         if self._touched:
             return
+        room = ROOM if camera.info.mount is None else ROOM_ON_MOUNT
         for handle, sign in ((self._low, -1), (self._high, 1)):
-            x, y, z = (round(number + sign * ROOM, 2) for number in camera.now.position)
+            x, y, z = (round(number + sign * room, 2) for number in camera.now.position)
             if handle.value != (x, y, z):
                 handle.value = (x, y, z)
 
-    def _draw_names(self, view: SessionView, studio: StudioView) -> None:
-        names = () if view.task is None else objects_of(view.task, studio)
-        chosen = frozenset(names) if self._chosen is None else frozenset(self._chosen)
+    def _draw_names(self, view: SessionView) -> None:
+        key = view.studio.selected
+        objects = () if view.task is None or key is None else objects_of(view.task, key[0])
+        names = tuple(name for name, _ in objects)
+        self._names, self._first = names, frozenset(name for name, whole in objects if whole)
+        chosen = self._first if self._chosen is None else frozenset(self._chosen)
         if (names, chosen) == self._drawn_names:
             return
-        self._names, self._drawn_names = names, (names, chosen)
+        self._drawn_names = names, chosen
         self._objects.content = render(
             "camera_objects",
             objects=[
@@ -207,7 +212,8 @@ class CameraSuggest:
             offset: (3,) where the selected env stands in the view.
         """
         camera = view.studio.chosen
-        if self._show_box.value is not True or camera is None or camera.info.mount is not None:
+        nowhere = camera is None or (camera.info.mount is not None and camera.mount_pose is None)
+        if self._show_box.value is not True or nowhere or camera is None:
             self._box.draw(None, offset)
             return
         try:
@@ -215,18 +221,23 @@ class CameraSuggest:
         except ValueError:
             self._box.draw(None, offset)
             return
-        self._box.draw(box_edges(low, high), offset)
+        edges = box_edges(low, high)
+        if camera.mount_pose is not None:
+            mount = camera.mount_pose.astype(np.float64)
+            edges = (edges @ rotation_matrix(mount[3:]).T + mount[:3]).astype(np.float32)
+        self._box.draw(edges, offset)
 
 
-def objects_of(task: TaskDescription, studio: StudioView) -> tuple[str, ...]:
-    """Names of what may be asked to be seen: as the last report has them, or before it the actors that can move.
-
-    Only the worker knows which articulation is the robot, so other articulations are offered after a judgement.
-    """
-    if studio.report is not None:
-        return tuple(thing.name for thing in studio.report.wanted_objects())
-    names = zip(task.geometry.body_names, task.geometry.body_kinds, strict=True)
-    return tuple(name for name, kind in names if kind == "dynamic")
+def objects_of(task: TaskDescription, kind: CameraKind) -> tuple[tuple[str, bool], ...]:
+    """Names of what a camera of a kind may be asked to see, each with whether it is a whole object or one link."""
+    found: list[tuple[str, bool]] = []
+    for thing in task.objects:
+        if thing.hidden and kind == "sensor":
+            continue
+        found.append((thing.name, True))
+        if len(thing.links) <= MOST_LINKS:
+            found += [(name, False) for name in thing.links]
+    return tuple(found)
 
 
 def box_edges(low: Corner, high: Corner) -> NDArray[np.float32]:

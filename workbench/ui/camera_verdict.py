@@ -1,18 +1,21 @@
-"""Judge a camera: over the envs as they stand or over fresh resets, as a table; and the pictures of all envs.
+"""Judge a camera: over the envs as they stand, the steps of an episode, or fresh resets; and the pictures of all envs.
 
 The table says of each object in how many envs it is seen, how large, and what is in its way; the bars say how far
 away is what the camera sees, with planes that would fit it. The sheet has the selected camera's picture of every env,
-worst first once it was judged; pressing one selects that env.
+worst first once it was judged; pressing one selects that env. Over steps each object has a strip besides, of when it
+is seen; pressing a step of it shows that moment.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import viser
 
 from workbench.core.camera_report import CameraReport
 from workbench.core.pictures import Picture
+from workbench.session.camera_studio import MOST_STEPS
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera, StudioView
 from workbench.session.view import SessionView
@@ -24,7 +27,8 @@ from workbench.ui.fragments import render
 from workbench.ui.inline_pictures import data_address
 from workbench.ui.presses import Presses
 
-AS_THEY_ARE, FRESH = "the envs as they are", "fresh resets"
+AS_THEY_ARE, STEPS, FRESH = "the envs as they are", "this env's steps so far", "fresh resets"
+OVERS = (AS_THEY_ARE, STEPS, FRESH)
 MOST_RESETS = 1000
 MOST_PICTURES = 64
 """On the sheet: the worst of them."""
@@ -42,8 +46,18 @@ class CameraVerdict:
         with server.gui.add_folder("Judge", expand_by_default=False) as self.folder:
             self._over = server.gui.add_dropdown(
                 "Over",
-                (AS_THEY_ARE, FRESH),
-                hint="The envs at their present moment, or freshly reset ones with other seeds, in a process beside.",
+                OVERS,
+                hint="The envs at the moment that is shown; the selected env's episode, step by step; or freshly reset "
+                "envs with other seeds, in a process beside.",
+            )
+            self._steps = server.gui.add_number(
+                "Steps",
+                50,
+                min=1,
+                max=MOST_STEPS,
+                step=1,
+                visible=False,
+                hint="How many of the episode's steps at most, evenly spread: each takes some pictures.",
             )
             self._resets = server.gui.add_number(
                 "Resets",
@@ -73,8 +87,11 @@ class CameraVerdict:
         if key is None:
             return
         try:
-            fresh = checked_choice(self._over.value, (AS_THEY_ARE, FRESH), "choice") == FRESH
-            seeds = checked_int(self._resets.value, 1, MOST_RESETS, "number of resets") if fresh else 0
+            over = checked_choice(self._over.value, OVERS, "choice")
+            seeds = (
+                checked_int(self._resets.value, 1, MOST_RESETS, "number of resets") if over == FRESH else 0
+            )
+            steps = checked_int(self._steps.value, 1, MOST_STEPS, "number of steps")
         except ValueError as error:
             if event.client is not None:
                 event.client.add_notification(
@@ -82,13 +99,21 @@ class CameraVerdict:
                 )
             return
         self._bar.asked()
-        self._session.studio.judge(key, seeds)
+        if over == STEPS:
+            self._session.studio.judge_steps(key, steps)
+        else:
+            self._session.studio.judge(key, seeds)
 
     def _ask_for_sheet(self) -> None:
         key = self._session.view().studio.selected
         if key is not None:
             self._sheet_bar.asked()
             self._session.studio.make_sheet(key)
+
+    def _show_moment(self, position: int) -> None:
+        moments = self._session.view().studio.report_moments
+        if position < len(moments):
+            self._session.show(moments[position].env, moments[position].serial)
 
     def _use(self, plane: str) -> None:
         studio = self._session.view().studio
@@ -107,8 +132,8 @@ class CameraVerdict:
     def draw(self, view: SessionView) -> None:
         studio = view.studio
         camera = studio.chosen
-        fresh = self._over.value == FRESH
-        show(self._resets, fresh)
+        show(self._resets, self._over.value == FRESH)
+        show(self._steps, self._over.value == STEPS)
         self._bar.draw(studio.progress)
         self._sheet_bar.draw(studio.progress)
         self._draw_report(studio, camera)
@@ -126,7 +151,16 @@ class CameraVerdict:
         uses = {
             plane: self._presses.id_of(plane, lambda _, p=plane: self._use(p)) for plane in ("near", "far")
         }
-        fill(self._report, report_html(report, camera, studio.report_stale, studio.report_seeds, uses))
+        seen_at = [
+            {
+                "words": f"step {moment.step}",
+                "press": self._presses.id_of(("moment", i), lambda _, i=i: self._show_moment(i)),
+            }
+            for i, moment in enumerate(studio.report_moments)
+        ]
+        fill(
+            self._report, report_html(report, camera, studio.report_stale, studio.report_seeds, uses, seen_at)
+        )
 
     def _draw_sheet(self, view: SessionView, camera: StudioCamera | None) -> None:
         studio = view.studio
@@ -139,7 +173,7 @@ class CameraVerdict:
         show(self._pictures, mine)
         if not mine or camera is None:
             return
-        judged = studio.report_of == camera.key and not studio.report_seeds
+        judged = studio.report_of == camera.key and not studio.report_seeds and not studio.report_moments
         fill(self._pictures, self._sheet_html(sheet, studio.report if judged else None, view.selected_env))
 
     def _sheet_html(self, sheet: tuple[Picture, ...], report: CameraReport | None, selected: int) -> str:
@@ -172,9 +206,18 @@ class CameraVerdict:
 
 
 def report_html(
-    report: CameraReport, camera: StudioCamera, stale: bool, resets: int, uses: dict[str, str]
+    report: CameraReport,
+    camera: StudioCamera,
+    stale: bool,
+    resets: int,
+    uses: dict[str, str],
+    moments: Sequence[dict[str, str]] = (),
 ) -> str:
-    """The table, the bars and the planes that would fit."""
+    """The table, the bars and the planes that would fit.
+
+    Args:
+        moments: where the report is over an episode's steps, ``words`` and ``press`` of each.
+    """
     depth, info = report.depth, camera.info
     near = info.near if camera.now is None else camera.now.near
     far = info.far if camera.now is None else camera.now.far
@@ -189,15 +232,22 @@ def report_html(
                 "press": uses[name] if camera.now is not None and not camera.refused else "",
             }
         )
-    over = f"{len(report.envs)} fresh resets" if resets else f"{len(report.envs)} envs as they are"
+    count = len(report.envs)
+    over = f"{count} fresh resets" if resets else f"{count} envs as they are"
+    unit = "envs"
+    if moments:
+        span = moments[0]["words"] if count == 1 else f"{moments[0]['words']} to {moments[-1]['words']}"
+        over, unit = f"{count} moments of env {report.envs[-1]}'s episode, {span}", "steps"
     width, height = report.judged_size
     return render(
         "camera_report",
         stale=stale,
         over=over,
         how=f"{report.pictures} pictures of {width} × {height} in {report.milliseconds / 1000:.1f} s",
-        headline=words.headline(report),
-        rows=words.object_rows(report),
+        unit=unit,
+        moments=moments,
+        headline=words.headline(report, unit),
+        rows=words.object_rows(report, unit),
         bars=words.histogram(depth, near, far),
         metres=words.metres,
         background=words.percent(float(depth.background.mean())),

@@ -65,12 +65,19 @@ class CameraWriting:
         self._undo = gui.add_button(
             "Take it back out of the file", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
         )
+        self._copy = gui.add_button(
+            "Copy the task into my folder",
+            icon=viser.Icon.COPY,
+            visible=False,
+            hint=f"A file of your own in {session.studio.folder}, under a name that is free; the page opens it.",
+        )
         self._drop = gui.add_button(LEAVE, color="gray", visible=False)
         self._name: viser.GuiTextHandle | None = None
         self._with_chosen: viser.GuiButtonGroupHandle | None = None
         self._plan.on_click(lambda _: self._plan_write())
         self._write.on_click(lambda _: session.studio.write())
         self._undo.on_click(lambda _: session.studio.undo_write())
+        self._copy.on_click(lambda _: session.studio.copy_task())
         self._drop.on_click(lambda _: session.studio.drop_plan())
 
     def add_members(self, server: viser.ViserServer) -> None:
@@ -155,14 +162,15 @@ class CameraWriting:
         show(self._plan, can_place and (writing.stage != "planned" or stale))
         if self._plan.disabled == wants_plan:
             self._plan.disabled = not wants_plan
-        show(self._text, writing.stage != "none")
+        show(self._text, writing.stage != "none" or bool(writing.message))
+        show(self._copy, writing.can_copy)
         show(self._write, writing.stage == "planned" and not stale)
         show(self._drop, writing.stage in ("planned", "refused", "undone"))
         show(self._undo, writing.stage in DONE)
         leave = LEAVE if writing.stage == "planned" else CLOSE
         if self._drop.label != leave:
             self._drop.label = leave
-        name = "" if writing.edit is None else PurePath(writing.edit.file).name
+        name = "" if writing.edit is None else writing.edit.names
         label = f"Write it to {name}" if name else "Write it"
         if self._write.label != label:
             self._write.label = label
@@ -183,15 +191,13 @@ class CameraWriting:
 def writing_html(writing: Writing, chosen: StudioCamera | None, stale: bool) -> str:
     """How far the change is; every value escaped."""
     edit, refusal = writing.edit, writing.refusal
-    diff = "" if edit is None else edit.diff
+    files = [] if edit is None or writing.stage == "undone" else edit.changes
     return render(
         "camera_writing",
         message="The camera was moved since: show the change again." if stale else writing.message,
         mood="warn" if stale else MOODS.get(writing.stage, "plain"),
-        file="" if edit is None else edit.file,
-        name="" if edit is None else PurePath(edit.file).name,
+        files=[(change.file, PurePath(change.file).name, diff_lines(change.diff)) for change in files],
         folded=writing.stage in DONE,
-        lines=[] if writing.stage == "undone" else diff_lines(diff),
         notes=() if edit is None or writing.stage == "undone" else edit.notes,
         reason="" if refusal is None or refusal.reason in writing.message else refusal.reason,
         snippet="" if refusal is None else refusal.snippet,

@@ -77,6 +77,7 @@ class CamerasPanel:
         self._env = -1
         self._drawn_at = 0.0
         self._asked: tuple[CameraRequest, ...] | None = None
+        self._quick = False
         self._studio: CameraKey | None = None
         """The camera that is being placed, whose picture is wanted whether or not it has a tick here."""
         self._note = server.gui.add_html(render("note", text="Pictures appear when the task is loaded."))
@@ -94,6 +95,7 @@ class CamerasPanel:
 
     def draw(self, view: SessionView) -> None:
         self._studio = view.studio.selected
+        self._quick = view.studio.quick_scale != 1.0
         if view.task is not None and view.cameras_serial != self._cameras_serial:
             self._cameras_serial = view.cameras_serial
             self._build(view.task)
@@ -196,6 +198,8 @@ class CamerasPanel:
 
     def _wanted_of(self, key: CameraKey, camera: _Camera) -> tuple[str, ...]:
         wanted = camera.wanted()
+        if self._quick:
+            return wanted  # it is looked through in another size, and need not be drawn in its own
         return ("rgb", *wanted) if key == self._studio and "rgb" not in wanted else wanted
 
     def _mark_stale(self, view: SessionView) -> None:

@@ -33,6 +33,8 @@ class Command:
     key: HotkeyKey | None = None
     modifier: KeyModifier | None = None
     description: str | None = None
+    registered: Callable[[viser.CommandHandle], None] | None = None
+    """Gets its handle, for who wants to disable it at times."""
 
     @property
     def key_name(self) -> str:
@@ -54,6 +56,8 @@ def register(server: viser.ViserServer, commands: list[Command]) -> None:
             modifier=command.modifier,
         )
         handle.on_trigger(_without_event(command.run))
+        if command.registered is not None:
+            command.registered(handle)
 
 
 def _without_event(run: Callable[[], None]) -> Callable[[object], None]:

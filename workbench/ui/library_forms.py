@@ -20,13 +20,10 @@ MOST_NAMES = 6
 class Question:
     """One window with a question, open until it is answered or `close`."""
 
-    def __init__(self, server: viser.ViserServer, title: str) -> None:
+    def __init__(self, server: viser.ViserServer, title: str, closed: Callable[[], None]) -> None:
         self.modal = server.gui.add_modal(title)
+        self._closed = closed
         self._lock = threading.Lock()
-
-    @property
-    def is_open(self) -> bool:
-        return not self.modal.closed
 
     def close(self) -> bool:
         """Close it; False if it was closed already: of two answers only one counts."""
@@ -34,7 +31,8 @@ class Question:
             if self.modal.closed:
                 return False
             self.modal.close()
-            return True
+        self._closed()
+        return True
 
     def give_up(self, _event: object) -> None:
         """For *Cancel*."""
@@ -48,6 +46,7 @@ def ask_text(
     names: Sequence[str],
     value: str,
     answered: Callable[[str], None],
+    closed: Callable[[], None],
 ) -> Question:
     """Ask for one line of text; Enter or *Save* is the answer.
 
@@ -55,8 +54,9 @@ def ask_text(
         names: of the recordings that it is for.
         value: what stands in the field.
         answered: gets what was typed, as the page sent it, on a thread of viser's.
+        closed: is called once, when the window is gone, before `answered`.
     """
-    question = Question(server, title)
+    question = Question(server, title, closed)
     with question.modal:
         server.gui.add_html(_question("", names, explained))
         form = server.gui.add_form(None)
@@ -84,9 +84,10 @@ def ask_whether(
     explained: str,
     do: str,
     answered: Callable[[], None],
+    closed: Callable[[], None],
 ) -> Question:
     """Ask whether to do something that takes something away; only the button `do` is a yes."""
-    question = Question(server, title)
+    question = Question(server, title, closed)
     with question.modal:
         server.gui.add_html(_question(asked, names, explained))
         yes = server.gui.add_button(do, color="red", icon=viser.Icon.TRASH)

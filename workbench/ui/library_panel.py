@@ -13,20 +13,21 @@ from __future__ import annotations
 
 import base64
 import datetime
-import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import viser
 
-from workbench.recording.library import Library, LibraryError, LibraryView
-from workbench.recording.library_row import LONGEST_NOTE, LibraryRow, clean_tags
+from workbench.recording.library import Library, LibraryView
+from workbench.recording.library_row import LibraryRow
 from workbench.ui.changed import fill, show
 from workbench.ui.commands import Command
 from workbench.ui.fragments import render
-from workbench.ui.library_forms import Question, ask_text, ask_whether
+from workbench.ui.library_edits import LibraryEdits
+from workbench.ui.library_list import MOST_ROWS, RANGE, TOGGLE, LibraryList
 from workbench.ui.library_rows import (
     COLUMNS,
     HINTS,
@@ -34,30 +35,21 @@ from workbench.ui.library_rows import (
     OUTCOMES,
     SECOND_LINE,
     Column,
-    Outcome,
-    begins_descending,
     cells,
     chosen,
     has_outcome,
-    in_words,
     newest_sources,
-    ordered,
     size_in_words,
 )
 from workbench.ui.presses import Presses
 
-log = logging.getLogger(__name__)
-
-MOST_ROWS = 50
-"""On one page of the table."""
 MOST_OPEN = 4
 """Recordings that a review shows at once."""
 TYPING = 0.2
 """Seconds without a keystroke after which the words that are looked for are taken."""
-LONGEST_WORDS = 200
 ALL_TASKS = "all tasks"
-TOGGLE, RANGE, OPEN = 1, 2, 4
-"""What was held, or done, with a press on a row (``choosable.html``)."""
+OPEN = 4
+"""In what ``choosable.html`` says of a press, beside `TOGGLE` and `RANGE`: it was the second of two."""
 
 
 @dataclass(frozen=True)
@@ -89,12 +81,15 @@ class LibraryPanel:
     ) -> None:
         self._server, self._library = server, library
         self._on_selection = on_selection
+        self._folder = os.fsencode(library.folder).decode(errors="replace")
+        self._list = LibraryList(library)
+        self._edits = LibraryEdits(server, library, self._on_asking)
         self._lock = threading.RLock()
         self._actions = [
             Action("Open", "Show it in the review (Enter, or press it twice)", on_open, MOST_OPEN),
-            Action("Tag", "Add tags or take them away (T)", self._ask_tags),
-            Action("Note", "Write a note to it", self._ask_note),
-            Action("Delete", "Move its files to the trash (Delete)", self._ask_delete),
+            Action("Tag", "Add tags or take them away (T)", self._edits.ask_tags),
+            Action("Note", "Write a note to it", self._edits.ask_note),
+            Action("Delete", "Move its files to the trash (Delete)", self._edits.ask_delete),
         ]
         self._filters = server.gui.add_html("")
         self._find = server.gui.add_text(
@@ -110,25 +105,15 @@ class LibraryPanel:
         self._presses = Presses(server)
         self._numbers = self._presses.number_id("rows", self._on_row)
 
-        self._column: Column = "date"
-        self._descending = True
-        self._outcome: Outcome = "all"
-        self._words, self._task = "", None
         self._typed_at: float | None = None
-        self._first = 0
-        self._selected: frozenset[str] = frozenset()
-        self._cursor: str | None = None
-        self._anchor: str | None = None
-        self._follow = False
-        """Whether the page shall scroll to the cursor."""
         self._ids: list[str] = []
         """By the number of its row."""
         self._number_of: dict[str, int] = {}
-        self._arranged: tuple[object, list[LibraryRow]] = (None, [])
         self._drawn: dict[str, object] = {}
         self._told: tuple[str, ...] = ()
-        self._question: Question | None = None
 
+        self._keys: list[viser.CommandHandle] = []
+        self._escapes: list[viser.CommandHandle] = []
         self._find.on_update(lambda _: self._on_typed())
         self._tasks.on_update(lambda _: self._on_task())
 
@@ -136,14 +121,11 @@ class LibraryPanel:
 
     def selected(self) -> tuple[str, ...]:
         """Ids of the selected recordings, in the order of the table."""
-        with self._lock:
-            return tuple(row.id for row in self._rows() if row.id in self._selected)
+        return self._list.selected_ids()
 
     def select(self, ids: Iterable[str]) -> None:
         """Select these recordings, of those that are listed."""
-        with self._lock:
-            listed = {row.id for row in self._rows()}
-            self._selected = frozenset(ids) & listed
+        self._list.select(ids)
         self._tell()
 
     def add_action(
@@ -158,52 +140,61 @@ class LibraryPanel:
         with self._lock:
             self._actions.append(Action(label, hint, run, most))
 
+    def close(self) -> None:
+        """Close the window with a question, if there is one. For when the page goes."""
+        self._edits.close()
+
     def commands(self) -> list[Command]:
         """Keys of the table, for the page to register."""
-        actions = {action.label: action for action in self._actions}
+        commands = [replace(command, registered=self._keys.append) for command in self._commands()]
+        return [*commands, Command("Cancel", self.close, "escape", registered=self._add_escape)]
+
+    def _add_escape(self, handle: viser.CommandHandle) -> None:
+        handle.disabled = True  # of no use but while something is asked
+        self._escapes.append(handle)
+
+    def _commands(self) -> list[Command]:
+        listed, actions = self._list, {action.label: action for action in self._actions}
+
+        def move(by: int, held: int = 0) -> Callable[[], None]:
+            return self._then_tell(lambda: listed.move(by, held))
+
         return [
-            Command("The next recording of the table", lambda: self._move(1), "arrowdown"),
-            Command("The recording before it", lambda: self._move(-1), "arrowup"),
-            Command("Select the next recording too", lambda: self._move(1, RANGE), "arrowdown", "shift"),
-            Command("Select the one before it too", lambda: self._move(-1, RANGE), "arrowup", "shift"),
-            Command("The next page of recordings", lambda: self._turn(1), "pagedown"),
-            Command("The page of recordings before it", lambda: self._turn(-1), "pageup"),
-            Command("Select this recording, or no longer", self._toggle_cursor, "X"),
-            Command("Select all recordings that are listed", self._select_all, "A", "cmd/ctrl"),
+            Command("The next recording of the table", move(1), "arrowdown"),
+            Command("The recording before it", move(-1), "arrowup"),
+            Command("Select the next recording too", move(1, RANGE), "arrowdown", "shift"),
+            Command("Select the one before it too", move(-1, RANGE), "arrowup", "shift"),
+            Command("The next page of recordings", lambda: listed.turn(1), "pagedown"),
+            Command("The page of recordings before it", lambda: listed.turn(-1), "pageup"),
+            Command("Select this recording, or no longer", self._then_tell(listed.toggle_cursor), "X"),
+            Command(
+                "Select all recordings that are listed", self._then_tell(listed.select_all), "A", "cmd/ctrl"
+            ),
             Command("Open the selected recordings", lambda: self._run(actions["Open"]), "enter"),
             Command("Tag the selected recordings", lambda: self._run(actions["Tag"]), "T"),
             Command("Delete the selected recordings", lambda: self._run(actions["Delete"]), "delete"),
-            Command("Take back the last deletion", self._undo_delete, "Z"),
+            Command("Take back the last deletion", self._edits.undo_delete, "Z"),
         ]
-
-    def close(self) -> None:
-        """Close the window with a question, if there is one. For when the page goes."""
-        with self._lock:
-            if self._question is not None:
-                self._question.close()
 
     # --- drawing ---------------------------------------------------------------------------------------
 
-    def draw(self) -> None:
-        """Draw what has changed. To be called often; costs nothing while nothing has."""
+    def draw(self, _view: object = None) -> None:
+        """Draw what has changed. To be called often; costs nothing while nothing has.
+
+        Args:
+            _view: of the page that hosts it; not looked at.
+        """
         view = self._library.view()
-        with self._lock:
+        with self._lock, self._list.lock:
             if self._typed_at is not None and time.monotonic() - self._typed_at > TYPING:
                 self._typed_at = None
-                self._look_for(self._find.value, self._task)
-            rows = self._rows(view)
-            state = (self._arranged[0], self._first, self._selected, self._cursor, len(self._actions))
-            if not self._is_new("all", state):
+                self._list.look_for(self._find.value, self._list.task)
+            if not self._is_new("all", (view.serial, self._list.state(), len(self._actions))):
                 return
-            listed = {row.id for row in rows}
-            self._selected &= listed
-            if self._cursor not in listed:
-                self._cursor = None
-            self._first = min(self._first, max(0, (len(rows) - 1) // MOST_ROWS * MOST_ROWS))
-            page = rows[self._first : self._first + MOST_ROWS]
+            page = self._list.page(view)
             self._draw_filters(view)
-            self._draw_table(view, rows, page)
-            self._draw_tools(view, rows, page)
+            self._draw_table(view, page)
+            self._draw_tools(view, page)
             self._draw_marks(page)
             if self._is_new("trash", view.trash):
                 fill(self._trash, self._trash_html(view))
@@ -215,28 +206,18 @@ class LibraryPanel:
         self._drawn[part] = wanted
         return True
 
-    def _rows(self, view: LibraryView | None = None) -> list[LibraryRow]:
-        """What is listed, in its order."""
-        view = self._library.view() if view is None else view
-        key = (view.serial, self._words, self._outcome, self._task, self._column, self._descending)
-        if self._arranged[0] != key:
-            rows = chosen(view.rows, self._words, self._outcome, self._task)
-            self._arranged = (key, ordered(rows, self._column, self._descending))
-        return self._arranged[1]
-
     def _draw_filters(self, view: LibraryView) -> None:
-        if not self._is_new("filters", (view.serial, self._words, self._task, self._outcome)):
+        listed = self._list
+        if not self._is_new("filters", (view.serial, listed.words, listed.task, listed.outcome)):
             return
         tasks = tuple(sorted({row.task for row in view.rows if row.task}))
-        options = (ALL_TASKS, *tasks)
-        if self._tasks.options != options:
-            self._tasks.options = options
-            self._tasks.value = ALL_TASKS if self._task is None else self._task
-            if self._task not in tasks:
-                self._task, self._tasks.value = None, ALL_TASKS
+        if self._tasks.options != (ALL_TASKS, *tasks):
+            listed.look_for(listed.words, listed.task)  # its task may have gone
+            self._tasks.options = (ALL_TASKS, *tasks)
+            self._tasks.value = ALL_TASKS if listed.task is None else listed.task
         show(self._tasks, len(tasks) > 1)
         show(self._find, bool(view.rows))
-        others = chosen(view.rows, self._words, "all", self._task)
+        others = chosen(view.rows, listed.words, "all", listed.task)
         counts = {outcome: sum(has_outcome(row, outcome) for row in others) for outcome in OUTCOMES}
         done, total = view.reading or (0, 0)
         fill(
@@ -255,18 +236,18 @@ class LibraryPanel:
                         "name": outcome,
                         "hint": MEANS[outcome],
                         "count": counts[outcome],
-                        "on": outcome == self._outcome,
-                        "press": self._press(outcome, lambda outcome=outcome: self._choose_outcome(outcome)),
+                        "on": outcome == listed.outcome,
+                        "press": self._press(outcome, lambda outcome=outcome: listed.choose(outcome)),
                     }
                     for outcome in OUTCOMES
-                    if outcome != "broken" or counts["broken"] or self._outcome == "broken"
+                    if outcome != "broken" or counts["broken"] or listed.outcome == "broken"
                 ]
                 if view.rows
                 else [],
             ),
         )
 
-    def _draw_table(self, view: LibraryView, rows: Sequence[LibraryRow], page: Sequence[LibraryRow]) -> None:
+    def _draw_table(self, view: LibraryView, page: Sequence[LibraryRow]) -> None:
         now = datetime.datetime.now().astimezone()
         newest = newest_sources(view.rows)
         here = {row.task: newest.get(row.task) for row in page}
@@ -274,9 +255,9 @@ class LibraryPanel:
             page,
             here,
             bool(view.rows),
-            view.reading is None,
-            self._column,
-            self._descending,
+            self._none_so(view),
+            self._list.column,
+            self._list.descending,
             now.date(),
         )
         if not self._is_new("table", wanted):
@@ -308,13 +289,14 @@ class LibraryPanel:
         if view.problem is not None or view.reading is not None:
             return ""
         return (
-            f"There are no recordings in {self._library.folder} yet. Those that are made there, on the Episodes tab of "
+            f"There are no recordings in {self._folder} yet. Those that are made there, on the Episodes tab of "
             "a task or with workbench record, appear here."
         )
 
     def _head(self, column: Column) -> dict[str, str]:
-        arrow = "" if column != self._column else " ↓" if self._descending else " ↑"
-        press = self._press(("sort", column), lambda: self._choose_column(column))
+        listed = self._list
+        arrow = "" if column != listed.column else " ↓" if listed.descending else " ↑"
+        press = self._press(("sort", column), lambda: listed.sort_by(column))
         return {
             "name": column,
             "arrow": arrow,
@@ -322,15 +304,24 @@ class LibraryPanel:
             "hint": f"{HINTS[column]}. Press to sort by it",
         }
 
-    def _draw_tools(self, view: LibraryView, rows: Sequence[LibraryRow], page: Sequence[LibraryRow]) -> None:
-        count = len(self._selected)
-        wanted = (count, len(rows), self._first, len(page), bool(view.rows), len(self._actions))
+    def _draw_tools(self, view: LibraryView, page: Sequence[LibraryRow]) -> None:
+        listed, rows = self._list, self._list.rows(view)
+        count, first = len(listed.selected), listed.first
+        wanted = (
+            count,
+            len(rows),
+            first,
+            len(page),
+            bool(view.rows),
+            len(self._actions),
+            bool(view.trash.files),
+        )
         if not self._is_new("tools", wanted):
             return
-        if not view.rows:
+        if not view.rows and not view.trash.files:
             fill(self._tools, "")
             return
-        last = self._first + len(page)
+        last = first + len(page)
         fill(
             self._tools,
             render(
@@ -347,36 +338,39 @@ class LibraryPanel:
                     }
                     for k, action in enumerate(self._actions)
                 ],
-                summary=f"{count} selected" if count else "Press a row to select it",
+                summary=f"{count} selected" if count else "Press a row to select it" if rows else "",
                 count=len(rows),
-                all=self._press("all", self._select_all) if count < len(rows) else "",
+                all=self._press("all", self._then_tell(listed.select_all)) if count < len(rows) else "",
                 none=self._press("none", lambda: self.select(())) if count else "",
+                undo=self._press("undo", self._edits.undo_delete) if view.trash.files else "",
                 pages=None
                 if len(rows) <= MOST_ROWS
                 else {
-                    "first": self._first + 1,
+                    "first": first + 1,
                     "last": last,
                     "of": len(rows),
-                    "back": self._press("back", lambda: self._turn(-1)) if self._first else "",
-                    "on": self._press("on", lambda: self._turn(1)) if last < len(rows) else "",
+                    "back": self._press("back", lambda: listed.turn(-1)) if first else "",
+                    "on": self._press("on", lambda: listed.turn(1)) if last < len(rows) else "",
                 },
             ),
         )
 
     def _draw_marks(self, page: Sequence[LibraryRow]) -> None:
-        selected = [self._number(row.id) for row in page if row.id in self._selected]
-        cursor = None if self._cursor is None else self._number(self._cursor)
+        listed = self._list
+        selected = [self._number(row.id) for row in page if row.id in listed.selected]
+        cursor = None if listed.cursor is None else self._number(listed.cursor)
         if self._is_new("marks", (selected, cursor)):
-            content = render("library_marks", selected=selected, cursor=cursor, follow=self._follow)
-            fill(self._marks, content)
+            fill(
+                self._marks,
+                render("library_marks", selected=selected, cursor=cursor, follow=listed.follow),
+            )
 
     def _trash_html(self, view: LibraryView) -> str:
         return render(
             "library_trash",
             files=view.trash.files,
             size=size_in_words(view.trash.size),
-            undo=self._press("undo", self._undo_delete),
-            empty=self._press("empty", self._ask_empty),
+            empty=self._press("empty", self._edits.ask_empty),
         )
 
     def _number(self, id: str) -> int:
@@ -391,85 +385,29 @@ class LibraryPanel:
     def _press(self, key: object, do: Callable[[], None]) -> str:
         return self._presses.id_of(("library", key), lambda _client: do())
 
+    def _then_tell(self, do: Callable[[], None]) -> Callable[[], None]:
+        def done() -> None:
+            do()
+            self._tell()
+
+        return done
+
     def _on_row(self, sent: int, _client: viser.ClientHandle | None) -> None:
         number, held = divmod(sent, 8)
         with self._lock:
-            if not 1 <= number <= len(self._ids):
-                return
-            id = self._ids[number - 1]
-            if id not in {row.id for row in self._rows()}:
-                return
-            self._take(id, held & (TOGGLE | RANGE))
+            id = self._ids[number - 1] if 1 <= number <= len(self._ids) else None
+        if id is None or not self._list.press(id, held & (TOGGLE | RANGE)):
+            return
         self._tell()
         if held & OPEN:
             self._run(self._actions[0])
-
-    def _take(self, id: str, held: int, follow: bool = False) -> None:
-        """Select as lists of files do: alone, with control this one too, with shift all from the last one on."""
-        if held & RANGE and self._anchor is not None:
-            order = [row.id for row in self._rows()]
-            if self._anchor in order:
-                a, b = sorted((order.index(self._anchor), order.index(id)))
-                between = frozenset(order[a : b + 1])
-                self._selected = between | self._selected if held & TOGGLE else between
-                self._cursor, self._follow = id, follow
-                return
-        if held & TOGGLE:
-            self._selected = self._selected ^ {id}
-        else:
-            self._selected = frozenset((id,))
-        self._cursor, self._anchor, self._follow = id, id, follow
-
-    def _move(self, by: int, held: int = 0) -> None:
-        with self._lock:
-            order = [row.id for row in self._rows()]
-            if not order:
-                return
-            if self._cursor in order:
-                place = min(max(order.index(self._cursor) + by, 0), len(order) - 1)
-            else:
-                place = self._first
-            self._take(order[place], held, follow=True)
-            self._first = place // MOST_ROWS * MOST_ROWS
-        self._tell()
-
-    def _turn(self, by: int) -> None:
-        with self._lock:
-            last = max(0, (len(self._rows()) - 1) // MOST_ROWS * MOST_ROWS)
-            self._first = min(max(0, self._first + by * MOST_ROWS), last)
-
-    def _toggle_cursor(self) -> None:
-        with self._lock:
-            if self._cursor is not None:
-                self._take(self._cursor, TOGGLE)
-        self._tell()
-
-    def _select_all(self) -> None:
-        self.select(row.id for row in self._rows())
-
-    def _choose_column(self, column: Column) -> None:
-        with self._lock:
-            self._descending = not self._descending if column == self._column else begins_descending(column)
-            self._column, self._first = column, 0
-
-    def _choose_outcome(self, outcome: Outcome) -> None:
-        with self._lock:
-            self._outcome, self._first = outcome, 0
 
     def _on_typed(self) -> None:
         with self._lock:
             self._typed_at = time.monotonic()
 
     def _on_task(self) -> None:
-        with self._lock:
-            # What a page sends may be anything: only a task of the table is one.
-            tasks = {row.task for row in self._library.rows()}
-            self._look_for(self._words, self._tasks.value if self._tasks.value in tasks else None)
-
-    def _look_for(self, words: object, task: str | None) -> None:
-        words = words[:LONGEST_WORDS] if isinstance(words, str) else ""
-        if (words, task) != (self._words, self._task):
-            self._words, self._task, self._first = words, task, 0
+        self._list.look_for(self._list.words, self._tasks.value)
 
     def _tell(self) -> None:
         """Say which are selected, if others are."""
@@ -486,98 +424,20 @@ class LibraryPanel:
     def _run(self, action: Action) -> None:
         ids = self.selected()
         if not ids:
-            self._notify("Nothing is selected", f"Select a recording to {action.label.lower()} it.")
+            self._edits.notify("Nothing is selected", f"Select a recording to {action.label.lower()} it.")
         elif action.most is not None and len(ids) > action.most:
-            self._notify(f"{len(ids)} are selected", f"{action.label} takes at most {action.most} at once.")
+            self._edits.notify(
+                f"{len(ids)} are selected", f"{action.label} takes at most {action.most} at once."
+            )
         else:
             action.run(ids)
 
-    def _ask(self, make: Callable[[], Question]) -> None:
-        with self._lock:
-            if self._question is not None:
-                self._question.close()
-            self._question = make()
-
-    def _ask_tags(self, ids: tuple[str, ...]) -> None:
-        rows = self._rows_of(ids)
-        if not rows:
-            return
-        shared = [tag for tag in rows[0].tags if all(tag in row.tags for row in rows)]
-
-        def answered(typed: str) -> None:
-            tags = clean_tags(typed.split(","))
-            removed = [tag for tag in shared if tag not in tags]
-            self._do(lambda: self._library.set_tags(ids, [tag for tag in tags if tag not in shared], removed))
-
-        known = sorted({tag for row in self._library.rows() for tag in row.tags})
-        explained = "Words, with commas between them."
-        if len(rows) > 1:
-            explained += " Those that all of them have stand here; others that they have stay."
-        if known:
-            explained += f" In use: {', '.join(known[:12])}."
-        names = [row.name for row in rows]
-        self._ask(lambda: ask_text(self._server, "Tags", explained, names, ", ".join(shared), answered))
-
-    def _ask_note(self, ids: tuple[str, ...]) -> None:
-        rows = self._rows_of(ids)
-        if not rows:
-            return
-        notes = {row.note for row in rows}
-        explained = "" if len(notes) == 1 else "They have different notes; this one takes their place."
-        names = [row.name for row in rows]
-        value = notes.pop() if len(notes) == 1 else ""
-
-        def answered(typed: str) -> None:
-            self._do(lambda: self._library.set_note(ids, typed[:LONGEST_NOTE]))
-
-        self._ask(lambda: ask_text(self._server, "Note", explained, names, value, answered))
-
-    def _ask_delete(self, ids: tuple[str, ...]) -> None:
-        rows = self._rows_of(ids)
-        if not rows:
-            return
-        self._ask(
-            lambda: ask_whether(
-                self._server,
-                "Delete recordings",
-                f"Delete {in_words(rows)}?",
-                [row.name for row in rows],
-                "All their files go to the folder .trash in the library, and can be taken back from there.",
-                "Delete",
-                lambda: self._do(lambda: self._library.delete(ids)),
-            )
-        )
-
-    def _ask_empty(self) -> None:
-        trash = self._library.view().trash
-        self._ask(
-            lambda: ask_whether(
-                self._server,
-                "Empty the trash",
-                f"Delete {trash.files} files ({size_in_words(trash.size)}) for good?",
-                [],
-                "This cannot be undone.",
-                "Delete for good",
-                lambda: self._do(self._library.empty_trash),
-            )
-        )
-
-    def _undo_delete(self) -> None:
-        self._do(self._library.undo_delete)
-
-    def _rows_of(self, ids: Sequence[str]) -> list[LibraryRow]:
-        rows = (self._library.row(id) for id in ids)
-        return [row for row in rows if row is not None]
-
-    def _do(self, work: Callable[[], object]) -> None:
-        try:
-            work()
-        except LibraryError as error:
-            self._notify("Not possible", str(error))
-
-    def _notify(self, title: str, body: str) -> None:
-        for client in self._server.get_clients().values():
-            client.add_notification(title, body, color="orange", auto_close_seconds=8.0)
+    def _on_asking(self, asking: bool) -> None:
+        # viser's keys come before a focused button's: Enter on Cancel would open a recording.
+        for key in self._keys:
+            key.disabled = asking
+        for key in self._escapes:
+            key.disabled = not asking
 
 
 def data_address_of_jpeg(jpeg: bytes | None) -> str:

@@ -171,10 +171,16 @@ def cells(row: LibraryRow, newest: dict[str, str], now: datetime.datetime) -> Ce
         name=row.name,
         about=", ".join(part for part in about if part),
         problem=row.problem or "",
-        remark="cut short"
-        if row.facts.recovered
-        else {"workbench": "", "maniskill": "ManiSkill", "rrd only": ".rrd only"}[row.kind],
+        remark=_remark(row),
     )
+
+
+def _remark(row: LibraryRow) -> str:
+    if row.facts.recovered:
+        return "cut short"
+    if row.kind == "workbench" or row.problem:
+        return ""
+    return {"maniskill": "ManiSkill", "rrd only": ".rrd only"}.get(row.kind, row.kind)
 
 
 def _outcome(row: LibraryRow) -> str:

@@ -70,10 +70,9 @@ class Presses:
                 number = self._server.gui.add_number("·", 0)
 
             def typed(event: viser.GuiEvent[viser.GuiNumberHandle[int]]) -> None:
-                value = event.target.value
-                plain = isinstance(value, (int, float)) and not isinstance(value, bool)
-                if event.client is not None and plain and 0 <= value < 2**53:
-                    pressed(int(value) % NUMBERS, event.client)
+                sent = number_of(event.target.value)
+                if event.client is not None and sent is not None:
+                    pressed(sent, event.client)
 
             number.on_update(typed)
             self._ids[key] = element_id(number)
@@ -100,6 +99,13 @@ class Presses:
             number.on_update(typed)
             self._ids[key] = element_id(number)
         return self._ids[key]
+
+
+def number_of(sent: object) -> int | None:
+    """What ``choosable.html`` sends, without its running part; None for anything that it does not send."""
+    if isinstance(sent, bool) or not isinstance(sent, (int, float)) or not 0 <= sent < 2**53:
+        return None
+    return int(sent) % NUMBERS
 
 
 def place_of(number: object) -> tuple[float, float] | None:

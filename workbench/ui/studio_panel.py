@@ -45,6 +45,7 @@ from workbench.ui.presses import Presses
 
 NOBODY = "none"
 SNAPS = {"none": Snap(), "1 cm, 5°": Snap(0.01, 5.0), "5 cm, 15°": Snap(0.05, 15.0)}
+SCALES = {"own size": 1.0, "¼": 0.25, "½": 0.5, "× 2": 2.0}
 STEP = 0.01
 """Metres by which a key moves the camera."""
 TURN = 1.0
@@ -156,7 +157,7 @@ class StudioPanel:
             fill(self._facts, self._facts_of(chosen, view))
         if camera is not None:
             fill(self._tools, self._tools_of(camera, studio))
-            fill(self._handles, self._handles_of())
+            fill(self._handles, self._handles_of(studio.quick_scale))
 
     def _draw_choice(self, view: SessionView) -> None:
         studio = view.studio
@@ -187,6 +188,10 @@ class StudioPanel:
     def _draw_picture(self, view: SessionView) -> None:
         key = view.studio.selected
         picture = None if key is None else view.pictures.get(key)
+        if view.studio.quick_scale != 1.0:
+            picture = view.studio.quick
+            if view.studio.wants_quick:
+                self._session.studio.look()
         if picture is not None and (picture.env != view.selected_env or picture.rgb is None):
             picture = None
         if self._picture is not None:
@@ -218,7 +223,10 @@ class StudioPanel:
             varies=VARIES if info.varies else "",
             hint=IN_ITS_EYE if self._in_its_eye else "",
             problem=view.studio.problem,
-            took=f"{view.picture_milliseconds:.0f}" if view.picture_milliseconds else "",
+            took=f"{view.picture_milliseconds:.0f}"
+            if view.picture_milliseconds and view.studio.quick_scale == 1.0
+            else "",
+            quick=_quick_words(camera, view.studio.quick_scale),
         )
 
     def _tools_of(self, camera: StudioCamera, studio: StudioView) -> str:
@@ -270,8 +278,9 @@ class StudioPanel:
         ]
         return render("studio_tools", rows=rows)
 
-    def _handles_of(self) -> str:
-        """What is dragged in the view, along which axes, in which steps."""
+    def _handles_of(self, scale: float) -> str:
+        """What is dragged in the view, along which axes, in which steps; and how large the picture above is."""
+        studio = self._session.studio
         rows = [
             [
                 {"label": "Drag"},
@@ -316,6 +325,21 @@ class StudioPanel:
                         name, "Of what is dragged.", f"snap {name}", self._sets(snap=snap), self._snap == snap
                     )
                     for name, snap in SNAPS.items()
+                ),
+            ],
+            [
+                {"label": "Picture"},
+                *(
+                    self._tool(
+                        name,
+                        "In the camera's own size."
+                        if of == 1
+                        else "The picture above in another size, for a quick look. The camera keeps its own.",
+                        f"quick {name}",
+                        lambda _, of=of: studio.set_quick_scale(of),
+                        scale == of,
+                    )
+                    for name, of in SCALES.items()
                 ),
             ],
         ]
@@ -403,3 +427,13 @@ class StudioPanel:
 def _placed(camera: StudioCamera) -> CameraSettings:
     assert camera.now is not None
     return camera.now
+
+
+def _quick_words(camera: StudioCamera, scale: float) -> str:
+    if scale == 1.0 or camera.now is None:
+        return ""
+    width, height = round(camera.now.width * scale), round(camera.now.height * scale)
+    return (
+        f"The picture is {width} × {height} for a quick look; the camera stays {camera.now.width} × "
+        f"{camera.now.height}, and only that is written."
+    )

@@ -12,6 +12,7 @@ import pytest
 from tests.authoring.camera_source.real_cameras import FILE, real_settings
 from tests.authoring.camera_source.shapes import WRITTEN
 from workbench.authoring.camera_source import Refusal, SourceEdit, apply, plan_edit, revert
+from workbench.authoring.camera_source.result import FileChange
 from workbench.authoring.modules import decode
 
 SOURCE = WRITTEN["an argument a line, with remarks"]
@@ -42,6 +43,23 @@ def test_line_ends_encoding_and_mode_stay(tmp_path: Path, encoding: str, end: st
     assert revert(edit) is None
     assert path.read_bytes() == old
     assert os.listdir(tmp_path) == ["task.py"]
+
+
+def test_two_files_are_changed_together_or_not_at_all(tmp_path: Path) -> None:
+    one, other = tmp_path / "one.py", tmp_path / "other.py"
+    one.write_text("a = 1\n")
+    other.write_text("b = 1\n")
+    edit = SourceEdit(
+        str(one), "a = 1\n", "a = 2\n", (), None, (FileChange(str(other), "b = 1\n", "b = 2\n"),)
+    )
+    assert apply(edit) is None
+    assert (one.read_text(), other.read_text()) == ("a = 2\n", "b = 2\n")
+    assert revert(edit) is None
+    assert (one.read_text(), other.read_text()) == ("a = 1\n", "b = 1\n")
+    other.write_text("b = 3\n")
+    refusal = apply(edit)
+    assert refusal is not None and "other.py was edited" in refusal.reason
+    assert (one.read_text(), other.read_text()) == ("a = 1\n", "b = 3\n")
 
 
 def test_mixed_line_ends_stay_where_they_are(tmp_path: Path) -> None:

@@ -195,12 +195,17 @@ def test_a_constant_that_another_file_reads_is_left_as_it_is() -> None:
     assert any("more.py" in note for note in plan.notes)
 
 
-def test_changes_of_two_files_are_refused() -> None:
+def test_a_change_of_two_files_is_one_plan_with_both() -> None:
     sources = {FILE: IMPORTING, "/author/places.py": PLACES}
     before = real_settings(sources, "cam")
     after = dataclasses.replace(higher(before), height=100)
     plan = plan_edit(sources, "cam", before, after)
-    assert isinstance(plan, Refusal) and "several files" in plan.reason
+    assert isinstance(plan, SourceEdit), plan
+    assert [change.file for change in plan.changes] == [FILE, "/author/places.py"]
+    assert "places.SIZE, 100, 1.0" in plan.new_text and "[0.5, 0, 0.75]" in plan.others[0].new_text
+    assert plan.diff.count("+++") == 2 and plan.notes[-1].startswith("2 files change together")
+    new = {change.file: change.new_text for change in plan.changes}
+    assert plan.settings == real_settings(sources | new, "cam")
 
 
 def test_what_an_argument_of_the_env_decides_is_left_alone_and_said() -> None:

@@ -1,5 +1,8 @@
 """An edit made on disk, or taken back: whole or not at all, and never over somebody else's newer text.
 
+Where an edit is of two files, both are looked at before the first is written, and if the second then fails the first is
+taken back.
+
 The author has the same file open in an editor and saves when they like. So the file must still have the text that
 the edit was planned on; it is replaced by a rename, which no reader sees half done; and what a text does not show
 stays as it was: line ends, encoding, byte order mark, permissions, a link that leads to the file.
@@ -18,7 +21,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from workbench.authoring.camera_source.find import check_own
-from workbench.authoring.camera_source.result import Refusal, Refused, SourceEdit
+from workbench.authoring.camera_source.result import FileChange, Refusal, Refused, SourceEdit
 from workbench.authoring.camera_source.source_file import BOM
 
 _LINES = re.compile(r"[^\r\n]*(?:\r\n|\r|\n|$)")
@@ -26,12 +29,13 @@ _LINES = re.compile(r"[^\r\n]*(?:\r\n|\r|\n|$)")
 
 def apply(edit: SourceEdit) -> Refusal | None:
     """Write the edit. None when it is done; the file is as it was when there is a reason why not."""
-    return _exchange(edit.file, edit.old_text, edit.new_text, "since the change was shown")
+    return _exchange_all(edit.changes, "since the change was shown")
 
 
 def revert(edit: SourceEdit) -> Refusal | None:
     """Take an applied edit back, as long as nothing else was changed in the file since."""
-    return _exchange(edit.file, edit.new_text, edit.old_text, "since the camera was written into it")
+    back = tuple(FileChange(change.file, change.new_text, change.old_text) for change in edit.changes)
+    return _exchange_all(back, "since the camera was written into it")
 
 
 def not_writable(path: str) -> str | None:
@@ -54,7 +58,25 @@ def not_writable(path: str) -> str | None:
     return None
 
 
-def _exchange(path: str, expected: str, wanted: str, since: str) -> Refusal | None:
+def _exchange_all(changes: tuple[FileChange, ...], since: str) -> Refusal | None:
+    for change in changes if len(changes) > 1 else ():
+        refusal = _exchange(change.file, change.old_text, None, since)
+        if refusal is not None:
+            return refusal
+    done: list[FileChange] = []
+    for change in changes:
+        refusal = _exchange(change.file, change.old_text, change.new_text, since)
+        if refusal is not None:
+            left = [made.file for made in done if _exchange(made.file, made.new_text, made.old_text, since)]
+            names = " and ".join(Path(path).name for path in left)
+            told = f"; {names} could not be put back, and has the change without the other" if left else ""
+            return Refusal(f"{refusal.reason}{told}")
+        done.append(change)
+    return None
+
+
+def _exchange(path: str, expected: str, wanted: str | None, since: str) -> Refusal | None:
+    """Put `wanted` in place of the text that is expected there; None only looks whether it could be."""
     reason = not_writable(path)
     if reason is not None:
         return Refusal(reason)
@@ -65,6 +87,8 @@ def _exchange(path: str, expected: str, wanted: str, since: str) -> Refusal | No
         text = raw.decode(encoding)
         if _plain(text) != _plain(expected):
             return Refusal(f"{real.name} was edited {since}, so it is left as it is; ask again")
+        if wanted is None:
+            return None
         new = _with_line_ends_of(text, wanted).encode(encoding)
         if not _replace(real, raw, new):
             return Refusal(

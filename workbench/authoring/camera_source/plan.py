@@ -28,7 +28,7 @@ from workbench.authoring.camera_source.read_camera import (
     readings,
     same_value,
 )
-from workbench.authoring.camera_source.result import Refusal, Refused, SourceEdit
+from workbench.authoring.camera_source.result import FileChange, Refusal, Refused, SourceEdit
 from workbench.authoring.camera_source.snippet import snippet
 from workbench.authoring.camera_source.source_file import Replacement, SourceFile
 from workbench.authoring.camera_source.values import Nothing, Number, PoseValue, Text, Vector
@@ -231,13 +231,16 @@ def _edit(
     files = {file.path: file for file, _ in changes.replacements}
     if not files:
         raise Refused("the change is smaller than what is written (0.1 mm, 0.01 degree)")
-    if len(files) > 1:
-        names = " and ".join(sorted(file.name for file in files.values()))
-        raise Refused(f"the change would be one of several files ({names})")
-    (file,) = files.values()
-    check_own(file.path)
-    new_text = file.replaced([change for _, change in changes.replacements])
-    found = _read_again(project, read, file, new_text, fields, before, after)
+    # The file that makes the camera first: it is what the author thinks of.
+    ordered = sorted(files.values(), key=lambda file: (file.path != read.call.file.path, file.path))
+    made: list[FileChange] = []
+    for file in ordered:
+        check_own(file.path)
+        new_text = file.replaced([change for of, change in changes.replacements if of.path == file.path])
+        made.append(FileChange(file.path, file.text, new_text))
+    if len(made) > 1:
+        changes.note(f"{len(made)} files change together: {' and '.join(file.name for file in ordered)}")
+    found = _read_again(project, read, made, fields, before, after)
     left = [n for n in FIELDS if n not in fields and n not in read.unknown and mismatch(read, n, before)]
     if left:
         changes.note(
@@ -246,11 +249,12 @@ def _edit(
         )
     settings = found.settings(before)
     return SourceEdit(
-        file=file.path,
-        old_text=file.text,
-        new_text=new_text,
+        file=made[0].file,
+        old_text=made[0].old_text,
+        new_text=made[0].new_text,
         notes=tuple(changes.notes),
         settings=_with(settings, before, left),
+        others=tuple(made[1:]),
     )
 
 
@@ -268,16 +272,15 @@ def _with(settings: CameraSettings, env: CameraSettings, names: list[str]) -> Ca
 def _read_again(
     project: Project,
     read: ReadCamera,
-    file: SourceFile,
-    new_text: str,
+    made: list[FileChange],
     fields: list[str],
     before: CameraSettings,
     after: CameraSettings,
 ) -> ReadCamera:
     """The camera as the new text has it. Raises `Refused` if it, or another camera, is not as it should be."""
-    changed = Project({**project.texts, file.path: new_text})
+    changed = Project({**project.texts, **{change.file: change.new_text for change in made}})
     result: ReadCamera | None = None
-    for path in {file.path, read.call.file.path}:
+    for path in {*(change.file for change in made), read.call.file.path}:
         old_calls = list(camera_calls(project, project.file(path)))
         new_calls = list(camera_calls(changed, changed.file(path)))
         if len(old_calls) != len(new_calls):

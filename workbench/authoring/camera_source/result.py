@@ -10,16 +10,12 @@ from workbench.core.camera_settings import CameraSettings
 
 
 @dataclass(frozen=True)
-class SourceEdit:
-    """A change of one file, not made yet: `workbench.authoring.camera_source.apply` makes it."""
+class FileChange:
+    """What one file says, and is to say."""
 
     file: str
     old_text: str
     new_text: str
-    notes: tuple[str, ...]
-    """Sentences for the author: what was done otherwise than they may expect."""
-    settings: CameraSettings | None
-    """What the new text gives the camera, rounded as it is written. None for a camera that was removed."""
 
     @property
     def diff(self) -> str:
@@ -29,6 +25,37 @@ class SourceEdit:
             self.old_text.splitlines(), self.new_text.splitlines(), name, name, lineterm=""
         )
         return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class SourceEdit:
+    """A change of the author's files, not made yet: `workbench.authoring.camera_source.apply` makes it."""
+
+    file: str
+    """The one that it is about; where a constant of another module is changed too, that is one of `others`."""
+    old_text: str
+    new_text: str
+    notes: tuple[str, ...]
+    """Sentences for the author: what was done otherwise than they may expect."""
+    settings: CameraSettings | None
+    """What the new text gives the camera, rounded as it is written. None for a camera that was removed."""
+    others: tuple[FileChange, ...] = ()
+    """Changes of further files, which are made and taken back along with it."""
+
+    @property
+    def changes(self) -> tuple[FileChange, ...]:
+        """Of every file, the one that it is about first."""
+        return (FileChange(self.file, self.old_text, self.new_text), *self.others)
+
+    @property
+    def names(self) -> str:
+        """Of the files, for a sentence."""
+        return " and ".join(PurePath(change.file).name for change in self.changes)
+
+    @property
+    def diff(self) -> str:
+        """Of every file, one after the other; see `FileChange.diff`."""
+        return "\n".join(change.diff for change in self.changes)
 
 
 @dataclass(frozen=True)

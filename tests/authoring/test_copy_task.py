@@ -1,0 +1,116 @@
+"""An installed task copied into a folder of the user's: what leaned on its place is said otherwise, all else is the same."""
+
+from __future__ import annotations
+
+import difflib
+from pathlib import Path
+
+import mani_skill.envs.tasks
+import pytest
+
+from workbench.authoring.copy_task import NoCopy, copied_text, copy_task
+
+TASKS = Path(mani_skill.envs.tasks.__path__[0])
+TEXT = '''"""A task."""
+
+from __future__ import annotations
+
+import os
+from ..base import Base, other
+from . import sibling
+from .deep.module import (
+    name,
+)
+
+
+@register_env("Näh-Task-v1", max_episode_steps=5)
+@utils.register_env(uid="Other", override=True)
+class Task(Base):
+    assets = f"{os.path.dirname(__file__)}/ä" + __file__
+'''
+COPIED = '''"""A task."""
+
+from __future__ import annotations
+
+import pack.sub.inner.task as installed_task  # its files lie there
+import os
+from pack.sub.base import Base, other
+from pack.sub.inner import sibling
+from pack.sub.inner.deep.module import (
+    name,
+)
+
+
+@register_env("MyNäh-Task2-v1", max_episode_steps=5)
+@utils.register_env(uid="MyOther2", override=True)
+class Task(Base):
+    assets = f"{os.path.dirname(installed_task.__file__)}/ä" + installed_task.__file__
+'''
+
+
+@pytest.fixture
+def installed(tmp_path: Path) -> Path:
+    inner = tmp_path / "site" / "pack" / "sub" / "inner"
+    inner.mkdir(parents=True)
+    for folder in (inner, inner.parent, inner.parent.parent):
+        (folder / "__init__.py").touch()
+    return inner / "task.py"
+
+
+def test_imports_ids_and_its_own_place_are_said_otherwise_and_nothing_else(installed: Path) -> None:
+    text, ids = copied_text(installed, TEXT, 2)
+    assert text == COPIED
+    assert ids == (("Näh-Task-v1", "MyNäh-Task2-v1"), ("Other", "MyOther2"))
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("from ....base import x", "beyond its package"),
+        ("@register_env(ENV_ID)\nclass Task: pass", "line 1 registers an id that is computed"),
+        ("class Task(:", "not valid Python"),
+    ],
+)
+def test_what_cannot_be_said_otherwise_is_refused(installed: Path, text: str, why: str) -> None:
+    with pytest.raises(NoCopy, match=why):
+        copied_text(installed, text)
+
+
+def test_a_file_in_no_package_has_nothing_to_import_from_or_to_find_beside_it(tmp_path: Path) -> None:
+    for text in ("from .base import x", "print(__file__)"):
+        with pytest.raises(NoCopy, match="line 1"):
+            copied_text(tmp_path / "task.py", text)
+
+
+def test_a_copy_is_never_written_over_another_file(installed: Path, tmp_path: Path) -> None:
+    installed.write_text(TEXT)
+    folder = tmp_path / "mine"
+    with pytest.raises(NoCopy, match="there is no folder"):
+        copy_task(installed, folder)
+    folder.mkdir()
+    (folder / "task.py").write_text("mine")
+    copied = copy_task(installed, folder)
+    assert copied.file == folder / "task_2.py" and copied.file.read_text() == COPIED
+    assert copy_task(installed, folder).file.name == "task_3.py"
+    assert (folder / "task.py").read_text() == "mine"
+    assert sorted(path.name for path in folder.iterdir()) == ["task.py", "task_2.py", "task_3.py"]
+
+
+def test_every_file_of_maniskills_tasks_is_copied_with_few_lines_changed_or_refused_with_a_reason() -> None:
+    copied = refused = 0
+    for file in sorted(TASKS.rglob("*.py")):
+        text = file.read_text()
+        if "register_env(" not in text or file.name == "__init__.py":
+            continue
+        try:
+            new, ids = copied_text(file, text)
+        except NoCopy as reason:
+            assert "line" in str(reason)
+            refused += 1
+            continue
+        compile(new, str(file), "exec")
+        assert ids and "from ." not in new
+        changed = [line for line in difflib.ndiff(text.splitlines(), new.splitlines()) if line[:1] in "+-"]
+        assert len(changed) <= 2 * (len(ids) + text.count("__file__") + text.count("from .") + 1)
+        copied += 1
+    assert copied > 40 and refused < 3, (copied, refused)

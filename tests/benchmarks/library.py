@@ -1,0 +1,194 @@
+"""How long a library takes to its first screen: python tests/benchmarks/library.py
+
+Makes a folder of real recordings (one that `EpisodeWriter` wrote, with a camera; the others are copies with ids, seeds,
+dates and versions of their own, whose .h5 and .rrd are links to the first one's) and opens it as the review does: a
+`Library` that is watched and its panel on a viser server, drawn thirty times a second. Each opening is in a process of
+its own. Printed: milliseconds from making the `Library` to the first full page of rows in the table, and until
+everything is read, without an index and with one; then of a second look, and of the first screen in Chromium (from
+the address to the rows, viser's own page included).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+import uuid
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+
+@dataclass
+class Options:
+    recordings: int = 2000
+    repeats: int = 3
+    browser: bool = False
+    """Measure the page in Chromium too."""
+    folder: Path | None = None
+    """Keep what is made there for the next time."""
+    one: bool = False
+    """Open `folder` once, print what it took as JSON, and end: for the program itself."""
+
+
+def write_one(folder: Path) -> Path:
+    """A recording of 50 steps of a scene of two bodies with one camera; returns its ``.json``."""
+    from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
+    from workbench.core.pictures import CameraInfo, Picture
+    from workbench.recording.episode import EpisodeInfo
+    from workbench.recording.episode_writer import EpisodeWriter
+    from workbench.recording.row import EpisodeRow
+
+    rng = np.random.default_rng(0)
+    corner = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.uint32))
+    both = np.array([0, 1], np.int32)
+    visual = Visual("box", corner, Material((1.0, 0.5, 0.0, 1.0)), np.zeros(2, np.int32), both)
+    geometry = SceneGeometry(1, ("floor", "cube"), ("static", "dynamic"), (False, False), (visual,))
+    source = (Path(__file__).parents[2] / "tasks" / "push_cube.py").read_text()
+    info = EpisodeInfo(
+        task="PushCube-v1",
+        env_index=0,
+        seed=0,
+        source_file=None,
+        source_hash="0" * 12,
+        source={"push_cube.py": source},
+        control_dt=0.05,
+        control_mode="pd_joint_delta_pos",
+        backend="cpu",
+    )
+    camera = CameraInfo(
+        "base", "sensor", 128, 128, 1.0, 0.01, 10.0, np.eye(3, dtype=np.float32), None, ("rgb",)
+    )
+    writer = EpisodeWriter(folder, info, geometry, {}, ("x", "y"), (camera,))
+    poses = np.tile(np.array([0, 0, 0, 1, 0, 0, 0], np.float32), (2, 1))
+    noise = rng.integers(0, 255, (8, 8, 3), dtype=np.uint8).repeat(16, 0).repeat(16, 1)
+    for step in range(51):
+        picture = Picture("base", "sensor", 0, poses[0], noise)
+        action = None if step == 0 else np.zeros(2, np.float32)
+        done = np.array(step == 50)
+        writer.append(EpisodeRow(poses, {"success": done}, action=action, reward=0.1, pictures=(picture,)))
+    return writer.finish().json
+
+
+def make(folder: Path, count: int) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    first = write_one(folder)
+    whole = json.loads(first.read_text())
+    rng = random.Random(0)
+    for k in range(1, count):
+        stem = folder / f"PushCube-v1_seed{k:04d}_env00_copy"
+        changed: dict[str, Any] = {
+            "id": uuid.UUID(int=rng.getrandbits(128)).hex,
+            "seed": k,
+            "written_at": f"2026-{1 + k % 12:02}-{1 + k % 28:02}T{k % 24:02}:{k % 60:02}:00+00:00",
+            "return": rng.random() * 50,
+            "success": rng.random() < 0.5,
+            "source_hash": f"{k * 5 // count:012}",
+            "tags": ["good"] if k % 7 == 0 else [],
+        }
+        stem.with_suffix(".json").write_text(json.dumps({**whole, "workbench": whole["workbench"] | changed}))
+        for suffix in (".h5", ".rrd"):
+            os.link(first.with_suffix(suffix), stem.with_suffix(suffix))
+
+
+def open_once(folder: Path, count: int, browser: bool) -> dict[str, float]:
+    import viser
+
+    from workbench.recording.library import Library
+    from workbench.ui.fragments import style_sheet
+    from workbench.ui.library_list import MOST_ROWS
+    from workbench.ui.library_panel import LibraryPanel
+
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    server.gui.add_html(style_sheet())
+    began = time.perf_counter()
+    library = Library(folder)
+    library.watch()
+    panel = LibraryPanel(server, library, lambda ids: None)
+    said: dict[str, float] = {}
+    draws: list[float] = []
+    wanted = min(MOST_ROWS, count)
+    while "all" not in said:
+        at = time.perf_counter()
+        panel.draw()
+        draws.append(time.perf_counter() - at)
+        view = library.view()
+        if "first" not in said and panel._table.content.count("<tbody") == wanted:
+            said["first"] = 1e3 * (time.perf_counter() - began)
+        if view.reading is None and len(view.rows) == count:
+            said["all"] = 1e3 * (time.perf_counter() - began)
+            panel.draw()
+        time.sleep(1 / 30)
+    said["page KB"] = len(panel._table.content) / 1e3
+    said["longest draw"] = 1e3 * max(draws)
+    at = time.perf_counter()
+    library.refresh()
+    said["look again"] = 1e3 * (time.perf_counter() - at)
+    if browser:
+        said["Chromium"] = in_chromium(server.get_port())
+    library.close()
+    server.stop()
+    return said
+
+
+def in_chromium(port: int) -> float:
+    from playwright.sync_api import sync_playwright
+
+    from tests.browser.opened import launch, new_page
+    from workbench.machine.chromium import find_chromium, how_to_get_chromium
+
+    chromium = find_chromium()
+    if chromium is None:
+        sys.exit(how_to_get_chromium())
+    with sync_playwright() as playwright:
+        page, _ = new_page(launch(playwright, chromium))
+        began = time.perf_counter()
+        page.goto(f"http://127.0.0.1:{port}")
+        page.wait_for_selector(".wb-library tbody:nth-of-type(50)")
+        return 1e3 * (time.perf_counter() - began)
+
+
+def measure(folder: Path, options: Options) -> dict[str, float]:
+    command = [sys.executable, __file__, "--one", "--folder", str(folder)]
+    command += ["--recordings", str(options.recordings), *(["--browser"] if options.browser else [])]
+    return json.loads(
+        subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1]
+    )
+
+
+def main(options: Options) -> None:
+    if options.one:
+        assert options.folder is not None
+        print(json.dumps(open_once(options.folder, options.recordings, options.browser)))
+        return
+    with tempfile.TemporaryDirectory() as made:
+        folder = options.folder or Path(made) / "recordings"
+        if not folder.exists():
+            began = time.perf_counter()
+            make(folder, options.recordings)
+            print(f"{options.recordings} recordings made in {time.perf_counter() - began:.1f} s")
+        index = folder / ".workbench" / "library.sqlite"
+        for name in ("without an index", "with an index"):
+            runs = []
+            for _ in range(options.repeats):
+                if name == "without an index":
+                    index.unlink(missing_ok=True)
+                runs.append(measure(folder, options))
+            keys = runs[0].keys()
+            print(
+                f"{name}: " + ", ".join(f"{k} {statistics.median(run[k] for run in runs):.0f}" for k in keys)
+            )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

@@ -1,0 +1,160 @@
+"""The table of recordings in a real Chromium, used as a person uses it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import pytest
+import viser
+from playwright.sync_api import Locator, Page, expect, sync_playwright
+
+from tests.browser.opened import launch, new_page, until
+from tests.recording.library_files import describe
+from workbench.recording.library import Library
+from workbench.ui.commands import register
+from workbench.ui.fragments import style_sheet
+from workbench.ui.library_panel import LibraryPanel
+
+pytestmark = pytest.mark.browser
+COUNT = 60
+
+
+@dataclass
+class Shown:
+    page: Page
+    panel: LibraryPanel
+    library: Library
+    opened: list[tuple[str, ...]]
+
+    def row(self, place: int) -> Locator:
+        return self.page.locator(".wb-library tbody[data-row]").nth(place)
+
+    def seeds(self) -> list[int]:
+        """Of the rows that are listed, as the page has them."""
+        script = "() => [...document.querySelectorAll('.wb-library tbody')].map(b => +b.rows[0].cells[4].innerText)"
+        return self.page.evaluate(script)
+
+    def selects(self, *seeds: int) -> None:
+        ids = tuple(f"id{seed:02}" for seed in seeds)
+        until(lambda: self.panel.selected() == ids, f"{seeds} selected")
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Iterator[Shown]:
+    folder = tmp_path_factory.mktemp("recordings")
+    for k in range(COUNT):
+        when = f"2026-11-21T10:{k:02}:00"
+        describe(folder, f"r{k:02}", id=f"id{k:02}", seed=k, written_at=when, tags=["even"] * (k % 2 == 0))
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    server.gui.add_html(style_sheet())
+    library, opened = Library(folder), []
+    library.watch()
+    window = server.gui.add_panel()
+    with window.add_tab("Library"):
+        panel = LibraryPanel(server, library, opened.append)
+    register(server, panel.commands())
+    window.dock_left()
+    window.set_width(520)
+    stopping = threading.Event()
+
+    def draw() -> None:
+        while not stopping.wait(1 / 30):
+            panel.draw()
+
+    drawing = threading.Thread(target=draw, daemon=True)
+    drawing.start()
+    with sync_playwright() as playwright:
+        browser = launch(playwright, chromium_path)
+        page, errors = new_page(browser)
+        page.set_default_timeout(15_000)
+        page.goto(f"http://127.0.0.1:{server.get_port()}")
+        page.wait_for_selector(".wb-library tbody")
+        yield Shown(page, panel, library, opened)
+        assert not errors
+        browser.close()
+    stopping.set()
+    drawing.join()
+    library.close()
+    server.stop()
+
+
+def test_rows_are_selected_by_mouse_and_keys_and_opened(shown: Shown) -> None:
+    assert shown.seeds()[:2] == [59, 58]
+    shown.row(1).click()
+    shown.selects(58)
+    shown.row(3).click(modifiers=["Shift"])
+    shown.selects(58, 57, 56)
+    shown.row(5).locator(".wb-tick").click()
+    shown.selects(58, 57, 56, 54)
+    shown.row(2).click(modifiers=["Control"])
+    shown.selects(58, 56, 54)
+    # Marked without the table being sent again: the same element is there, and coloured.
+    expect(shown.row(5)).to_have_css("background-color", "rgba(34, 139, 230, 0.22)")
+    expect(shown.row(4)).not_to_have_css("background-color", "rgba(34, 139, 230, 0.22)")
+    shown.page.keyboard.press("Enter")
+    until(lambda: shown.opened == [("id58", "id56", "id54")], "opened")
+    shown.row(0).dblclick()
+    until(lambda: shown.opened[1:] == [("id59",)], "opened by pressing twice")
+
+
+def test_keys_walk_down_and_the_page_scrolls_along(shown: Shown) -> None:
+    shown.row(0).click()
+    shown.selects(59)
+    for seed in range(58, 39, -1):
+        shown.page.keyboard.press("ArrowDown")
+        shown.selects(seed)
+    expect(shown.row(19)).to_be_in_viewport(ratio=0.95)
+    expect(shown.page.locator(".wb-library-tools")).to_be_in_viewport(ratio=0.95)
+    shown.page.keyboard.press("PageDown")
+    until(lambda: len(shown.seeds()) == COUNT - 50, "the second page")
+    shown.page.keyboard.press("PageUp")
+    until(lambda: shown.seeds()[0] == 59, "the first page")
+
+
+def test_words_are_looked_for_as_they_are_typed(shown: Shown) -> None:
+    field = shown.page.get_by_role("textbox").first
+    field.fill("even r1")
+    until(lambda: shown.seeds() == [18, 16, 14, 12, 10], "what has those words")
+    field.fill("")
+    until(lambda: len(shown.seeds()) == 50, "all of them")
+
+
+def test_a_recording_is_tagged_and_deleted_and_comes_back(shown: Shown) -> None:
+    page = shown.page
+    page.locator("[data-press]", has_text="seed").first.click()
+    until(lambda: shown.seeds()[0] == 0, "sorted by seed")
+    shown.row(1).click()
+    shown.selects(1)
+    page.keyboard.press("t")
+    save = page.get_by_role("button", name="Save")
+    expect(save).to_be_visible()
+    page.get_by_role("dialog").get_by_role("textbox").fill("wobbly, good")
+    page.wait_for_timeout(100)  # viser sends the last of two messages within 50 ms
+    page.keyboard.press("Enter")
+    expect(shown.row(1).locator(".wb-library-tag")).to_have_text(["wobbly", "good"])
+    expect(save).to_be_hidden()
+    page.keyboard.press("Delete")
+    expect(page.get_by_text("Delete 1 recording (3 files")).to_be_visible()
+    # While it is asked, Enter is the button's that has the focus, and opens no recording.
+    opened = len(shown.opened)
+    page.get_by_role("button", name="Cancel").focus()
+    page.keyboard.press("Enter")
+    expect(page.get_by_text("Delete 1 recording (3 files")).to_be_hidden()
+    assert len(shown.opened) == opened and len(shown.library.rows()) == COUNT
+    page.keyboard.press("Delete")
+    expect(page.get_by_text("Delete 1 recording (3 files")).to_be_visible()
+    page.keyboard.press("Escape")
+    expect(page.get_by_text("Delete 1 recording (3 files")).to_be_hidden()
+    page.keyboard.press("Delete")
+    page.get_by_role("button", name="Delete", exact=True).click()
+    until(lambda: shown.seeds()[:2] == [0, 2], "one row fewer")
+    page.locator("[data-press]", has_text="undo delete").click()
+    until(lambda: shown.seeds()[:2] == [0, 1], "the row again")
+
+
+def test_a_new_recording_appears_by_itself(shown: Shown) -> None:
+    describe(shown.library.folder, "new", id="new", seed=99, written_at="2026-11-21T12:00:00")
+    shown.page.locator("[data-press]", has_text="date").first.click()
+    until(lambda: shown.seeds()[0] == 99, "the new row")

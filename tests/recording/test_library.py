@@ -1,0 +1,515 @@
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import mani_skill.envs  # noqa: F401  (registers the tasks)
+import numpy as np
+import pytest
+import rerun as rr
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mani_skill.utils.wrappers.record import RecordEpisode
+
+from tests.recording.library_files import describe, jpeg
+from tests.recording.made import Made
+from workbench.recording.library import Library, LibraryError
+from workbench.recording.library_index import LibraryIndex
+from workbench.recording.library_read import read_found
+from workbench.recording.library_row import LibraryRow, facts_as_dict, facts_from_dict
+from workbench.recording.library_scan import scan_folder
+from workbench.recording.read_episode import read_episode
+
+
+@pytest.fixture(scope="module")
+def maniskill(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with two episodes, of 3 and 2 steps, that ManiSkill's own recorder wrote."""
+    folder = tmp_path_factory.mktemp("demos")
+    env: Any = gym.make("PushCube-v1", obs_mode="none", render_backend="none", num_envs=1)
+    env = RecordEpisode(env, str(folder), trajectory_name="demo", save_video=False, source_type="test")
+    for seed, steps in ((5, 3), (6, 2)):
+        env.reset(seed=seed)
+        for _ in range(steps):
+            env.step(np.zeros(env.action_space.shape, np.float32))
+    env.close()
+    return folder
+
+
+@pytest.fixture
+def library(tmp_path: Path) -> Iterator[Library]:
+    library = Library(tmp_path)
+    yield library
+    library.close()
+
+
+def read(folder: Path) -> list[LibraryRow]:
+    """As somebody who opens it anew sees it."""
+    library = Library(folder)
+    library.refresh()
+    library.close()
+    return list(library.rows())
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    """All files that a person sees."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file() and ".workbench" not in path.parts
+    }
+
+
+# --- what rows say --------------------------------------------------------------------------------------
+
+
+def test_a_recording_of_ours_is_a_row_with_what_its_description_says(
+    tmp_path: Path, library: Library
+) -> None:
+    describe(tmp_path / "monday", "a", id="ab12", tags=["good", "good", " "], note="slips")
+    library.refresh()
+    (row,) = library.rows()
+    assert (row.id, row.name, row.kind, row.task, row.seed, row.length) == (
+        "ab12",
+        "monday/a",
+        "workbench",
+        "PushCube-v1",
+        7,
+        12,
+    )
+    assert (row.total_reward, row.success, row.source_hash) == (3.5, True, "aaaaaaaaaaaa")
+    assert (row.tags, row.note, row.problem) == (("good",), "slips", None)
+    assert row.date is not None and row.date.isoformat() == "2026-11-21T10:00:00+00:00"
+    assert [path.suffix for path in row.paths] == [".json", ".h5", ".rrd"]
+    assert row.size == sum(path.stat().st_size for path in row.paths)
+    assert library.thumbnail("ab12") == jpeg() and library.thumbnail("other") is None
+
+
+def test_what_the_writer_wrote_is_a_row_and_is_read_as_before_when_it_has_tags(
+    tmp_path: Path, library: Library, make_episode: Callable[..., Made]
+) -> None:
+    made = make_episode(5, reward=np.full(5, 0.5, np.float32), evaluate={"success": np.arange(6) >= 4})
+    unfinished = make_episode().writer(tmp_path)
+    files = made.write(tmp_path)
+    library.refresh()
+    (row,) = library.rows()
+    assert (row.id, row.task, row.seed, row.length) == (made.info.id, "Made-v1", 7, 5)
+    assert (row.total_reward, row.success, row.problem) == (2.5, True, None)
+    assert set(row.paths) == {files.json, files.h5, files.rrd}
+    library.set_tags([row.id], add=["good"])
+    library.set_note([row.id], "slips")
+    read_back = read_episode(files.json)
+    assert read_back.info == made.info and len(read_back.reward) == 5
+    assert [row.tags for row in library.rows()] == [("good",)]
+    unfinished.discard()
+
+
+def test_each_trajectory_of_maniskills_recorder_is_a_row(maniskill: Path) -> None:
+    first, second = read(maniskill)
+    assert (first.name, second.name) == ("demo#traj_0", "demo#traj_1")
+    assert (first.kind, first.task, first.trajectory, first.problem) == (
+        "maniskill",
+        "PushCube-v1",
+        "traj_0",
+        None,
+    )
+    assert (first.seed, first.length, second.seed, second.length) == (5, 3, 6, 2)
+    assert first.success is False and first.total_reward is not None and first.total_reward > 0
+    assert first.facts.control_mode == "pd_joint_delta_pos" and first.id != second.id
+
+
+def test_a_lone_rrd_is_a_row_with_its_properties(tmp_path: Path) -> None:
+    recording = rr.RecordingStream("workbench Old-v1")
+    memory = recording.memory_recording()
+    recording.send_property(
+        "episode", rr.AnyValues(task="Old-v1", seed=4, length=6, success=True, fail=False)
+    )
+    (tmp_path / "old.rrd").write_bytes(memory.drain_as_bytes())
+    (row,) = read(tmp_path)
+    assert (row.kind, row.task, row.seed, row.length, row.success) == ("rrd only", "Old-v1", 4, 6, True)
+
+
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        ({"x.json": b'{"workbench": {"task": '}, "x.json is not JSON, or was cut short."),
+        ({"x.json": b"[" * 100_000}, "x.json is not JSON, or was cut short."),
+        ({"x.rrd": b""}, "x.rrd is no recording that rerun can read"),
+        ({"x.rrd": b"RRF2" + bytes(300)}, "x.rrd is no recording that rerun can read"),
+        ({"x.json": b'{"episodes": [{"episode_id": 0}], "env_info": {"env_id": "A-v1"}}'}, "is missing"),
+        (
+            {"x.json": b'{"episodes": [{"episode_id": 0}], "env_info": {"env_id": "A-v1"}}', "x.h5": b"HDF"},
+            "x.h5 is damaged, or still being written.",
+        ),
+        ({"x.json": b'{"workbench": {"task": "A-v1"}}', "x.h5": b""}, "x.rrd is missing."),
+        ({"x.json": b"3", "x.h5": b""}, "x.json names neither an env nor episodes."),
+    ],
+)
+def test_files_that_are_broken_are_rows_that_say_so(
+    tmp_path: Path, files: dict[str, bytes], said: str
+) -> None:
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    (row,) = read(tmp_path)
+    assert row.problem is not None and said in row.problem
+
+
+def test_an_h5_alone_is_a_row_once_it_is_clear_that_nothing_comes_to_it(tmp_path: Path) -> None:
+    path = tmp_path / "x.h5"
+    path.write_bytes(b"HDF")
+    assert read(tmp_path) == []
+    os.utime(path, (1e9, 1e9))
+    (row,) = read(tmp_path)
+    assert row.problem is not None and "needs x.json beside it" in row.problem
+
+
+def test_what_is_no_recording_is_no_row(tmp_path: Path) -> None:
+    (tmp_path / "package.json").write_text('{"name": "x"}')
+    (tmp_path / "lonely.notes").write_text("{}")
+    (tmp_path / "notes.txt").write_text("x")
+    describe(tmp_path / ".hidden", "a")
+    (tmp_path / "round").symlink_to(tmp_path)
+    (tmp_path / "nowhere.json").symlink_to(tmp_path / "gone.json")
+    assert read(tmp_path) == []
+
+
+def test_names_of_files_that_are_no_text_can_be_shown_and_deleted(tmp_path: Path, library: Library) -> None:
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9"))
+    describe(folder, os.fsdecode(b"a\xff\n"), id="aaaa")
+    for _ in range(2):
+        library.refresh()
+        (row,) = library.rows()
+        row.name.encode()
+    library.set_note(["aaaa"], "x")
+    library.delete(["aaaa"])
+    assert library.rows() == ()
+    library.undo_delete()
+    assert [row.note for row in library.rows()] == ["x"]
+
+
+_anything = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
+    max_leaves=6,
+)
+_KEYS = (
+    "id task seed env_index length return success fail recovered source_hash written_at tags note thumbnail"
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.fixed_dictionaries({}, optional=dict.fromkeys(_KEYS.split(), _anything)))
+def test_whatever_a_description_says_there_is_one_row_that_the_index_can_hold(fields: dict) -> None:
+    with tempfile.TemporaryDirectory() as name:
+        describe(Path(name), "a", **fields)
+        ((facts, picture),) = read_found(Path(name), scan_folder(Path(name)).found["a"])
+    assert facts.kind == "workbench" and facts.problem is None
+    assert facts_from_dict(json.loads(json.dumps(facts_as_dict(facts)))) == facts
+    assert picture is None or picture[:2] == b"\xff\xd8"
+
+
+def test_a_copy_of_a_recording_is_another_row(tmp_path: Path) -> None:
+    describe(tmp_path, "a", id="ab12")
+    shutil.copytree(tmp_path, tmp_path / "copy", ignore=shutil.ignore_patterns("copy"))
+    first, second = read(tmp_path)
+    assert first.id == "ab12" and second.id.startswith("at-")
+
+
+# --- keeping up -----------------------------------------------------------------------------------------
+
+
+def test_only_what_changed_is_read_again(
+    tmp_path: Path, library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in "abc":
+        describe(tmp_path, name, note=name)
+    library.refresh()
+    opened: list[str] = []
+    real = Path.open
+
+    def spy(path: Path, *arguments: Any, **options: Any) -> Any:
+        opened.append(path.name)
+        return real(path, *arguments, **options)
+
+    monkeypatch.setattr(Path, "open", spy)
+    library.refresh()
+    assert opened == []
+    describe(tmp_path, "b", note="changed")
+    opened.clear()
+    for suffix in (".json", ".h5", ".rrd"):
+        (tmp_path / f"c{suffix}").unlink()
+    library.refresh()
+    assert opened == ["b.json"]
+    assert [(row.name, row.note) for row in library.rows()] == [("a", "a"), ("b", "changed")]
+    opened.clear()
+    assert [row.note for row in read(tmp_path)] == ["a", "changed"]
+    assert opened == []  # from the index
+
+
+@pytest.mark.parametrize(
+    "damage", ["deleted", "garbage", "cut", "another version", "rows of another version"]
+)
+def test_an_index_that_is_wrong_is_made_anew(tmp_path: Path, damage: str) -> None:
+    for k in range(30):
+        describe(tmp_path, f"r{k:02}", seed=k)
+    good = read(tmp_path)
+    index = tmp_path / ".workbench" / "library.sqlite"
+    content = index.read_bytes()
+    if damage == "deleted":
+        index.unlink()
+    elif damage == "garbage":
+        index.write_bytes(os.urandom(len(content)))
+    elif damage == "cut":
+        index.write_bytes(content[: len(content) // 2])
+    else:
+        with sqlite3.connect(index) as database:
+            if damage == "another version":
+                database.execute("PRAGMA user_version = 99")
+                database.execute("ALTER TABLE read DROP COLUMN rows")
+            else:
+                database.execute("""UPDATE read SET rows = '[{"kind": "workbench"}]' WHERE key = 'r03'""")
+        database.close()
+    assert len(good) == 30 and read(tmp_path) == good
+    library = Library(tmp_path)
+    library.refresh()
+    assert len(library.thumbnails([row.id for row in good])) == 30
+    library.close()
+
+
+def test_a_page_of_garbage_within_the_index_costs_no_more_than_reading_again(tmp_path: Path) -> None:
+    for k in range(120):
+        describe(tmp_path, f"r{k:03}", seed=k)
+    good = read(tmp_path)
+    index = tmp_path / ".workbench" / "library.sqlite"
+    content = bytearray(index.read_bytes())
+    for page in range(1, len(content) // 4096):
+        content[page * 4096 : page * 4096 + 200] = os.urandom(200)
+    index.write_bytes(content)
+    assert read(tmp_path) == good
+
+
+def test_where_the_folder_cannot_be_written_the_index_lies_in_the_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, cache = tmp_path / "recordings", tmp_path / "cache"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
+    describe(folder, "a")
+    (folder / ".workbench").write_text("a file where the folder should be")
+    index = LibraryIndex(folder)
+    assert index.path is not None and index.path.is_relative_to(cache)
+    index.close()
+    shutil.rmtree(cache)
+    cache.write_text("no place here either")
+    assert [row.name for row in read(folder)] == ["a"]
+
+
+def test_two_processes_at_once_have_the_same_rows(tmp_path: Path) -> None:
+    for k in range(150):
+        describe(tmp_path, f"r{k:03}", seed=k)
+    program = (
+        "import sys, pathlib\n"
+        "from workbench.recording.library import Library\n"
+        "for _ in range(3):\n"
+        "    library = Library(pathlib.Path(sys.argv[1])); library.refresh(); library.close()\n"
+        "print(*(row.id for row in library.rows()))\n"
+    )
+    running = [
+        subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    said = {process.communicate(timeout=100)[0] for process in running}
+    assert said == {" ".join(row.id for row in read(tmp_path)) + "\n"} and running[0].returncode == 0
+
+
+def test_the_table_follows_the_folder_by_itself(tmp_path: Path) -> None:
+    folder = tmp_path / "later"
+    library = Library(folder)
+    library.watch()
+
+    def wait_for(names: list[str], problem: bool) -> None:
+        done = threading.Event()
+        threading.Timer(30, done.set).start()
+        while not done.is_set():
+            view = library.view()
+            if [row.name for row in view.rows] == names and (view.problem is not None) == problem:
+                return
+            library.wait(view.serial, 1.0)
+        raise AssertionError(library.view())
+
+    try:
+        wait_for([], problem=True)
+        describe(folder, "a")
+        wait_for(["a"], problem=False)
+        describe(folder / "more", "b")
+        wait_for(["a", "more/b"], problem=False)
+        shutil.rmtree(folder / "more")
+        wait_for(["a"], problem=False)
+        shutil.rmtree(folder)
+        wait_for([], problem=True)
+        assert "is not there" in str(library.view().problem)
+    finally:
+        library.close()
+
+
+def test_rows_are_shown_while_others_are_read_and_from_the_index_before_anything_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workbench.recording.library.PUBLISH_EVERY", 0.0)
+    for k in range(5):
+        describe(tmp_path, f"r{k}")
+        os.utime(tmp_path / f"r{k}.json", ns=(10**18 + k, 10**18 + k))
+    for suffix in (".h5", ".rrd"):
+        for path in tmp_path.glob(f"*{suffix}"):
+            os.utime(path, ns=(10**18, 10**18))
+    seen: list[tuple[int, object]] = []
+
+    def follow(library: Library) -> None:
+        real = library._publish
+
+        def publish(*arguments: Any, **changes: Any) -> None:
+            real(*arguments, **changes)
+            seen.append((len(library.rows()), library.view().reading))
+
+        library._publish = publish  # type: ignore[method-assign]
+
+    library = Library(tmp_path)
+    follow(library)
+    library.refresh()
+    library.close()
+    assert seen == [*((k, (k, 5)) for k in range(1, 6)), (5, None)]
+    seen.clear()
+    library = Library(tmp_path)
+    follow(library)
+    library.refresh()
+    library.close()
+    assert seen == [(5, (0, 0)), (5, None)]
+
+
+# --- tags and notes ---------------------------------------------------------------------------------------
+
+
+def test_tags_and_note_go_where_the_recording_goes_and_nothing_else_of_it_changes(
+    tmp_path: Path, library: Library
+) -> None:
+    path = describe(tmp_path, "a", id="a1", tags=["old"])
+    before = json.loads(path.read_text())
+    library.refresh()
+    library.set_tags(["a1"], add=["good", "demo"], remove=["old"])
+    library.set_note(["a1"], "slips\nat the end")
+    row = library.row("a1")
+    assert row is not None and (row.tags, row.note) == (("good", "demo"), "slips at the end")
+    after = json.loads(path.read_text())
+    assert after.pop("workbench") == {
+        **before.pop("workbench"),
+        "tags": ["good", "demo"],
+        "note": "slips at the end",
+    }
+    assert after == before
+    # Moved elsewhere, under another name, without the index: they are there.
+    for suffix in (".json", ".h5", ".rrd"):
+        (tmp_path / "elsewhere").mkdir(exist_ok=True)
+        os.rename(path.with_suffix(suffix), tmp_path / "elsewhere" / f"renamed{suffix}")
+    (moved,) = read(tmp_path / "elsewhere")
+    assert (moved.id, moved.tags, moved.note) == ("a1", ("good", "demo"), "slips at the end")
+
+
+def test_files_of_others_are_not_written_into(tmp_path: Path, maniskill: Path, library: Library) -> None:
+    shutil.copytree(maniskill, tmp_path, dirs_exist_ok=True)
+    before = tree(tmp_path)
+    library.refresh()
+    first, second = library.rows()
+    dates = [first.date, second.date]
+    library.set_tags([second.id], add=["fast"])
+    library.set_note([first.id], "odd")
+    assert [(row.tags, row.note) for row in library.rows()] == [((), "odd"), (("fast",), "")]
+    assert tree(tmp_path).keys() - before.keys() == {"demo.notes"}
+    assert [row.date for row in library.rows()] == dates
+    assert before.items() <= tree(tmp_path).items()
+    assert [(row.tags, row.note) for row in read(tmp_path)] == [((), "odd"), (("fast",), "")]
+    library.set_tags([second.id], remove=["fast"])
+    library.set_note([first.id], "")
+    assert tree(tmp_path) == before
+
+
+def test_a_note_that_cannot_be_kept_is_an_error_and_nothing_is_half_written(
+    tmp_path: Path, library: Library
+) -> None:
+    describe(tmp_path, "a", id="a1")
+    library.refresh()
+    (tmp_path / "a.json").write_text("{}")
+    before = tree(tmp_path)
+    with pytest.raises(LibraryError, match="a could not be kept .*is not a recording"):
+        library.set_note(["a1"], "x")
+    assert tree(tmp_path) == before
+    with pytest.raises(LibraryError, match="not in the library any more"):
+        library.set_tags(["a1", "zz"], add=["x"])
+
+
+# --- deleting ---------------------------------------------------------------------------------------------
+
+
+def test_deleting_takes_all_files_and_can_be_taken_back(tmp_path: Path, library: Library) -> None:
+    for name in ("a", "b", "sub/c"):
+        path = tmp_path / name
+        describe(path.parent, path.name, id=path.name * 4)
+    before = tree(tmp_path)
+    library.refresh()
+    library.delete(["aaaa", "cccc"])
+    assert [row.name for row in library.rows()] == ["b"] == [row.name for row in read(tmp_path)]
+    assert {name for name in tree(tmp_path) if not name.startswith(".trash/")} == {"b.json", "b.h5", "b.rrd"}
+    assert library.view().trash.files == 6
+    library.undo_delete()
+    assert tree(tmp_path) == before and [row.name for row in library.rows()] == ["a", "b", "sub/c"]
+    assert library.view().trash.files == 0
+    with pytest.raises(LibraryError, match="trash is empty"):
+        library.undo_delete()
+
+
+def test_what_stands_there_now_is_not_written_over_when_a_deletion_is_taken_back(
+    tmp_path: Path, library: Library
+) -> None:
+    describe(tmp_path, "a", id="aaaa")
+    library.refresh()
+    library.delete(["aaaa"])
+    describe(tmp_path, "a", id="bbbb")
+    before = tree(tmp_path)
+    with pytest.raises(LibraryError, match="there is a file of that name already"):
+        library.undo_delete()
+    assert tree(tmp_path) == before
+    library.empty_trash()
+    assert not (tmp_path / ".trash").exists() and library.view().trash.files == 0
+
+
+def test_one_of_several_trajectories_of_a_file_cannot_be_deleted_alone(
+    tmp_path: Path, maniskill: Path, library: Library
+) -> None:
+    shutil.copytree(maniskill, tmp_path, dirs_exist_ok=True)
+    library.refresh()
+    before = tree(tmp_path)
+    first, second = library.rows()
+    for refused in (library.may_delete, library.delete):
+        with pytest.raises(LibraryError, match="demo.h5 holds 2 recordings"):
+            refused([first.id])
+    assert tree(tmp_path) == before
+    library.set_note([first.id], "x")
+    library.delete([first.id, second.id])
+    assert library.rows() == () and library.view().trash.files == 3
+
+
+def test_a_deletion_that_fails_leaves_the_recording_whole(tmp_path: Path, library: Library) -> None:
+    describe(tmp_path, "a", id="aaaa")
+    (tmp_path / ".trash").write_text("a file where the folder should be")
+    before = tree(tmp_path)
+    library.refresh()
+    with pytest.raises(LibraryError, match="Not everything was deleted"):
+        library.delete(["aaaa"])
+    assert tree(tmp_path) == before and [row.id for row in library.rows()] == ["aaaa"]

@@ -1,0 +1,136 @@
+"""Cameras added, copied, renamed and removed in the author's file; and changes that do not come to what they should."""
+
+# pyright: reportOptionalMemberAccess=false, reportArgumentType=false, reportOptionalSubscript=false
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from tests.session.conftest import wait_until
+from tests.session.test_camera_studio import BASE, camera, moved, said
+from workbench.core.camera_settings import CameraKey, CameraSettings, differences
+from workbench.session.messages import TaskOptions
+from workbench.session.session import Session
+from workbench.session.studio_view import Writing
+
+LIMITED = '''
+
+def limited(configs):
+    """Of its own mind."""
+    for config in configs:
+        if config.fov < 0.5:
+            raise ValueError("too narrow")
+        config.fov = max(config.fov, 0.8)
+    return configs
+'''
+CALL = 'return [CameraConfig("base_camera", pose=pose, width=128, height=128, fov=1.0, near=0.01, far=10)]'
+
+
+@pytest.fixture(scope="module")
+def session(task_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+    text = task_file.read_text().replace("512", "64")
+    assert CALL in text
+    text = text.replace(CALL, CALL.replace("return ", "return limited(") + ")")
+    task_file.write_text(text + LIMITED)
+    options = TaskOptions(num_envs=1, env_kwargs={"obs_mode": "rgb"})
+    session = Session(str(task_file), options, recordings=tmp_path_factory.mktemp("recordings"))
+    wait_until(session, lambda view: view.task is not None, "the first load")
+    yield session
+    session.close()
+
+
+def planned(session: Session) -> Writing:
+    view = wait_until(session, said(lambda s: s.writing.stage in ("planned", "refused")), "the plan")
+    assert view.studio.writing.stage == "planned", view.studio.writing.message
+    return view.studio.writing
+
+
+def written(session: Session, stage: str = "checked") -> Writing:
+    planned(session)
+    session.studio.write()
+    ended = ("checked", "mismatch", "refused")
+    view = wait_until(session, said(lambda s: s.writing.stage in ended), "the check")
+    assert view.studio.writing.stage == stage, view.studio.writing.message
+    return view.studio.writing
+
+
+def there(session: Session, key: CameraKey) -> CameraSettings:
+    found = camera(session, key).info.settings
+    assert found is not None
+    return found
+
+
+def names(session: Session) -> list[str]:
+    return [c.key[1] for c in session.view().studio.cameras if c.key[0] == "human"]
+
+
+def test_a_camera_is_added_moved_copied_renamed_and_removed_and_the_env_has_it_each_time(
+    session: Session, task_file: Path
+) -> None:
+    studio, before = session.studio, task_file.read_text()
+    new = replace(there(session, ("human", "render_camera")), position=(0.6, 0.0, 0.7), fov=0.9)
+    studio.plan_add("human", "side", new)
+    assert written(session).message == f"side is in {task_file.name}, and the env has it."
+    assert not differences(there(session, ("human", "side")), new)
+    assert session.view().studio.selected == ("human", "side"), "one wants to place what one has added"
+    # What is not written yet is in the copy, and stays with the original.
+    away = replace(new, position=(0.61, 0.1, 0.7))
+    studio.place(("human", "side"), away)
+    studio.plan_duplicate(("human", "side"), "other")
+    assert "a copy of side" in written(session).message
+    assert names(session) == ["render_camera", "side", "other"]
+    assert ("human", "side") in moved(session.view())
+    assert camera(session, ("human", "other")).now.position == away.position
+    studio.plan_rename(("human", "side"), "front")
+    assert written(session).message == f"side is front in {task_file.name} now."
+    assert names(session) == ["render_camera", "front", "other"]
+    assert camera(session, ("human", "front")).now.position == away.position, "the placement is lost"
+    for name in ("front", "other"):
+        studio.plan_remove(("human", name))
+        assert f"{name} is no longer in" in written(session).message
+    assert names(session) == ["render_camera"] and task_file.read_text().count(
+        "CameraConfig("
+    ) == before.count("CameraConfig(")
+    studio.drop_plan()
+
+
+def test_a_camera_that_comes_out_otherwise_is_an_error_and_is_taken_back(
+    session: Session, task_file: Path
+) -> None:
+    studio, before = session.studio, task_file.read_text()
+    studio.place(BASE, replace(there(session, BASE), fov=0.7))
+    studio.plan_write(BASE)
+    message = written(session, "mismatch").message
+    assert (
+        "base_camera is not what was written (fov: 0.8, not 0.7)" in message
+        and "Take the change back" in message
+    )
+    assert "fov=0.7" in task_file.read_text() and there(session, BASE).fov == 0.8
+    studio.undo_write()
+    wait_until(session, said(lambda s: "as it was before." in s.writing.message), "the file of before")
+    assert task_file.read_text() == before
+    studio.back_to_file(BASE)
+    studio.drop_plan()
+
+
+def test_a_change_with_which_the_file_does_not_load_says_so_and_is_taken_back(
+    session: Session, task_file: Path
+) -> None:
+    studio, before = session.studio, task_file.read_text()
+    studio.place(BASE, replace(there(session, BASE), fov=0.4))
+    studio.plan_write(BASE)
+    planned(session)
+    studio.write()
+    view = wait_until(session, said(lambda s: "does not load" in s.writing.message), "the failure")
+    assert "take it back if that is the reason" in view.studio.writing.message
+    assert view.problem is not None and "too narrow" in view.problem.message
+    assert there(session, BASE).fov == 1.0, "the version before goes on"
+    studio.undo_write()
+    wait_until(
+        session, lambda v: v.problem is None and "as it was before." in v.studio.writing.message, "it back"
+    )
+    assert task_file.read_text() == before

@@ -1,0 +1,146 @@
+"""Tags, notes and deleting, from the page: what is asked before, and what is said when it cannot be done."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+
+import viser
+
+from workbench.recording.library import Library, LibraryError
+from workbench.recording.library_row import LONGEST_NOTE, LibraryRow, clean_tags
+from workbench.ui.library_forms import Question, ask_text, ask_whether
+from workbench.ui.library_rows import in_words, size_in_words
+
+MOST_KNOWN = 12
+"""Tags in use that are named."""
+
+
+class LibraryEdits:
+    """One question at a time.
+
+    Args:
+        asking: is told when a window with a question comes and when it goes.
+    """
+
+    def __init__(self, server: viser.ViserServer, library: Library, asking: Callable[[bool], None]) -> None:
+        self._server, self._library, self._asking = server, library, asking
+        self._lock = threading.RLock()
+        self._question: Question | None = None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        with self._lock:
+            if self._question is not None:
+                self._question.close()
+
+    def ask_tags(self, ids: tuple[str, ...]) -> None:
+        rows = self._rows(ids)
+        if not rows:
+            return
+        shared = [tag for tag in rows[0].tags if all(tag in row.tags for row in rows)]
+
+        def answered(typed: str) -> None:
+            tags = clean_tags(typed.split(","))
+            removed = [tag for tag in shared if tag not in tags]
+            self._do(lambda: self._library.set_tags(ids, [tag for tag in tags if tag not in shared], removed))
+
+        known = sorted({tag for row in self._library.rows() for tag in row.tags})
+        explained = "Words, with commas between them."
+        if len(rows) > 1:
+            explained += " Those that all of them have stand here; others that they have stay."
+        if known:
+            explained += f" In use: {', '.join(known[:MOST_KNOWN])}."
+        self._ask_text("Tags", explained, rows, ", ".join(shared), answered)
+
+    def ask_note(self, ids: tuple[str, ...]) -> None:
+        rows = self._rows(ids)
+        if not rows:
+            return
+        notes = {row.note for row in rows}
+        explained = "" if len(notes) == 1 else "They have different notes; this one takes their place."
+
+        def answered(typed: str) -> None:
+            self._do(lambda: self._library.set_note(ids, typed[:LONGEST_NOTE]))
+
+        self._ask_text("Note", explained, rows, notes.pop() if len(notes) == 1 else "", answered)
+
+    def ask_delete(self, ids: tuple[str, ...]) -> None:
+        rows = self._rows(ids)
+        if not rows or not self._do(lambda: self._library.may_delete(ids)):
+            return
+        self._ask(
+            lambda: ask_whether(
+                self._server,
+                "Delete recordings",
+                f"Delete {in_words(rows)}?",
+                [row.name for row in rows],
+                "All their files go to the folder .trash in the library, and can be taken back from there.",
+                "Delete",
+                lambda: self._delete(ids),
+                self._closed,
+            )
+        )
+
+    def ask_empty(self) -> None:
+        trash = self._library.view().trash
+        self._ask(
+            lambda: ask_whether(
+                self._server,
+                "Empty the trash",
+                f"Delete {trash.files} files ({size_in_words(trash.size)}) for good?",
+                [],
+                "This cannot be undone.",
+                "Delete for good",
+                self._empty,
+                self._closed,
+            )
+        )
+
+    def _delete(self, ids: tuple[str, ...]) -> None:
+        self._do(lambda: self._library.delete(ids))
+
+    def _empty(self) -> None:
+        self._do(self._library.empty_trash)
+
+    def undo_delete(self) -> None:
+        self._do(self._library.undo_delete)
+
+    def notify(self, title: str, body: str) -> None:
+        """Say something to every open page: a key does not tell which one it was pressed on."""
+        for client in self._server.get_clients().values():
+            client.add_notification(title, body, color="orange", auto_close_seconds=8.0)
+
+    def _ask_text(
+        self,
+        title: str,
+        explained: str,
+        rows: Sequence[LibraryRow],
+        value: str,
+        answered: Callable[[str], None],
+    ) -> None:
+        names = [row.name for row in rows]
+        self._ask(lambda: ask_text(self._server, title, explained, names, value, answered, self._closed))
+
+    def _ask(self, make: Callable[[], Question]) -> None:
+        with self._lock:
+            if self._question is not None:
+                self._question.close()
+            self._asking(True)
+            self._question = make()
+
+    def _closed(self) -> None:
+        self._asking(False)
+
+    def _rows(self, ids: Sequence[str]) -> list[LibraryRow]:
+        rows = (self._library.row(id) for id in ids)
+        return [row for row in rows if row is not None]
+
+    def _do(self, work: Callable[[], object]) -> bool:
+        """Whether it could be done; if not, it is said why."""
+        try:
+            work()
+        except LibraryError as error:
+            self.notify("Not possible", str(error))
+            return False
+        return True

@@ -1,0 +1,163 @@
+"""Which recordings the library lists, in which order, on which page, and which of them are selected.
+
+Selection works as in every list of files: a press selects a row alone, control adds it or takes it away, shift takes
+all from the last one on; arrows walk, and shift takes what they walk over along. What is not listed is not selected,
+or a filter would hide what a deletion then takes. The list lives in the server, so all pages show the same; its
+methods are called from any thread.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable
+
+from workbench.recording.library import Library, LibraryView
+from workbench.recording.library_row import LibraryRow
+from workbench.ui.library_rows import Column, Outcome, begins_descending, chosen, ordered
+
+MOST_ROWS = 50
+"""On one page of the table."""
+LONGEST_WORDS = 200
+TOGGLE, RANGE = 1, 2
+"""What was held with a press on a row; both together take a range along with what is selected."""
+
+
+class LibraryList:
+    """Of one `Library`."""
+
+    def __init__(self, library: Library) -> None:
+        self._library = library
+        self.lock = threading.RLock()
+        self.column: Column = "date"
+        self.descending = True
+        self.outcome: Outcome = "all"
+        self.words = ""
+        self.task: str | None = None
+        self.first = 0
+        """Place of the first row of the page."""
+        self.selected: frozenset[str] = frozenset()
+        self.cursor: str | None = None
+        """The row that was taken last, by mouse or keys."""
+        self.follow = False
+        """Whether a browser shall scroll to the cursor: after keys, which may go where it does not look."""
+        self._anchor: str | None = None
+        self._place = 0
+        """Of the cursor when it was set: where to go on from when its row is deleted."""
+        self._arranged: tuple[object, list[LibraryRow]] = (None, [])
+
+    # --- what there is -------------------------------------------------------------------------------
+
+    def rows(self, view: LibraryView | None = None) -> list[LibraryRow]:
+        """What is listed, in its order."""
+        with self.lock:
+            view = self._library.view() if view is None else view
+            key = (view.serial, self.words, self.outcome, self.task, self.column, self.descending)
+            if self._arranged[0] != key:
+                rows = chosen(view.rows, self.words, self.outcome, self.task)
+                self._arranged = (key, ordered(rows, self.column, self.descending))
+            return self._arranged[1]
+
+    def page(self, view: LibraryView) -> list[LibraryRow]:
+        """The rows of the page. What is not listed any more is let go of."""
+        with self.lock:
+            rows = self.rows(view)
+            listed = {row.id for row in rows}
+            self.selected &= listed
+            if self.cursor not in listed:
+                self.cursor = None
+            self.first = min(self.first, self._last_page(rows))
+            return rows[self.first : self.first + MOST_ROWS]
+
+    def state(self) -> object:
+        """Differs when anything here is another."""
+        with self.lock:
+            self.rows()
+            return self._arranged[0], self.first, self.selected, self.cursor
+
+    def selected_ids(self) -> tuple[str, ...]:
+        """In the order of the list."""
+        with self.lock:
+            return tuple(row.id for row in self.rows() if row.id in self.selected)
+
+    # --- selecting -----------------------------------------------------------------------------------
+
+    def select(self, ids: Iterable[str]) -> None:
+        """Select these, of those that are listed."""
+        with self.lock:
+            self.selected = frozenset(ids) & {row.id for row in self.rows()}
+
+    def select_all(self) -> None:
+        self.select(row.id for row in self.rows())
+
+    def press(self, id: str, held: int = 0) -> bool:
+        """Select as a press on this row does; False if it is not listed.
+
+        Args:
+            held: `TOGGLE`, `RANGE`, both or neither.
+        """
+        with self.lock:
+            order = [row.id for row in self.rows()]
+            if id not in order:
+                return False
+            self._take(order, order.index(id), held)
+            self.follow = False
+            return True
+
+    def move(self, by: int, held: int = 0) -> None:
+        """As an arrow key does: from the cursor, or from where it was."""
+        with self.lock:
+            order = [row.id for row in self.rows()]
+            if not order:
+                return
+            if self.cursor in order:
+                place = order.index(self.cursor) + by
+            else:
+                place = max(self._place, self.first)
+            place = min(max(place, 0), len(order) - 1)
+            self._take(order, place, held)
+            self.first, self.follow = place // MOST_ROWS * MOST_ROWS, True
+
+    def toggle_cursor(self) -> None:
+        with self.lock:
+            if self.cursor is not None:
+                self.press(self.cursor, TOGGLE)
+
+    def _take(self, order: list[str], place: int, held: int) -> None:
+        id = order[place]
+        self.cursor, self._place = id, place
+        if held & RANGE and self._anchor in order:
+            a, b = sorted((order.index(self._anchor), place))
+            between = frozenset(order[a : b + 1])
+            self.selected = between | self.selected if held & TOGGLE else between
+            return
+        self.selected = self.selected ^ {id} if held & TOGGLE else frozenset((id,))
+        self._anchor = id
+
+    # --- arranging -----------------------------------------------------------------------------------
+
+    def turn(self, by: int) -> None:
+        """Go on by so many pages."""
+        with self.lock:
+            self.first = min(max(0, self.first + by * MOST_ROWS), self._last_page(self.rows()))
+
+    def sort_by(self, column: Column) -> None:
+        """By another column, or the same one the other way round."""
+        with self.lock:
+            self.descending = not self.descending if column == self.column else begins_descending(column)
+            self.column, self.first = column, 0
+
+    def choose(self, outcome: Outcome) -> None:
+        with self.lock:
+            self.outcome, self.first = outcome, 0
+
+    def look_for(self, words: object, task: object) -> None:
+        """List what has these words, and is of this task; what a page sends may be of any type."""
+        with self.lock:
+            known = {row.task for row in self._library.rows()}
+            words = words[:LONGEST_WORDS] if isinstance(words, str) else ""
+            task = task if isinstance(task, str) and task in known else None
+            if (words, task) != (self.words, self.task):
+                self.words, self.task, self.first = words, task, 0
+
+    def _last_page(self, rows: list[LibraryRow]) -> int:
+        return max(0, (len(rows) - 1) // MOST_ROWS * MOST_ROWS)
