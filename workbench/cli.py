@@ -12,7 +12,7 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn
@@ -25,8 +25,10 @@ import workbench
 
 if TYPE_CHECKING:
     from workbench.authoring.problem import Problem
+    from workbench.session.kept_worker import WorkerOptions
     from workbench.session.messages import Event, TaskOptions
     from workbench.ui.door import Door
+    from workbench.ui.put_together import Workplace
 
 Task = Annotated[str, tyro.conf.Positional]
 """A task file, ``file.py:ClassName``, or a registered env id such as ``PickCube-v1``."""
@@ -116,6 +118,7 @@ def open_page(
     place = Workplace(door.server, recordings, session)
     sharing = Sharing(door)
     place.offer(sharing.offer)
+    leave_recordings = _go_back_in(place, recordings, WorkerOptions(worker.memory_limit))
     end.at_signals()
     try:
         place.pages.start("live")
@@ -125,6 +128,7 @@ def open_page(
         out.print("closing")
         place.close()
         sharing.close()
+        leave_recordings()
         session.close()
         door.close()
     _leave(end.code)
@@ -212,6 +216,8 @@ def review(
         door = open_door(DoorOptions(host=host, port=port, token=token), label="Recordings")
     except (ValueError, DoorError) as error:
         return _refuse(str(error))
+    from workbench.session.kept_worker import WorkerOptions
+    from workbench.session.memory_limit import parse_memory
     from workbench.ui.put_together import Workplace
     from workbench.ui.share_part import Sharing
 
@@ -223,6 +229,7 @@ def review(
     place = Workplace(door.server, folder, tasks=task)
     sharing = Sharing(door)
     place.offer(sharing.offer)
+    leave_recordings = _go_back_in(place, folder, WorkerOptions(parse_memory("auto")))
     end.at_signals()
     try:
         place.pages.start("review")
@@ -232,8 +239,60 @@ def review(
         out.print("closing")
         place.close()
         sharing.close()
+        leave_recordings()
         door.close()
     _leave(end.code)
+
+
+@app.command
+def rescore(
+    places: Annotated[tuple[Path, ...], tyro.conf.Positional],
+    /,
+    task: str | None = None,
+    recorded_source: bool = False,
+    use_env_states: bool = False,
+    num_envs: int = 16,
+    backend: Backend = "auto",
+    csv: Path | None = None,
+    json: Path | None = None,
+) -> int:
+    """Judge recorded episodes again with today's reward and evaluate, and say what is otherwise.
+
+    Args:
+        places: recordings (.json, .h5 or .rrd of the workbench, .h5 of ManiSkill's RecordEpisode) and folders of them.
+        task: a task file, file.py:ClassName or id to judge all of them with, in place of the one each names.
+        recorded_source: judge each by the text that it was recorded with.
+        use_env_states: put every recorded state in after its step, so that nothing drifts from the record.
+        num_envs: episodes to run at once.
+        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (gpu if it works).
+        csv: also write the table to this file, as CSV.
+        json: also write the table to this file, as JSON.
+    """
+    from workbench.rescore_command import run_rescore
+
+    if task is not None and recorded_source:
+        return _refuse("--task and --recorded-source name two versions to judge with: give one of them")
+    for table in (csv, json):
+        if table is not None and not table.resolve().parent.is_dir():
+            return _refuse(f"there is no folder {table.resolve().parent} to write {table.name} into")
+    try:
+        base = _task_options(num_envs, backend, 0, ())
+    except ValueError as error:
+        return _refuse(str(error))
+    _use_private_driver()
+    from workbench.authoring.problem import TaskError
+    from workbench.session.rescore_all import RescoreOptions
+
+    what = RescoreOptions(places, task, recorded_source, use_env_states, num_envs, base)
+    try:
+        return run_rescore(what, out, err, csv, json)
+    except TaskError as error:
+        _print_problem(error.problem)
+        return 1
+    except (OSError, ValueError) as error:
+        return _refuse(str(error))
+    except KeyboardInterrupt:
+        return _refuse("interrupted")
 
 
 @app.command
@@ -373,6 +432,17 @@ def _use_private_driver() -> None:
     from workbench.machine.software_vulkan import ensure_render_device
 
     os.environ.update(ensure_render_device(install=False).env)
+
+
+def _go_back_in(place: Workplace, recordings: Path, worker: WorkerOptions) -> Callable[[], None]:
+    """Let the review go on live, and judge again; returns what ends that."""
+    from workbench.session.session import Session
+    from workbench.ui.step_in import offer_going_back_in
+
+    def open_task(task: str, options: TaskOptions) -> Session:
+        return Session(task, options, recordings=recordings, worker=worker, on_event=_say, on_line=_echo)
+
+    return offer_going_back_in(place, open_task)
 
 
 class _End:

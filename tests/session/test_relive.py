@@ -1,6 +1,6 @@
 """Recorded episodes lived through again in running envs, measured against what was recorded."""
 
-# pyright: reportOptionalSubscript=false
+# pyright: reportOptionalSubscript=false, reportAttributeAccessIssue=false
 
 from __future__ import annotations
 

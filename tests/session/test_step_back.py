@@ -197,5 +197,6 @@ def test_its_env_is_made_with_its_own_robot_and_modes() -> None:
 
 def test_another_task_than_the_open_one_is_named(live: Session) -> None:
     task = live.view().task
+    assert task is not None
     assert why_not_into(task, info(None)) == ""
     assert "PickCube-v1" in why_not_into(task, info(None, "PickCube-v1"))

@@ -89,8 +89,11 @@ def test_where_there_is_no_reward_is_a_gap_and_without_a_change_no_line() -> Non
 
 def test_what_could_not_be_put_back_is_said_and_escaped() -> None:
     view = running(2, timeline=TimelineView(100, 200, not_carried=("actor <b>peg</b>: gone",)))
-    html = render("timeline_hint", live=True, not_carried="; ".join(view.timeline.not_carried))
-    assert "not put back: actor &lt;b&gt;peg&lt;/b&gt;: gone" in html
+    not_carried = "; ".join(view.timeline.not_carried)
+    for arrived in ("", "<i>Push</i>, step 3: its actions were made again."):
+        html = render("timeline_hint", live=True, not_carried=not_carried, arrived=arrived)
+        assert "not put back: actor &lt;b&gt;peg&lt;/b&gt;: gone" in html
+        assert ("&lt;i&gt;Push&lt;/i&gt;, step 3" in html) == bool(arrived) and "<i>" not in html
 
 
 def test_fail_is_drawn_before_success() -> None:

@@ -26,6 +26,7 @@ from workbench.session.camera_messages import (
     CameraQuestion,
     Searching,
 )
+from workbench.session.rescore_messages import Rescore, Rescored
 
 Backend = Literal["auto", "cpu", "gpu"]
 ActionSource = Literal["hold", "zero", "random", "sliders", "policy"]
@@ -315,6 +316,7 @@ Request = (
     | WarmUp
     | Inspect
     | JudgeMoments
+    | Rescore
     | CaptureMoments
     | Quit
 )
@@ -501,6 +503,7 @@ Event = (
     | PastPictures
     | Inspection
     | Judged
+    | Rescored
     | Captured
     | Status
     | WarmedUp

@@ -66,28 +66,32 @@ class Arrival:
     """Entries that ``evaluate`` says otherwise of the same state."""
 
 
-def begin_again(
-    opened: OpenedTask, runs: Mapping[int, RecordedRun]
-) -> tuple[dict[int, bool], dict[str, str]]:
-    """Let these envs stand at the first state of their runs.
+@dataclass(frozen=True)
+class Beginning:
+    """How an env came to the first state of a run."""
 
-    Returns:
-        of each env, whether the reset gave another state, which the recorded one then took the place of; and what
-        could not be put back, with the reason.
+    otherwise: bool
+    """The reset gave another state, which the recorded one then took the place of."""
+    missed: dict[str, str]
+    """What could not be put back, and why."""
+
+
+def begin_again(opened: OpenedTask, runs: Mapping[int, RecordedRun]) -> dict[int, Beginning]:
+    """Let these envs stand at the first state of their runs.
 
     Raises:
         TaskError: a reset raised.
     """
     task, env = opened.env, opened.env.env
-    missed: dict[str, str] = {}
+    missed: dict[int, dict[str, str]] = {i: {} for i in runs}
     with blamed("restore", opened.loaded, task):
         new_physics(env, list(runs))
     for i, run in runs.items():
         options = {name: value for name, value in run.reset_options.items() if name != "env_idx"}
         if options.pop("reconfigure", False):
-            missed["reset option reconfigure"] = "the scene is not built anew for one env of a batch"
+            missed[i]["reset option reconfigure"] = "the scene is not built anew for one env of a batch"
         if run.seed < 0:
-            missed["the seed"] = "the recording does not know it: what the task drew at the reset is new"
+            missed[i]["the seed"] = "the recording does not know it: what the task drew at the reset is new"
         seed = [run.seed] if run.seed >= 0 else None
         # One by one: numbers that are drawn for several envs together are others than each would get alone.
         reset_checked(task, opened.loaded, seed, [i], options)
@@ -97,11 +101,11 @@ def begin_again(
     with blamed("restore", opened.loaded, task):
         for i, run in runs.items():
             if run.env_states:
-                missed |= misfits(env, i, run.state(0))
+                missed[i] |= misfits(env, i, run.state(0))
         if wrong:
             write_states(env, wrong)
             settle_robot(env, list(wrong))
-    return other, missed
+    return {i: Beginning(other[i], missed[i]) for i in runs}
 
 
 def arrive(
@@ -132,7 +136,8 @@ def arrive(
     why_not = why_not or reason
     corrected = 0
     with only_these_move(env, chosen, kept):
-        begins_otherwise, missed = begin_again(opened, dict.fromkeys(chosen, run))
+        beginnings = begin_again(opened, dict.fromkeys(chosen, run))
+        missed = {what: why for each in beginnings.values() for what, why in each.missed.items()}
         if not why_not:
             for t in range(state):
                 step_checked(task, opened.loaded, _for_all(opened, run.action[t]))
@@ -159,7 +164,7 @@ def arrive(
         metres,
         radians,
         corrected,
-        any(begins_otherwise.values()),
+        any(each.otherwise for each in beginnings.values()),
         missed,
         otherwise_said(step, chosen[0], run, state) if near else (),
     )
@@ -169,6 +174,8 @@ def why_not_lived_through(opened: OpenedTask, run: RecordedRun) -> str:
     """Why the recorded actions cannot be made; empty where they can."""
     width = sum(len(part.names) for part in opened.env.parts)
     recorded = run.action.shape[1] if run.action.ndim == 2 else 0
+    if not np.isfinite(run.action).all():
+        return "the recorded actions hold NaN or infinity: they were not made again"
     if width == recorded:
         return ""
     return f"the recorded actions have {recorded} numbers each, and this robot takes {width}: they were not made again"

@@ -37,12 +37,11 @@ def run_of(episode: Episode, state: int | None = None) -> RecordedRun:
     if state is not None and not 0 <= state <= episode.length:
         raise CannotStepIn(f"this episode has states 0 to {episode.length}, and not {state}")
     info = episode.info
-    action = np.asarray(episode.action, np.float32).reshape(episode.length, -1)
     run = RecordedRun(
         name=name_of(info),
         seed=info.seed,
         reset_options=dict(info.reset_options),
-        action=action,
+        action=np.asarray(episode.action, np.float32),
         env_states={name: np.asarray(rows) for name, rows in episode.env_states.items()},
         evaluate=dict(episode.evaluate),
         reward=np.asarray(episode.reward, np.float32),

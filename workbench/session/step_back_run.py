@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from workbench.core.step import StepResult
+from workbench.session.lengths import length
 from workbench.session.messages import NO_MOMENT, Restored, StepBack
 from workbench.session.open_task import OpenedTask
 from workbench.session.relive import Arrival, arrive
@@ -57,11 +58,3 @@ def how(arrival: Arrival) -> str:
     if arrival.otherwise:
         words += f"; evaluate says otherwise of this state: {', '.join(arrival.otherwise)}"
     return words + "."
-
-
-def length(metres: float) -> str:
-    """For a person: ``3.2 cm``, ``0.4 mm``, ``70 nm``."""
-    for unit, size, least in (("m", 1.0, 1.0), ("cm", 1e-2, 1e-2), ("mm", 1e-3, 1e-4), ("µm", 1e-6, 1e-6)):
-        if metres >= least:
-            return f"{metres / size:.2g} {unit}"
-    return f"{metres / 1e-9:.2g} nm"

@@ -38,6 +38,7 @@ from workbench.core.snapshot import restore_snapshot
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import Request as PictureRequest
 from workbench.core.take_pictures import list_cameras, take_pictures
+from workbench.session import rescore_run
 from workbench.session.acting import Acting
 from workbench.session.camera_answers import answer
 from workbench.session.camera_messages import (
@@ -91,6 +92,7 @@ from workbench.session.pacing import Pacer, Rate
 from workbench.session.picture_maker import PictureMaker
 from workbench.session.pulse import Doing, PulseWriter
 from workbench.session.reload import Running, load_version
+from workbench.session.rescore_messages import Rescore
 from workbench.session.step_back_run import going_there, step_back
 from workbench.session.step_events import StepEvents
 from workbench.session.warm_up import warm_up
@@ -146,6 +148,7 @@ class Worker:
             WarmUp: self._warm_up,
             Inspect: self._inspect,
             JudgeMoments: self._judge_moments,
+            Rescore: self._rescore,
             CaptureMoments: self._capture_moments,
             Quit: self._stop,
         }
@@ -420,6 +423,10 @@ class Worker:
     def _judge_moments(self, request: JudgeMoments) -> None:
         if self._opened is not None:
             self._send(judge_moments(self._opened, request))
+
+    def _rescore(self, request: Rescore) -> None:
+        if self._opened is not None:
+            rescore_run.answer(self._opened, request, self._send)
 
     def _capture_moments(self, request: CaptureMoments) -> None:
         def capture(opened: OpenedTask) -> None:

@@ -6,6 +6,7 @@ import math
 
 from workbench.session.judge import JudgementView
 from workbench.session.judgement import EpisodeDifference, Summary
+from workbench.session.lengths import length
 
 FAR_METRES = 1e-3
 FAR_RADIANS = 1e-2
@@ -47,7 +48,7 @@ def drift(summary: Summary) -> str:
     """One sentence on how far the states are from the record."""
     if summary.drift_metres == 0 and summary.drift_radians == 0:
         return "Every body is where it was, to the last bit: what differs comes of the code."
-    amount = f"{metres(summary.drift_metres)} and {math.degrees(summary.drift_radians):.2g}°"
+    amount = f"{length(summary.drift_metres)} and {math.degrees(summary.drift_radians):.2g}°"
     if not is_far(summary):
         return f"States drifted by at most {amount}: the rewards are comparable."
     where = "" if summary.drift_at is None else f", most in env {summary.drift_at[0]}"
@@ -63,16 +64,6 @@ def difference(episode: EpisodeDifference) -> list[str]:
 
 def change(was: float, now: float) -> str:
     return f"{_short(was)} → {_short(now)}"
-
-
-def metres(length: float) -> str:
-    """For a person: ``3.2 cm``, ``0.4 mm``, ``70 nm``."""
-    if not math.isfinite(length):
-        return "more than can be told"
-    for unit, size in (("m", 1.0), ("cm", 1e-2), ("mm", 1e-3), ("µm", 1e-6)):
-        if length >= (size if unit != "mm" else 1e-4):
-            return f"{length / size:.2g} {unit}"
-    return f"{length / 1e-9:.2g} nm"
 
 
 def _moved(name: str, was: int | None, now: int | None) -> str:

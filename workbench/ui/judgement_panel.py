@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from workbench.session.judge import JudgementView
 from workbench.session.judgement import EpisodeDifference, JudgedCurve
+from workbench.session.lengths import length
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui import judged_in_words as words
@@ -143,7 +144,7 @@ class JudgementPanel:
             "env": episode.env,
             "lines": words.difference(episode),
             "returns": words.change(*episode.returns),
-            "drift": f"drifted {words.metres(episode.drift)}" if far else "",
+            "drift": f"drifted {length(episode.drift)}" if far else "",
             "hint": "Show this moment" if kept else "This moment is no longer in the history",
             "selected": view.timeline.shown == episode.at and view.selected_env == episode.env,
             "press": self._presses.id_of(

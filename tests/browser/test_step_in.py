@@ -1,0 +1,101 @@
+"""From a recording into the live env, and recordings judged again, in a real Chromium."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import expect, sync_playwright
+
+from tests.browser.opened import TASK, launch, new_page
+from workbench.session.messages import TaskOptions
+from workbench.session.record import RecordOptions, record
+
+pytestmark = pytest.mark.browser
+PATIENT = 120_000
+
+
+@pytest.fixture(scope="module")
+def author(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A task file with an episode of it, whose reward was edited since."""
+    folder = tmp_path_factory.mktemp("author")
+    file = Path(shutil.copy(TASK, folder))
+    options = TaskOptions(1, "cpu", 5, {"render_backend": "none"})
+    record(
+        RecordOptions(
+            str(file), folder / "recordings", episodes=1, pictures=False, max_steps=15, options=options
+        )
+    )
+    text = file.read_text()
+    assert "action, info) / 3" in text
+    file.write_text(text.replace("action, info) / 3", "action, info) / 2"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def address(author: Path) -> Iterator[str]:
+    """Of ``workbench review``, which ends with Ctrl-C's signal and leaves no folder of recorded text."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "workbench.cli", "review", "recordings", "--port", "0"],
+        cwd=author,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "COLUMNS": "200", "PYTHONUNBUFFERED": "1", "TMPDIR": str(author)},
+    )
+    assert process.stdout is not None
+    said = ""
+    for said in process.stdout:
+        if re.search(r"page +http", said):
+            break
+    yield said.split()[-1]
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=30) == 0, process.stdout.read()
+    assert not list(author.glob("workbench-recorded-*"))
+
+
+def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
+    address: str, author: Path, chromium_path: str
+) -> None:
+    with sync_playwright() as playwright:
+        browser = launch(playwright, chromium_path)
+        page, errors = new_page(browser)
+        page.goto(address)
+        page.locator("tr", has_text="WorkbenchPushCube").first.click()
+        page.keyboard.press("Enter")
+        live = page.get_by_role("button", name="Go on live from here")
+        expect(live).to_be_visible(timeout=PATIENT)
+
+        page.get_by_role("tab", name="Judge").click()
+        page.get_by_role("button", name="Judge what is open").click()
+        expect(page.get_by_text("1 of 1 episode differs")).to_be_visible(timeout=PATIENT)
+        page.get_by_text("reward by up to").click()
+        expect(page.get_by_text("step 1 / 15").first).to_be_visible()
+
+        page.get_by_role("tab", name="Review").click()
+        page.keyboard.press("ArrowRight")
+        expect(page.get_by_text("step 2 / 15").first).to_be_visible()
+        live.click()
+        told = page.get_by_text("WorkbenchPushCube-v1, seed 5, step 2: its actions were made again")
+        expect(told).to_be_visible(timeout=PATIENT)
+        expect(told).to_contain_text("to the last bit")
+        expect(page.get_by_role("button", name="undo stepping in")).to_be_visible()
+
+        page.get_by_role("tab", name="Episodes").click()
+        page.get_by_role("button", name="Review recordings").click()
+        page.get_by_text("Going on live").click()
+        page.locator('input[value="today\'s"]:visible').click()
+        page.get_by_role("option", name="as recorded", exact=True).click()
+        live.click()
+        told = page.get_by_text("seed 5 as it was recorded, step 2: its actions were made again")
+        expect(told).to_be_visible(timeout=PATIENT)
+        assert list(author.glob("workbench-recorded-*/push_cube.py"))
+        assert not [error for error in errors if "non-existent component" not in error]
+        browser.close()

@@ -1,0 +1,169 @@
+"""What the Judge tab says of verdicts, and where a press on one goes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import viser
+
+from tests.session.recordings import made, write
+from workbench.authoring.problem import Problem
+from workbench.recording.library import Library
+from workbench.session import rescore_words as words
+from workbench.session.rescore_messages import EpisodeFile, Verdict
+from workbench.session.rescorer import Rescorer, RescoreView
+from workbench.session.review import Review
+from workbench.ui.rescore_panel import MOST_ROWS, RescoreChoices, RescorePanel, in_order, status_html
+from workbench.ui.step_in import episode_files
+
+
+def verdict(id: str = "a", **changes: Any) -> Verdict:
+    plain = Verdict(EpisodeFile(id, f"push_{id}", Path(f"{id}.json")), "Push-v1", 3, 5)
+    reward = np.arange(5, dtype=np.float32)
+    return replace(
+        plain,
+        **{"returns": (10.0, 10.0), "old_reward": reward, "new_reward": reward, "metres": 0.0, **changes},
+    )
+
+
+def test_success_is_said_before_rewards_and_what_is_the_same_is_said_to_be() -> None:
+    moved = verdict(success=(None, 41), fail=(7, None), first_difference=7)
+    assert words.what_changed(moved) == "success now at step 41, was never, fail never now, was at step 7"
+    assert (
+        words.what_changed(verdict(largest=0.25, first_difference=4)) == "reward by up to 0.25, from step 4"
+    )
+    assert words.what_changed(verdict()) == "as it was"
+    assert words.what_changed(verdict(differing=("height",))) == "as it was, but for height"
+    assert words.what_changed(verdict(why_not="it has no step")) == "not judged: it has no step"
+    assert words.returns(verdict(returns=(1.0, 2.5))) == "1 → 2.5"
+
+
+def test_all_of_them_are_one_sentence() -> None:
+    many = [
+        verdict("a"),
+        verdict("b", success=(None, 3), has_success=True, first_difference=3, returns=(1.0, 5.0)),
+        verdict("c", why_not="x"),
+    ]
+    assert words.summary(many) == (
+        "1 of 2 episodes differs; successes: 0 → 1; mean return 5.5 → 7.5; 1 episode not judged."
+    )
+    assert words.summary(many[:1]).startswith("Nothing differs in 1 episode:")
+    assert words.summary(many[2:]) == "No episode could be judged."
+    assert words.doubts(many) == "" and "3.2 cm" in words.doubts([verdict(metres=0.032)])
+
+
+def test_what_changed_most_comes_first_and_what_was_not_judged_last() -> None:
+    given = [
+        verdict("same"),
+        verdict("skipped", why_not="x"),
+        verdict("less", first_difference=1, returns=(1.0, 1.1)),
+        verdict("more", first_difference=1, returns=(1.0, 9.0)),
+        verdict("moved", first_difference=1, success=(None, 2), returns=(1.0, 1.0)),
+    ]
+    assert [v.file.id for v in in_order(given)] == ["moved", "more", "less", "same", "skipped"]
+
+
+def test_numbers_that_are_none_are_null_in_json() -> None:
+    assert '"return_now": null' in words.as_json([verdict(returns=(1.0, float("nan")))])
+    assert words.as_csv([]) == "\n"
+
+
+def test_a_problem_is_told_with_file_and_line_and_escaped() -> None:
+    problem = Problem("reward", "KeyError: '<b>'", "/home/me/push.py", 88, "raise <b>", "")
+    html = status_html(RescoreView("failed", 1, 3, why="the code raised", problem=problem))
+    assert "push.py:88" in html and "<b>" not in html and "&lt;b&gt;" in html
+    assert "Select recordings" in status_html(RescoreView())
+    assert "1 of 3" in status_html(RescoreView("judging", 2, 3, (verdict(),), task="Push-v1"))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for seed in range(1, 4):
+        write(tmp_path, made(6, seed=seed), pictures=False)
+    return tmp_path
+
+
+@pytest.fixture
+def library(folder: Path) -> Iterator[Library]:
+    library = Library(folder)
+    library.refresh()
+    yield library
+    library.close()
+
+
+@pytest.fixture
+def review(library: Library) -> Iterator[Review]:
+    review = Review(library)
+    yield review
+    review.close()
+
+
+@pytest.fixture
+def panel(server: viser.ViserServer, library: Library, review: Review) -> Iterator[RescorePanel]:
+    rescorer = Rescorer()
+    yield RescorePanel(
+        server, rescorer, review, lambda ids: episode_files(library, ids), RescoreChoices(True, False)
+    )
+    rescorer.close()
+
+
+def draw(panel: RescorePanel, told: RescoreView) -> None:
+    panel._rescorer._view = told
+    panel._drawn_at = 0.0
+    panel.draw(panel._review.view())
+
+
+def test_a_row_opens_its_episode_at_the_first_difference(
+    panel: RescorePanel, library: Library, review: Review
+) -> None:
+    rows = {row.seed: row for row in library.rows()}
+    given = [
+        verdict(rows[seed].id, seed=seed, first_difference=seed + 1, returns=(0.0, float(seed)))
+        for seed in (1, 2, 3)
+    ]
+    draw(panel, RescoreView("done", 1, 3, tuple(given)))
+    assert "3 of 3 episodes differ" in panel._status.content and panel._list.content.index("seed 3") > 0
+    assert not panel._begin.visible and not panel._stop.visible
+    panel._go(1)  # by the change of their returns: 3, 2, 1
+    deadline = time.monotonic() + 60
+    while not review.view().opened:
+        assert time.monotonic() < deadline, review.view().problems
+        time.sleep(0.01)
+    view = review.view()
+    assert view.opened[0].id == rows[2].id and view.states == (3,)
+    draw(panel, replace(panel._rescorer.view, serial=2))
+    assert panel._chart is not None and panel._chart.visible and panel._begin.visible
+    assert "wb-selected" in panel._list.content
+
+
+def test_a_long_list_is_turned_a_page_at_a_time(panel: RescorePanel) -> None:
+    many = tuple(verdict(str(k), first_difference=1, returns=(0.0, 99.0 - k), seed=k) for k in range(23))
+    draw(panel, RescoreView("done", 1, 23, many))
+    assert (
+        panel._list.content.count('data-press="') == MOST_ROWS + 2 and "1 to 10 of 23" in panel._list.content
+    )
+    panel._turn(MOST_ROWS)
+    panel._turn(MOST_ROWS)
+    panel._turn(MOST_ROWS)
+    draw(panel, RescoreView("done", 2, 23, many))
+    assert "21 to 23 of 23" in panel._list.content
+
+
+def test_what_a_page_sends_as_its_choice_may_be_anything(panel: RescorePanel) -> None:
+    assert panel._code.value == "as recorded"
+    panel._code.value = "today's"
+    panel._states.value = True
+    panel._chosen()
+    assert panel._choices == RescoreChoices(False, True)
+
+
+def test_recordings_that_are_gone_are_not_judged(library: Library) -> None:
+    rows = library.rows()
+    found = episode_files(library, ["no such", rows[0].id, rows[0].id])
+    assert [(file.id, file.path) for file in found] == [(rows[0].id, rows[0].paths[0])]

@@ -1,0 +1,93 @@
+"""Recorded episodes judged again in this process: what ``workbench rescore`` does."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+
+from workbench.authoring.problem import TaskError
+from workbench.session.messages import TaskOptions
+from workbench.session.open_task import OpenedTask, open_task
+from workbench.session.rescore import find_episodes, group_episodes, with_renderer
+from workbench.session.rescore_messages import Verdict
+from workbench.session.rescore_run import rescore
+from workbench.session.step_back import write_source
+
+
+@dataclass(frozen=True)
+class RescoreOptions:
+    places: tuple[Path, ...]
+    """Files and folders."""
+    task: str | None = None
+    """Opened for all of them, in place of what each names."""
+    recorded_source: bool = False
+    use_env_states: bool = False
+    num_envs: int = 16
+    base: TaskOptions = field(default_factory=TaskOptions)
+    """Which backend, and what else is the same for all."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    episodes: int
+    total: int
+    steps: int
+
+
+def rescore_all(
+    what: RescoreOptions,
+    on_activity: Callable[[str], None] = lambda activity: None,
+    on_progress: Callable[[Progress], None] = lambda progress: None,
+) -> tuple[list[Verdict], tuple[str, ...]]:
+    """The verdicts, in the order of the files; and what is not as it was recorded on purpose, in words.
+
+    Raises:
+        UnreadableRecording: there is nothing to judge.
+        TaskError: a task cannot be opened, or raises.
+        CannotStepIn: a recorded text cannot be opened.
+    """
+    torch.set_num_threads(1)  # see workbench.session.worker.work
+    files = find_episodes(what.places)
+    groups, verdicts = group_episodes(
+        files, what.num_envs, what.base, task=what.task, recorded_source=what.recorded_source
+    )
+    steps = 0
+    for group in groups:
+        folder: Path | None = None
+        reference = group.reference
+        if what.recorded_source:
+            folder, reference = write_source(group.info)
+        try:
+            opened = _open(reference, group.options, on_activity)
+            before = steps
+
+            def tell(now: int, before: int = before) -> None:
+                nonlocal steps
+                steps = before + now
+                on_progress(Progress(len(verdicts), len(files), steps))
+
+            try:
+                for verdict in rescore(
+                    opened, group.files, use_env_states=what.use_env_states, on_steps=tell
+                ):
+                    verdicts.append(verdict)
+                    on_progress(Progress(len(verdicts), len(files), steps))
+            finally:
+                opened.env.close()
+        finally:
+            if folder is not None:
+                shutil.rmtree(folder, ignore_errors=True)
+    place = {file.id: number for number, file in enumerate(files)}
+    verdicts.sort(key=lambda verdict: place[verdict.file.id])
+    return verdicts, tuple(dict.fromkeys(group.note for group in groups if group.note))
+
+
+def _open(reference: str, options: TaskOptions, on_activity: Callable[[str], None]) -> OpenedTask:
+    try:
+        return open_task(reference, options, on_activity=on_activity)
+    except TaskError:
+        return open_task(reference, with_renderer(options), on_activity=on_activity)

@@ -1,0 +1,177 @@
+"""Recorded episodes lived through again by a batch of envs, as many at once as there are envs.
+
+Each env takes an episode, begins it as it began (`relive.begin_again`), makes its actions, and takes the next when it
+is through, whatever the others are at. What the task says of every state is noted, and how far its bodies are from the
+record. Envs that have none left stand still.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.authoring.problem import TaskError
+from workbench.core.recorded_run import RecordedRun
+from workbench.core.recorded_state import apart, read_states, write_states
+from workbench.core.stand_still import only_these_move
+from workbench.core.step import StepResult
+from workbench.recording.read_episode import UnreadableRecording
+from workbench.session.open_task import OpenedTask, blamed, step_checked
+from workbench.session.relive import Beginning, begin_again, why_not_lived_through
+from workbench.session.rescore import Heard, verdict_of
+from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored, Verdict
+from workbench.session.step_back import run_of
+
+_TELL_EVERY = 0.2
+"""Seconds."""
+
+
+@dataclass
+class _Seat:
+    """An env with the episode that it lives through."""
+
+    file: EpisodeFile
+    task: str
+    run: RecordedRun
+    beginning: Beginning
+    heard: Heard
+    at: int = 0
+    """The state that it is in."""
+
+
+def rescore(
+    opened: OpenedTask,
+    files: Iterable[EpisodeFile],
+    *,
+    use_env_states: bool = False,
+    on_steps: Callable[[int], None] = lambda steps: None,
+) -> Iterator[Verdict]:
+    """Judge these episodes with the code that is open; a verdict for each, in the order in which they end.
+
+    Args:
+        use_env_states: put every recorded state in after its step, so that nothing drifts.
+        on_steps: called with the number of control steps of all episodes that were made so far.
+
+    Raises:
+        TaskError: the task's code raised.
+    """
+    task = opened.env
+    waiting = iter(files)
+    seats: dict[int, _Seat] = {}
+    steps = 0
+    more = True
+    while more or seats:
+        begun: dict[int, tuple[EpisodeFile, str, RecordedRun]] = {}
+        while more and len(seats) + len(begun) < task.num_envs:
+            file = next(waiting, None)
+            if file is None:
+                more = False
+                break
+            told = _ready(opened, file, use_env_states)
+            if isinstance(told, Verdict):
+                yield told
+            else:
+                env = next(i for i in range(task.num_envs) if i not in seats and i not in begun)
+                begun[env] = (file, *told)
+        if begun:
+            seats |= _begin(opened, begun)
+        if not seats:
+            continue
+        _one_step(opened, seats, use_env_states)
+        steps += len(seats)
+        on_steps(steps)
+        for env in [env for env, seat in seats.items() if seat.at == seat.run.length]:
+            seat = seats.pop(env)
+            verdict = verdict_of(seat.file, seat.run, seat.task, seat.heard)
+            yield replace(verdict, begins_otherwise=seat.beginning.otherwise, missed=seat.beginning.missed)
+
+
+def answer(opened: OpenedTask, request: Rescore, send: Callable[[Rescored], None]) -> None:
+    """Carry out `request` in a worker, telling how far it is a few times a second."""
+    told, steps = time.monotonic(), 0
+    ready: list[Verdict] = []
+
+    def tell(now: int) -> None:
+        nonlocal told, steps
+        steps = now
+        if time.monotonic() - told > _TELL_EVERY:
+            told = time.monotonic()
+            send(Rescored(tuple(ready), steps, False))
+            ready.clear()
+
+    try:
+        for verdict in rescore(opened, request.files, use_env_states=request.use_env_states, on_steps=tell):
+            ready.append(verdict)
+    except TaskError as error:
+        send(Rescored(tuple(ready), steps, True, error.problem))
+        return
+    send(Rescored(tuple(ready), steps, True))
+
+
+def _ready(opened: OpenedTask, file: EpisodeFile, use_env_states: bool) -> tuple[str, RecordedRun] | Verdict:
+    try:
+        episode = file.read()
+    except (UnreadableRecording, OSError) as error:
+        return Verdict(file, why_not=str(error))
+    run, info = run_of(episode), episode.info
+    why_not = why_not_lived_through(opened, run)
+    if run.length == 0:
+        why_not = "it has no step"
+    elif use_env_states and not run.env_states:
+        why_not = "it holds no env states"
+    if why_not:
+        return Verdict(file, task=info.task, seed=info.seed, length=run.length, why_not=why_not)
+    return info.task, run
+
+
+def _begin(opened: OpenedTask, begun: dict[int, tuple[EpisodeFile, str, RecordedRun]]) -> dict[int, _Seat]:
+    task = opened.env
+    beginnings = begin_again(opened, {env: run for env, (_, _, run) in begun.items()})
+    with blamed("restore", opened.loaded, task):
+        first = task.judge()
+    now = read_states(task.env)
+    seats: dict[int, _Seat] = {}
+    for env, (file, name, run) in begun.items():
+        seat = seats[env] = _Seat(file, name, run, beginnings[env], Heard())
+        _hear(seat, first, env, now)
+    return seats
+
+
+def _one_step(opened: OpenedTask, seats: dict[int, _Seat], use_env_states: bool) -> None:
+    task = opened.env
+    action = np.zeros((task.num_envs, sum(len(part.names) for part in task.parts)), np.float32)
+    for env, seat in seats.items():
+        action[env] = seat.run.action[seat.at]
+    if len(seats) < task.num_envs:
+        with only_these_move(task.env, [*seats], None):
+            step = step_checked(task, opened.loaded, action)
+    else:
+        step = step_checked(task, opened.loaded, action)
+    now = read_states(task.env)
+    for seat in seats.values():
+        seat.at += 1
+    if use_env_states:
+        with blamed("restore", opened.loaded, task):
+            write_states(task.env, {env: seat.run.state(seat.at) for env, seat in seats.items()})
+            step = task.judge(action if task.parts else None)
+        now = read_states(task.env)
+    for env, seat in seats.items():
+        seat.heard.reward.append(float(step.reward[env]))
+        _hear(seat, step, env, now)
+
+
+def _hear(seat: _Seat, step: StepResult, env: int, now: dict[str, NDArray[np.float32]]) -> None:
+    states = len(seat.heard.reward) + 1
+    for name, values in step.evaluate.items():
+        if values.dtype.kind in "fiub" and values.shape in ((len(step.reward),), (len(step.reward), 1)):
+            rows = seat.heard.evaluate.setdefault(name, [])
+            # The terms of a reward are there from the first step on.
+            rows += [np.nan] * (states - 1 - len(rows))
+            rows.append(float(values.reshape(-1)[env]))
+    recorded = seat.run.state(seat.at)
+    if recorded:
+        seat.heard.drifted(apart({name: rows[env] for name, rows in now.items()}, recorded)[0], seat.at)

@@ -1,0 +1,248 @@
+"""Recorded episodes judged again for a page: in a process of its own, with progress, and to be stopped.
+
+One thread does all of it. It groups the episodes by the env that they are judged in, has the process load one after the
+other and judge its episodes, and gathers what it says. To stop is to end the process: what is known by then stays.
+Else it is kept for a while, since it takes seconds to start.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from workbench.authoring.problem import Problem
+from workbench.session.messages import Event, Failed, Load, Loaded, TaskOptions
+from workbench.session.process import WorkerProcess, describe_exit, start_in_background
+from workbench.session.rescore import Group, group_episodes, with_renderer
+from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored, Verdict
+from workbench.session.step_back import CannotStepIn, write_source
+
+MOST_AT_ONCE = 16
+"""Envs."""
+IDLE_SECONDS = 300.0
+"""How long the process is kept without work."""
+_LOOK = 0.1
+
+RescoreState = Literal["none", "loading", "judging", "done", "stopped", "failed"]
+
+
+@dataclass(frozen=True)
+class RescoreView:
+    """How far it is, and what it came to."""
+
+    state: RescoreState = "none"
+    serial: int = 0
+    """Grows with every change."""
+    total: int = 0
+    """Episodes."""
+    verdicts: tuple[Verdict, ...] = ()
+    """In the order in which they came."""
+    steps: int = 0
+    """Control steps of all episodes so far."""
+    seconds: float = 0.0
+    """That they took, without loading."""
+    task: str = ""
+    """What is being judged with."""
+    recorded_source: bool = False
+    use_env_states: bool = False
+    notes: tuple[str, ...] = ()
+    why: str = ""
+    """Why it failed."""
+    problem: Problem | None = None
+    """What the code raised."""
+
+
+@dataclass(frozen=True)
+class _Job:
+    files: tuple[EpisodeFile, ...]
+    base: TaskOptions | None
+    recorded_source: bool
+    use_env_states: bool
+
+
+class _Stopped(Exception):
+    """The job is to go no further."""
+
+
+class _Failure(Exception):
+    def __init__(self, why: str, problem: Problem | None = None) -> None:
+        super().__init__(why)
+        self.why, self.problem = why, problem
+
+
+class Rescorer:
+    """One judgement at a time; a new one takes the place of the one before. All methods return at once."""
+
+    def __init__(self, on_change: Callable[[], None] = lambda: None) -> None:
+        """
+        Args:
+            on_change: called on this object's thread when `view` has something new.
+        """
+        self._on_change = on_change
+        self._wake = threading.Condition()
+        self._view = RescoreView()
+        self._waiting: _Job | None = None
+        self._job: _Job | None = None
+        self._closing = False
+        self._process: WorkerProcess | None = None
+        """The thread's own."""
+        self._thread: threading.Thread | None = None
+
+    @property
+    def view(self) -> RescoreView:
+        return self._view
+
+    def start(
+        self,
+        files: Sequence[EpisodeFile],
+        *,
+        base: TaskOptions | None = None,
+        recorded_source: bool = False,
+        use_env_states: bool = False,
+    ) -> None:
+        """Judge these; see `group_episodes` for the arguments."""
+        with self._wake:
+            if self._closing or not files:
+                return
+            self._waiting = _Job(tuple(files), base, recorded_source, use_env_states)
+            self._job = None
+            self._view = RescoreView(
+                "loading",
+                self._view.serial + 1,
+                len(files),
+                recorded_source=recorded_source,
+                use_env_states=use_env_states,
+            )
+            self._wake.notify_all()
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._run, name="rescore", daemon=True)
+                self._thread.start()
+
+    def stop(self) -> None:
+        """Go no further; what is known by now stays to be seen."""
+        with self._wake:
+            self._waiting = self._job = None
+            if self._view.state in ("loading", "judging"):
+                self._view = replace(self._view, state="stopped", serial=self._view.serial + 1)
+        self._on_change()
+
+    def close(self) -> None:
+        """End it all; returns when the thread has ended."""
+        with self._wake:
+            self._closing = True
+            self._waiting = self._job = None
+            self._wake.notify_all()
+        if self._thread is not None:
+            self._thread.join(timeout=10.0)
+
+    # --- the thread --------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while (job := self._next()) is not None:
+            try:
+                groups, unread = group_episodes(
+                    job.files, MOST_AT_ONCE, job.base, recorded_source=job.recorded_source
+                )
+                self._tell(job, verdicts=tuple(unread), notes=tuple({g.note for g in groups if g.note}))
+                for group in groups:
+                    self._judge(job, group)
+                self._tell(job, state="done")
+            except _Stopped:
+                self._end_process()
+            except EOFError:
+                code = None if self._process is None else self._process.exit_code()
+                self._end_process()
+                self._tell(job, state="failed", why=f"the process that judges {describe_exit(code)}")
+            except _Failure as failure:
+                self._tell(job, state="failed", why=failure.why, problem=failure.problem)
+        self._end_process()
+
+    def _next(self) -> _Job | None:
+        with self._wake:
+            while self._waiting is None and not self._closing:
+                if not self._wake.wait(IDLE_SECONDS):
+                    self._end_process()
+            if self._closing:
+                return None
+            job, self._waiting = self._waiting, None
+            self._job = job
+        self._on_change()
+        return job
+
+    def _end_process(self) -> None:
+        process, self._process = self._process, None
+        if process is not None:
+            process.stop(grace=0.0)
+
+    def _judge(self, job: _Job, group: Group) -> None:
+        process = self._process = self._process or _start()
+        folder: Path | None = None
+        reference = group.reference
+        try:
+            if job.recorded_source:
+                folder, reference = write_source(group.info)
+            shown = group.info.task + (" as it was recorded" if job.recorded_source else "")
+            self._tell(job, state="loading", task=shown)
+            # Never patched into what the last episodes were judged in.
+            process.send(Load(reference, group.options, level="rebuilt"))
+            told = self._answer(job, process, Loaded)
+            if isinstance(told, Failed):
+                process.send(Load(reference, with_renderer(group.options), level="rebuilt"))
+                told = self._answer(job, process, Loaded)
+            if isinstance(told, Failed):
+                raise _Failure(f"{group.info.task} could not be opened to judge with", told.problem)
+            self._tell(job, state="judging")
+            process.send(Rescore(group.files, job.use_env_states))
+            began, before, steps = time.monotonic(), self._view.seconds, self._view.steps
+            while True:
+                told = self._answer(job, process, Rescored)
+                if isinstance(told, Failed):
+                    raise _Failure("the episodes could not be run again", told.problem)
+                assert isinstance(told, Rescored)
+                self._tell(
+                    job,
+                    verdicts=(*self._view.verdicts, *told.verdicts),
+                    steps=steps + told.steps,
+                    seconds=before + time.monotonic() - began,
+                )
+                if told.problem is not None:
+                    raise _Failure(f"the code of {group.info.task} raised", told.problem)
+                if told.finished:
+                    return
+        except CannotStepIn as error:
+            raise _Failure(str(error)) from error
+        finally:
+            if folder is not None:
+                shutil.rmtree(folder, ignore_errors=True)
+
+    def _answer(self, job: _Job, process: WorkerProcess, kind: type) -> Event:
+        """The next event of this kind, or that it cannot be had.
+
+        Raises:
+            _Stopped: nobody waits for it any more.
+            EOFError: the process died.
+        """
+        while self._job is job:
+            event = process.receive(timeout=_LOOK)
+            if event is not None and isinstance(event, (kind, Failed)):
+                return event
+        raise _Stopped
+
+    def _tell(self, job: _Job, **values: object) -> None:
+        with self._wake:
+            if self._job is not job:
+                return
+            self._view = replace(self._view, serial=self._view.serial + 1, **values)  # type: ignore[arg-type]
+        self._on_change()
+
+
+def _start() -> WorkerProcess:
+    try:
+        return start_in_background()
+    except OSError as error:
+        raise _Failure(f"no process could be started to judge with: {error}") from error

@@ -1,0 +1,249 @@
+"""The Judge tab of the review: recorded episodes run again with today's code, and what is judged otherwise now.
+
+What to judge is chosen where recordings are chosen, in the library, or it is what is open. A row of the list opens its
+episode at the first state that differs; its reward, as it was recorded and as it is now, is drawn below.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import viser
+import viser.uplot as uplot
+
+from workbench.session import rescore_words as words
+from workbench.session.rescore_messages import EpisodeFile, Verdict
+from workbench.session.rescorer import Rescorer, RescoreView
+from workbench.session.review import Review
+from workbench.session.review_view import ReviewView
+from workbench.ui.changed import fill, show
+from workbench.ui.curves_panel import LONGEST, value_span
+from workbench.ui.fragments import render
+from workbench.ui.judgement_panel import SERIES
+from workbench.ui.presses import Presses
+
+REDRAW_EVERY = 0.2
+MOST_ROWS = 10
+"""Of the list, at a time."""
+TODAYS, RECORDED = "today's", "as recorded"
+RUNNING = ("loading", "judging")
+
+
+@dataclass
+class RescoreChoices:
+    """How it is judged; outlives the page, which goes and comes."""
+
+    recorded_source: bool = False
+    use_env_states: bool = False
+
+
+class RescorePanel:
+    """The panel in the present container.
+
+    Args:
+        server: The page.
+        rescorer: What judges.
+        review: Shows the episode of a row, and says what is open.
+        find: The files of recordings by their ids in the library; ids that are gone are left out.
+        choices: What was chosen before.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        rescorer: Rescorer,
+        review: Review,
+        find: Callable[[Sequence[str]], list[EpisodeFile]],
+        choices: RescoreChoices,
+    ) -> None:
+        self._server, self._rescorer, self._review = server, rescorer, review
+        self._find, self._choices = find, choices
+        gui = server.gui
+        self._begin = gui.add_button("Judge what is open", icon=viser.Icon.GAVEL, visible=False)
+        self._begin.on_click(lambda _: self.judge([one.id for one in review.view().opened]))
+        self._code = gui.add_dropdown(
+            "Code",
+            (TODAYS, RECORDED),
+            initial_value=RECORDED if choices.recorded_source else TODAYS,
+            hint="Today's code of the task, or the text that the recording was made with",
+        )
+        self._code.on_update(lambda _: self._chosen())
+        self._states = gui.add_checkbox(
+            "Recorded states",
+            choices.use_env_states,
+            hint="Put the recorded state in after every step, so that nothing drifts from the record",
+        )
+        self._states.on_update(lambda _: self._chosen())
+        self._stop = gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, visible=False)
+        self._stop.on_click(lambda _: rescorer.stop())
+        self._status = gui.add_html("")
+        self._list = gui.add_html("")
+        self._presses = Presses(server)
+        self._folder = gui.add_folder(None)
+        self._chart: viser.GuiUplotHandle | None = None
+        self._first = 0
+        self._listed: list[Verdict] = []
+        self._selected: str | None = None
+        self._drawn: object = None
+        self._drawn_at = 0.0
+
+    def judge(self, ids: Sequence[str]) -> None:
+        """Begin with these recordings of the library."""
+        files = self._find(ids)
+        self._first, self._selected = 0, None
+        self._rescorer.start(
+            files,
+            recorded_source=self._choices.recorded_source,
+            use_env_states=self._choices.use_env_states,
+        )
+
+    def _chosen(self) -> None:
+        # What a page sends as its choice may be anything.
+        self._choices.recorded_source = self._code.value == RECORDED
+        self._choices.use_env_states = self._states.value is True
+
+    # --- drawing -----------------------------------------------------------------------------------
+
+    def draw(self, view: ReviewView) -> None:
+        told = self._rescorer.view
+        wanted = (told.serial, view.opened_serial, view.selected, self._first, self._selected)
+        if wanted == self._drawn or time.monotonic() - self._drawn_at < REDRAW_EVERY:
+            return
+        self._drawn, self._drawn_at = wanted, time.monotonic()
+        running = told.state in RUNNING
+        show(self._begin, bool(view.opened) and not running)
+        show(self._stop, running)
+        fill(self._status, status_html(told))
+        self._listed = in_order(told.verdicts)
+        self._draw_list()
+        self._draw_chart()
+
+    def _draw_list(self) -> None:
+        count = len(self._listed)
+        self._first = max(0, min(self._first, (count - 1) // MOST_ROWS * MOST_ROWS))
+        shown = range(self._first, min(self._first + MOST_ROWS, count))
+        content = render(
+            "rescore_table",
+            rows=[self._row(place) for place in shown],
+            more=None
+            if count <= MOST_ROWS
+            else {
+                "first": shown.start + 1,
+                "last": shown.stop,
+                "of": count,
+                "back": self._presses.id_of("back", lambda _: self._turn(-MOST_ROWS)),
+                "on": self._presses.id_of("on", lambda _: self._turn(MOST_ROWS)),
+            },
+        )
+        fill(self._list, content)
+
+    def _row(self, place: int) -> dict[str, object]:
+        verdict = self._listed[place]
+        at = verdict.first_difference
+        return {
+            "episode": f"seed {verdict.seed}" if verdict.seed >= 0 else verdict.file.name[-24:],
+            "changed": words.what_changed(verdict),
+            "returns": "" if verdict.why_not else words.returns(verdict),
+            "drift": f"drifted {words.drift(verdict)}" if verdict.drifted else "",
+            "hint": f"{verdict.file.name}. Press to open it"
+            + (f" at step {at}, the first that differs" if at is not None else ""),
+            "selected": verdict.file.id == self._selected,
+            "same": not verdict.differs,
+            "press": self._presses.id_of(
+                ("row", place % MOST_ROWS), lambda _, k=place % MOST_ROWS: self._go(k)
+            ),
+        }
+
+    def _go(self, row: int) -> None:
+        place = self._first + row
+        if place >= len(self._listed):
+            return
+        verdict = self._listed[place]
+        self._selected = verdict.file.id
+        view = self._review.view()
+        opened = next((k for k, one in enumerate(view.opened) if one.id == verdict.file.id), None)
+        if opened is None:
+            self._review.open((verdict.file.id,), verdict.first_difference)
+            return
+        self._review.select(opened)
+        if verdict.first_difference is not None:
+            self._review.seek(verdict.first_difference - view.anchors[opened])
+
+    def _turn(self, by: int) -> None:
+        self._first += by
+
+    def _draw_chart(self) -> None:
+        chosen = next((v for v in self._listed if v.file.id == self._selected), None)
+        if chosen is None or len(chosen.new_reward) < 2:
+            if self._chart is not None:
+                show(self._chart, False)
+            return
+        end = min(len(chosen.new_reward), len(chosen.old_reward))
+        if chosen.first_difference is not None:
+            end = min(end, max(LONGEST, chosen.first_difference + LONGEST // 2))
+        part = slice(max(0, end - LONGEST), end)
+        steps = np.arange(1, len(chosen.new_reward) + 1, dtype=np.float64)[part]
+        data = (steps, *(np.asarray(v[part], np.float64) for v in (chosen.old_reward, chosen.new_reward)))
+        scales = {"x": uplot.Scale(time=False), "y": uplot.Scale(range=value_span(data[1:]))}
+        title = f"reward of {f'seed {chosen.seed}' if chosen.seed >= 0 else chosen.file.name}, then and now"
+        if self._chart is None:
+            with self._folder:
+                self._chart = self._server.gui.add_uplot(
+                    data,
+                    SERIES,
+                    title=title,
+                    scales=scales,
+                    axes=(uplot.Axis(size=30), uplot.Axis(size=46)),
+                    legend=uplot.Legend(show=True),
+                    height=160,
+                    padding=(6, 12, 0, 0),
+                )
+            return
+        with self._server.atomic():
+            self._chart.scales, self._chart.title, self._chart.data = scales, title, data
+        show(self._chart, True)
+
+
+def in_order(verdicts: Sequence[Verdict]) -> list[Verdict]:
+    """What changed most first: success and fail, then return; what is as it was, and what was not judged, last."""
+
+    def key(verdict: Verdict) -> tuple[bool, bool, bool, float]:
+        moved = verdict.success[0] != verdict.success[1] or verdict.fail[0] != verdict.fail[1]
+        change = abs(verdict.returns[1] - verdict.returns[0])
+        return (
+            bool(verdict.why_not),
+            not verdict.differs,
+            not moved,
+            -change if np.isfinite(change) else -np.inf,
+        )
+
+    return sorted(verdicts, key=key)
+
+
+def status_html(told: RescoreView) -> str:
+    problem = told.problem
+    file = None if problem is None else problem.file
+    known = told.verdicts if told.state != "none" else ()
+    rate = told.steps / told.seconds if told.seconds > 0.5 else 0.0
+    return render(
+        "rescore",
+        state=told.state,
+        task=told.task,
+        done=len(told.verdicts),
+        total=told.total,
+        percent=f"{100 * len(told.verdicts) / max(1, told.total):.0f}",
+        rate=f"{rate:.0f} steps a second" if rate >= 1 else "",
+        why=told.why,
+        message="" if problem is None else problem.message,
+        where="" if file is None or problem is None else f"{Path(file).name}:{problem.line}",
+        path=file or "",
+        code="" if problem is None else problem.code or "",
+        headline=words.summary(known) if known and told.state in ("done", "stopped") else "",
+        doubt=words.doubts(known),
+        notes=told.notes,
+        not_carried=words.not_carried(known),
+    )

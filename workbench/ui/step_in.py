@@ -1,0 +1,263 @@
+"""From the review into the live env, and back: what "Go on live from here" opens, and in which code.
+
+Where the task of the recording is open already, its selected env (or all) is put into the recorded state. Where it is
+not, or where the recorded text is wanted, another session is opened for it beside the one that is open, which goes on as it
+is and can be gone back to. Sessions that are opened here are closed here, with the folder of a recorded text.
+"""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import viser
+
+from workbench.recording.library import Library
+from workbench.session.messages import TaskOptions
+from workbench.session.rescore_messages import EpisodeFile
+from workbench.session.rescorer import Rescorer
+from workbench.session.review_view import ReviewView
+from workbench.session.session import Session
+from workbench.session.step_back import (
+    CannotStepIn,
+    options_of,
+    reference_of,
+    run_of,
+    why_not_into,
+    write_source,
+)
+from workbench.ui.changed import show
+from workbench.ui.put_together import Workplace
+from workbench.ui.rescore_panel import RescoreChoices, RescorePanel
+from workbench.ui.review_page import Places, ReviewOffers
+
+TODAYS, RECORDED = "today's", "as recorded"
+ONE, ALL = "the selected env", "all envs"
+NEW_ENVS = 4
+"""Envs of a session that is opened for all of them."""
+
+
+class StepIn:
+    """Goes live from recordings.
+
+    Args:
+        place: The pages, and the session that is open, if one is.
+        make_session: Opens a task; gets what `Session` gets.
+    """
+
+    def __init__(self, place: Workplace, make_session: Callable[[str, TaskOptions], Session]) -> None:
+        self._place, self._make = place, make_session
+        self._first = place.session
+        self._lock = threading.Lock()
+        self._own: tuple[Session, Path | None] | None = None
+        self.recorded_source, self.everywhere = False, False
+        self._server: viser.ViserServer | None = None
+
+    def go(self, id: str, state: int) -> None:
+        """Go on live from a state of an opened recording."""
+        review = self._place.shelf.review.view()
+        one = next((one for one in review.opened if one.id == id), None)
+        if one is None:
+            return
+        try:
+            run = run_of(one.episode, state)
+            info = one.episode.info
+            with self._lock:
+                session = self._place.session
+                task = None if session is None else session.view().task
+                fits = session is not None and (task is None or not why_not_into(task, info))
+                if self.recorded_source:
+                    run = replace(run, name=f"{run.name} as it was recorded")
+                    folder, reference = write_source(info)
+                    session = self._open(reference, options_of(info, self._count()), folder)
+                elif not fits or session is None or (self._own is not None and self._own[1] is not None):
+                    known = self._first if self._first is not session else None
+                    task = None if known is None else known.view().task
+                    if known is not None and task is not None and not why_not_into(task, info):
+                        session = known
+                    else:
+                        session = self._open(reference_of(info), options_of(info, self._count()), None)
+        except CannotStepIn as error:
+            self._say(str(error))
+            return
+        session.step_back(run, self.everywhere)
+        self._place.go_live_with(session)
+        self._place.pages.show("live")
+
+    def part(self, server: viser.ViserServer, places: Places) -> StepInPart:
+        """The choices, for the review page."""
+        self._server = server
+        with places.review:
+            return StepInPart(server, self)
+
+    def can_go_home(self) -> bool:
+        """Whether another session is live than the one that was opened first."""
+        return self._first is not None and self._place.session is not self._first
+
+    def go_home(self) -> None:
+        """Back to the session that was opened first; the other ends."""
+        if self._first is None:
+            return
+        self._place.go_live_with(self._first)
+        self._place.pages.show("live")
+        with self._lock:
+            before, self._own = self._own, None
+        if before is not None:
+            threading.Thread(target=_end, args=before, name="end-session", daemon=True).start()
+
+    def close(self) -> None:
+        """End what was opened here; the pages must be stopped."""
+        with self._lock:
+            self._end_own()
+
+    def _count(self) -> int:
+        return NEW_ENVS if self.everywhere else 1
+
+    def _open(self, reference: str, options: TaskOptions, folder: Path | None) -> Session:
+        if self._first is not None:
+            self._first.pause()
+        before, self._own = self._own, None
+        session = self._make(reference, options)
+        self._own = session, folder
+        if before is not None:
+            # Its page, if it is the one that is shown, is taken away before it is missed.
+            threading.Thread(target=_end, args=before, name="end-session", daemon=True).start()
+        return session
+
+    def _end_own(self) -> None:
+        own, self._own = self._own, None
+        if own is not None:
+            _end(*own)
+
+    def _say(self, text: str) -> None:
+        if self._server is not None:
+            for client in self._server.get_clients().values():
+                client.add_notification("This recording cannot be gone into", text, color="red")
+
+
+class StepInPart:
+    """How to go live: the code, and into which envs."""
+
+    def __init__(self, server: viser.ViserServer, step_in: StepIn) -> None:
+        self._step_in = step_in
+        gui = server.gui
+        self._folder = gui.add_folder("Going on live", expand_by_default=False, visible=False)
+        with self._folder:
+            self._code = gui.add_dropdown(
+                "Code",
+                (TODAYS, RECORDED),
+                initial_value=RECORDED if step_in.recorded_source else TODAYS,
+                hint="Today's code of the task, or the recorded text, opened from a folder that goes when you are done",
+            )
+            self._envs = gui.add_dropdown(
+                "Into",
+                (ONE, ALL),
+                initial_value=ALL if step_in.everywhere else ONE,
+                hint="Which envs are put into the recorded state",
+            )
+            self._home = gui.add_button(
+                "Back to the task opened first", icon=viser.Icon.ARROW_BACK_UP, visible=False
+            )
+        self._code.on_update(lambda _: self._chosen())
+        self._envs.on_update(lambda _: self._chosen())
+        self._home.on_click(lambda _: step_in.go_home())
+
+    def draw(self, view: ReviewView) -> None:
+        home = self._step_in.can_go_home()
+        show(self._folder, bool(view.opened) or home)
+        show(self._home, home)
+
+    def _chosen(self) -> None:
+        # What a page sends as its choice may be anything.
+        self._step_in.recorded_source = self._code.value == RECORDED
+        self._step_in.everywhere = self._envs.value == ALL
+
+
+class Judging:
+    """Judging again, as the review page offers it.
+
+    Args:
+        place: The pages.
+    """
+
+    def __init__(self, place: Workplace) -> None:
+        self._place = place
+        self.rescorer = Rescorer()
+        self._choices = RescoreChoices()
+        self._panel: RescorePanel | None = None
+        self._server: viser.ViserServer | None = None
+
+    def part(self, server: viser.ViserServer, places: Places) -> RescorePanel:
+        """The tab, for the review page."""
+        self._server = server
+        with places.tabs.add_tab("Judge", viser.Icon.GAVEL):
+            shelf = self._place.shelf
+            self._panel = RescorePanel(
+                server,
+                self.rescorer,
+                shelf.review,
+                lambda ids: episode_files(shelf.library, ids),
+                self._choices,
+            )
+        return self._panel
+
+    def judge(self, ids: tuple[str, ...]) -> None:
+        """Judge recordings that are selected in the library."""
+        if self._panel is None or self._server is None:
+            return
+        self._panel.judge(ids)
+        for client in self._server.get_clients().values():
+            client.add_notification(
+                f"Judging {len(ids)} recording{'' if len(ids) == 1 else 's'} again",
+                "What is otherwise now is listed under Judge.",
+                auto_close_seconds=4.0,
+            )
+
+    def close(self) -> None:
+        self.rescorer.close()
+
+
+def episode_files(library: Library, ids: Sequence[str]) -> list[EpisodeFile]:
+    """Where these recordings are; those that are gone, or cannot be read, are left out."""
+    rows = {row.id: row for row in library.rows()}
+    return [
+        EpisodeFile(row.id, row.name, row.paths[0], row.trajectory)
+        for row in (rows[id] for id in dict.fromkeys(ids) if id in rows)
+        if row.paths
+    ]
+
+
+def offer_going_back_in(
+    place: Workplace, make_session: Callable[[str, TaskOptions], Session]
+) -> Callable[[], None]:
+    """Put both into what the review page offers.
+
+    Returns:
+        what ends them, to be called after the pages were stopped.
+    """
+    step_in, judging = StepIn(place, make_session), Judging(place)
+
+    def add(_: Workplace, offers: ReviewOffers) -> ReviewOffers:
+        return replace(
+            offers,
+            on_step_back=step_in.go,
+            on_rescore=judging.judge,
+            parts=(*offers.parts, step_in.part, judging.part),
+        )
+
+    place.offer(add)
+
+    def close() -> None:
+        judging.close()
+        step_in.close()
+
+    return close
+
+
+def _end(session: Session, folder: Path | None) -> None:
+    session.close()
+    if folder is not None:
+        shutil.rmtree(folder, ignore_errors=True)
