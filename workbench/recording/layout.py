@@ -19,14 +19,16 @@ z forward); ManiSkill has wxyz and x forward, y left, z up.
 from __future__ import annotations
 
 import math
+import weakref
 from collections import Counter
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from workbench.core.geometry import Material, Mesh, SceneGeometry
+from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo
 from workbench.recording.columns import EVALUATE, OBS, Column
 from workbench.recording.encoded_pictures import MILLIMETRES_PER_METRE, decode
@@ -71,7 +73,7 @@ class EpisodeLog:
         log, survey, states = self._log, self._survey, piece.states
         poses = piece.columns["poses"]
         for body, entity in self._bodies:
-            if not _stands(survey, body):
+            if not survey.still[body]:
                 log.pose(entity, states, poses[:, body, :3], xyzw(poses[:, body, 3:]))
         for (index, modality), (frames, blobs) in piece.pictures.items():
             _log_pictures(log, survey.cameras[index], self._cameras[index], modality, frames, blobs)
@@ -148,33 +150,48 @@ def evaluate_entity(name: str) -> str:
 # --- scene ----------------------------------------------------------------------------------------
 
 
-def _stands(survey: Survey, body: int) -> bool:
-    return bool(survey.still[body]) and survey.header.geometry.body_kinds[body] == "static"
-
-
 def _log_scene(log: Log, survey: Survey, entities: dict[int, str]) -> None:
     log.static(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     for body, entity in entities.items():
-        if _stands(survey, body):
+        if survey.still[body]:
             pose = survey.first_poses[body]
             log.still(entity, pose[:3], xyzw(pose[3:]))
     worn: Counter[int] = Counter()
     for visual in survey.header.geometry.visuals:
-        mesh = _mesh(visual.mesh, visual.material) if survey.info.env_index in visual.envs else None
-        if mesh is None:
+        worn_by = [int(body) for body in visual.bodies[visual.envs == survey.info.env_index]]
+        drawn = _drawn(visual) if any(body in entities for body in worn_by) else None
+        if drawn is None:
             continue
+        for body in worn_by:
+            if body in entities:
+                log.static(f"{entities[body]}/{worn[body]}", *drawn)
+                worn[body] += 1
+
+
+_made: dict[int, tuple[weakref.ref[Visual], tuple[Any, ...] | None]] = {}
+"""What `_drawn` made, by the visual's id, for as long as the visual lives: episodes follow each other in one scene, and its textures
+are megabytes to convert."""
+
+
+def _drawn(visual: Visual) -> tuple[Any, ...] | None:
+    """`visual` as what rerun logs for it; None where it has no triangles."""
+    held = _made.get(id(visual))
+    if held is not None and held[0]() is visual:
+        return held[1]
+    mesh = _mesh(visual.mesh, visual.material)
+    drawn = None
+    if mesh is not None:
         # What rerun's mesh does not say, for whoever reads the scene back.
-        material = rr.AnyValues(
+        said = rr.AnyValues(
             visual=visual.name,
             base_color=list(visual.material.base_color),
             metallic=visual.material.metallic,
             roughness=visual.material.roughness,
         )
-        for body in visual.bodies[visual.envs == survey.info.env_index]:
-            if int(body) in entities:
-                log.static(f"{entities[int(body)]}/{worn[int(body)]}", mesh)
-                log.static(f"{entities[int(body)]}/{worn[int(body)]}", material)
-                worn[int(body)] += 1
+        drawn = (mesh, said)
+    key = id(visual)
+    _made[key] = (weakref.ref(visual, lambda _: _made.pop(key, None)), drawn)
+    return drawn
 
 
 def _mesh(mesh: Mesh, material: Material) -> rr.Mesh3D | None:

@@ -49,8 +49,8 @@ class Log:
         self._control_dt = control_dt
         self.account = Account()
 
-    def static(self, entity: str, values: Any) -> None:
-        self._recording.log(entity, values, static=True)
+    def static(self, entity: str, *values: Any) -> None:
+        self._recording.log(entity, *values, static=True)
         self.account.statics.add(entity)
 
     def columns(self, entity: str, steps: NDArray[np.int64], columns: Iterable[Any]) -> None:
