@@ -129,9 +129,12 @@ def test_aligned_at_an_event_each_shows_its_own_state_of_it() -> None:
     review.close_one(0)
     assert [o.id for o in review.view().opened] == ["b", "c"]
     assert review.view().align == "first success"
-    review.close_one(0), review.close_one(0)
+    review.close_one(0)
+    review.close_one(0)
     assert review.view().opened == () and review.view().states == ()
-    review.toggle_play(), review.seek_by(1), review.seek_event(1)
+    review.toggle_play()
+    review.seek_by(1)
+    review.seek_event(1)
 
 
 def test_what_cannot_be_read_is_said_and_the_rest_opens() -> None:
@@ -165,14 +168,16 @@ def test_more_than_can_be_open_are_left_out_with_a_word() -> None:
 
 def test_files_that_change_or_go_are_said_and_stay_open(tmp_path: Path) -> None:
     changed, gone = tmp_path / "a.rrd", tmp_path / "a.h5"
-    changed.write_text("1"), gone.write_text("1")
+    changed.write_text("1")
+    gone.write_text("1")
     review, shelf = review_of(a=made(3))
     shelf.extra["a"] = (changed, gone)
     opened(review, "a")
     shelf.now += 10
     review.look_at_files()
     assert review.view().problems == ()
-    changed.write_text("another"), gone.unlink()
+    changed.write_text("another")
+    gone.unlink()
     shelf.now += 10
     review.look_at_files()
     said = " ".join(review.view().problems)

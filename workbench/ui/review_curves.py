@@ -189,7 +189,7 @@ class ReviewCurves:
             dot[at] = drawn[cursor][2][position - int(axis[0])]
             data, series = (*data, dot), [*series, CURSOR]
         # uPlot finds no range for data with NaN in it.
-        scales = {"x": uplot.Scale(time=False), "y": uplot.Scale(range=value_span(data[1:]))}
+        scales = {"x": uplot.Scale(time=False), "y": uplot.Scale(range=span_of(data[1:]))}
         if handle is None:
             with self._charts_folder:
                 self._charts[chart] = self._server.gui.add_uplot(
@@ -217,6 +217,14 @@ class ReviewCurves:
 
 
 ORDER = {"reward": 1.0, "also": 2.0, "terms": 3.0, "action": 4.0}
+
+
+def span_of(lines: tuple[NDArray[np.float64], ...]) -> tuple[float, float]:
+    """The range of a chart; of a yes or no always the same one, whether it changes or not."""
+    values = np.concatenate(lines)
+    if np.isin(values[np.isfinite(values)], (0.0, 1.0)).all():
+        return -0.05, 1.05
+    return value_span(lines)
 
 
 def known(number: str) -> str:
