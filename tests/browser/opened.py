@@ -54,9 +54,9 @@ class Opened:
 
 
 @contextmanager
-def open_workbench(*arguments: str, cwd: Path) -> Iterator[Opened]:
-    """Start it on a free port; end it with Ctrl-C's signal and insist that it ends."""
-    command = [sys.executable, "-m", "workbench.cli", "open", *arguments, "--port", "0"]
+def open_workbench(*arguments: str, cwd: Path, what: str = "open") -> Iterator[Opened]:
+    """Start ``workbench open``, or `what`, on a free port; end it with Ctrl-C's signal and insist that it ends."""
+    command = [sys.executable, "-m", "workbench.cli", what, *arguments, "--port", "0"]
     process = subprocess.Popen(
         command,
         cwd=cwd,
