@@ -130,3 +130,10 @@ def until(reached: Callable[[], bool], what: str, seconds: float = 60.0) -> None
     while not reached():
         assert time.monotonic() < deadline, f"{what} did not come within {seconds} s"
         time.sleep(0.05)
+
+
+def close_notice(page: Page) -> None:
+    """Press away viser's notice that the browser draws in software: it lies over what is below it."""
+    notice = page.locator(".mantine-Notification-closeButton")
+    if notice.count():
+        notice.first.click()

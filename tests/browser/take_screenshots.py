@@ -18,7 +18,7 @@ from PIL import Image
 from playwright.sync_api import Page, expect, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.browser.opened import launch, new_page, open_workbench
+from tests.browser.opened import close_notice, launch, new_page, open_workbench
 from workbench.machine.chromium import find_chromium, how_to_get_chromium
 
 ROOT = Path(__file__).parents[2]
@@ -225,12 +225,6 @@ def shoot_camera_judged(page: Page) -> None:
     shoot(page, "judge_camera")
     page.locator("input[aria-haspopup=listbox]:visible").first.click()
     page.get_by_role("option", name="none", exact=True).click()
-
-
-def close_notice(page: Page) -> None:
-    notice = page.locator(".mantine-Notification-closeButton")
-    if notice.count():
-        notice.first.click()
 
 
 def shoot_judged(page: Page, file: Path) -> None:

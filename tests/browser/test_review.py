@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
-from tests.browser.opened import launch, new_page, open_workbench, until
+from tests.browser.opened import close_notice, launch, new_page, open_workbench, until
 from tests.session.recordings import made, write
 
 pytestmark = pytest.mark.browser
@@ -142,6 +142,7 @@ def test_from_the_live_page_to_the_recordings_and_back(folder: Path, browser: Br
         page.get_by_role("tab", name="Episodes").click()
         page.get_by_role("button", name="Review recordings").click()
         expect(page.get_by_text("No recording is open")).to_be_visible()
+        close_notice(page)
         page.get_by_role("button", name="Back to the live env").click()
         expect(page.get_by_role("tab", name="Studio")).to_be_visible()
 
