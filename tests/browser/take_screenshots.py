@@ -185,8 +185,8 @@ def shoot_review(chromium: str) -> None:
         ):
             page, _ = new_page(launch(playwright, chromium))
             page.goto(opened.url)
-            rows = page.get_by_text(re.compile("seed0000"))
-            expect(rows).to_have_count(2, timeout=60_000)
+            rows = page.locator(".wb-library").get_by_text(re.compile("seed0000"))
+            expect(rows).to_have_count(2, timeout=120_000)
             close_notice(page)
             rows.last.click()
             shoot(page, "library")
