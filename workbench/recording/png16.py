@@ -39,5 +39,10 @@ def encode_png16(pixels: NDArray[np.uint16]) -> bytes:
 
 def _chunk(kind: bytes, content: bytes) -> bytes:
     return b"".join(
-        (struct.pack(">I", len(content)), kind, content, struct.pack(">I", zlib.crc32(content, zlib.crc32(kind))))
+        (
+            struct.pack(">I", len(content)),
+            kind,
+            content,
+            struct.pack(">I", zlib.crc32(content, zlib.crc32(kind))),
+        )
     )

@@ -18,7 +18,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.pictures import Picture
@@ -157,6 +156,9 @@ class EpisodeGatherer:
         elapsed, reward = step.elapsed_steps.tolist(), step.reward.tolist()
         over = (step.terminated | step.truncated).tolist()
         success = step.evaluate.get("success")
+        if success is not None:
+            success = success.reshape(len(success), -1).any(axis=1).tolist()
+        captured = stepped.captured
         layout, rows = self._packer.pack(batch_columns(step, stepped.columns, state_names))
         for episode in episodes:
             env = episode.env
@@ -165,11 +167,11 @@ class EpisodeGatherer:
                     f"env {env}: step {episode.steps + 1} was expected and step {elapsed[env]} came; a step was lost or "
                     "the env was reset unseen"
                 )
-            pictures = [p for p in stepped.captured if p.env == env] if stepped.captured else ()
+            pictures = [p for p in captured if p.env == env] if captured else ()
             episode.writer.append_packed(layout, rows[env], pictures)
             episode.steps += 1
             episode.total_reward += reward[env]
-            episode.success = None if success is None else bool(np.any(success[env]))
+            episode.success = None if success is None else success[env]
             if over[env] and self._ends == "over":
                 self.end(env)
 
