@@ -33,7 +33,11 @@ def encode_png16(pixels: NDArray[np.uint16]) -> bytes:
     filtered[0, 1:] = lines[0]
     np.subtract(lines[1:], lines[:-1], out=filtered[1:, 1:])
     header = struct.pack(">IIBBBBB", width, height, 16, _GREYSCALE, 0, 0, 0)
-    parts = (_chunk(b"IHDR", header), _chunk(b"IDAT", zlib.compress(filtered, _LEVEL)), _chunk(b"IEND", b""))
+    parts = (
+        _chunk(b"IHDR", header),
+        _chunk(b"IDAT", zlib.compress(filtered.data, _LEVEL)),
+        _chunk(b"IEND", b""),
+    )
     return _SIGNATURE + b"".join(parts)
 
 

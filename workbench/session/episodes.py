@@ -155,9 +155,10 @@ class EpisodeGatherer:
         step = stepped.step
         elapsed, reward = step.elapsed_steps.tolist(), step.reward.tolist()
         over = (step.terminated | step.truncated).tolist()
-        success = step.evaluate.get("success")
-        if success is not None:
-            success = success.reshape(len(success), -1).any(axis=1).tolist()
+        successes = step.evaluate.get("success")
+        success: list[bool] | None = None
+        if successes is not None:
+            success = successes.reshape(len(successes), -1).any(axis=1).tolist()
         captured = stepped.captured
         layout, rows = self._packer.pack(batch_columns(step, stepped.columns, state_names))
         for episode in episodes:
