@@ -156,9 +156,12 @@ class EpisodeGatherer:
         elapsed, reward = step.elapsed_steps.tolist(), step.reward.tolist()
         over = (step.terminated | step.truncated).tolist()
         successes = step.evaluate.get("success")
-        success: list[bool] | None = None
-        if successes is not None:
-            success = successes.reshape(len(successes), -1).any(axis=1).tolist()
+        # One value an env, or several.
+        success = (
+            None
+            if successes is None
+            else [bool(value) for value in successes.any(tuple(range(1, successes.ndim)))]
+        )
         captured = stepped.captured
         layout, rows = self._packer.pack(batch_columns(step, stepped.columns, state_names))
         for episode in episodes:
