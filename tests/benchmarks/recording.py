@@ -46,6 +46,7 @@ class Options:
     steps: int = 200
     """Of an episode."""
     rounds: int = 5
+    """Without a camera; 0 leaves it out."""
     camera_steps: int = 50
     """PickCube's own episode. RecordEpisode copies all that it has at every step, so its steps grow slower with the episode."""
     camera_rounds: int = 3
@@ -247,8 +248,9 @@ def measure(options: Options, num_envs: int, camera: bool) -> None:
 
 def main(options: Options) -> None:
     torch.set_num_threads(1)
-    for num_envs in options.num_envs:
-        measure(options, num_envs, camera=False)
+    if options.rounds:
+        for num_envs in options.num_envs:
+            measure(options, num_envs, camera=False)
     if options.camera_rounds:
         for num_envs in options.num_envs:
             measure(options, num_envs, camera=True)

@@ -18,6 +18,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.pictures import Picture
@@ -156,12 +157,10 @@ class EpisodeGatherer:
         elapsed, reward = step.elapsed_steps.tolist(), step.reward.tolist()
         over = (step.terminated | step.truncated).tolist()
         successes = step.evaluate.get("success")
-        # One value an env, or several.
-        success = (
-            None
-            if successes is None
-            else [bool(value) for value in successes.any(tuple(range(1, successes.ndim)))]
-        )
+        success: list[bool] | None = None
+        if successes is not None:
+            # One value an env, or several.
+            success = np.any(successes.reshape(len(successes), -1), axis=1).tolist()
         captured = stepped.captured
         layout, rows = self._packer.pack(batch_columns(step, stepped.columns, state_names))
         for episode in episodes:
