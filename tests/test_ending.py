@@ -69,7 +69,7 @@ def test_ctrl_c_ends_all_that_there_can_be(tmp_path: Path) -> None:
         assert gone(processes)
         print(f"all gone after {time.monotonic() - began:.2f} s")
         deaf.close()
-    recordings = list((tmp_path / "recordings").iterdir())
+    recordings = list((tmp_path / "recordings").glob("*.rrd"))
     assert recordings and not [problem for problem in map(verify_rrd, recordings) if problem is not None]
     ending = "\n".join(opened.lines[said:])
     assert "Traceback" not in ending, "\n".join(opened.lines)

@@ -54,9 +54,9 @@ class Opened:
 
 
 @contextmanager
-def open_workbench(*arguments: str, cwd: Path) -> Iterator[Opened]:
-    """Start it on a free port; end it with Ctrl-C's signal and insist that it ends."""
-    command = [sys.executable, "-m", "workbench.cli", "open", *arguments, "--port", "0"]
+def open_workbench(*arguments: str, cwd: Path, what: str = "open") -> Iterator[Opened]:
+    """Start ``workbench open``, or `what`, on a free port; end it with Ctrl-C's signal and insist that it ends."""
+    command = [sys.executable, "-m", "workbench.cli", what, *arguments, "--port", "0"]
     process = subprocess.Popen(
         command,
         cwd=cwd,
@@ -130,3 +130,10 @@ def until(reached: Callable[[], bool], what: str, seconds: float = 60.0) -> None
     while not reached():
         assert time.monotonic() < deadline, f"{what} did not come within {seconds} s"
         time.sleep(0.05)
+
+
+def close_notice(page: Page) -> None:
+    """Press away viser's notice that the browser draws in software: it lies over what is below it."""
+    notice = page.locator(".mantine-Notification-closeButton")
+    if notice.count():
+        notice.first.click()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import subprocess
 import sys
 import tempfile
 import time
@@ -17,7 +18,7 @@ from PIL import Image
 from playwright.sync_api import Page, expect, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.browser.opened import launch, new_page, open_workbench
+from tests.browser.opened import close_notice, launch, new_page, open_workbench
 from workbench.machine.chromium import find_chromium, how_to_get_chromium
 
 ROOT = Path(__file__).parents[2]
@@ -153,6 +154,61 @@ def shoot_studio(chromium: str) -> None:
             shoot(page, "studio")
 
 
+def record(file: Path, folder: Path, *arguments: str) -> None:
+    """Eight episodes of a policy that is careless in some."""
+    policy = f"{Path(__file__).parent / 'pusher.py'}:act"
+    command = [
+        sys.executable,
+        "-m",
+        "workbench.cli",
+        "record",
+        str(file),
+        "--actions",
+        policy,
+        "--out",
+        str(folder),
+    ]
+    subprocess.run([*command, "--env", "control_mode=pd_ee_delta_pos", *arguments], check=True)
+
+
+def shoot_review(chromium: str) -> None:
+    """The library; one episode; and one seed under two versions of the task, over each other."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(shutil.copy(TASK, Path(folder) / "push_cube.py"))
+        recordings = Path(folder) / "recordings"
+        record(file, recordings, "--episodes", "8", "--num-envs", "8")
+        file.write_text(TASK.read_text().replace("CUBE_HALF_SIZE = 0.02", "CUBE_HALF_SIZE = 0.025"))
+        record(file, recordings, "--episodes", "2", "--num-envs", "8", "--no-pictures")
+        with (
+            open_workbench(str(recordings), cwd=Path(folder), what="review") as opened,
+            sync_playwright() as playwright,
+        ):
+            page, _ = new_page(launch(playwright, chromium))
+            page.goto(opened.url)
+            rows = page.get_by_text(re.compile("seed0000"))
+            expect(rows).to_have_count(2, timeout=60_000)
+            close_notice(page)
+            rows.last.click()
+            shoot(page, "library")
+            page.keyboard.press("Enter")
+            expect(page.get_by_text(re.compile("step 0 /")).first).to_be_visible(timeout=60_000)
+            for _ in range(2):
+                page.keyboard.press("Shift+ArrowRight")
+                time.sleep(1.0)
+            tab(page, "Cameras")
+            shoot(page, "review")
+            page.keyboard.press("b")
+            rows.first.click()
+            page.keyboard.down("Control")
+            rows.last.click()
+            page.keyboard.up("Control")
+            page.keyboard.press("Enter")
+            tab(page, "Compare")
+            expect(page.get_by_text(re.compile("They part at"))).to_be_visible(timeout=60_000)
+            page.keyboard.press("End")
+            shoot(page, "compare")
+
+
 def shoot_camera_judged(page: Page) -> None:
     """What a camera sees of all envs: the table, the depths, and the pictures."""
     tab(page, "Studio")
@@ -169,12 +225,6 @@ def shoot_camera_judged(page: Page) -> None:
     shoot(page, "judge_camera")
     page.locator("input[aria-haspopup=listbox]:visible").first.click()
     page.get_by_role("option", name="none", exact=True).click()
-
-
-def close_notice(page: Page) -> None:
-    notice = page.locator(".mantine-Notification-closeButton")
-    if notice.count():
-        notice.first.click()
 
 
 def shoot_judged(page: Page, file: Path) -> None:
@@ -203,6 +253,7 @@ def main() -> None:
     OUT.mkdir(exist_ok=True)
     shoot_envs(chromium)
     shoot_studio(chromium)
+    shoot_review(chromium)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(shutil.copy(TASK, Path(folder) / "push_cube.py"))
         with (

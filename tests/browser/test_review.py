@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
-from tests.browser.opened import launch, new_page, open_workbench, until
+from tests.browser.opened import close_notice, launch, new_page, open_workbench, until
 from tests.session.recordings import made, write
 
 pytestmark = pytest.mark.browser
@@ -136,15 +136,22 @@ def test_from_the_live_page_to_the_recordings_and_back(folder: Path, browser: Br
     task = Path(__file__).parents[2] / "tasks" / "minimal.py"
     arguments = (str(task), "--num-envs", "1", "--no-spare", "--recordings", str(folder))
     with open_workbench(*arguments, cwd=folder) as opened:
-        page, errors = new_page(browser, 900, 600)
+        page, errors = new_page(browser)
         page.goto(opened.url)
         expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
         page.get_by_role("tab", name="Episodes").click()
         page.get_by_role("button", name="Review recordings").click()
         expect(page.get_by_text("No recording is open")).to_be_visible()
+        close_notice(page)
         page.get_by_role("button", name="Back to the live env").click()
         expect(page.get_by_role("tab", name="Studio")).to_be_visible()
-        page.keyboard.press("s")
-        expect(page.locator(".wb-status").get_by_text(re.compile("step 1"))).to_be_visible()
+
+        def steps() -> bool:
+            # Keys come with the last part of the page.
+            page.keyboard.press("s")
+            page.wait_for_timeout(500)
+            return page.locator(".wb-status").get_by_text(re.compile(r"step [1-9]")).count() > 0
+
+        until(steps, "a step")
         assert [e for e in errors if LATE not in e] == []
         page.close()

@@ -23,7 +23,7 @@ def import_file(name: str) -> None:
     spec.loader.exec_module(importlib.util.module_from_spec(spec))
 
 
-@pytest.fixture(scope="session", autouse=True)
+@pytest.fixture(scope="module", autouse=True)
 def example_tasks() -> None:
     for name, env_id in IDS.items():
         # Another test may have left an edited version, which ManiSkill would not replace.
@@ -33,7 +33,7 @@ def example_tasks() -> None:
 
 
 @pytest.fixture(scope="session")
-def render_system(example_tasks: None) -> object:
+def render_system() -> object:
     """Kept alive, because with the last one go the shaders: 5 s for each env instead of 0.2 s."""
     try:
         return sapien.render.RenderSystem(sapien.Device("cpu"))

@@ -73,6 +73,8 @@ class CameraStudio:
         self.folder = Path.cwd()
         """Where a copy of a task goes: where the program was started."""
         self._lock = threading.Lock()
+        self._asking = threading.Lock()
+        """Held while placements are sent; taken before `_lock`."""
         self._thread = ThreadPoolExecutor(1, "studio")
         self._closing = False
         self._serial = 0
@@ -103,24 +105,20 @@ class CameraStudio:
         with self._lock:
             why_not = self._refusal(key) or why_no_camera(settings)
             self._problem = f"{key[1]} is left where it is: {why_not}." if why_not else ""
-            request = None
-            if not why_not and self._placements.place(key, settings, gesture):
-                request = self._request(key)
-        self._send_all([request] if request else [])
+            moved = not why_not and self._placements.place(key, settings, gesture)
+        self.ask_for([key] if moved else [])
 
     def undo(self) -> None:
         """Take the last step back."""
         with self._lock:
             step = self._placements.undo()
-            requests = [self._request(step.key)] if step is not None else []
-        self._send_all(requests)
+        self.ask_for([] if step is None else [step.key])
 
     def redo(self) -> None:
         """Make the step again that was taken back last."""
         with self._lock:
             step = self._placements.redo()
-            requests = [self._request(step.key)] if step is not None else []
-        self._send_all(requests)
+        self.ask_for([] if step is None else [step.key])
 
     def back_to_file(self, key: CameraKey) -> None:
         """Place a camera as the file says."""
@@ -129,7 +127,7 @@ class CameraStudio:
             moved = file is not None and self._placements.place(
                 key, file, words=f"put {key[1]} back to the file"
             )
-        self._send_all([PlaceCamera(key, None)] if moved else [])
+        self.ask_for([key] if moved else [])
 
     # --- into the file -------------------------------------------------------------------------------
 
@@ -444,14 +442,14 @@ class CameraStudio:
 
     # --- what the session tells ------------------------------------------------------------------------
 
-    def loaded(self, task: TaskDescription, level: ReloadLevel | None) -> list[PlaceCamera]:
+    def loaded(self, task: TaskDescription, level: ReloadLevel | None) -> tuple[CameraKey, ...]:
         """A version runs, and what was written is compared with it. To be told under the session's lock: calls nobody.
 
         Args:
             level: how it came in; None for the first.
 
         Returns:
-            what is to be asked of the worker, so that its cameras stand where they are placed.
+            the cameras to `ask_for` then, so that the worker's stand where they are placed.
         """
         with self._lock:
             self._task = task
@@ -480,7 +478,7 @@ class CameraStudio:
             if level not in ("same", "cameras"):
                 self._judging.outdate()
             # The dropped ones too: their placement may have been on its way while the version came in.
-            return [self._request(key) for key in (*self._placements.all_moved, *dropped)]
+            return (*self._placements.all_moved, *dropped)
 
     def _follow_the_file(self, wish: Wish) -> None:
         """What an edit, or its being taken back, means for the placements: none is to be lost by it."""
@@ -522,17 +520,17 @@ class CameraStudio:
 
     def placed(self, event: Placed) -> None:
         """The worker's answer to a placement."""
-        requests: list[PlaceCamera] = []
+        again = False
         with self._lock:
             task = self._task
             if event.why_not:
                 self._problem = f"{event.key[1]} could not be placed: {event.why_not}."
                 self._placements.refused(event.key)
-                requests = [self._request(event.key)] if event.settings is not None else []
+                again = event.settings is not None
             elif event.info is not None and task is not None:
                 infos = [event.info if c.key == event.key else c for c in task.cameras]
                 self._task = replace(task, cameras=tuple(infos))
-        self._send_all(requests)
+        self.ask_for([event.key] if again else [])
 
     def close(self) -> None:
         """Wait for what is being written."""
@@ -544,12 +542,15 @@ class CameraStudio:
 
     # --- small things ----------------------------------------------------------------------------------
 
-    def _request(self, key: CameraKey) -> PlaceCamera:
-        return PlaceCamera(key, self._placements.now(key) if self._placements.moved(key) else None)
-
-    def _send_all(self, requests: Sequence[Request]) -> None:
-        for request in requests:
-            self._send(request)
+    def ask_for(self, keys: Sequence[CameraKey]) -> None:
+        """Ask the worker to place these cameras as they are placed now."""
+        # What is asked for is read and sent in one go, or of two threads the one that read first might send last.
+        with self._asking:
+            with self._lock:
+                now = self._placements
+                requests = [PlaceCamera(key, now.now(key) if now.moved(key) else None) for key in keys]
+            for request in requests:
+                self._send(request)
         self._note()
 
     def _later(self, work: Callable[..., None], *args: object) -> None:

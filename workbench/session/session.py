@@ -510,15 +510,14 @@ class Session:
             stale = restored and not is_on_disk(event.task.source)
             s.loaded(event, restored=restored, stale=stale)
             level = None if event.reload is None else event.reload.level
-            placements = self.studio.loaded(event.task, level)
+            placed = self.studio.loaded(event.task, level)
         if judgement is not None:
             self._judge.judge(self._state.load_request(Wanted(dict(event.task.source), None)), judgement)
         elif meaning == "forget":
             self._judge.forget()
         self._follow(event.task.source_files, {} if stale else event.task.source)
         self._watch()
-        for request in placements:
-            self._send(request)
+        self.studio.ask_for(placed)
         if recording:
             self._record_on(event, recording, one_each)
         with self._lock:
