@@ -54,8 +54,9 @@ def read_state_columns(task: TaskEnv) -> dict[str, NDArray]:
             continue
         at = 0
         for part, shape, _ in parts:
-            width = math.prod(shape)
-            columns[OBS + part] = column[:, at : at + width].reshape(count, *shape)
+            width = shape[0] if len(shape) == 1 else math.prod(shape)
+            held = column[:, at : at + width]
+            columns[OBS + part] = held if len(shape) == 1 else held.reshape(count, *shape)
             at += width
     return columns
 

@@ -385,5 +385,5 @@ def _batch(value: NDArray[Any], num_envs: int) -> NDArray[Any]:
 def to_numpy(value: Any) -> NDArray[Any]:
     """A copy on the host, so that what was returned does not change with the next step."""
     if isinstance(value, torch.Tensor):
-        return value.detach().cpu().numpy().copy()
+        return value.numpy(force=True).copy()
     return np.array(value)

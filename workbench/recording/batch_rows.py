@@ -1,8 +1,7 @@
 """The rows of many envs packed at once: what `columns.RowPacker` does for one, in as many calls for sixty-four.
 
 Envs of a batch step together, and their rows are the same arrays with another index. Taken apart an env at a time that is fifty
-small arrays for each env and step, 75 us; here each array of the batch is looked at once, as bytes, and one call puts
-them side by side. A row is then a slice.
+small arrays for each env and step, 75 us; here each array of the batch is copied once, to its place in rows that stay from step to step.
 """
 
 from __future__ import annotations
@@ -28,19 +27,20 @@ class BatchPacker:
     def __init__(self) -> None:
         self._layouts: dict[object, Layout] = {}
         self._last: Layout | None = None
+        self._rows = np.zeros(0, np.uint8)
+        self._parts: list[NDArray] = []
+        """Where in `_rows` each column goes."""
 
     def pack(self, columns: Sequence[tuple[str, NDArray]]) -> tuple[Layout, list[bytes]]:
         """The layout and (N) rows of `columns`, each a name and an array (N, ...)."""
         key = tuple([(name, values.dtype, values.shape[1:]) for name, values in columns])
-        layout = self._last
-        if layout is None or layout.key != key:
+        layout, count = self._last, len(columns[0][1])
+        if layout is None or layout.key != key or len(self._rows) != count:
             layout = self._last = self._layouts.setdefault(key, Layout(key))
-        count = len(columns[0][1])
-        rows = [
-            np.ascontiguousarray(values).reshape(count, -1).view(np.uint8)
-            for _, values in columns
-            if values.size
-        ]
-        packed = np.concatenate(rows, axis=1)
-        size, together = packed.shape[1], packed.tobytes()
+            fields = [(f"f{i}", values.dtype, values.shape[1:]) for i, (_, values) in enumerate(columns)]
+            self._rows = np.zeros(count, fields)
+            self._parts = [self._rows[name] for name, *_ in fields]
+        for part, (_, values) in zip(self._parts, columns):
+            part[...] = values
+        size, together = self._rows.itemsize, self._rows.tobytes()
         return layout, [together[i : i + size] for i in range(0, count * size, size)]

@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from workbench.recording.png16 import encode_png16
+
 Modality = Literal["rgb", "depth", "segmentation"]
 MODALITIES: tuple[Modality, ...] = ("rgb", "depth", "segmentation")
 
@@ -82,17 +84,14 @@ def encode_depth_png(depth: NDArray[np.float32]) -> bytes:
     farthest that 16 bits hold, and what is farther stays there.
     """
     millimetres = np.nan_to_num(depth * MILLIMETRES_PER_METRE, nan=0.0, posinf=0.0, neginf=0.0)
-    return _png(np.rint(np.clip(millimetres, 0, 0xFFFF)).astype(np.uint16))
+    return encode_png16(np.rint(np.clip(millimetres, 0, 0xFFFF)).astype(np.uint16))
 
 
 def encode_segmentation_png(ids: NDArray[np.int32]) -> bytes:
     """(H, W) ids as 16-bit PNG, or as RGBA where one of them is negative or beyond 65535."""
     if ids.min() >= 0 and ids.max() <= 0xFFFF:
-        return _png(ids.astype(np.uint16))
-    return _png(np.ascontiguousarray(ids, dtype=np.int32)[..., None].view(np.uint8))
-
-
-def _png(pixels: NDArray) -> bytes:
+        return encode_png16(ids.astype(np.uint16))
     buffer = io.BytesIO()
-    Image.fromarray(pixels).save(buffer, format="PNG", compress_level=3)
+    bytes_of = np.ascontiguousarray(ids, dtype=np.int32)[..., None].view(np.uint8)
+    Image.fromarray(bytes_of).save(buffer, format="PNG", compress_level=3)
     return buffer.getvalue()

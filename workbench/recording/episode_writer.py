@@ -1,8 +1,8 @@
 """An episode while it happens: rows go in, and the files of a recording come out at the end.
 
 Whoever records (the page, the command line, a wrapper around an env) has a row a step and must not wait for the disk, must
-not fill the memory, and may be killed at any moment. So a row is checked, packed, its pictures are encoded, and it is handed to a
-`Journal`; that is all that a step pays for. The rest (`make_files`) is done once, when the episode is over, and may be done on another
+not fill the memory, and may be killed at any moment. So a row is checked, packed and handed to a `Journal`, its pictures to
+`encode_soon`; that is all that a step pays for. The rest (`make_files`) is done once, when the episode is over, and may be done on another
 thread.
 """
 
@@ -13,12 +13,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.recording.batch_rows import Layout
 from workbench.recording.columns import RowPacker
-from workbench.recording.encoded_pictures import MODALITIES, Modality, encode
+from workbench.recording.encode_soon import encode_soon
+from workbench.recording.encoded_pictures import MODALITIES, Modality
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.journal import FOLDER, Journal
 from workbench.recording.landing import RecordingError, reason
@@ -29,6 +31,12 @@ from workbench.recording.scene_file import keep_scene
 from workbench.recording.survey import Header, header_text
 
 SCENE_SUFFIX = ".scene"
+_PIXELS: dict[Modality, tuple[tuple[int, ...], str, str]] = {
+    "rgb": ((3,), "u", "(H, W, 3) of uint8"),
+    "depth": ((), "f", "(H, W) of floats"),
+    "segmentation": ((), "iu", "(H, W) of integers"),
+}
+"""Shape of a pixel, kinds of numbers, and both in words."""
 
 
 class EpisodeWriter:
@@ -111,7 +119,15 @@ class EpisodeWriter:
         """As `append`, with a row after the first that was packed together with those of other envs."""
         if self._states == 0:
             raise ValueError("the first row is the state after a reset, which no action led to.")
-        number, text = self._shared.get(layout), None
+        number = self._shared.get(layout)
+        if number is not None and not pictures:
+            try:
+                self._journal.put("row", number, packed)
+            except OSError as error:
+                raise self._failed(error) from error
+            self._states += 1
+            return
+        text = None
         if number is None:
             number, text = self._packer.number_of(layout.key)
         self._append(number, packed, text, pictures)
@@ -178,9 +194,14 @@ class EpisodeWriter:
             self._journal.add(
                 f"camera/{index}", self._states, np.asarray(picture.pose, dtype=np.float32).tobytes()
             )
-            for modality in seen[index]:
-                blob = encode(modality, getattr(picture, modality))
-                self._journal.add(f"picture/{index}/{modality}", self._states, blob)
+            self._journal.add_later(
+                encode_soon(
+                    [
+                        (f"picture/{index}/{modality}", self._states, modality, getattr(picture, modality))
+                        for modality in seen[index]
+                    ]
+                )
+            )
         return seen
 
     def _check(self, picture: Picture, seen: Mapping[int, object]) -> int:
@@ -192,6 +213,7 @@ class EpisodeWriter:
         info = self._header.cameras[index]
         given = _given(picture)
         for modality in given:
+            self._check_numbers(info.name, modality, getattr(picture, modality))
             shape = getattr(picture, modality).shape
             if shape[:2] != (info.height, info.width):
                 raise ValueError(
@@ -205,6 +227,15 @@ class EpisodeWriter:
                 f"{', '.join(given) or 'nothing'}; a recording keeps the same all through."
             )
         return index
+
+    @staticmethod
+    def _check_numbers(camera: str, modality: Modality, pixels: NDArray) -> None:
+        """What an encoder would say later, when nobody knows any more of which step."""
+        shape, kinds, what = _PIXELS[modality]
+        if pixels.dtype.kind not in kinds or pixels.shape[2:] != shape or (shape and pixels.itemsize != 1):
+            raise ValueError(
+                f"camera {camera} gave a {modality} picture {pixels.shape} of {pixels.dtype}, not {what}."
+            )
 
     def _failed(self, error: OSError) -> RecordingError:
         return RecordingError(

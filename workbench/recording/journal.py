@@ -25,9 +25,10 @@ import os
 import threading
 import time
 import weakref
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
 from pathlib import Path
+from typing import NamedTuple
 
 import pyarrow as pa
 
@@ -39,11 +40,13 @@ _BATCH_BYTES = 4 << 20
 _SCHEMA = pa.schema([("kind", pa.string()), ("number", pa.int32()), ("value", pa.binary())])
 
 
-@dataclass(frozen=True)
-class Entry:
+class Entry(NamedTuple):
     kind: str
     number: int
     value: bytes
+
+
+_Item = Entry | Future[list[Entry]]
 
 
 class Journal:
@@ -55,8 +58,8 @@ class Journal:
         self._descriptor = _create(path)
         self._closer = weakref.finalize(self, os.close, self._descriptor)
         self._size = 0
-        self._pending: list[Entry] = []  # the owner's alone
-        self._waiting: list[Entry] = []
+        self._pending: list[_Item] = []  # the owner's alone
+        self._waiting: list[_Item] = []
         self._waiting_bytes = 0
         self._lock = threading.Lock()  # of what waits; never held while the disk works
         self._writing = threading.Lock()
@@ -78,24 +81,44 @@ class Journal:
     def add(self, kind: str, number: int, value: bytes) -> None:
         self._pending.append(Entry(kind, number, value))
 
+    def add_later(self, entries: Future[list[Entry]]) -> None:
+        """`add` what somebody is still working at; it keeps this place. Whoever writes waits for it, not the owner."""
+        self._pending.append(entries)
+
     def commit(self) -> None:
         """What was added belongs together from here on, and will be on the disk soon.
 
         Raises:
-            OSError: something that was committed before could not be written; this is not kept then.
+            OSError: something that was committed before could not be written, or not be made; this is not kept then.
         """
         if self._error is not None:
             raise self._error
-        added = sum(map(_size, self._pending))
+        pending, self._pending = self._pending, []
+        added = sum([_size(item) for item in pending if isinstance(item, Entry)])
         with self._lock:
-            self._waiting += self._pending
+            self._waiting += pending
             self._waiting_bytes += added
             full = self._waiting_bytes > _BATCH_BYTES
-        self._pending = []
+        for item in pending:
+            if not isinstance(item, Entry):
+                item.add_done_callback(self._weigh)
         if full:
             self.write()
         if self._error is not None:
             raise self._error
+
+    def put(self, kind: str, number: int, value: bytes) -> None:
+        """`add` and `commit` of what is a whole state by itself, in one: sixty-four envs do it at every step."""
+        if self._error is not None:
+            raise self._error
+        entry = Entry(kind, number, value)
+        with self._lock:
+            self._waiting.append(entry)
+            self._waiting_bytes += _size(entry)
+        if self._waiting_bytes > _BATCH_BYTES:
+            self.write()
+            if self._error is not None:
+                raise self._error
 
     def rollback(self) -> None:
         """Forget what was added since the last `commit`."""
@@ -104,30 +127,33 @@ class Journal:
     def write(self) -> None:
         """Hand what was committed to the system: a process that dies now loses nothing of it."""
         with self._writing:
-            with self._lock:
-                entries, self._waiting = self._waiting, []
-                self._waiting_bytes = 0
-            if not entries or self._error is not None or not self._closer.alive:
-                self._wait_again(entries)
+            if self._error is not None or not self._closer.alive:
                 return
-            batch = pa.record_batch(
-                [
-                    pa.array([entry.kind for entry in entries], pa.string()),
-                    pa.array([entry.number for entry in entries], pa.int32()),
-                    pa.array([entry.value for entry in entries], pa.binary()),
-                ],
-                schema=_SCHEMA,
-            )
-            try:
-                self._put(batch.serialize())
-            except OSError as error:
-                self._error = error
-                self._wait_again(entries)
+            with self._lock:
+                items, self._waiting = self._waiting, []
+            entries, done, error = _made(items)
+            if entries:
+                batch = pa.record_batch(
+                    [
+                        pa.array([entry.kind for entry in entries], pa.string()),
+                        pa.array([entry.number for entry in entries], pa.int32()),
+                        pa.array([entry.value for entry in entries], pa.binary()),
+                    ],
+                    schema=_SCHEMA,
+                )
+                try:
+                    self._put(batch.serialize())
+                except OSError as failed:
+                    done, entries, error = 0, [], failed
+            with self._lock:
+                self._waiting = items[done:] + self._waiting
+                self._waiting_bytes -= sum(map(_size, entries))
+            self._error = error
 
-    def _wait_again(self, entries: list[Entry]) -> None:
-        with self._lock:
-            self._waiting = entries + self._waiting
-            self._waiting_bytes += sum(map(_size, entries))
+    def _weigh(self, made: Future[list[Entry]]) -> None:
+        if not made.cancelled() and made.exception() is None:
+            with self._lock:
+                self._waiting_bytes += sum(map(_size, made.result()))
 
     def sync(self) -> None:
         """Write what was committed and make it last, also through a power cut. An error is raised by the next `commit`."""
@@ -177,6 +203,24 @@ class Journal:
             os.lseek(self._descriptor, self._size, os.SEEK_SET)
             raise
         self._size += written
+
+
+def _made(items: Sequence[_Item]) -> tuple[list[Entry], int, OSError | None]:
+    """Their entries, and how many of them these are. Where one cannot be made, those of the states before it."""
+    entries: list[Entry] = []
+    whole, done = 0, 0
+    for number, item in enumerate(items, 1):
+        if not isinstance(item, Entry):
+            try:
+                entries += item.result()
+            except Exception as error:
+                why = OSError(errno.EIO, f"a picture could not be encoded ({error})")
+                return entries[:whole], done, why
+            continue
+        entries.append(item)
+        if item.kind == "row":
+            whole, done = len(entries), number
+    return entries, len(items), None
 
 
 def _size(entry: Entry) -> int:

@@ -22,17 +22,17 @@ import math
 import weakref
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
+from rerun.chunk import Chunk
 
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo
 from workbench.recording.columns import EVALUATE, OBS, Column
 from workbench.recording.encoded_pictures import MILLIMETRES_PER_METRE, decode
-from workbench.recording.rerun_log import Log
+from workbench.recording.rerun_log import Log, static_chunk
 from workbench.recording.survey import CameraSurvey, Piece, Survey
 
 WORLD = "/world"
@@ -89,11 +89,12 @@ class EpisodeLog:
 
     def _take_numbers(self, piece: Piece) -> None:
         log, survey, states = self._log, self._survey, piece.states
+        skip = 1 if piece.first == 0 else 0
+        stepped = states[skip:]
         for name, entity, _ in _numbers(survey):
             if name in ("action", "reward", "terminated", "truncated"):
                 # State 0 is a reset: nothing led to it.
-                skip = 1 if piece.first == 0 else 0
-                log.scalars(entity, states[skip:], piece.columns[name][skip:])
+                log.scalars(entity, stepped, piece.columns[name][skip:])
             else:
                 log.scalars(entity, states, piece.columns[name])
         for name, values in survey.flags.items():
@@ -159,39 +160,46 @@ def _log_scene(log: Log, survey: Survey, entities: dict[int, str]) -> None:
     worn: Counter[int] = Counter()
     for visual in survey.header.geometry.visuals:
         worn_by = [int(body) for body in visual.bodies[visual.envs == survey.info.env_index]]
-        drawn = _drawn(visual) if any(body in entities for body in worn_by) else None
-        if drawn is None:
-            continue
         for body in worn_by:
-            if body in entities:
-                log.static(f"{entities[body]}/{worn[body]}", *drawn)
+            if body in entities and (drawn := _drawn(visual, f"{entities[body]}/{worn[body]}")) is not None:
+                log.chunk(drawn)
                 worn[body] += 1
 
 
-_made: dict[int, tuple[weakref.ref[Visual], tuple[Any, ...] | None]] = {}
+_made: dict[int, tuple[weakref.ref[Visual], dict[str, Chunk | None]]] = {}
 """What `_drawn` made, by the visual's id, for as long as the visual lives: episodes follow each other in one scene, and its textures
 are megabytes to convert."""
+_MOST_MADE = 64
+"""Of one visual. In a scene that names its bodies by env each env has an entity, and a copy, of its own."""
 
 
-def _drawn(visual: Visual) -> tuple[Any, ...] | None:
-    """`visual` as what rerun logs for it; None where it has no triangles."""
-    held = _made.get(id(visual))
-    if held is not None and held[0]() is visual:
-        return held[1]
-    mesh = _mesh(visual.mesh, visual.material)
-    drawn = None
-    if mesh is not None:
-        # What rerun's mesh does not say, for whoever reads the scene back.
-        said = rr.AnyValues(
-            visual=visual.name,
-            base_color=list(visual.material.base_color),
-            metallic=visual.material.metallic,
-            roughness=visual.material.roughness,
-        )
-        drawn = (mesh, said)
+def _drawn(visual: Visual, entity: str) -> Chunk | None:
+    """`visual` as rerun is to have it at `entity`; None where it has no triangles."""
     key = id(visual)
-    _made[key] = (weakref.ref(visual, lambda _: _made.pop(key, None)), drawn)
-    return drawn
+    held = _made.get(key)
+    if held is None or held[0]() is not visual:
+        held = _made[key] = (weakref.ref(visual, lambda _: _made.pop(key, None)), {})
+    made = held[1]
+    if entity not in made:
+        chunk = next((chunk for chunk in made.values() if chunk is not None), None)
+        if len(made) >= _MOST_MADE:
+            made.clear()
+        made[entity] = _visual_chunk(visual, entity) if chunk is None else chunk.with_entity_path(entity)
+    return made[entity]
+
+
+def _visual_chunk(visual: Visual, entity: str) -> Chunk | None:
+    mesh = _mesh(visual.mesh, visual.material)
+    if mesh is None:
+        return None
+    # What rerun's mesh does not say, for whoever reads the scene back.
+    said = rr.AnyValues(
+        visual=visual.name,
+        base_color=list(visual.material.base_color),
+        metallic=visual.material.metallic,
+        roughness=visual.material.roughness,
+    )
+    return static_chunk(entity, mesh, said)
 
 
 def _mesh(mesh: Mesh, material: Material) -> rr.Mesh3D | None:
@@ -330,7 +338,7 @@ def _log_events(log: Log, survey: Survey) -> None:
 
 def xyzw(wxyz: NDArray) -> NDArray:
     """(..., 4) quaternions from our order to rerun's."""
-    return np.roll(wxyz, -1, axis=-1)
+    return wxyz[..., [1, 2, 3, 0]]
 
 
 def optical_pose(pose: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

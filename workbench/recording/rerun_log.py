@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
+from rerun.chunk import Chunk
 
 STEP = "step"
 SIM_TIME = "sim_time"
@@ -41,29 +43,54 @@ class Account:
     """Entities that hold something static."""
 
 
+def static_chunk(entity: str, *values: Any) -> Chunk:
+    """`values` as what `entity` is all through, ready to be sent: making it takes longer than that.
+
+    Raises:
+        ValueError: rerun refuses one of them.
+    """
+    batches = [batch for value in values for batch in value.as_component_batches()]
+    columns = [batch.partition([len(batch.as_arrow_array())]) for batch in batches]
+    return Chunk.from_columns(entity, [], columns)
+
+
+@lru_cache(maxsize=512)
+def _series_chunk(entity: str, names: tuple[str, ...], first_color: int) -> Chunk:
+    colors = [SERIES_COLORS[(first_color + index) % len(SERIES_COLORS)] for index in range(len(names))]
+    return static_chunk(entity, rr.SeriesLines(names=list(names), colors=colors))
+
+
 class Log:
     """One recording's way in."""
 
     def __init__(self, recording: rr.RecordingStream, control_dt: float) -> None:
         self._recording = recording
         self._control_dt = control_dt
+        self._steps: NDArray[np.int64] | None = None
+        self._times: list[rr.TimeColumn] = []  # of `_steps`, which most entities of a piece share
         self.account = Account()
 
     def static(self, entity: str, *values: Any) -> None:
-        self._recording.log(entity, *values, static=True)
-        self.account.statics.add(entity)
+        self.chunk(static_chunk(entity, *values))
+
+    def chunk(self, chunk: Chunk) -> None:
+        """What `static_chunk` made, for this recording or an earlier one."""
+        self._recording.send_chunks(chunk)
+        self.account.statics.add(chunk.entity_path)
 
     def columns(self, entity: str, steps: NDArray[np.int64], columns: Iterable[Any]) -> None:
         if len(steps) == 0:
             return
-        times = [
-            rr.TimeColumn(STEP, sequence=steps),
-            # Whole nanoseconds by rounding: rerun itself cuts off, and 3 * 0.05 s would be 149999999 ns.
-            rr.TimeColumn(
-                SIM_TIME, duration=np.rint(steps * self._control_dt * 1e9).astype("timedelta64[ns]")
-            ),
-        ]
-        self._recording.send_columns(entity, times, columns)
+        if steps is not self._steps:
+            self._steps = steps
+            self._times = [
+                rr.TimeColumn(STEP, sequence=steps),
+                # Whole nanoseconds by rounding: rerun itself cuts off, and 3 * 0.05 s would be 149999999 ns.
+                rr.TimeColumn(
+                    SIM_TIME, duration=np.rint(steps * self._control_dt * 1e9).astype("timedelta64[ns]")
+                ),
+            ]
+        self._recording.send_columns(entity, self._times, columns)
         self.account.rows[entity] += len(steps)
 
     def pose(
@@ -85,10 +112,7 @@ class Log:
         """Name and colour of each number of the batched `scalars` of `entity`."""
         if names:
             # Left to itself rerun gives all series of an entity one colour, and entities of one folder much the same.
-            colors = [
-                SERIES_COLORS[(first_color + index) % len(SERIES_COLORS)] for index in range(len(names))
-            ]
-            self.static(entity, rr.SeriesLines(names=list(names), colors=colors))
+            self.chunk(_series_chunk(entity, tuple(names), first_color))
 
     def scalars(self, entity: str, steps: NDArray[np.int64], values: NDArray) -> None:
         """`values` (len(steps), ...), all of a step as one batch."""

@@ -14,15 +14,19 @@ instead, which a thread of ours empties whatever happens, and where the bytes la
 
 from __future__ import annotations
 
+import fcntl
 import os
 import threading
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 
 import rerun as rr
 import rerun.blueprint as rrb
 import rerun_bindings
+from rerun.chunk import RrdReader
 
 
 @contextmanager
@@ -41,7 +45,7 @@ def recording_into(
         )
     )
     arrangement = layout.memory_recording().storage
-    out, into = os.pipe()
+    out, into = _pipe()
     try:
         recording.save(f"/dev/fd/{into}")
     except BaseException:
@@ -65,9 +69,24 @@ def recording_into(
         pump.join()
 
 
+_PIPE_BYTES = 1 << 20
+"""More than this an ordinary user may not ask for (Linux, pipe(7))."""
+
+
+def _pipe() -> tuple[int, int]:
+    out, into = os.pipe()
+    if hasattr(fcntl, "F_SETPIPE_SZ"):
+        try:
+            # At the usual 64 kB two threads wake each other a hundred times for one scene's textures.
+            fcntl.fcntl(into, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+        except OSError:  # the user's share of pipe memory is used up: it works as it is
+            pass
+    return out, into
+
+
 def _pump(out: int, write: Callable[[bytes], object]) -> None:
     try:
-        while content := os.read(out, 1 << 18):
+        while content := os.read(out, _PIPE_BYTES):
             write(content)
     finally:
         os.close(out)
@@ -76,3 +95,25 @@ def _pump(out: int, write: Callable[[bytes], object]) -> None:
 def release_streams() -> None:
     """End the threads of every stream that nothing refers to any more. Streams in use are left alone."""
     rerun_bindings.flush_and_cleanup_orphaned_recordings()
+
+
+@dataclass(frozen=True)
+class IndexedChunk:
+    """What the index at the end of an ``.rrd`` says of one chunk."""
+
+    entity: str
+    rows: int
+    static: bool
+    end: int
+    """Where in the file its bytes end."""
+
+
+def read_index(path: Path) -> list[IndexedChunk]:
+    """The chunks of the recording in `path`; none of them is decoded. Raises ValueError or OSError where there is no index."""
+    _, index = RrdReader(path).store()._internal._chunk_index()
+    names = ("entity_path", "num_rows", "is_static", "byte_offset", "byte_size")
+    columns = [index.column(f"chunk_{name}").to_pylist() for name in names]
+    return [
+        IndexedChunk(entity, rows, static, offset + size)
+        for entity, rows, static, offset, size in zip(*columns)
+    ]

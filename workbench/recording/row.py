@@ -27,4 +27,5 @@ class EpisodeRow:
     terminated: bool = False
     truncated: bool = False
     pictures: tuple[Picture, ...] = ()
-    """Of this env alone; every state keeps the modalities that the first picture of a camera had."""
+    """Of this env alone; every state keeps the modalities that the first picture of a camera had. They are encoded while the episode
+    goes on, so nobody may write to them any more."""

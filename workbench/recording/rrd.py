@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import errno
 import json
-import os
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,7 +16,6 @@ from pathlib import Path
 from typing import Any
 
 import rerun as rr
-from rerun.chunk import RrdReader
 from rerun.error_utils import catch_and_log_exceptions
 
 from workbench.recording.blueprint import episode_blueprint
@@ -27,7 +25,7 @@ from workbench.recording.landing import RecordingError as RecordingError
 from workbench.recording.landing import SafeFile
 from workbench.recording.layout import EpisodeLog
 from workbench.recording.rerun_log import Account
-from workbench.recording.rerun_seam import recording_into, release_streams
+from workbench.recording.rerun_seam import read_index, recording_into, release_streams
 from workbench.recording.survey import Piece, Survey
 
 
@@ -118,19 +116,24 @@ def properties(survey: Survey) -> dict[str, dict[str, Any]]:
 
 
 def check_written(path: Path, account: Account) -> None:
-    """Raise OSError unless every row and every static entity of `account` can be read from `path`."""
+    """Raise OSError unless the index at the end of `path` has every row and every static entity of `account`.
+
+    Rerun writes the index last, of what it encoded; that its bytes arrived is `SafeFile`'s affair. So not a chunk need be decoded.
+    """
     rows: Counter[str] = Counter()
     statics: set[str] = set()
+    size = path.stat().st_size
     try:
-        reader = RrdReader(path)
-        reader.store()  # needs the footer, which is written last
-        for chunk in reader.stream():
-            if chunk.is_static:
-                statics.add(chunk.entity_path)
-            else:
-                rows[chunk.entity_path] += chunk.num_rows
+        indexed = read_index(path)
     except (ValueError, RuntimeError, OSError) as error:
-        raise OSError(errno.EIO, f"{os.path.basename(path)} could not be read back ({error})") from error
+        raise OSError(errno.EIO, f"{path.name} could not be read back ({error})") from error
+    for chunk in indexed:
+        if chunk.end > size:
+            raise OSError(errno.EIO, f"{path.name} ends before {chunk.entity}")
+        if chunk.static:
+            statics.add(chunk.entity)
+        else:
+            rows[chunk.entity] += chunk.rows
     short = [
         f"{name}: {rows[name]} of {count} rows" for name, count in account.rows.items() if rows[name] != count
     ]

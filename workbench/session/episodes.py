@@ -156,7 +156,12 @@ class EpisodeGatherer:
         step = stepped.step
         elapsed, reward = step.elapsed_steps.tolist(), step.reward.tolist()
         over = (step.terminated | step.truncated).tolist()
-        success = step.evaluate.get("success")
+        successes = step.evaluate.get("success")
+        success: list[bool] | None = None
+        if successes is not None:
+            # One value an env, or several.
+            success = np.any(successes.reshape(len(successes), -1), axis=1).tolist()
+        captured = stepped.captured
         layout, rows = self._packer.pack(batch_columns(step, stepped.columns, state_names))
         for episode in episodes:
             env = episode.env
@@ -165,11 +170,11 @@ class EpisodeGatherer:
                     f"env {env}: step {episode.steps + 1} was expected and step {elapsed[env]} came; a step was lost or "
                     "the env was reset unseen"
                 )
-            pictures = [p for p in stepped.captured if p.env == env] if stepped.captured else ()
+            pictures = [p for p in captured if p.env == env] if captured else ()
             episode.writer.append_packed(layout, rows[env], pictures)
             episode.steps += 1
             episode.total_reward += reward[env]
-            episode.success = None if success is None else bool(np.any(success[env]))
+            episode.success = None if success is None else success[env]
             if over[env] and self._ends == "over":
                 self.end(env)
 

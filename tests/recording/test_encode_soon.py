@@ -1,0 +1,104 @@
+"""Pictures that are encoded beside the steps come into the recording as if they had not been, and errors are still told."""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.recording.made import Made, Track
+from workbench.core.pictures import CameraInfo
+from workbench.recording import encode_soon
+from workbench.recording.landing import RecordingError
+from workbench.recording.read_episode import read_episode
+from workbench.recording.recover import recover
+
+Maker = Callable[..., Made]
+STATES = 7
+
+
+@pytest.fixture
+def seen(make_episode: Maker) -> Made:
+    """Every picture is one number, which tells it from all others."""
+    info = CameraInfo(
+        "eye", "sensor", 40, 30, 1.0, 0.01, 10.0, np.eye(3, dtype=np.float32), None, ("segmentation",)
+    )
+    ids = np.broadcast_to(np.arange(STATES, dtype=np.int32)[:, None, None], (STATES, 30, 40)).copy()
+    poses = np.tile(np.array([0, 0, 0, 1, 0, 0, 0], np.float32), (STATES, 1))
+    return make_episode(STATES - 1, cameras=[Track(info, np.arange(STATES), poses, segmentation=ids)])
+
+
+@pytest.fixture
+def held_back(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
+    """No picture is encoded before the event is set."""
+    go, encode = threading.Event(), encode_soon.encode
+
+    def wait(*args: Any) -> bytes:
+        assert go.wait(60)
+        return encode(*args)
+
+    monkeypatch.setattr(encode_soon, "encode", wait)
+    yield go
+    go.set()
+
+
+def pictures_of(path: Path) -> list[int]:
+    (camera,) = read_episode(path).cameras
+    assert camera.segmentation is not None
+    assert camera.frame.tolist() == list(range(len(camera.segmentation)))
+    return [int(camera.segmentation[k][0, 0]) for k in range(len(camera.segmentation))]
+
+
+def test_steps_do_not_wait_for_their_pictures(seen: Made, held_back: threading.Event, tmp_path: Path) -> None:
+    writer = seen.writer(tmp_path)
+    for row in seen.rows():
+        writer.append(row)
+    assert not held_back.is_set()
+    held_back.set()
+    assert pictures_of(writer.finish().json) == list(range(STATES))
+
+
+def test_what_is_too_much_to_wait_is_encoded_at_once(
+    seen: Made, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(encode_soon, "MOST_BYTES", 1)
+    assert pictures_of(seen.write(tmp_path).json) == list(range(STATES))
+
+
+def test_what_is_no_picture_is_refused_at_its_own_step(seen: Made, tmp_path: Path) -> None:
+    writer = seen.writer(tmp_path)
+    first, second, *_ = seen.rows()
+    writer.append(first)
+    (picture,) = second.pictures
+    assert picture.segmentation is not None
+    wrong = dataclasses.replace(picture, segmentation=picture.segmentation.astype(np.float32))
+    with pytest.raises(ValueError, match="float32"):
+        writer.append(dataclasses.replace(second, pictures=(wrong,)))
+    writer.append(second)
+    assert pictures_of(writer.finish().json) == [0, 1]
+
+
+def test_a_picture_that_cannot_be_encoded_is_told_and_what_came_before_it_is_kept(
+    seen: Made, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    encode = encode_soon.encode
+
+    def fails(modality: Any, picture: np.ndarray) -> bytes:
+        if picture[0, 0] == 4:
+            raise MemoryError("no room for a picture")
+        return encode(modality, picture)
+
+    monkeypatch.setattr(encode_soon, "encode", fails)
+    writer = seen.writer(tmp_path)
+    with pytest.raises(RecordingError, match="no room for a picture"):
+        for row in seen.rows():
+            writer.append(row)
+        writer.finish()
+    writer.close()
+    (files,) = recover(tmp_path)
+    assert pictures_of(files.json) == [0, 1, 2, 3]
