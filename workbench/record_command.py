@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import signal
 import time
 from collections.abc import Callable
@@ -109,7 +110,8 @@ def _say(asked: RecordOptions, recorded: Recorded, refuse: Callable[[str], int])
             f"{count} began elsewhere than recorded with the recorded seed, and were put to the recorded first state."
         )
     if recorded.written:
-        print(f"Open one with: workbench view {recorded.written[0].path}")
+        folder = shlex.quote(str(recorded.written[0].path.parent))
+        print(f"Look at them with: workbench review {folder}")
     if recorded.stopped:
         return refuse("interrupted; episodes that had ended are kept")
     if asked.successes is not None and kept < asked.successes:

@@ -86,7 +86,7 @@ def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
         told = page.get_by_text("WorkbenchPushCube-v1, seed 5, step 2: its actions were made again")
         expect(told).to_be_visible(timeout=PATIENT)
         expect(told).to_contain_text("to the last bit")
-        expect(page.get_by_role("button", name="undo stepping in")).to_be_visible()
+        expect(page.get_by_role("button", name="undo going live")).to_be_visible()
 
         page.get_by_role("tab", name="Episodes").click()
         page.get_by_role("button", name="Review recordings").click()

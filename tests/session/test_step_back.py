@@ -90,7 +90,7 @@ def test_the_live_env_stands_in_the_recorded_state_and_goes_on_from_there_as_it_
 def test_it_is_a_jump_that_undo_takes_back(live: Session, run: RecordedRun) -> None:
     stood = live.view().step.poses[ENV].copy()
     view = into(live, run.until(10))
-    assert view.timeline.undo == "stepping in of env 1"
+    assert view.timeline.undo == "going live of env 1"
     last = view.timeline.last
     live.undo()
     view = wait_until(live, lambda v: v.timeline.last > last, "the way back")

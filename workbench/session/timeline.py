@@ -231,7 +231,7 @@ class Timeline:
 def _in_words(jump: Moment, envs: tuple[int, ...], num_envs: int) -> str:
     what = "reset" if jump.restored is None else "going back"
     if jump.restored is not None and jump.restored.recording:
-        what = "stepping in"
+        what = "going live"
     if num_envs == 1:
         return what
     if len(envs) == num_envs:
