@@ -130,6 +130,13 @@ class CameraExport:
             self._session.studio.import_pose(camera.key, text, direction, convention, metres)
         except ValueError as error:
             event.client.add_notification("Not placed", str(error), color="orange", auto_close_seconds=12.0)
+            return
+        event.client.add_notification(
+            "Placed",
+            "The pose was taken. A lens that the text may hold was not: its matrix goes into Lens and picture.",
+            color="green",
+            auto_close_seconds=8.0,
+        )
 
     def draw(self, view: SessionView) -> None:
         camera = view.studio.chosen

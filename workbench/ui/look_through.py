@@ -119,12 +119,14 @@ class LookThrough:
         if shown == looking.shown:
             return
         looking.shown = shown
-        forward, _, up = axes_of(pose[3:])
+        forward, left, up = axes_of(pose[3:])
+        # The page's orbit turns about its up: about the camera's own, a drag would tilt a level horizon.
+        level = abs(left[2]) < 1e-3 and up[2] > 0.05
         eye = client.camera
         aspect = eye.image_width / eye.image_height if eye.image_height and eye.image_width else USUAL_ASPECT
         fov = vertical_fov(intrinsic_of(now), now.height)
         with client.atomic():
-            eye.up_direction = up
+            eye.up_direction = UPRIGHT if level else up
             eye.position = pose[:3]
             eye.look_at = pose[:3] + forward * self._placing.distance(camera)
             eye.fov = min(fov_that_shows_all(fov, now.width / now.height, aspect), WIDEST)
