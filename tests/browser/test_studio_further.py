@@ -84,7 +84,9 @@ def test_a_lens_typed_as_a_matrix_is_written_as_one(page: Page, task_file: Path)
     until(lambda: numbers(page, "fx, fy")[0] == 150, "the focal length")
     page.locator(field(page, "cx, cy", 2)).fill("70")
     page.evaluate("document.activeElement.blur()")
-    page.wait_for_timeout(500)  # viser's page sends one message in 50 ms, the last: the number, before the press
+    page.wait_for_timeout(
+        500
+    )  # viser's page sends one message in 50 ms, the last: the number, before the press
     button(page, "Show the change")
     expect(page.locator(".wb-diff-add").filter(has_text="intrinsic=")).to_contain_text("[150")
     button(page, f"Write it to {FILE}")
