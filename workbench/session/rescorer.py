@@ -1,7 +1,7 @@
 """Recorded episodes judged again for a page: in a process of its own, with progress, and to be stopped.
 
-One thread does all of it. It groups the episodes by the env that they are judged in, has the process load one after the
-other and judge its episodes, and gathers what it says. To stop is to end the process: what is known by then stays.
+A lane's thread does all of it. It groups the episodes by the env that they are judged in, has the process load one after
+the other and judge its episodes, and gathers what it says. To stop is to end the process: what is known by then stays.
 Else it is kept for a while, since it takes seconds to start.
 """
 
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Literal
 
 from workbench.authoring.problem import Problem
+from workbench.session.lane import Job, Lane, Stopped
 from workbench.session.messages import Event, Failed, Load, Loaded, TaskOptions
 from workbench.session.process import WorkerProcess, describe_exit, start_in_background
 from workbench.session.rescore import Group, group_episodes, with_renderer
@@ -58,15 +59,11 @@ class RescoreView:
 
 
 @dataclass(frozen=True)
-class _Job:
+class _Asked:
     files: tuple[EpisodeFile, ...]
     base: TaskOptions | None
     recorded_source: bool
     use_env_states: bool
-
-
-class _Stopped(Exception):
-    """The job is to go no further."""
 
 
 class _Failure(Exception):
@@ -84,14 +81,13 @@ class Rescorer:
             on_change: called on this object's thread when `view` has something new.
         """
         self._on_change = on_change
-        self._wake = threading.Condition()
+        self._lock = threading.Lock()
+        """Of `view`: what a job that was stopped still has to say is not heard."""
         self._view = RescoreView()
-        self._waiting: _Job | None = None
-        self._job: _Job | None = None
-        self._closing = False
         self._process: WorkerProcess | None = None
-        """The thread's own."""
-        self._thread: threading.Thread | None = None
+        """The lane's own."""
+        # `_run` tells of failures itself, with what the code raised.
+        self._lane = Lane("rescore", on_change, lambda why: None, IDLE_SECONDS, self._end_process)
 
     @property
     def view(self) -> RescoreView:
@@ -106,11 +102,12 @@ class Rescorer:
         use_env_states: bool = False,
     ) -> None:
         """Judge these; see `group_episodes` for the arguments."""
-        with self._wake:
-            if self._closing or not files:
-                return
-            self._waiting = _Job(tuple(files), base, recorded_source, use_env_states)
-            self._job = None
+        if not files:
+            return
+        asked = _Asked(tuple(files), base, recorded_source, use_env_states)
+        with self._lock:
+            # Under the lock, or the job might tell how far it is before it is said that it begins.
+            self._lane.start("judging", lambda job: self._run(job, asked))
             self._view = RescoreView(
                 "loading",
                 self._view.serial + 1,
@@ -118,75 +115,54 @@ class Rescorer:
                 recorded_source=recorded_source,
                 use_env_states=use_env_states,
             )
-            self._wake.notify_all()
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name="rescore", daemon=True)
-                self._thread.start()
+        self._on_change()
 
     def stop(self) -> None:
         """Go no further; what is known by now stays to be seen."""
-        with self._wake:
-            self._waiting = self._job = None
+        with self._lock:
+            self._lane.stop()
             if self._view.state in ("loading", "judging"):
                 self._view = replace(self._view, state="stopped", serial=self._view.serial + 1)
         self._on_change()
 
     def close(self) -> None:
         """End it all; returns when the thread has ended."""
-        with self._wake:
-            self._closing = True
-            self._waiting = self._job = None
-            self._wake.notify_all()
-        if self._thread is not None:
-            self._thread.join(timeout=10.0)
+        self._lane.close()
 
-    # --- the thread --------------------------------------------------------------------------------
+    # --- on the lane ---------------------------------------------------------------------------------
 
-    def _run(self) -> None:
-        while (job := self._next()) is not None:
-            try:
-                groups, unread = group_episodes(
-                    job.files, MOST_AT_ONCE, job.base, recorded_source=job.recorded_source
-                )
-                self._tell(job, verdicts=tuple(unread), notes=tuple({g.note for g in groups if g.note}))
-                for group in groups:
-                    self._judge(job, group)
-                self._tell(job, state="done")
-            except _Stopped:
-                self._end_process()
-            except EOFError:
-                code = None if self._process is None else self._process.exit_code()
-                self._end_process()
-                self._tell(job, state="failed", why=f"the process that judges {describe_exit(code)}")
-            except _Failure as failure:
-                self._tell(job, state="failed", why=failure.why, problem=failure.problem)
-        self._end_process()
-
-    def _next(self) -> _Job | None:
-        with self._wake:
-            while self._waiting is None and not self._closing:
-                if not self._wake.wait(IDLE_SECONDS):
-                    self._end_process()
-            if self._closing:
-                return None
-            job, self._waiting = self._waiting, None
-            self._job = job
-        self._on_change()
-        return job
+    def _run(self, job: Job, asked: _Asked) -> None:
+        try:
+            groups, unread = group_episodes(
+                asked.files, MOST_AT_ONCE, asked.base, recorded_source=asked.recorded_source
+            )
+            self._tell(job, verdicts=tuple(unread), notes=tuple({g.note for g in groups if g.note}))
+            for group in groups:
+                self._judge(job, asked, group)
+            self._tell(job, state="done")
+        except Stopped:
+            self._end_process()
+            raise
+        except EOFError:
+            code = None if self._process is None else self._process.exit_code()
+            self._end_process()
+            self._tell(job, state="failed", why=f"the process that judges {describe_exit(code)}")
+        except _Failure as failure:
+            self._tell(job, state="failed", why=failure.why, problem=failure.problem)
 
     def _end_process(self) -> None:
         process, self._process = self._process, None
         if process is not None:
             process.stop(grace=0.0)
 
-    def _judge(self, job: _Job, group: Group) -> None:
+    def _judge(self, job: Job, asked: _Asked, group: Group) -> None:
         process = self._process = self._process or _start()
         folder: Path | None = None
         reference = group.reference
         try:
-            if job.recorded_source:
+            if asked.recorded_source:
                 folder, reference = write_source(group.info)
-            shown = group.info.task + (" as it was recorded" if job.recorded_source else "")
+            shown = group.info.task + (" as it was recorded" if asked.recorded_source else "")
             self._tell(job, state="loading", task=shown)
             # Never patched into what the last episodes were judged in.
             process.send(Load(reference, group.options, level="rebuilt"))
@@ -197,7 +173,7 @@ class Rescorer:
             if isinstance(told, Failed):
                 raise _Failure(f"{group.info.task} could not be opened to judge with", told.problem)
             self._tell(job, state="judging")
-            process.send(Rescore(group.files, job.use_env_states))
+            process.send(Rescore(group.files, asked.use_env_states))
             began, before, steps = time.monotonic(), self._view.seconds, self._view.steps
             while True:
                 told = self._answer(job, process, Rescored)
@@ -220,22 +196,22 @@ class Rescorer:
             if folder is not None:
                 shutil.rmtree(folder, ignore_errors=True)
 
-    def _answer(self, job: _Job, process: WorkerProcess, kind: type) -> Event:
+    def _answer(self, job: Job, process: WorkerProcess, kind: type) -> Event:
         """The next event of this kind, or that it cannot be had.
 
         Raises:
-            _Stopped: nobody waits for it any more.
+            Stopped: nobody waits for it any more.
             EOFError: the process died.
         """
-        while self._job is job:
+        while True:
+            job.check()
             event = process.receive(timeout=_LOOK)
             if event is not None and isinstance(event, (kind, Failed)):
                 return event
-        raise _Stopped
 
-    def _tell(self, job: _Job, **values: object) -> None:
-        with self._wake:
-            if self._job is not job:
+    def _tell(self, job: Job, **values: object) -> None:
+        with self._lock:
+            if job.stopped:
                 return
             self._view = replace(self._view, serial=self._view.serial + 1, **values)  # type: ignore[arg-type]
         self._on_change()
