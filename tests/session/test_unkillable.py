@@ -282,6 +282,7 @@ def test_an_interrupt_is_for_the_thread_that_python_handles_signals_in() -> None
     """The kernel may give a signal for the process to a thread of torch's, and then nothing leaves the loop."""
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
     child.send_signal(signal.SIGSTOP)
+    os.waitpid(child.pid, os.WUNTRACED)  # it stops some time later, and until then a signal is delivered
     try:
         signal_main_thread(child.pid, INTERRUPT_SIGNAL)
         status = Path(f"/proc/{child.pid}/status").read_text()

@@ -322,9 +322,9 @@ class Judge:
         return event
 
     def _end_process(self) -> None:
-        process, self._process, self._owed = self._process, None, None
-        if process is not None:
-            process.stop(grace=0.0)
+        if self._process is not None:
+            self._process.stop(grace=0.0)
+        self._process = self._owed = None
 
     def _tell(self, job: _Job, state: JudgeState, why: str = "", problem: Problem | None = None) -> None:
         with self._wake:
