@@ -19,7 +19,7 @@ import pytest
 
 from tests.session.conftest import wait_until
 from tests.session.hazards import calm, edit, line_of, provoke, write_task
-from workbench.recording.read import read_properties
+from workbench.recording.read_properties import read_properties
 from workbench.recording.verify import verify_rrd
 from workbench.session.interrupts import INTERRUPT_SIGNAL
 from workbench.session.kept_worker import WorkerOptions
