@@ -25,13 +25,11 @@ from workbench.session.judgement import JudgedCurve, Judgement, Summary
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
 from workbench.session.messages import (
     Failed,
-    Judged,
-    JudgeMoments,
     Load,
     Loaded,
-    MomentToJudge,
     TaskDescription,
 )
+from workbench.session.moment_messages import Judged, JudgeMoments, MomentToJudge
 
 IDLE_SECONDS = 300.0
 """How long the process is kept without a judgement."""

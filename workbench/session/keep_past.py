@@ -26,16 +26,14 @@ from workbench.session.episodes import GatheredEpisode, episode_info, first_row,
 from workbench.session.keep_status import KeepStatus
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
 from workbench.session.messages import (
-    Captured,
-    CaptureMoments,
     Failed,
     Load,
     Loaded,
-    MomentToCapture,
     PlaceCamera,
     Placed,
     Request,
 )
+from workbench.session.moment_messages import Captured, CaptureMoments, MomentToCapture
 from workbench.session.past_episodes import PastEpisode, WhatToKeep, moments_of
 
 _IDLE_SECONDS = 60.0

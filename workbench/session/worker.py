@@ -44,12 +44,10 @@ from workbench.session.interrupts import Interrupts
 from workbench.session.judge_moments import judge_moments
 from workbench.session.messages import (
     SCENE_KEPT,
-    CaptureMoments,
     DrawPast,
     EpisodeEnd,
     Failed,
     Inspect,
-    JudgeMoments,
     Load,
     Loaded,
     Loading,
@@ -72,6 +70,7 @@ from workbench.session.messages import (
     WarmUp,
     WatchCameras,
 )
+from workbench.session.moment_messages import CaptureMoments, JudgeMoments
 from workbench.session.open_task import OpenedTask, reset_checked, restore_checked, step_checked
 from workbench.session.pacing import Pacer, Rate
 from workbench.session.pulse import Doing, PulseWriter

@@ -22,7 +22,6 @@ from workbench.session.capture_moments import capture_moments
 from workbench.session.held_task import HeldTask
 from workbench.session.interrupts import Interrupts
 from workbench.session.messages import (
-    CaptureMoments,
     DrawPast,
     PastPictures,
     Pictures,
@@ -30,6 +29,7 @@ from workbench.session.messages import (
     Placed,
     WatchCameras,
 )
+from workbench.session.moment_messages import CaptureMoments
 from workbench.session.open_task import OpenedTask, blamed
 from workbench.session.picture_maker import PictureMaker
 from workbench.session.pulse import PulseWriter
