@@ -88,11 +88,6 @@ class BackgroundAsker:
         """By the process that is there."""
         self.num_envs = 0
 
-    @property
-    def pid(self) -> int | None:
-        """None while there is no process."""
-        return self._process.pid
-
     def load(self, load: Load, job: Job) -> None:
         """Have that version there, with no more than `MOST_ENVS` envs."""
         load = _for_judging(load)
