@@ -105,6 +105,10 @@ class SceneView:
             self._floor_grid.remove()
             self._floor_grid = None
 
+    @property
+    def handles(self) -> tuple[viser.BatchedGlbHandle, ...]:
+        return tuple(group.handle for group in self._drawn.values())
+
 
 class _DrawnGroup:
     def __init__(self, server: viser.ViserServer, number: int, group: WornTogether, limit: int) -> None:
