@@ -305,11 +305,14 @@ def doctor() -> int:
 
 def main(args: Sequence[str] | None = None) -> None:
     """Entry of the ``workbench`` command."""
-    code: Any = app.cli(
-        prog="workbench",
-        description="Workbench: write ManiSkill tasks in front of a live, batched view of them.",
-        args=args,
-    )
+    try:
+        code: Any = app.cli(
+            prog="workbench",
+            description="Workbench: write ManiSkill tasks in front of a live, batched view of them.",
+            args=args,
+        )
+    except KeyboardInterrupt:  # in the seconds before a command listens for it: importing torch takes some
+        code = _refuse("interrupted")
     sys.exit(code)
 
 

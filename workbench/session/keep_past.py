@@ -93,11 +93,11 @@ class PastKeeper:
             raise
         job.tell(1, 1, "writing the files")
         made = [self._finisher.finish(episode) for episode in writers.values()]
-        kept = sum(future.result() is not None for future in made)
+        problems = [result for future in made if isinstance(result := future.result(), str)]
+        if problems:
+            raise JobFailed(problems[0])
         steps = sum(episode.steps for episode in what.episodes)
-        if kept < len(made):
-            raise JobFailed(self._finisher.finished.problem or "its files could not be written")
-        self._say(f"kept {kept} episode{'' if kept == 1 else 's'}, {steps} steps")
+        self._say(f"kept {len(made)} episode{'' if len(made) == 1 else 's'}, {steps} steps")
 
     def _capture_all(self, job: Job, what: WhatToKeep, writers: dict[int, GatheredEpisode]) -> None:
         names = [dimension.name for dimension in what.task.actions]
