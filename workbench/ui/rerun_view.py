@@ -21,8 +21,10 @@ import gzip
 import html
 import json
 import logging
+import math
 import secrets
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -42,6 +44,8 @@ log = logging.getLogger(__name__)
 
 SHARE, LEAST = 0.66, 480
 """Of the width between the other panels; and pixels. The rest is the scene's, with the timeline under it."""
+SETTLES = 0.5
+"""Seconds until a page has placed a panel."""
 Moments = Mapping[Path, int]
 """The step at which a recording is looked at."""
 
@@ -91,6 +95,13 @@ window.fetch = (what, how) => fetch_as_told(what, { ...how, credentials: "same-o
   for (const moment of asked.getAll("at")) {
     const end = moment.lastIndexOf("@");
     go(moment.slice(0, end), Number(moment.slice(end + 1)));
+  }
+  if (parent !== window) {
+    // It takes the keyboard when it starts; in a panel the keys are the page's until somebody presses into it.
+    const focus = HTMLElement.prototype.focus;
+    let pressed = false;
+    addEventListener("pointerdown", () => { pressed = true; }, true);
+    HTMLElement.prototype.focus = function (...how) { if (pressed) focus.apply(this, how); };
   }
   addEventListener("load", () => { document.title = asked.get("title") || document.title; });
 }
@@ -182,6 +193,9 @@ class RerunView:
         self._lock = threading.Lock()
         self._problem = ""
         self._waiting = False
+        self._width = LEAST
+        self._seen: dict[int, float] = {}
+        """Since when each page has the panel; minus infinity for one on which it has its width."""
         self._button = server.gui.add_button("Open in rerun", icon=viser.Icon.APP_WINDOW, disabled=True)
         self._words = server.gui.add_html("")
         self._button.on_click(lambda _: self.open())
@@ -208,6 +222,23 @@ class RerunView:
             problem=self._problem,
         )
         fill(self._words, words)
+        self._widen()
+
+    def _widen(self) -> None:
+        """Give the panel its width on pages that have had it for a moment.
+
+        viser gives 300 pixels to what is docked beside another panel, whatever width it is docked with; only one that
+        is there takes a width. So does one on a page that is opened later.
+        """
+        with self._lock:
+            if self._panel is None:
+                return
+            now, here = time.monotonic(), self._server.get_clients().keys()
+            self._seen = {id: self._seen.get(id, now) for id in here}
+            ripe = [id for id, since in self._seen.items() if math.inf > now - since > SETTLES]
+            if ripe:
+                self._panel.set_width(self._width)
+                self._seen.update(dict.fromkeys(ripe, -math.inf))
 
     def _address(self, paths: tuple[Path, ...]) -> str:
         return self._pages.address(paths, lambda: {path: self._moments.get(path, 0) for path in paths})
@@ -240,10 +271,9 @@ class RerunView:
             begins = {path: moments.get(path, 0) for path in paths}
             heading = [(path.stem, begins[path]) for path in paths]
             self._server.gui.add_html(render("rerun_frame", address=self._address(paths), heading=heading))
-        # Beside the scene, with a border that can be dragged. The folded library is a strip of the same side, and the
-        # width is that of the side, so it has to be folded before.
+        # Beside the scene, with a border that can be dragged.
         panel.dock_left()
-        panel.set_width(max(LEAST, round(SHARE * room)))
+        self._width, self._seen = max(LEAST, round(SHARE * room)), {}
 
     def close(self) -> None:
         """Take the panel away, and the program that runs in it."""
