@@ -169,7 +169,7 @@ def will_make(what: What, chosen: Chosen, camera: str, folder: Path) -> WillMake
     names = [source.name for source in chosen.sources]
     of = "of it" if len(names) == 1 else f"of these {len(names)} recordings"
     if what == "lerobot":
-        return WillMake(f"One dataset {of}", where=f"{folder / 'datasets'}/lerobot_\u2039date and time\u203a")
+        return WillMake(f"one dataset {of}", where=f"{folder / 'datasets'}/lerobot_\u2039date and time\u203a")
     if what != "film":
         files = [file_name(what, name) for name in names]
     elif camera in chosen.cameras:
@@ -177,7 +177,8 @@ def will_make(what: What, chosen: Chosen, camera: str, folder: Path) -> WillMake
     elif chosen.cameras and len(names) == 1:
         files = [file_name(what, name, known) for name in names for known in chosen.cameras]
     else:
-        return WillMake(f"One film for each camera {of}")
+        known = f" ({', '.join(chosen.cameras)})" if chosen.cameras else ""
+        return WillMake(f"one film for each camera{known} {of}")
     count = f"{len(files)} file{'' if len(files) == 1 else 's'}"
     return WillMake(count, tuple(files[:MOST_NAMED]), len(files[MOST_NAMED:]))
 
