@@ -312,7 +312,7 @@ def main(args: Sequence[str] | None = None) -> None:
             args=args,
         )
     except KeyboardInterrupt:  # in the seconds before a command listens for it: importing torch takes some
-        code = _refuse("interrupted")
+        code = refuse("interrupted")
     sys.exit(code)
 
 
