@@ -3,15 +3,15 @@
 // viser lowers the resolution of its view when frames come slowly, and raises it again. On a graphics card that costs
 // nothing that is seen. Where the browser draws on the processor, new buffers wait for all that is still to be drawn:
 // the page answers nothing for 0.2 to 0.8 s, at moments that nobody chose (it goes down, up, and down again), one of
-// them the first seconds in which the author's code hangs and the page is needed most. Such a page therefore begins
-// with the resolution that viser would come to, and stays there. Whoever has a card keeps what viser does.
+// them the first seconds in which the author's code hangs and the page is needed most. Such a page therefore stays at
+// the resolution it begins with. Not at a lower one: what lies over the view (the timeline, a banner) is fitted to the
+// view's width, which viser tells in these pixels. Whoever has a card keeps what viser does.
 //
 // viser reads a fixed resolution from its address, once, before it makes its canvas: so it is put there for that long,
 // and not left behind in what people bookmark or copy. One that stands there already is somebody's wish.
 "use strict";
 {
   const KEY = "fixedDpr"; // viser 1.1, DevSettingsStore.ts
-  const LOWEST = 0.75; // of the screen's resolution, as in its App.tsx
   const SOFTWARE = /swiftshader|llvmpipe|softpipe|software/i; // as in its BrowserWarning.tsx
 
   function isDrawnInSoftware() {
@@ -31,7 +31,8 @@
   }
 
   if (!new URLSearchParams(location.search).has(KEY) && isDrawnInSoftware()) {
-    changeAddress((asked) => asked.set(KEY, LOWEST * devicePixelRatio));
+    const beginsWith = Math.min(Math.max(devicePixelRatio, 1), 2); // as react-three-fiber's canvas by itself
+    changeAddress((asked) => asked.set(KEY, beginsWith));
     const looked = new MutationObserver(() => {
       if (!document.querySelector("canvas[data-engine]")) return;
       looked.disconnect();
