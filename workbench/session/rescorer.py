@@ -19,7 +19,7 @@ from workbench.authoring.problem import Problem
 from workbench.session.lane import Job, Lane, Stopped
 from workbench.session.messages import Event, Failed, Load, Loaded, TaskOptions
 from workbench.session.process import WorkerProcess, describe_exit, start_in_background
-from workbench.session.rescore import Group, group_episodes, with_renderer
+from workbench.session.rescore import Group, group_episodes, not_judged, with_renderer
 from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored, Verdict
 from workbench.session.step_back import CannotStepIn, write_source
 
@@ -137,8 +137,21 @@ class Rescorer:
                 asked.files, MOST_AT_ONCE, asked.base, recorded_source=asked.recorded_source
             )
             self._tell(job, verdicts=tuple(unread), notes=tuple({g.note for g in groups if g.note}))
+            failed: list[_Failure] = []
             for group in groups:
-                self._judge(job, asked, group)
+                try:
+                    self._judge(job, asked, group)
+                except _Failure as failure:
+                    failed.append(failure)
+                    if len(failed) == len(groups):
+                        raise failed[0] from None
+                    why = (
+                        failure.why
+                        if failure.problem is None
+                        else f"{failure.why}: {failure.problem.message}"
+                    )
+                    verdicts = self._view.verdicts
+                    self._tell(job, verdicts=(*verdicts, *not_judged(group, verdicts, why)))
             self._tell(job, state="done")
         except Stopped:
             self._end_process()
