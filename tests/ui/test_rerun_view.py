@@ -75,14 +75,6 @@ def test_a_file_is_sent_whole_and_only_under_the_address_that_was_made(door: Doo
     assert get(door, address)[0] == 404
 
 
-def test_a_withdrawn_file_is_not_to_be_had(door: Door, tmp_path: Path) -> None:
-    offers = Offers(door)
-    (tmp_path / "a.txt").write_text("a")
-    address = offers.address(tmp_path / "a.txt")
-    offers.withdraw(tmp_path / "a.txt")
-    assert get(door, address)[0] == 404
-
-
 def test_a_file_that_becomes_shorter_while_it_is_sent_is_no_whole_answer(door: Door, tmp_path: Path) -> None:
     big = tmp_path / "big.rrd"
     big.write_bytes(bytes(40_000_000))  # more than the sockets hold

@@ -177,8 +177,9 @@ class StepInPart:
         info = None if view.chosen is None else view.chosen.episode.info
         if self._about != (info and info.id, self._step_in.recorded_source):
             self._about = info and info.id, self._step_in.recorded_source
-            asked = info is not None and self._step_in.recorded_source
-            words = side_files_in_words(info.source_file, info.side_files) if asked else ""
+            words = ""
+            if info is not None and self._step_in.recorded_source:
+                words = side_files_in_words(info.source_file, info.side_files)
             fill(self._besides, render("note", text=words) if words else "")
 
     def _chosen(self) -> None:
