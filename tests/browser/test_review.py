@@ -137,7 +137,7 @@ def test_what_is_shared_is_named_made_and_fetched(desk: tuple[Page, list[str]]) 
     page, errors = desk
     page.get_by_role("tab", name="Share").click()
     expect(page.get_by_text("Selected in the library, 2 recordings")).to_be_visible()
-    page.get_by_role("textbox", name="Make").click()
+    page.locator('input[value="Film of a camera (mp4)"]:not([type="hidden"])').click()
     page.get_by_role("option", name="Sheet of pictures (png)").click()
     expect(page.get_by_text(re.compile("Makes 2 files"))).to_be_visible()
     page.get_by_role("button", name="Make", exact=True).click()

@@ -69,17 +69,17 @@ def geometry_of(episode: Episode) -> SceneGeometry:
 
 def begin(folder: Path, episode: Episode) -> None:
     """All of it in a journal, as a writer leaves it that was killed before it made the files."""
-    writer = _appended(folder, episode, pictures=False)
+    writer = appended(folder, episode, pictures=False)
     writer._journal.write()
     writer.close()
 
 
 def write(folder: Path, episode: Episode, pictures: bool = True) -> Path:
     """Its files in `folder`, with a camera whose picture at state k is k * 20 bright; returns the .json."""
-    return _appended(folder, episode, pictures).finish().json
+    return appended(folder, episode, pictures).finish().json
 
 
-def _appended(folder: Path, episode: Episode, pictures: bool) -> EpisodeWriter:
+def appended(folder: Path, episode: Episode, pictures: bool) -> EpisodeWriter:
     cameras = (camera(),) if pictures else ()
     writer = EpisodeWriter(
         folder, episode.info, geometry_of(episode), episode.segmentation, episode.action_names, cameras

@@ -232,6 +232,36 @@ def test_a_task_that_fails_while_recording_says_where(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+def test_a_keyword_that_the_task_does_not_take_is_named(tmp_path: Path) -> None:
+    options = TaskOptions(num_envs=1, env_kwargs={"colour": "red"})
+    with pytest.raises(TaskError, match="unexpected keyword argument 'colour'"):
+        record(RecordOptions("PickCube-v1", tmp_path / "out", options=options))
+
+
+def test_a_second_ctrl_c_ends_processes_that_hang(tmp_path: Path) -> None:
+    (tmp_path / "hangs.py").write_text(
+        "from pathlib import Path\n\nasked = 0\n\n\n"
+        "def act(obs):\n    global asked\n    asked += 1\n"
+        "    while asked > 3:\n        Path('hung').touch()\n    return obs.new_zeros(8)\n"
+    )
+    command = [
+        *(sys.executable, "-m", "workbench.cli", "record", "PushCube-v1", "--no-pictures", "--out", "out"),
+        *("--num-envs", "2", "--workers", "2", "--actions", "hangs.py:act"),
+    ]
+    process = subprocess.Popen(
+        command, cwd=tmp_path, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    deadline = time.monotonic() + 90
+    while not (tmp_path / "hung").exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.05)
+    for _ in range(2):
+        time.sleep(0.5)  # the first must have been heard, or both are one
+        os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 2 and "interrupted" in errors
+    assert "Traceback" not in errors
+
+
 @pytest.mark.parametrize("workers", ["1", "2"])
 def test_ctrl_c_keeps_what_is_over(workers: str, tmp_path: Path) -> None:
     command = [

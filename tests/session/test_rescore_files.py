@@ -202,6 +202,14 @@ def test_a_broken_task_is_told_with_its_line(author: Path, capsys: pytest.Captur
         rescore_all(RescoreOptions((author / "recordings",)))
 
 
+def test_a_broken_task_among_others_is_told_at_its_episodes(author: Path, foreign: Path) -> None:
+    edit(author, REWARD, "return self.nonsense(obs)")
+    verdicts, _ = rescore_all(RescoreOptions((author / "recordings", foreign)))
+    broken = [verdict for verdict in verdicts if "nonsense" in verdict.why_not]
+    judged = [verdict for verdict in verdicts if not verdict.why_not]
+    assert (len(broken), len(judged)) == (EPISODES, 2)
+
+
 def test_wrong_arguments_are_refused_in_a_sentence(author: Path, capsys: pytest.CaptureFixture[str]) -> None:
     recordings = str(author / "recordings")
     assert run([recordings, "--task", "x.py", "--recorded-source"], capsys)[0] == 2
@@ -223,7 +231,7 @@ def until(rescorer: Rescorer, *states: str) -> RescoreView:
     raise AssertionError(f"{states} did not come: {rescorer.view}")
 
 
-def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path) -> None:
+def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path, foreign: Path) -> None:
     rescorer = Rescorer()
     try:
         edit(author, REWARD, f"{REWARD} * 2")
@@ -237,6 +245,10 @@ def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path) -> Non
         rescorer.start(find_episodes((author / "recordings",)))
         view = until(rescorer, "failed", "done")
         assert "could not be opened" in view.why and "ZeroDivisionError" in view.problem.message
+        rescorer.start(find_episodes((author / "recordings", foreign)))
+        view = until(rescorer, "done", "failed")
+        assert view.state == "done"
+        assert ["ZeroDivisionError" in v.why_not for v in view.verdicts] == [True] * EPISODES + [False] * 2
         rescorer.start(find_episodes((author / "recordings",)), recorded_source=True)
         view = until(rescorer, "done", "failed")
         assert view.why == "" and not any(verdict.differs for verdict in view.verdicts)

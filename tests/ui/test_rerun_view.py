@@ -13,8 +13,10 @@ import pytest
 import rerun as rr
 from playwright.sync_api import Request, sync_playwright
 
+from tests.browser.opened import until
 from workbench.recording.web_viewer import VIEWER_FILES, web_viewer_folder
 from workbench.ui.door import Door, DoorOptions, open_door
+from workbench.ui.fragments import style_sheet
 from workbench.ui.gate import cookie_name
 from workbench.ui.offers import Offers
 from workbench.ui.rerun_view import RerunPages, RerunView
@@ -119,6 +121,7 @@ def test_a_recordings_name_is_text_and_no_script(door: Door, pages: RerunPages, 
 def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
     door: Door, pages: RerunPages, recording: Path, chromium_path: str
 ) -> None:
+    door.server.gui.add_html(style_sheet())
     library = door.server.gui.add_panel()
     with library.add_tab("Library"):
         door.server.gui.add_html("...")
@@ -150,11 +153,13 @@ def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
         frame.locator("canvas.visible").wait_for(timeout=90_000)
         # The state of the viewer as it tells it: the cursor of the timeline "step" is at 12.
         inside = next(frame for frame in tab.frames if "/rerun/viewer-" in frame.url)
-        inside.wait_for_function(
-            "new TextDecoder().decode(window._handle.viewer_state()).includes('step\\x10\\x01\\x1a\\x02\\x08\\x0c')"
+        state = "() => new TextDecoder().decode(window._handle.viewer_state())"
+        until(
+            lambda: "step\x10\x01\x1a\x02\x08\x0c" in inside.evaluate(state), "the moment that was asked for"
         )
         tab.get_by_text("from step 12").wait_for()
-        tab.wait_for_function("document.querySelector('iframe.wb-rerun').clientWidth > 500")
+        width = "document.querySelector('iframe.wb-rerun').clientWidth"
+        until(lambda: tab.evaluate(width) > 450, "half of the page")
         assert tab.evaluate("document.activeElement.tagName") != "IFRAME", "the keys are the page's"
         tab.get_by_role("button", name="Close rerun").click()
         tab.locator("iframe.wb-rerun").wait_for(state="detached")

@@ -12,7 +12,7 @@ one step from the state before.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -167,6 +167,13 @@ def group_episodes(
         replace(g, options=replace(g.options, num_envs=max(1, min(num_envs, len(g.files)))))
         for g in groups.values()
     ], unread
+
+
+def not_judged(group: Group, verdicts: Iterable[Verdict], why_not: str) -> list[Verdict]:
+    """Of those of the group that have no verdict: a folder holds recordings of many tasks, and one of them may be gone."""
+    judged = {verdict.file.id for verdict in verdicts}
+    missing = [file for file in group.files if file.id not in judged]
+    return [Verdict(file, task=group.info.task, why_not=why_not) for file in missing]
 
 
 def judging_options(options: TaskOptions) -> tuple[TaskOptions, str]:

@@ -12,10 +12,10 @@ import torch
 from workbench.authoring.problem import TaskError
 from workbench.session.messages import TaskOptions
 from workbench.session.open_task import OpenedTask, open_task
-from workbench.session.rescore import find_episodes, group_episodes, with_renderer
+from workbench.session.rescore import find_episodes, group_episodes, not_judged, with_renderer
 from workbench.session.rescore_messages import Verdict
 from workbench.session.rescore_run import rescore
-from workbench.session.step_back import write_source
+from workbench.session.step_back import CannotStepIn, write_source
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ def rescore_all(
 
     Raises:
         UnreadableRecording: there is nothing to judge.
-        TaskError: a task cannot be opened, or raises.
-        CannotStepIn: a recorded text cannot be opened.
+        TaskError: no task can be opened, or each raises; where others can be judged, it is said of its episodes.
+        CannotStepIn: as TaskError, where a recorded text cannot be opened.
     """
     torch.set_num_threads(1)  # see workbench.session.worker.work
     files = find_episodes(what.places)
@@ -56,12 +56,13 @@ def rescore_all(
         files, what.num_envs, what.base, task=what.task, recorded_source=what.recorded_source
     )
     steps = 0
+    failed: list[TaskError | CannotStepIn] = []
     for group in groups:
         folder: Path | None = None
         reference = group.reference
-        if what.recorded_source:
-            folder, reference = write_source(group.info)
         try:
+            if what.recorded_source:
+                folder, reference = write_source(group.info)
             opened = _open(reference, group.options, on_activity)
             before = steps
 
@@ -78,9 +79,14 @@ def rescore_all(
                     on_progress(Progress(len(verdicts), len(files), steps))
             finally:
                 opened.env.close()
+        except (TaskError, CannotStepIn) as error:
+            failed.append(error)
+            verdicts.extend(not_judged(group, verdicts, str(error)))
         finally:
             if folder is not None:
                 shutil.rmtree(folder, ignore_errors=True)
+    if failed and len(failed) == len(groups):
+        raise failed[0]
     place = {file.id: number for number, file in enumerate(files)}
     verdicts.sort(key=lambda verdict: place[verdict.file.id])
     return verdicts, tuple(dict.fromkeys(group.note for group in groups if group.note))

@@ -19,7 +19,7 @@ from workbench.authoring.problem import Problem
 from workbench.session.background import BackgroundProcess
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
 from workbench.session.messages import Failed, Load, Loaded, TaskOptions
-from workbench.session.rescore import Group, group_episodes, with_renderer
+from workbench.session.rescore import Group, group_episodes, not_judged, with_renderer
 from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored, Verdict
 from workbench.session.step_back import CannotStepIn, write_source
 
@@ -129,8 +129,19 @@ class Rescorer:
                 asked.files, MOST_AT_ONCE, asked.base, recorded_source=asked.recorded_source
             )
             self._tell(job, verdicts=tuple(unread), notes=tuple({g.note for g in groups if g.note}))
+            failed = 0
             for group in groups:
-                self._judge(job, asked, group)
+                try:
+                    self._judge(job, asked, group)
+                except JobFailed as failure:
+                    failed += 1
+                    if failed == len(groups):
+                        raise
+                    why = str(failure)
+                    if failure.problem is not None:
+                        why += f": {failure.problem.message}"
+                    verdicts = self._view.verdicts
+                    self._tell(job, verdicts=(*verdicts, *not_judged(group, verdicts, why)))
             self._tell(job, state="done")
         except Stopped:
             self._process.end()

@@ -21,7 +21,6 @@ import gzip
 import html
 import json
 import logging
-import math
 import secrets
 import threading
 import time
@@ -44,8 +43,8 @@ log = logging.getLogger(__name__)
 
 SHARE, LEAST = 0.66, 480
 """Of the width between the other panels; and pixels. The rest is the scene's, with the timeline under it."""
-SETTLES = 0.5
-"""Seconds until a page has placed a panel."""
+SETTLES = 0.3
+"""Seconds from what a panel shows being asked for until the panel is where it stays."""
 Moments = Mapping[Path, int]
 """The step at which a recording is looked at."""
 
@@ -194,8 +193,8 @@ class RerunView:
         self._problem = ""
         self._waiting = False
         self._width = LEAST
-        self._seen: dict[int, float] = {}
-        """Since when each page has the panel; minus infinity for one on which it has its width."""
+        self._asked_at: float | None = None
+        """When a page last asked for what is in the panel, if the panel has got no width since."""
         self._button = server.gui.add_button("Open in rerun", icon=viser.Icon.APP_WINDOW, disabled=True)
         self._words = server.gui.add_html("")
         self._button.on_click(lambda _: self.open())
@@ -225,23 +224,24 @@ class RerunView:
         self._widen()
 
     def _widen(self) -> None:
-        """Give the panel its width on pages that have had it for a moment.
+        """Give the panel its width on a page that has just placed it.
 
         viser gives 300 pixels to what is docked beside another panel, whatever width it is docked with; only one that
-        is there takes a width. So does one on a page that is opened later.
+        is there takes a width. That it is there is known by its asking for what is in it.
         """
         with self._lock:
-            if self._panel is None:
-                return
-            now, here = time.monotonic(), self._server.get_clients().keys()
-            self._seen = {id: self._seen.get(id, now) for id in here}
-            ripe = [id for id, since in self._seen.items() if math.inf > now - since > SETTLES]
-            if ripe:
+            asked = self._asked_at
+            if self._panel is not None and asked is not None and time.monotonic() - asked > SETTLES:
+                self._asked_at = None
                 self._panel.set_width(self._width)
-                self._seen.update(dict.fromkeys(ripe, -math.inf))
 
     def _address(self, paths: tuple[Path, ...]) -> str:
-        return self._pages.address(paths, lambda: {path: self._moments.get(path, 0) for path in paths})
+        def moments() -> Moments:
+            with self._lock:
+                self._asked_at = time.monotonic()
+            return {path: self._moments.get(path, 0) for path in paths}
+
+        return self._pages.address(paths, moments)
 
     def open(self) -> None:
         """Show the recordings in a panel beside the scene; returns when the viewer is there to be loaded."""
@@ -273,7 +273,7 @@ class RerunView:
             self._server.gui.add_html(render("rerun_frame", address=self._address(paths), heading=heading))
         # Beside the scene, with a border that can be dragged.
         panel.dock_left()
-        self._width, self._seen = max(LEAST, round(SHARE * room)), {}
+        self._width = max(LEAST, round(SHARE * room))
 
     def close(self) -> None:
         """Take the panel away, and the program that runs in it."""

@@ -25,6 +25,7 @@ from workbench.recording.scene_eye import Eye, usual_eye
 from workbench.session.review_events import success_words
 from workbench.ui.door import DoorOptions, open_door
 from workbench.ui.env_layout import lay_out
+from workbench.ui.fragments import render
 from workbench.ui.scene_view import SceneView
 
 TRIANGLES = 80_000
@@ -32,29 +33,6 @@ TRIANGLES = 80_000
 
 PAUSE = 1.0
 """Seconds at the end."""
-
-_CAPTION = """<style>
-.mantine-NumberInput-root { display: none; }
-.wb-caption { position: fixed; left: 1em; top: 1em; z-index: 2; padding: 0.5em 0.8em; border-radius: 0.4em;
-  font: 13px/1.5 system-ui, sans-serif; color: #eee; background: rgba(20, 20, 20, 0.72); font-variant-numeric: tabular-nums; }
-</style>
-<div class="wb-caption"><b>{about}</b><br>{ended}<br><span id="wb-time"></span></div>
-<script>
-{{
-  // The player puts its seconds into an input, with one digit; its slider has them all.
-  const dt = {dt}, steps = {steps}, said = document.getElementById("wb-time");
-  const tell = () => {{
-    const slider = document.querySelector(".mantine-Slider-root [aria-valuenow]");
-    if (slider !== null) {{
-      const step = Math.min(steps, Math.floor(slider.getAttribute("aria-valuenow") / dt + 1e-3));
-      const now = `step ${{step}} of ${{steps}}, ${{(step * dt).toFixed(2)}} of ${{(steps * dt).toFixed(2)}} s`;
-      if (said.textContent !== now) said.textContent = now;
-    }}
-    requestAnimationFrame(tell);
-  }};
-  tell();
-}}
-</script>"""
 
 
 def write_scene_html(
@@ -99,12 +77,9 @@ def _seconds_a_step(episode: Episode) -> float:
 def _caption(episode: Episode) -> str:
     info = episode.info
     about = f"{info.task}, seed {info.seed}" if info.seed >= 0 else info.task
-    return _CAPTION.format(
-        about=html.escape(about),
-        ended=html.escape(success_words(episode)[0]),
-        dt=_seconds_a_step(episode),
-        steps=episode.length,
-    )
+    ended, mood = success_words(episode)
+    dt = _seconds_a_step(episode)
+    return render("scene_caption", about=about, ended=ended if mood else "", dt=dt, steps=episode.length)
 
 
 def _recorded(
