@@ -28,7 +28,7 @@ window.requestAnimationFrame = (draw) => soon(() => setTimeout(() => {
     draw(now);
 }, 60));
 """
-ENOUGH_FRAMES = 90
+ENOUGH_FRAMES = 60
 """viser decides after ten quarters of a second in which frames follow each other."""
 CANVAS = "document.querySelector('canvas[data-engine]')"
 Show = Callable[..., Page]
