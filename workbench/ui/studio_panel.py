@@ -29,6 +29,7 @@ from workbench.session.view import SessionView
 from workbench.ui.camera_frustums import Placed
 from workbench.ui.camera_gizmo import CameraGizmo
 from workbench.ui.camera_judging import CameraJudging
+from workbench.ui.camera_lens import CameraLens
 from workbench.ui.camera_moves import Floats, Frame, Snap, nudged, panned
 from workbench.ui.camera_numbers import CameraNumbers
 from workbench.ui.camera_pick import CameraPick
@@ -82,7 +83,8 @@ class StudioPanel:
         self._look = LookThrough(server, self._placing)
         self._writing = CameraWriting(server, session, self._placing, self._new_from_viewer)
         self._handles = gui.add_html("", visible=False)
-        self._numbers = CameraNumbers(server, self._placing)
+        self._numbers = CameraNumbers(server, self._placing, look_at=lambda: self._look_at)
+        self._lens = CameraLens(server, self._placing)
         self._writing.add_members(server)
         self._judging = CameraJudging(server, session)
         self._presses = Presses(server)
@@ -149,6 +151,7 @@ class StudioPanel:
         show(self._tools, camera is not None)
         show(self._handles, camera is not None)
         self._numbers.draw(camera)
+        self._lens.draw(camera)
         self._writing.draw(studio)
         self._draw_picture(view)
         self._pick.draw(view, shown=self._picture is not None and self._picture.visible)
@@ -283,17 +286,17 @@ class StudioPanel:
         studio = self._session.studio
         rows = [
             [
-                {"label": "Drag"},
+                {"label": "Place"},
                 self._tool(
                     "move, turn",
-                    "Move and turn the camera.",
+                    "Its pose: move it, and what it looks at goes along; or turn it.",
                     "move",
                     self._sets(look_at=False),
                     not self._look_at,
                 ),
                 self._tool(
-                    "eye, target",
-                    "Move the eye, or what it looks at.",
+                    "eye and target",
+                    "Move the eye and it goes on looking at its target; or move the target.",
                     "look at",
                     self._sets(look_at=True),
                     self._look_at,
@@ -421,7 +424,10 @@ class StudioPanel:
         if camera is not None and camera.now is not None:
             frame = self._placing.frame(camera)
             moved = frame.from_view(camera.now, move(frame.to_view(camera.now)))
-            self._placing.place(camera.key, moved, hand)
+            if self._look_at and moved.position != camera.now.position:
+                self._placing.look(camera, moved, self._placing.target_in_view(camera, camera.now), hand)
+            else:
+                self._placing.place(camera.key, moved, hand)
 
 
 def _placed(camera: StudioCamera) -> CameraSettings:
