@@ -163,18 +163,18 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     studio, before = session.studio, task_file.read_text()
     start = camera(session, BASE).now
     studio.place(BASE, replace(start, position=(0.31, 0.02, 0.55), fov=1.2))
-    studio.plan_write(BASE)
+    studio.file.plan_write(BASE)
     view = wait_until(session, said(lambda s: s.writing.stage in ("planned", "refused")), "the plan")
     assert view.studio.writing.stage == "planned", view.studio.writing.message
     assert task_file.read_text() == before and "+" in view.studio.writing.edit.diff
-    studio.write()
+    studio.file.write()
     view = wait_until(session, said(lambda s: s.writing.stage in ("checked", "mismatch")), "the check")
     assert view.studio.writing.stage == "checked", view.studio.writing.message
     assert view.reload.level == "cameras" and not moved(view)
     now = camera(session, BASE)
     assert now.now == now.info.settings and not differences(now.now, view.studio.writing.edit.settings)
     assert task_file.read_text() == view.studio.writing.edit.new_text
-    studio.undo_write()
+    studio.file.undo_write()
     view = wait_until(session, said(lambda s: "as it was before." in s.writing.message), "the file of before")
     assert task_file.read_text() == before
     # The placement was not written any more, but it is not lost.
@@ -327,10 +327,10 @@ def test_an_installed_task_is_copied_opened_and_the_placement_planned_in_the_cop
         start = camera(session, BASE).now
         there = replace(start, position=(0.31, 0.02, 0.55))
         session.studio.place(BASE, there)
-        session.studio.plan_write(BASE)
+        session.studio.file.plan_write(BASE)
         view = wait_until(session, said(lambda s: s.writing.stage == "refused"), "the refusal")
         assert view.studio.writing.can_copy and "is installed" in view.studio.writing.message
-        session.studio.copy_task()
+        session.studio.file.copy_task()
         view = wait_until(session, said(lambda s: s.writing.stage == "planned"), "the plan in the copy")
         file = tmp_path / "push_cube_2.py"
         assert view.task.file == str(file) == view.studio.writing.edit.file
@@ -338,7 +338,7 @@ def test_an_installed_task_is_copied_opened_and_the_placement_planned_in_the_cop
         assert view.reload.reason == "push_cube_2.py was opened in place of PushCubeEnv"
         assert view.studio.writing.message.startswith(f"This is your copy of the task, {file}. This is what")
         assert moved(view) == {BASE}, "the placement is lost"
-        session.studio.write()
+        session.studio.file.write()
         view = wait_until(session, said(lambda s: s.writing.stage in ("checked", "mismatch")), "the check")
         assert view.studio.writing.stage == "checked", view.studio.writing.message
         assert (tmp_path / "push_cube.py").read_text() == "somebody's own"

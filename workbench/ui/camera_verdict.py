@@ -9,7 +9,7 @@ is seen; pressing a step of it shows that moment.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import viser
 
@@ -34,6 +34,16 @@ MOST_PICTURES = 64
 """On the sheet: the worst of them."""
 THUMBNAIL = 128
 """Pixels along the longer side of a picture on the sheet."""
+
+
+@dataclass(frozen=True)
+class Standing:
+    """What a report is worth by now."""
+
+    moved: bool = False
+    """The camera was moved since."""
+    before: bool = False
+    """The camera is being judged anew, and nothing is known of that yet."""
 
 
 class CameraVerdict:
@@ -141,7 +151,12 @@ class CameraVerdict:
 
     def _draw_report(self, studio: StudioView, camera: StudioCamera | None) -> None:
         report = studio.report if camera is not None and studio.report_of == camera.key else None
-        wanted = (id(report), studio.report_stale, None if camera is None else camera.now)
+        wanted = (
+            id(report),
+            studio.report_stale,
+            studio.report_before,
+            None if camera is None else camera.now,
+        )
         if wanted == self._drawn:
             return
         self._drawn = wanted
@@ -158,9 +173,8 @@ class CameraVerdict:
             }
             for i, moment in enumerate(studio.report_moments)
         ]
-        fill(
-            self._report, report_html(report, camera, studio.report_stale, studio.report_seeds, uses, seen_at)
-        )
+        how = Standing(studio.report_stale, studio.report_before)
+        fill(self._report, report_html(report, camera, how, studio.report_seeds, uses, seen_at))
 
     def _draw_sheet(self, view: SessionView, camera: StudioCamera | None) -> None:
         studio = view.studio
@@ -208,7 +222,7 @@ class CameraVerdict:
 def report_html(
     report: CameraReport,
     camera: StudioCamera,
-    stale: bool,
+    standing: Standing,
     resets: int,
     uses: dict[str, str],
     moments: Sequence[dict[str, str]] = (),
@@ -242,7 +256,8 @@ def report_html(
     width, height = report.judged_size
     return render(
         "camera_report",
-        stale=stale,
+        stale=standing.moved,
+        before=standing.before,
         over=over,
         how=f"{report.pictures} pictures of {width} × {height} in {report.milliseconds / 1000:.1f} s",
         unit=unit,

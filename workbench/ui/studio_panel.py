@@ -85,7 +85,7 @@ class StudioPanel:
         self._handles = gui.add_html("", visible=False)
         self._numbers = CameraNumbers(server, self._placing, look_at=lambda: self._look_at)
         self._lens = CameraLens(server, self._placing)
-        self._writing.add_members(server)
+        self._writing.add_members()
         self._judging = CameraJudging(server, session)
         self._presses = Presses(server)
         with self._picture_folder:
