@@ -258,7 +258,7 @@ def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session:
     studio.judge(BASE, 3)
     assert session.view().studio.progress is not None
     found = settled(session, lambda s: s.report_seeds == 3, "three seeds")
-    assert len(found.report.envs) == 3 and found.report_of == BASE
+    assert len(found.report.envs) == 3 and found.report_of == BASE and not found.report_before
     studio.suggest(BASE, ("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2)
     offered = settled(session, lambda s: len(s.suggestions) > 0, "suggestions").suggestions
     assert offered[0].score >= offered[-1].score > 0 and "cube: in 2 of 2 envs" in offered[0].words
@@ -266,10 +266,13 @@ def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session:
     wait_until(session, lambda v: moved(v) == {BASE}, "the suggestion taken")
     studio.judge(BASE, 500)
     wait_until(
+        session, said(lambda s: s.report_before and s.report is not None), "what is known, as from before"
+    )
+    wait_until(
         session, said(lambda s: s.progress is not None and s.progress.total == 500), "a long judgement"
     )
     studio.stop()
-    wait_until(session, said(lambda s: s.progress is None), "its end")
+    wait_until(session, said(lambda s: s.progress is None and not s.report_before), "its end")
     studio.suggest(BASE, ("nothing",), (0.0, 0.0, 0.3), (0.1, 0.1, 0.4), 1)
     wait_until(session, said(lambda s: "no object 'nothing'" in s.problem), "why not")
 

@@ -1,19 +1,19 @@
 """A change of the author's file, shown where it was asked for: the diff, and the buttons that make it or leave it.
 
 A change is asked for in two places of the tab, at the top for the placement and at its end for adding and removing,
-and a diff that opens a screen away from the button is not seen. So each place has a box of its own. When something new
-comes into one, its last button is brought into sight.
+and a diff that opens a screen away from the button is not seen. So each place has a box of its own, and when what was
+asked for comes into it, its last button is brought into sight.
 """
 
 from __future__ import annotations
 
-import time
 from pathlib import PurePath
 
 import viser
 
 from workbench.session.session import Session
 from workbench.session.studio_view import Writing
+from workbench.ui.arrival import Arrival
 from workbench.ui.changed import fill, show
 from workbench.ui.fragments import render
 from workbench.ui.viser_seam import element_id
@@ -21,8 +21,6 @@ from workbench.ui.viser_seam import element_id
 LEAVE, CLOSE = "Leave the file as it is", "Close"
 MOODS = {"checked": "good", "undone": "plain", "refused": "warn", "mismatch": "bad"}
 DONE = ("written", "checked", "mismatch")
-NEW = 1.0
-"""Seconds in which a page that hears of it scrolls to what is new."""
 
 
 class CameraChange:
@@ -30,8 +28,7 @@ class CameraChange:
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         gui = server.gui
-        self._shown: Writing | None = None
-        self._came = -1e9
+        self.arrival = Arrival()
         self._text = gui.add_html("", visible=False)
         self._write = gui.add_button("Write it", icon=viser.Icon.DEVICE_FLOPPY, color="green", visible=False)
         self._undo = gui.add_button(
@@ -65,16 +62,11 @@ class CameraChange:
         name = "" if writing.edit is None else writing.edit.names
         _label(self._drop, LEAVE if stage == "planned" else CLOSE)
         _label(self._write, f"Write it to {name}" if name else "Write it")
-        if writing != self._shown:
-            self._shown = writing
-            if stage in ("planned", "refused", *DONE):
-                self._came = time.monotonic()
-        fresh = time.monotonic() - self._came < NEW
-        last = self._undo if stage in DONE else self._drop
+        new = self.arrival.just_came(writing if stage != "none" else None)
         fill(
             self._text,
             writing_html(
-                writing, stale, about if stage == "planned" else "", element_id(last) if fresh else ""
+                writing, stale, about if stage == "planned" else "", element_id(self._drop) if new else ""
             ),
         )
 

@@ -20,6 +20,7 @@ from workbench.session.messages import TaskDescription
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera
 from workbench.session.view import SessionView
+from workbench.ui.arrival import Arrival
 from workbench.ui.camera_work import WorkBar
 from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_int, checked_number
@@ -66,6 +67,7 @@ class CameraSuggest:
         self._touched = False
         self._drawn: object = None
         self._drawn_names: object = None
+        self._arrival = Arrival()
         with server.gui.add_folder("Suggest a placement", expand_by_default=False) as self.folder:
             self._mounted = server.gui.add_html("", visible=False)
             self._objects = server.gui.add_html("")
@@ -142,6 +144,7 @@ class CameraSuggest:
                 )
             return
         self._bar.asked()
+        self._arrival.asked(self._session.view().studio.suggestions)
         self._session.studio.suggest(key, wanted, low, high, resets)
 
     # --- drawn ---------------------------------------------------------------------------------------
@@ -155,14 +158,15 @@ class CameraSuggest:
         self._draw_mounted(camera)
         self._draw_bounds(camera)
         self._draw_names(view)
-        wanted = (id(studio.suggestions), studio.selected, None if camera is None else camera.now)
+        new = self._arrival.just_came(studio.suggestions)
+        wanted = (id(studio.suggestions), studio.selected, None if camera is None else camera.now, new)
         if wanted == self._drawn:
             return
         self._drawn = wanted
         mine = bool(studio.suggestions) and studio.suggestions_of == studio.selected
         show(self._offers, mine)
         if mine and camera is not None:
-            content = self._offers_html(studio.suggestions, camera)
+            content = self._offers_html(studio.suggestions, camera, new)
             fill(self._offers, content)
 
     def _draw_mounted(self, camera: StudioCamera | None) -> None:
@@ -209,9 +213,10 @@ class CameraSuggest:
         press = self._presses.id_of(("object", name), lambda _: self._toggle(name))
         return {"name": choice.label, "title": name, "on": name in chosen, "press": press}
 
-    def _offers_html(self, suggestions: tuple[OfferedPlacement, ...], camera: StudioCamera) -> str:
+    def _offers_html(self, suggestions: tuple[OfferedPlacement, ...], camera: StudioCamera, new: bool) -> str:
         return render(
             "camera_offers",
+            new=new,
             offers=[
                 {
                     "picture": "" if offer.picture.rgb is None else data_address(offer.picture.rgb, LARGEST),

@@ -102,6 +102,9 @@ class CameraWriting:
         """Note what is asked for and where, and then ask: the answer may come at once."""
         self._planned, self._about = (key, placed), about
         self._of_members, self._before = of_members, self._session.view().studio.writing
+        change = self._member_change if of_members else self._change
+        if change is not None:
+            change.arrival.asked(self._before)
         ask()
 
     def _on_member(self, event: viser.GuiEvent) -> None:
