@@ -23,7 +23,8 @@ AROUND = 0.1
 """Metres of room around the middles of the objects."""
 ROOM = 1.25
 """Times the distance from which they just fill the picture."""
-NEAREST = 0.3
+NEAREST = 0.6
+"""Metres from which a hand that reaches for one small thing is in the picture too."""
 NEAR_ENOUGH = 1.5
 """Times the distance that is wanted, up to which an eye stays where it is."""
 MOST_NAMES = 3
