@@ -3,7 +3,8 @@
 // viser's keys are heard on the document, but never while the focus is in an <input>, which a ticked checkbox and a
 // dropdown are too; and a tab or a button that was clicked takes the arrows and the space for itself. So once the
 // pointer is up, the focus stays only where somebody types: in a text or number field, or in a dropdown that is open.
-// Whoever walks through the controls with the Tab key presses no pointer, and keeps the focus.
+// Whoever walks through the controls with the Tab key presses no pointer, and keeps the focus, also when they press
+// Enter.
 "use strict";
 {
   const NOT_TYPED_INTO = ["checkbox", "radio", "range", "button", "submit", "reset", "color", "file"];
@@ -15,6 +16,7 @@
   }
 
   function giveBack(event) {
+    if (event.type === "click" && event.detail === 0) return; // by a key, or by a script
     const focused = document.activeElement;
     if (!focused || focused === document.body) return;
     // The view keeps the browser from moving the focus when it is clicked, also out of a field.

@@ -192,6 +192,34 @@ def test_typed_and_nudged_and_undone(page: Page) -> None:
     page.get_by_text("Lens and picture", exact=True).click()
 
 
+def test_an_eye_is_typed_and_the_target_stays_pressed_by_keys_alone(page: Page) -> None:
+    at = "[document.activeElement.textContent, document.activeElement.ariaPressed]"
+    tool(page, "move, turn")
+    page.evaluate(
+        "[...document.querySelectorAll('.wb-tools .wb-pill')].find(e => e.textContent === 'move, turn').focus()"
+    )
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    # The row is replaced, and what was walked to has the focus in the new one.
+    until(lambda: page.evaluate(at) == ["eye and target", "true"], "the other way to place")
+    expect(page.get_by_text("the camera goes on looking at its target")).to_be_visible()
+    page.locator("//label[text()='Eye']/ancestor::*[.//input][1]//input").first.fill("0.6")
+    until(lambda: numbers(page, "Eye") == [0.6, 0, 0.6], "the eye")
+    until(lambda: numbers(page, "Degrees")[1] == 49.09, "the angle")
+    assert numbers(page, "Target") == [0.08, 0, 0]
+    page.evaluate("document.activeElement.blur()")
+    page.keyboard.press("Alt+ArrowLeft")
+    until(lambda: numbers(page, "Eye") == [0.6, -0.01, 0.6], "the nudge")
+    assert numbers(page, "Target") == [0.08, 0, 0]
+    for _ in range(2):
+        page.keyboard.press("Control+z")
+    until(lambda: numbers(page, "Eye") == [0.45, 0, 0.6], "both undone")
+    press(page, "move, turn")
+    until(lambda: "wb-on" in tool(page, "move, turn")["classes"], "the pose again")
+    page.locator("//label[text()='Position']/ancestor::*[.//input][1]//input").first.fill("0.6")
+    until(lambda: numbers(page, "Looks at") == [0.23, 0, 0], "the target, which goes along")
+
+
 def test_put_where_one_looks_through_it_it_stays(page: Page) -> None:
     press(page, "Look through it")
     tool(page, "Back to my view")

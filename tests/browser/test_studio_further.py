@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Locator, Page, expect
 
 from tests.browser.opened import page_on, until
 from tests.browser.test_studio import HEIGHT, VIEW, WIDTH, choose, numbers, picture, press, view
@@ -42,6 +42,11 @@ def button(page: Page, name: str) -> None:
 def field(page: Page, label: str, number: int = 1) -> str:
     """XPath: viser's fields are not tied to their labels."""
     return f"(//label[text()='{label}']/ancestor::*[.//input][1]//input)[{number}]"
+
+
+def bottom_of(part: Locator) -> float:
+    box = part.bounding_box()
+    return HEIGHT if box is None else box["y"] + box["height"]
 
 
 def option(page: Page, label: str, name: str) -> None:
@@ -104,6 +109,12 @@ def test_a_camera_is_added_where_one_looks_renamed_and_removed(page: Page, task_
     before = task_file.read_text()
     page.get_by_text("Add, copy, rename, remove", exact=True).click()
     page.locator(field(page, "New name")).fill("third")
+    button(page, "Add a sensor")
+    expect(page.get_by_text(re.compile("It looks from your side at cube, goal from 0"))).to_be_visible()
+    leave = page.get_by_role("button", name="Leave the file as it is")
+    until(lambda: bottom_of(leave) < HEIGHT, "the last of it in sight")
+    leave.click()
+    expect(page.locator(".wb-diff:visible")).to_have_count(0)
     button(page, "Add one for people")
     expect(page.locator(".wb-diff-add").filter(has_text='"third"').first).to_be_visible()
     button(page, f"Write it to {FILE}")

@@ -14,6 +14,7 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from workbench.core.camera_frames import axes_of
 from workbench.core.camera_search import SearchProgress, SearchSpace, score_of, suggest_cameras
 from workbench.core.camera_settings import CameraSettings
+from workbench.core.take_pictures import segmentation_names
 from workbench.core.task_env import EnvOptions, make_env
 from workbench.core.visibility import Placement, judge_placement, objects_to_see
 
@@ -123,16 +124,33 @@ def test_a_camera_on_a_link_is_suggested_places_in_that_links_frame_that_keep_it
 
 
 def test_one_link_of_an_articulation_can_be_what_must_be_seen(env: Any) -> None:
-    assert {thing.name: thing.links for thing in objects_to_see(env)} == {"cube": (), "goal_region": ()}
-    with pytest.raises(ValueError, match="'panda/panda_hand' is the robot"):
-        suggest_cameras(env, SearchSpace(("panda/panda_hand",), LOW, HIGH, LENS), [0])
+    assert {t.name: t.links for t in objects_to_see(env) if not t.robot} == {"cube": (), "goal_region": ()}
     valves = make_env(REGISTERED_ENVS["RotateValveLevel0-v1"].cls, EnvOptions(num_envs=1, backend="cpu"))
     try:
         valves.reset(seed=1)
-        (valve,) = objects_to_see(valves)
+        (valve,) = (thing for thing in objects_to_see(valves) if not thing.robot)
         assert valve.links == ("valve_station/mount", "valve_station/valve")
         space = SearchSpace(valve.links[1:], (-0.5, -0.5, 0.1), (0.5, 0.5, 0.6), LENS, candidates=6, best=1)
         (found,) = suggest_cameras(valves, space, [0])
         assert [thing.name for thing in found.report.wanted_objects(space.objects)] == ["valve_station/valve"]
     finally:
         valves.close()
+
+
+def test_the_robots_hand_can_be_what_must_be_seen_and_the_rest_of_the_robot_hides_it(env: Any) -> None:
+    (robot,) = (thing for thing in objects_to_see(env) if thing.robot)
+    assert set(robot.links[:3]) == {"panda/panda_leftfinger", "panda/panda_rightfinger", "panda/panda_hand"}
+    assert "panda/panda_hand_tcp" not in robot.links, "it has nothing to be seen"
+    hand = "panda/panda_hand"
+    space = SearchSpace((hand, "cube"), LOW, HIGH, LENS, candidates=16, best=1)
+    (found,) = suggest_cameras(env, space, range(N))
+    seen = {thing.name: thing for thing in found.report.wanted_objects(space.objects)}
+    assert set(seen) == {hand, "cube"} and found.picture.segmentation is not None
+    number = next(n for n, name in segmentation_names(env).items() if name == hand)
+    e = found.report.envs.index(found.picture.env)
+    # Counted in a smaller picture, of which each pixel stands for some of the camera's own.
+    assert (found.picture.segmentation == number).sum() == pytest.approx(seen[hand].pixels[e], rel=0.4)
+    # From behind the arm's base less of the hand is left to see than if the arm were not there.
+    behind = SearchSpace((hand,), (-1.2, 0.0, 0.2), (-1.2, 0.0, 0.2), LENS, candidates=1, best=1)
+    for thing in suggest_cameras(env, behind, range(N))[0].report.wanted_objects((hand,)):
+        assert (thing.pixels < thing.alone).all() and (thing.hidden_share > 0).all()

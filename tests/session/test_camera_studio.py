@@ -163,18 +163,18 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     studio, before = session.studio, task_file.read_text()
     start = camera(session, BASE).now
     studio.place(BASE, replace(start, position=(0.31, 0.02, 0.55), fov=1.2))
-    studio.plan_write(BASE)
+    studio.file.plan_write(BASE)
     view = wait_until(session, said(lambda s: s.writing.stage in ("planned", "refused")), "the plan")
     assert view.studio.writing.stage == "planned", view.studio.writing.message
     assert task_file.read_text() == before and "+" in view.studio.writing.edit.diff
-    studio.write()
+    studio.file.write()
     view = wait_until(session, said(lambda s: s.writing.stage in ("checked", "mismatch")), "the check")
     assert view.studio.writing.stage == "checked", view.studio.writing.message
     assert view.reload.level == "cameras" and not moved(view)
     now = camera(session, BASE)
     assert now.now == now.info.settings and not differences(now.now, view.studio.writing.edit.settings)
     assert task_file.read_text() == view.studio.writing.edit.new_text
-    studio.undo_write()
+    studio.file.undo_write()
     view = wait_until(session, said(lambda s: "as it was before." in s.writing.message), "the file of before")
     assert task_file.read_text() == before
     # The placement was not written any more, but it is not lost.
@@ -258,7 +258,7 @@ def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session:
     studio.judge(BASE, 3)
     assert session.view().studio.progress is not None
     found = settled(session, lambda s: s.report_seeds == 3, "three seeds")
-    assert len(found.report.envs) == 3 and found.report_of == BASE
+    assert len(found.report.envs) == 3 and found.report_of == BASE and not found.report_before
     studio.suggest(BASE, ("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2)
     offered = settled(session, lambda s: len(s.suggestions) > 0, "suggestions").suggestions
     assert offered[0].score >= offered[-1].score > 0 and "cube: in 2 of 2 envs" in offered[0].words
@@ -266,10 +266,13 @@ def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session:
     wait_until(session, lambda v: moved(v) == {BASE}, "the suggestion taken")
     studio.judge(BASE, 500)
     wait_until(
+        session, said(lambda s: s.report_before and s.report is not None), "what is known, as from before"
+    )
+    wait_until(
         session, said(lambda s: s.progress is not None and s.progress.total == 500), "a long judgement"
     )
     studio.stop()
-    wait_until(session, said(lambda s: s.progress is None), "its end")
+    wait_until(session, said(lambda s: s.progress is None and not s.report_before), "its end")
     studio.suggest(BASE, ("nothing",), (0.0, 0.0, 0.3), (0.1, 0.1, 0.4), 1)
     wait_until(session, said(lambda s: "no object 'nothing'" in s.problem), "why not")
 
@@ -327,10 +330,10 @@ def test_an_installed_task_is_copied_opened_and_the_placement_planned_in_the_cop
         start = camera(session, BASE).now
         there = replace(start, position=(0.31, 0.02, 0.55))
         session.studio.place(BASE, there)
-        session.studio.plan_write(BASE)
+        session.studio.file.plan_write(BASE)
         view = wait_until(session, said(lambda s: s.writing.stage == "refused"), "the refusal")
         assert view.studio.writing.can_copy and "is installed" in view.studio.writing.message
-        session.studio.copy_task()
+        session.studio.file.copy_task()
         view = wait_until(session, said(lambda s: s.writing.stage == "planned"), "the plan in the copy")
         file = tmp_path / "push_cube_2.py"
         assert view.task.file == str(file) == view.studio.writing.edit.file
@@ -338,7 +341,7 @@ def test_an_installed_task_is_copied_opened_and_the_placement_planned_in_the_cop
         assert view.reload.reason == "push_cube_2.py was opened in place of PushCubeEnv"
         assert view.studio.writing.message.startswith(f"This is your copy of the task, {file}. This is what")
         assert moved(view) == {BASE}, "the placement is lost"
-        session.studio.write()
+        session.studio.file.write()
         view = wait_until(session, said(lambda s: s.writing.stage in ("checked", "mismatch")), "the check")
         assert view.studio.writing.stage == "checked", view.studio.writing.message
         assert (tmp_path / "push_cube.py").read_text() == "somebody's own"

@@ -52,7 +52,7 @@ def planned(session: Session) -> Writing:
 
 def written(session: Session, stage: str = "checked") -> Writing:
     planned(session)
-    session.studio.write()
+    session.studio.file.write()
     ended = ("checked", "mismatch", "refused")
     view = wait_until(session, said(lambda s: s.writing.stage in ended), "the check")
     assert view.studio.writing.stage == stage, view.studio.writing.message
@@ -74,29 +74,29 @@ def test_a_camera_is_added_moved_copied_renamed_and_removed_and_the_env_has_it_e
 ) -> None:
     studio, before = session.studio, task_file.read_text()
     new = replace(there(session, ("human", "render_camera")), position=(0.6, 0.0, 0.7), fov=0.9)
-    studio.plan_add("human", "side", new)
+    studio.file.plan_add("human", "side", new)
     assert written(session).message == f"side is in {task_file.name}, and the env has it."
     assert not differences(there(session, ("human", "side")), new)
     assert session.view().studio.selected == ("human", "side"), "one wants to place what one has added"
     # What is not written yet is in the copy, and stays with the original.
     away = replace(new, position=(0.61, 0.1, 0.7))
     studio.place(("human", "side"), away)
-    studio.plan_duplicate(("human", "side"), "other")
+    studio.file.plan_duplicate(("human", "side"), "other")
     assert "a copy of side" in written(session).message
     assert names(session) == ["render_camera", "side", "other"]
     assert ("human", "side") in moved(session.view())
     assert camera(session, ("human", "other")).now.position == away.position
-    studio.plan_rename(("human", "side"), "front")
+    studio.file.plan_rename(("human", "side"), "front")
     assert written(session).message == f"side is front in {task_file.name} now."
     assert names(session) == ["render_camera", "front", "other"]
     assert camera(session, ("human", "front")).now.position == away.position, "the placement is lost"
     for name in ("front", "other"):
-        studio.plan_remove(("human", name))
+        studio.file.plan_remove(("human", name))
         assert f"{name} is no longer in" in written(session).message
     assert names(session) == ["render_camera"] and task_file.read_text().count(
         "CameraConfig("
     ) == before.count("CameraConfig(")
-    studio.drop_plan()
+    studio.file.drop_plan()
 
 
 def test_a_camera_that_comes_out_otherwise_is_an_error_and_is_taken_back(
@@ -104,18 +104,18 @@ def test_a_camera_that_comes_out_otherwise_is_an_error_and_is_taken_back(
 ) -> None:
     studio, before = session.studio, task_file.read_text()
     studio.place(BASE, replace(there(session, BASE), fov=0.7))
-    studio.plan_write(BASE)
+    studio.file.plan_write(BASE)
     message = written(session, "mismatch").message
     assert (
         "base_camera is not what was written (fov: 0.8, not 0.7)" in message
         and "Take the change back" in message
     )
     assert "fov=0.7" in task_file.read_text() and there(session, BASE).fov == 0.8
-    studio.undo_write()
+    studio.file.undo_write()
     wait_until(session, said(lambda s: "as it was before." in s.writing.message), "the file of before")
     assert task_file.read_text() == before
     studio.back_to_file(BASE)
-    studio.drop_plan()
+    studio.file.drop_plan()
 
 
 def test_a_change_with_which_the_file_does_not_load_says_so_and_is_taken_back(
@@ -123,14 +123,14 @@ def test_a_change_with_which_the_file_does_not_load_says_so_and_is_taken_back(
 ) -> None:
     studio, before = session.studio, task_file.read_text()
     studio.place(BASE, replace(there(session, BASE), fov=0.4))
-    studio.plan_write(BASE)
+    studio.file.plan_write(BASE)
     planned(session)
-    studio.write()
+    studio.file.write()
     view = wait_until(session, said(lambda s: "does not load" in s.writing.message), "the failure")
     assert "take it back if that is the reason" in view.studio.writing.message
     assert view.problem is not None and "too narrow" in view.problem.message
     assert there(session, BASE).fov == 1.0, "the version before goes on"
-    studio.undo_write()
+    studio.file.undo_write()
     wait_until(
         session, lambda v: v.problem is None and "as it was before." in v.studio.writing.message, "it back"
     )

@@ -9,13 +9,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.ui.scenes import description, table_scene
 from workbench.core.camera_frames import matrix_of, pose_of
+from workbench.core.camera_report import ObjectToSee
 from workbench.core.camera_settings import CameraSettings
 from workbench.core.pictures import CameraInfo
 from workbench.session.studio_view import StudioCamera
+from workbench.ui.arrival import Arrival
 from workbench.ui.camera_compare import what_differs
 from workbench.ui.camera_export import as_lists, file_name, matrices_html
-from workbench.ui.camera_suggest import box_edges
+from workbench.ui.camera_suggest import box_edges, choices_of
 
 SETTINGS = CameraSettings(
     position=(0.3, 0.0, 0.6),
@@ -69,6 +72,37 @@ def test_the_box_of_the_bounds_has_four_edges_along_each_axis() -> None:
     edges = box_edges((0.0, 0.0, 0.0), (1.0, 2.0, 3.0))
     assert edges.shape == (12, 2, 3)
     assert sorted(np.abs(edges[:, 0] - edges[:, 1]).sum(axis=1)) == [1] * 4 + [2] * 4 + [3] * 4
+
+
+def test_hands_of_robots_are_offered_first_and_are_not_asked_for_by_themselves() -> None:
+    objects = (
+        ObjectToSee("cube", False),
+        ObjectToSee("goal", True),
+        ObjectToSee("left", False, ("left/hand", "left/arm"), robot=True),
+        ObjectToSee("right", False, ("right/hand",), robot=True),
+    )
+    task = replace(description(table_scene(1)[0]), objects=objects)
+    found = choices_of(task, "sensor")
+    assert [(c.name, c.first) for c in found] == [
+        ("cube", True),
+        ("left/hand", False),
+        ("right/hand", False),
+        ("left/arm", False),
+    ]
+    assert [c.label for c in choices_of(replace(task, objects=objects[:3]), "human")] == [
+        "cube",
+        "goal",
+        "hand",
+        "arm",
+    ]
+
+
+def test_what_was_asked_for_is_brought_into_sight_when_it_comes_and_only_then() -> None:
+    before, after, arrival = (object(),), (object(),), Arrival()
+    assert not arrival.just_came(before), "nobody asked"
+    arrival.asked(before)
+    assert not arrival.just_came(before) and not arrival.just_came(())
+    assert arrival.just_came(after) and arrival.just_came(after)
 
 
 def test_a_matrix_is_copied_with_more_digits_than_are_read() -> None:

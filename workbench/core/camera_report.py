@@ -25,14 +25,16 @@ ENOUGH_PIXELS = 100.0
 
 @dataclass(frozen=True)
 class ObjectToSee:
-    """One object of the task that a camera may be asked to see: neither robot nor scenery."""
+    """One object that a camera may be asked to see: of the task, or a robot, of which single links can be asked for."""
 
     name: str
     """An actor's or an articulation's."""
     hidden: bool
     """The task hides it from the sensors (a goal marker): only cameras for people see it."""
     links: tuple[str, ...] = ()
-    """Names of an articulation's bodies, if it has several: each may be asked for alone."""
+    """Names of an articulation's bodies, if it has several: each may be asked for alone. Of a robot those that can be
+    seen, its hand first."""
+    robot: bool = False
 
 
 @dataclass(frozen=True)

@@ -200,7 +200,10 @@ class _Search:
         every = list_objects(env, table)
         self.wanted = [_wanted(every, name, space.kind, self.table) for name in space.objects]
         # Each is also looked at alone; the others are drawn, and hide what they hide.
-        self.objects = [*(thing for thing in every if thing.robot), *self.wanted]
+        # A link of the robot that is wanted is none of what may hide it.
+        asked = {body for thing in self.wanted for body in thing.bodies}
+        robots = [replace(t, bodies=tuple(b for b in t.bodies if b not in asked)) for t in every if t.robot]
+        self.objects = [*robots, *self.wanted]
         self.mounts = self._mounts()
         self.up = axes_of(space.lens.quaternion)[::2]
         self.size = small_size(space.lens.width, space.lens.height)
@@ -412,12 +415,14 @@ def _wanted(objects: Sequence[SceneObject], name: str, kind: CameraKind, table: 
     if found is None and name in table.names:
         body = table.names.index(name)
         whole = next((thing for thing in objects if body in thing.bodies), None)
-        found = None if whole is None else replace(whole, name=name, bodies=(body,))
+        found = None if whole is None else replace(whole, name=name, bodies=(body,), robot=False)
     there = ", ".join(thing.name for thing in objects if not (thing.robot or thing.name == "ground"))
     if found is None or found.name == "ground":
         raise ValueError(f"there is no object {name!r} to be seen; there are: {there}")
     if found.robot:
-        raise ValueError(f"{name!r} is the robot; the search is for objects of the task: {there}")
+        raise ValueError(
+            f"{name!r} is the robot: name links of it ({name}/...), or objects of the task: {there}"
+        )
     if found.hidden and kind == "sensor":
         raise ValueError(f"the task hides {name!r} from its sensors: no placement can see it")
     return found

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import sapien.render
 from mani_skill.utils.scene_builder import SceneBuilder
 from numpy.typing import NDArray
 
@@ -96,15 +97,39 @@ def list_objects(env: Any, table: BodyTable | None = None) -> tuple[SceneObject,
 def objects_to_see(env: Any, table: BodyTable | None = None) -> tuple[ObjectToSee, ...]:
     """What of a scene a camera may be asked to see, as plain data."""
     table = table or build_body_table(env)
-    return tuple(
+    objects = list_objects(env, table)
+    seen = tuple(
         ObjectToSee(
             thing.name,
             thing.hidden,
             tuple(table.names[body] for body in thing.bodies) if len(thing.bodies) > 1 else (),
         )
-        for thing in list_objects(env, table)
+        for thing in objects
         if not (thing.robot or thing.scenery)
     )
+    robots = [thing for thing in objects if thing.robot]
+    return seen + tuple(ObjectToSee(t.name, False, _links_from_the_hand(env, t, table), True) for t in robots)
+
+
+def _links_from_the_hand(env: Any, robot: SceneObject, table: BodyTable) -> tuple[str, ...]:
+    """Names of a robot's links that have something to be seen, from its tool centre point on; else the last one first.
+
+    That point is a link that ManiSkill's agents have under the name ``tcp``, where they have a hand.
+    """
+    drawn = [body for body in reversed(robot.bodies) if _is_drawn(table.entities[0, body])]
+    agents = getattr(env.agent, "agents", [env.agent])
+    tools = [getattr(agent, "tcp", None) for agent in agents if agent.robot.name == robot.name]
+    name = f"{robot.name}/{getattr(tools[0], 'name', '')}" if tools else ""
+    if name in table.names:
+        places = read_poses(env, table)[0, :, :3]
+        point = places[table.names.index(name)]
+        drawn.sort(key=lambda body: float(np.linalg.norm(places[body] - point)))
+    return tuple(table.names[body] for body in drawn)
+
+
+def _is_drawn(entity: Any) -> bool:
+    body = None if entity is None else entity.find_component_by_type(sapien.render.RenderBodyComponent)
+    return body is not None and len(body.render_shapes) > 0
 
 
 def judge_camera(

@@ -8,7 +8,8 @@ episodes, of another in the background. There is one job of each kind at a time,
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -64,6 +65,8 @@ class Looked:
     report_moments: tuple[JudgedMoment, ...] = ()
     outdated: bool = False
     """The report is of a version that was."""
+    judging: bool = False
+    """A judgement is under way, and the report is that of the one before."""
     suggestions: tuple[OfferedPlacement, ...] = ()
     suggestions_of: CameraKey | None = None
     compared: tuple[Picture, Picture] | None = None
@@ -112,11 +115,12 @@ class CameraJudging:
 
         def work(job: Job) -> None:
             reports: list[CameraReport] = []
-            for env in range(moment.num_envs):
-                job.tell(env, moment.num_envs)
-                question = JudgeCamera(0, key, None, (env,), moment.poses)
-                reports.append(self._live.ask(question, job, CameraJudged).report)
-            self._know_report(key, now, join_reports(reports), 0)
+            with self._judging_anew():
+                for env in range(moment.num_envs):
+                    job.tell(env, moment.num_envs)
+                    question = JudgeCamera(0, key, None, (env,), moment.poses)
+                    reports.append(self._live.ask(question, job, CameraJudged).report)
+                self._know_report(key, now, join_reports(reports), 0)
 
         self._live_lane.start(f"judging {key[1]} in all envs", work)
 
@@ -128,13 +132,14 @@ class CameraJudging:
         def work(job: Job) -> None:
             reports: list[CameraReport] = []
             done: list[JudgedMoment] = []
-            for moment in moments:
-                job.tell(len(done), len(moments))
-                question = JudgeCamera(0, key, None, (moment.env,), moment.poses)
-                reports.append(self._live.ask(question, job, CameraJudged).report)
-                done.append(JudgedMoment(moment.serial, moment.env, moment.step))
-                if len(done) % _TELL_EVERY == 0 or len(done) == len(moments):
-                    self._know_report(key, now, join_reports(reports), 0, tuple(done))
+            with self._judging_anew():
+                for moment in moments:
+                    job.tell(len(done), len(moments))
+                    question = JudgeCamera(0, key, None, (moment.env,), moment.poses)
+                    reports.append(self._live.ask(question, job, CameraJudged).report)
+                    done.append(JudgedMoment(moment.serial, moment.env, moment.step))
+                    if len(done) % _TELL_EVERY == 0 or len(done) == len(moments):
+                        self._know_report(key, now, join_reports(reports), 0, tuple(done))
 
         self._live_lane.start(f"judging {key[1]} over {len(moments)} steps", work)
 
@@ -144,17 +149,18 @@ class CameraJudging:
         """Judge a camera over so many fresh episodes; what is known so far can be seen all the while."""
 
         def work(job: Job) -> None:
-            self._background.load(load, job)
             reports: list[CameraReport] = []
             done = 0
-            while done < seeds:
-                self._background.reset(FIRST_SEED + done, job)
-                for env in range(min(self._background.num_envs, seeds - done)):
-                    job.tell(done, seeds)
-                    question = JudgeCamera(0, key, now if moved else None, (env,))
-                    reports.append(self._background.ask(question, job, CameraJudged).report)
-                    done += 1
-                self._know_report(key, now, join_reports(reports), done)
+            with self._judging_anew():
+                self._background.load(load, job)
+                while done < seeds:
+                    self._background.reset(FIRST_SEED + done, job)
+                    for env in range(min(self._background.num_envs, seeds - done)):
+                        job.tell(done, seeds)
+                        question = JudgeCamera(0, key, now if moved else None, (env,))
+                        reports.append(self._background.ask(question, job, CameraJudged).report)
+                        done += 1
+                    self._know_report(key, now, join_reports(reports), done)
 
         self._background_lane.start(f"judging {key[1]} over {seeds} seeds", work)
 
@@ -272,7 +278,17 @@ class CameraJudging:
             report_seeds=seeds,
             report_moments=moments,
             outdated=False,
+            judging=False,
         )
+
+    @contextmanager
+    def _judging_anew(self) -> Iterator[None]:
+        """What is known from before is said to be that, until there is something new or the work ends."""
+        self._know(judging=True)
+        try:
+            yield
+        finally:
+            self._know(judging=False)
 
     def _know(self, **values: object) -> None:
         with self._lock:

@@ -5,46 +5,38 @@ The page calls the methods here, on any thread; each returns at once. What comes
 A placement is known in three places: here (with its undo), in the worker's live cameras, and in the end in the
 author's file. What is here counts: after every version that comes in the worker is told again, so that neither a
 reload nor the end of a worker moves a camera. What is in the file counts more, when the author changed it there.
-What takes long (libcst, the disk) is done on a thread of its own, one thing after the other.
+
+Here is how a camera comes to stand somewhere, and what is asked about it there; the way into the file is `file`.
 """
 
 from __future__ import annotations
 
 import threading
-import traceback
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
-from workbench.authoring import camera_files
 from workbench.core.camera_frames import Convention, Direction, with_pose
 from workbench.core.camera_settings import (
     CameraKey,
-    CameraKind,
     CameraSettings,
     differences,
     why_no_camera,
 )
-from workbench.core.pictures import CameraInfo
 from workbench.core.step import StepResult
 from workbench.session import camera_in_words
 from workbench.session.camera_judging import CameraJudging, ShownMoment
 from workbench.session.camera_messages import CameraAnswer
-from workbench.session.camera_writing import CameraWriting, Wish, copy, plan
 from workbench.session.episode_moments import EpisodeMoment
 from workbench.session.messages import Load, PlaceCamera, Placed, ReloadLevel, Request, TaskDescription
-from workbench.session.placements import Placements
 from workbench.session.quick_look import QuickLook, Sight
-from workbench.session.studio_view import StudioCamera, StudioView
+from workbench.session.studio_cameras import StudioCameras
+from workbench.session.studio_file import StudioFile
+from workbench.session.studio_view import StudioView
 
 MOST_SEEDS = 1000
 MOST_STEPS = 1000
-_ON_THE_GPU = "in GPU simulation cameras cannot be moved; open the task with --backend cpu to place them"
 
 
 class CameraStudio:
@@ -69,31 +61,24 @@ class CameraStudio:
             open_copy: open this class of this file, in a folder of the user's, in place of the task.
         """
         self._send, self._on_change, self._shown, self._load = send, on_change, shown, load
-        self._episode, self._open_copy = episode, open_copy
-        self.folder = Path.cwd()
-        """Where a copy of a task goes: where the program was started."""
-        self._lock = threading.Lock()
+        self._episode = episode
+        self._cameras = StudioCameras()
+        self._lock = self._cameras.lock
+        self.file = StudioFile(self._cameras, self._note, open_copy)
         self._asking = threading.Lock()
         """Held while placements are sent; taken before `_lock`."""
-        self._thread = ThreadPoolExecutor(1, "studio")
-        self._closing = False
         self._serial = 0
-        self._task: TaskDescription | None = None
-        self._selected: CameraKey | None = None
-        self._problem = ""
-        self._placements = Placements()
-        self._writing = CameraWriting()
         self._judging = CameraJudging(send, self._note)
         self._quick = QuickLook(send, self._note)
-        self._drawn: tuple[StepResult | None, int] = (None, 0)
-        """What was shown last: the step and the selected env."""
 
     # --- placing -------------------------------------------------------------------------------------
 
     def select(self, key: CameraKey | None) -> None:
         """Choose the camera that the page works on."""
         with self._lock:
-            self._selected = key if key is None or self._info(key) is not None else self._selected
+            self._cameras.selected = (
+                key if key is None or self._cameras.info(key) is not None else self._cameras.selected
+            )
         self._note()
 
     def place(self, key: CameraKey, settings: CameraSettings, gesture: int | None = None) -> None:
@@ -103,110 +88,31 @@ class CameraStudio:
             gesture: calls with the same number, one behind the other, are one step of undo (a drag).
         """
         with self._lock:
-            why_not = self._refusal(key) or why_no_camera(settings)
-            self._problem = f"{key[1]} is left where it is: {why_not}." if why_not else ""
-            moved = not why_not and self._placements.place(key, settings, gesture)
+            why_not = self._cameras.refusal(key) or why_no_camera(settings)
+            self._cameras.problem = f"{key[1]} is left where it is: {why_not}." if why_not else ""
+            moved = not why_not and self._cameras.placements.place(key, settings, gesture)
         self.ask_for([key] if moved else [])
 
     def undo(self) -> None:
         """Take the last step back."""
         with self._lock:
-            step = self._placements.undo()
+            step = self._cameras.placements.undo()
         self.ask_for([] if step is None else [step.key])
 
     def redo(self) -> None:
         """Make the step again that was taken back last."""
         with self._lock:
-            step = self._placements.redo()
+            step = self._cameras.placements.redo()
         self.ask_for([] if step is None else [step.key])
 
     def back_to_file(self, key: CameraKey) -> None:
         """Place a camera as the file says."""
         with self._lock:
-            file = self._placements.file(key)
-            moved = file is not None and self._placements.place(
+            file = self._cameras.placements.file(key)
+            moved = file is not None and self._cameras.placements.place(
                 key, file, words=f"put {key[1]} back to the file"
             )
         self.ask_for([key] if moved else [])
-
-    # --- into the file -------------------------------------------------------------------------------
-
-    def plan_write(self, key: CameraKey) -> None:
-        """Find the edit that writes the placement of a camera; it becomes `StudioView.writing`."""
-        with self._lock:
-            wish = Wish("edit", key, self._placements.now(key))
-        self._plan(wish)
-
-    def plan_add(self, kind: CameraKind, name: str, settings: CameraSettings) -> None:
-        """Find the edit that adds a camera."""
-        self._plan(Wish("add", (kind, name), settings))
-
-    def plan_duplicate(self, key: CameraKey, name: str) -> None:
-        """Find the edit that adds a copy of a camera, placed as that one is now."""
-        with self._lock:
-            wish = Wish("duplicate", key, self._placements.now(key), name)
-        self._plan(wish)
-
-    def plan_rename(self, key: CameraKey, name: str) -> None:
-        """Find the edit that gives a camera another name."""
-        with self._lock:
-            wish = Wish("rename", key, self._placements.now(key), name)
-        self._plan(wish)
-
-    def plan_remove(self, key: CameraKey) -> None:
-        """Find the edit that removes a camera."""
-        self._plan(Wish("remove", key, None))
-
-    def _plan(self, wish: Wish) -> None:
-        self._later(self._find_plan, wish)
-
-    def _find_plan(self, wish: Wish) -> None:
-        with self._lock:
-            task, info = self._task, self._info(wish.key)
-        if task is None:
-            return
-        writing = plan(task, info, wish)
-        with self._lock:
-            self._writing.planned(wish, writing)
-        self._note()
-
-    def write(self) -> None:
-        """Make the planned edit; the file is reloaded, and the new camera compared with what was written."""
-        self._later(self._write, self._writing.write)
-
-    def undo_write(self) -> None:
-        """Take the edit that was made last out of the file again."""
-        self._later(self._write, self._writing.undo)
-
-    def copy_task(self) -> None:
-        """Copy the task's file into `folder` and open the copy; what was refused before is planned in it then.
-
-        Does nothing unless ``StudioView.writing.can_copy``. Nothing is written over.
-        """
-        self._later(self._copy)
-
-    def _copy(self) -> None:
-        with self._lock:
-            task, can = self._task, self._writing.view.can_copy
-        if task is None or not can:
-            return
-        file, view = copy(task, self.folder)
-        with self._lock:
-            self._writing.copied(file, view)
-        self._note()
-        if file is not None:
-            self._open_copy(file, task.class_name)
-
-    def _write(self, do: Callable[[], bool]) -> None:
-        with self._lock:  # the version with it must not come in before it is known to be awaited
-            do()
-        self._note()
-
-    def drop_plan(self) -> None:
-        """Forget the plan (or the message about the last one)."""
-        with self._lock:
-            self._writing.drop()
-        self._note()
 
     # --- judged ----------------------------------------------------------------------------------------
 
@@ -217,7 +123,11 @@ class CameraStudio:
             seeds: 0 for the envs at the shown moment; else over so many freshly reset ones, in the background.
         """
         with self._lock:
-            known, now, moved = self._known(key), self._placements.now(key), self._placements.moved(key)
+            known, now, moved = (
+                self._cameras.known(key),
+                self._cameras.placements.now(key),
+                self._cameras.placements.moved(key),
+            )
         if known and seeds <= 0:
             self._judging.judge(key, now, self._shown())
         elif known and (load := self._load()) is not None:
@@ -230,7 +140,7 @@ class CameraStudio:
             most: how many of them, evenly spread.
         """
         with self._lock:
-            known, now = self._known(key), self._placements.now(key)
+            known, now = self._cameras.known(key), self._cameras.placements.now(key)
         if known and (moments := self._episode(min(max(1, most), MOST_STEPS))):
             self._judging.judge_steps(key, now, moments)
         self._note()
@@ -250,9 +160,9 @@ class CameraStudio:
             low, high: metres, in the frame of the camera's mount, or the env's if it has none.
         """
         with self._lock:
-            known, lens = self._known(key), self._placements.now(key)
+            known, lens = self._cameras.known(key), self._cameras.placements.now(key)
             if known and lens is None:
-                self._problem = f"{key[1]} cannot be placed: {self._refusal(key)}."
+                self._cameras.problem = f"{key[1]} cannot be placed: {self._cameras.refusal(key)}."
         if known and lens is not None and (load := self._load()) is not None:
             self._judging.suggest(key, lens, tuple(objects), low, high, load, seeds)
         self._note()
@@ -265,7 +175,7 @@ class CameraStudio:
             return
         found = looked.suggestions[index].settings
         with self._lock:
-            now = self._placements.now(key)
+            now = self._cameras.placements.now(key)
         if now is not None:
             self.place(key, replace(now, position=found.position, quaternion=found.quaternion))
 
@@ -276,9 +186,9 @@ class CameraStudio:
     def compare(self, key: CameraKey, other: CameraSettings) -> None:
         """Two pictures of the shown env: the camera as it is placed, and as it would be with other settings."""
         with self._lock:
-            why_not = self._refusal(key) or why_no_camera(other)
+            why_not = self._cameras.refusal(key) or why_no_camera(other)
             if why_not:
-                self._problem = f"{key[1]} is not compared: {why_not}."
+                self._cameras.problem = f"{key[1]} is not compared: {why_not}."
         if not why_not:
             self._judging.compare(key, other, self._shown())
         self._note()
@@ -286,7 +196,7 @@ class CameraStudio:
     def make_sheet(self, key: CameraKey) -> None:
         """The pictures of all envs by one camera, worst first if it was judged over them."""
         with self._lock:
-            known = self._known(key)
+            known = self._cameras.known(key)
         if known:
             self._judging.make_sheet(key, self._shown())
 
@@ -303,25 +213,19 @@ class CameraStudio:
             self._quick.look(sight, self._shown())
 
     def _sight(self) -> Sight | None:
-        key = self._selected
-        now = None if key is None else self._placements.now(key)
-        if key is None or now is None or self._refusal(key) is not None:
+        key = self._cameras.selected
+        now = None if key is None else self._cameras.placements.now(key)
+        if key is None or now is None or self._cameras.refusal(key) is not None:
             return None
-        step, env = self._drawn
+        step, env = self._cameras.drawn
         return Sight(key, now, env, step, self._quick.scale)
 
     def pick(self, key: CameraKey, u: float, v: float) -> None:
         """What is seen at a place of the picture: 0, 0 is its upper left corner, 1, 1 its lower right one."""
         with self._lock:
-            info, task = self._info(key), self._task
+            info, task = self._cameras.info(key), self._cameras.task
         if info is not None and task is not None:
             self._judging.pick(info, u, v, self._shown(), task.segmentation)
-
-    def _known(self, key: CameraKey) -> bool:
-        if self._info(key) is None:
-            self._problem = f"There is no {key[0]} camera {key[1]}."
-            return False
-        return True
 
     # --- in other words --------------------------------------------------------------------------------
 
@@ -334,14 +238,8 @@ class CameraStudio:
             ValueError: one of them is not there, or cannot be said; a sentence for the reader.
         """
         with self._lock:
-            cameras = [self._to_export(key) for key in keys]
+            cameras = [self._cameras.to_export(key) for key in keys]
         return camera_in_words.exported(cameras, form)
-
-    def _to_export(self, key: CameraKey) -> camera_files.CameraToExport:
-        info, now = self._info(key), self._placements.now(key)
-        if info is None or now is None:
-            raise ValueError(f"there is no {key[0]} camera {key[1]} whose settings are known")
-        return camera_files.CameraToExport(key, now, info.mount, self._mount_pose(info, *self._drawn))
 
     def import_pose(
         self,
@@ -359,8 +257,8 @@ class CameraStudio:
             ValueError: with a sentence for the reader.
         """
         with self._lock:
-            info, now = self._info(key), self._placements.now(key)
-            mount = None if info is None else self._mount_pose(info, *self._drawn)
+            info, now = self._cameras.info(key), self._cameras.placements.now(key)
+            mount = None if info is None else self._cameras.mount_pose(info)
         if now is None or info is None:
             raise ValueError(f"there is no {key[0]} camera {key[1]} that can be placed")
         pose = camera_in_words.imported(info, mount, text, direction, convention, metres_per_unit)
@@ -376,69 +274,36 @@ class CameraStudio:
         """
         looked, progress = self._judging.looked, self._judging.progress
         with self._lock:
-            self._drawn = step, env
-            infos = () if self._task is None else self._task.cameras
+            self._cameras.drawn = step, env
             sight = self._sight()
-            judged = None if looked.report_of is None else self._placements.now(looked.report_of)
+            judged = None if looked.report_of is None else self._cameras.placements.now(looked.report_of)
             was = looked.report_settings
             # Not what is rounded away when it is written.
             moved = judged is None or was is None or bool(differences(judged, was, close=3e-4))
             return StudioView(
-                cameras=tuple(self._camera(info, step, env) for info in infos),
+                cameras=self._cameras.all_as_shown(),
                 report=looked.report,
                 report_of=looked.report_of,
                 report_seeds=looked.report_seeds,
                 report_moments=looked.report_moments,
                 report_stale=looked.report is not None and (moved or looked.outdated),
+                report_before=looked.judging,
                 suggestions=looked.suggestions,
                 suggestions_of=looked.suggestions_of,
                 compared=looked.compared,
                 picked=looked.picked,
                 sheet=looked.sheet,
                 quick_scale=self._quick.scale,
-                quick=self._quick.picture(self._selected, env),
+                quick=self._quick.picture(self._cameras.selected, env),
                 wants_quick=sight is not None and self._quick.wants(sight),
                 progress=progress,
-                selected=self._selected,
-                undo=self._placements.undo_words,
-                redo=self._placements.redo_words,
-                writing=self._writing.view,
-                problem=self._problem or looked.problem or self._quick.problem,
+                selected=self._cameras.selected,
+                undo=self._cameras.placements.undo_words,
+                redo=self._cameras.placements.redo_words,
+                writing=self.file.view,
+                problem=self._cameras.problem or looked.problem or self._quick.problem,
                 serial=self._serial,
             )
-
-    def _camera(self, info: CameraInfo, step: StepResult | None, env: int) -> StudioCamera:
-        key = info.key
-        return StudioCamera(
-            key=key,
-            info=info,
-            now=self._placements.now(key),
-            moved=self._placements.moved(key),
-            mount_pose=self._mount_pose(info, step, env),
-            refused=self._refusal(key) or "",
-        )
-
-    def _mount_pose(self, info: CameraInfo, step: StepResult | None, env: int) -> NDArray[np.float32] | None:
-        if info.mount is None or self._task is None or step is None:
-            return None
-        names = self._task.geometry.body_names
-        if info.mount not in names or step.poses.shape[1] != len(names) or env >= len(step.poses):
-            return None  # another version is coming in
-        return step.poses[env, names.index(info.mount)]
-
-    def _info(self, key: CameraKey) -> CameraInfo | None:
-        infos = () if self._task is None else self._task.cameras
-        return next((info for info in infos if info.key == key), None)
-
-    def _refusal(self, key: CameraKey) -> str | None:
-        info = self._info(key)
-        if info is None:
-            return f"there is no {key[0]} camera {key[1]}"
-        if self._task is not None and self._task.backend == "gpu":
-            return _ON_THE_GPU
-        if info.settings is None:
-            return "its pose is no pose, or its lens differs between envs, so one placement cannot be its"
-        return None
 
     # --- what the session tells ------------------------------------------------------------------------
 
@@ -452,50 +317,26 @@ class CameraStudio:
             the cameras to `ask_for` then, so that the worker's stand where they are placed.
         """
         with self._lock:
-            self._task = task
+            self._cameras.task = task
             said = {c.key: c.settings for c in task.cameras if c.settings is not None}
-            own: frozenset[CameraKey] = frozenset()
-            wish = self._writing.wish
-            if wish is not None and self._writing.is_in(task):
-                own = frozenset({wish.key, wish.result})
-                self._follow_the_file(wish)
-                self._writing.compare(task)
-            dropped = self._placements.loaded(said, own)
-            refused = self._writing.wish_for(task)
-            if refused is not None and not self._closing:
-                self._submit(self._find_plan, refused)
-            self._problem = ""
+            own = self.file.loaded(task)
+            dropped = self._cameras.placements.loaded(said, own)
+            self.file.plan_in_copy(task)
+            self._cameras.problem = ""
             if dropped:
                 names = " and ".join(key[1] for key in dropped)
                 one = len(dropped) == 1
-                self._problem = (
+                self._cameras.problem = (
                     f"{names} {'was' if one else 'were'} changed in the file, so {'it stands' if one else 'they stand'} "
                     "where the file says; Undo brings your placement back."
                 )
-            if self._selected is not None and self._info(self._selected) is None:
-                self._selected = None
+            if self._cameras.selected is not None and self._cameras.info(self._cameras.selected) is None:
+                self._cameras.selected = None
             self._serial += 1
             if level not in ("same", "cameras"):
                 self._judging.outdate()
             # The dropped ones too: their placement may have been on its way while the version came in.
-            return (*self._placements.all_moved, *dropped)
-
-    def _follow_the_file(self, wish: Wish) -> None:
-        """What an edit, or its being taken back, means for the placements: none is to be lost by it."""
-        placements, undone = self._placements, self._writing.view.stage == "undone"
-        now = placements.now(wish.key)
-        if wish.what == "rename":
-            pair = (wish.result, wish.key) if undone else (wish.key, wish.result)
-            placements.rename(*pair)
-        elif wish.what == "duplicate" and not undone and placements.moved(wish.key) and now is not None:
-            placements.keep(wish.result, now)
-        elif wish.what == "edit" and wish.settings is not None:
-            if undone and not placements.moved(wish.key):
-                placements.keep(wish.key, wish.settings)
-            elif not undone and now is not None and not differences(now, wish.settings):
-                placements.written(wish.key)  # but for what was rounded
-        if not undone and wish.what in ("add", "duplicate", "rename"):
-            self._selected = wish.result
+            return (*self._cameras.placements.all_moved, *dropped)
 
     def answered(self, answer: CameraAnswer) -> None:
         """The worker that plays answered a question about a camera."""
@@ -510,35 +351,33 @@ class CameraStudio:
     def failed_to_load(self) -> None:
         """A version does not load; the one before goes on."""
         with self._lock:
-            self._writing.failed_to_load()
+            self.file.failed_to_load()
         self._note()
 
     def placed_cameras(self) -> tuple[PlaceCamera, ...]:
         """What is to be asked of another worker, so that its cameras stand where they are placed."""
         with self._lock:
-            return tuple(PlaceCamera(key, settings) for key, settings in self._placements.all_moved.items())
+            return tuple(
+                PlaceCamera(key, settings) for key, settings in self._cameras.placements.all_moved.items()
+            )
 
     def placed(self, event: Placed) -> None:
         """The worker's answer to a placement."""
         again = False
         with self._lock:
-            task = self._task
             if event.why_not:
-                self._problem = f"{event.key[1]} could not be placed: {event.why_not}."
-                self._placements.refused(event.key)
+                self._cameras.problem = f"{event.key[1]} could not be placed: {event.why_not}."
+                self._cameras.placements.refused(event.key)
                 again = event.settings is not None
-            elif event.info is not None and task is not None:
-                infos = [event.info if c.key == event.key else c for c in task.cameras]
-                self._task = replace(task, cameras=tuple(infos))
+            elif event.info is not None:
+                self._cameras.changed(event.info)
         self.ask_for([event.key] if again else [])
 
     def close(self) -> None:
         """Wait for what is being written."""
-        with self._lock:
-            self._closing = True
         self._judging.close()
         self._quick.close()
-        self._thread.shutdown(wait=True, cancel_futures=True)
+        self.file.close()
 
     # --- small things ----------------------------------------------------------------------------------
 
@@ -547,27 +386,10 @@ class CameraStudio:
         # What is asked for is read and sent in one go, or of two threads the one that read first might send last.
         with self._asking:
             with self._lock:
-                now = self._placements
+                now = self._cameras.placements
                 requests = [PlaceCamera(key, now.now(key) if now.moved(key) else None) for key in keys]
             for request in requests:
                 self._send(request)
-        self._note()
-
-    def _later(self, work: Callable[..., None], *args: object) -> None:
-        with self._lock:
-            if not self._closing:
-                self._submit(work, *args)
-
-    def _submit(self, work: Callable[..., None], *args: object) -> None:
-        self._thread.submit(work, *args).add_done_callback(self._worked)
-
-    def _worked(self, future: Future[None]) -> None:
-        error = None if future.cancelled() else future.exception()
-        if error is None:
-            return
-        traceback.print_exception(error)
-        with self._lock:
-            self._problem = f"The workbench itself failed at this, and nothing was done: {error!r}"
         self._note()
 
     def _note(self) -> None:

@@ -55,7 +55,7 @@ class Writing:
     message: str = ""
     """One sentence or two: what happened, and what to do next."""
     can_copy: bool = False
-    """Refused since the file is not the user's to edit, and a copy of it would be: see `CameraStudio.copy_task`."""
+    """Refused since the file is not the user's to edit, and a copy of it would be: see `StudioFile.copy_task`."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +114,8 @@ class StudioView:
     """Where it is of an episode's steps: which one each of ``report.envs`` is; empty for all others."""
     report_stale: bool = False
     """The camera was moved since."""
+    report_before: bool = False
+    """Another judgement is under way, of which nothing is known yet."""
     suggestions: tuple[OfferedPlacement, ...] = ()
     """Best first."""
     suggestions_of: CameraKey | None = None

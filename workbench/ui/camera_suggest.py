@@ -6,6 +6,8 @@ box round the eye. They follow the camera until somebody writes into them. The b
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import viser
 from numpy.typing import NDArray
@@ -18,6 +20,7 @@ from workbench.session.messages import TaskDescription
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera
 from workbench.session.view import SessionView
+from workbench.ui.arrival import Arrival
 from workbench.ui.camera_work import WorkBar
 from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_int, checked_number
@@ -29,6 +32,8 @@ ROOM, ROOM_ON_MOUNT = 0.3, 0.1
 """Metres from the eye to each side of the box that is first offered; less on a body, which has to carry it."""
 MOST_LINKS = 12
 """An articulation with more offers none of them alone: a list that nobody reads."""
+OF_THE_ROBOT = 4
+"""Links of a robot that are offered at once, its hand's; the others on demand."""
 FARTHEST = 1000.0
 """Metres: bounds beyond are a slip of the finger."""
 MOST_RESETS = 256
@@ -38,19 +43,31 @@ BOX_COLOUR = (230, 73, 128)
 Corner = tuple[float, float, float]
 
 
+@dataclass(frozen=True)
+class Choice:
+    """Something that may be asked to be seen."""
+
+    name: str
+    label: str
+    first: bool
+    """Chosen before somebody chooses."""
+    robot: str = ""
+    """Of which it is a link; empty for the task's own objects."""
+
+
 class CameraSuggest:
     """The folder in the present container, and the box in the view."""
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
         self._chosen: set[str] | None = None
-        self._names: tuple[str, ...] = ()
-        self._first: frozenset[str] = frozenset()
-        """Which of them are chosen before somebody chooses."""
+        self._choices: tuple[Choice, ...] = ()
+        self._all_links = False
         self._of: CameraKey | None = None
         self._touched = False
         self._drawn: object = None
         self._drawn_names: object = None
+        self._arrival = Arrival()
         with server.gui.add_folder("Suggest a placement", expand_by_default=False) as self.folder:
             self._mounted = server.gui.add_html("", visible=False)
             self._objects = server.gui.add_html("")
@@ -91,7 +108,13 @@ class CameraSuggest:
             self._show_box.value = True
 
     def _toggle(self, name: str) -> None:
-        self._chosen = set(self._first if self._chosen is None else self._chosen) ^ {name}
+        self._chosen = self._now_chosen() ^ {name}
+
+    def _toggle_links(self) -> None:
+        self._all_links = not self._all_links
+
+    def _now_chosen(self) -> set[str]:
+        return {c.name for c in self._choices if c.first} if self._chosen is None else set(self._chosen)
 
     def _bounds(self) -> tuple[Corner, Corner]:
         """Raises ValueError with a sentence."""
@@ -108,8 +131,8 @@ class CameraSuggest:
         if key is None:
             return
         try:
-            chosen = self._first if self._chosen is None else self._chosen
-            wanted = tuple(name for name in self._names if name in chosen)
+            chosen = self._now_chosen()
+            wanted = tuple(choice.name for choice in self._choices if choice.name in chosen)
             if not wanted:
                 raise ValueError("Choose at least one object that must be seen.")
             low, high = self._bounds()
@@ -121,6 +144,7 @@ class CameraSuggest:
                 )
             return
         self._bar.asked()
+        self._arrival.asked(self._session.view().studio.suggestions)
         self._session.studio.suggest(key, wanted, low, high, resets)
 
     # --- drawn ---------------------------------------------------------------------------------------
@@ -134,14 +158,15 @@ class CameraSuggest:
         self._draw_mounted(camera)
         self._draw_bounds(camera)
         self._draw_names(view)
-        wanted = (id(studio.suggestions), studio.selected, None if camera is None else camera.now)
+        new = self._arrival.just_came(studio.suggestions)
+        wanted = (id(studio.suggestions), studio.selected, None if camera is None else camera.now, new)
         if wanted == self._drawn:
             return
         self._drawn = wanted
         mine = bool(studio.suggestions) and studio.suggestions_of == studio.selected
         show(self._offers, mine)
         if mine and camera is not None:
-            content = self._offers_html(studio.suggestions, camera)
+            content = self._offers_html(studio.suggestions, camera, new)
             fill(self._offers, content)
 
     def _draw_mounted(self, camera: StudioCamera | None) -> None:
@@ -166,28 +191,32 @@ class CameraSuggest:
 
     def _draw_names(self, view: SessionView) -> None:
         key = view.studio.selected
-        objects = () if view.task is None or key is None else objects_of(view.task, key[0])
-        names = tuple(name for name, _ in objects)
-        self._names, self._first = names, frozenset(name for name, whole in objects if whole)
-        chosen = self._first if self._chosen is None else frozenset(self._chosen)
-        if (names, chosen) == self._drawn_names:
+        self._choices = () if view.task is None or key is None else choices_of(view.task, key[0])
+        chosen = frozenset(self._now_chosen())
+        drawn = (self._choices, chosen, self._all_links)
+        if drawn == self._drawn_names:
             return
-        self._drawn_names = names, chosen
+        self._drawn_names = drawn
+        links = [choice for choice in self._choices if choice.robot]
+        few = [c for i, c in enumerate(links) if i < OF_THE_ROBOT or self._all_links or c.name in chosen]
         self._objects.content = render(
             "camera_objects",
-            objects=[
-                {
-                    "name": name,
-                    "on": name in chosen,
-                    "press": self._presses.id_of(("object", name), lambda _, name=name: self._toggle(name)),
-                }
-                for name in names
-            ],
+            objects=[self._pill(choice, chosen) for choice in self._choices if not choice.robot],
+            links=[self._pill(choice, chosen) for choice in few],
+            rest=len(links) - len(few),
+            fewer=self._all_links and len(links) > OF_THE_ROBOT,
+            more=self._presses.id_of("links", lambda _: self._toggle_links()),
         )
 
-    def _offers_html(self, suggestions: tuple[OfferedPlacement, ...], camera: StudioCamera) -> str:
+    def _pill(self, choice: Choice, chosen: frozenset[str]) -> dict[str, object]:
+        name = choice.name
+        press = self._presses.id_of(("object", name), lambda _: self._toggle(name))
+        return {"name": choice.label, "title": name, "on": name in chosen, "press": press}
+
+    def _offers_html(self, suggestions: tuple[OfferedPlacement, ...], camera: StudioCamera, new: bool) -> str:
         return render(
             "camera_offers",
+            new=new,
             offers=[
                 {
                     "picture": "" if offer.picture.rgb is None else data_address(offer.picture.rgb, LARGEST),
@@ -228,15 +257,25 @@ class CameraSuggest:
         self._box.draw(edges, offset)
 
 
-def objects_of(task: TaskDescription, kind: CameraKind) -> tuple[tuple[str, bool], ...]:
-    """Names of what a camera of a kind may be asked to see, each with whether it is a whole object or one link."""
-    found: list[tuple[str, bool]] = []
+def choices_of(task: TaskDescription, kind: CameraKind) -> tuple[Choice, ...]:
+    """What a camera of a kind may be asked to see: the task's objects, their links, and links of the robots.
+
+    Of several robots each gives as many in turn, so that no hand comes last.
+    """
+    found: list[Choice] = []
+    robots = [thing for thing in task.objects if thing.robot]
     for thing in task.objects:
-        if thing.hidden and kind == "sensor":
+        if thing.robot or (thing.hidden and kind == "sensor"):
             continue
-        found.append((thing.name, True))
+        found.append(Choice(thing.name, thing.name, True))
         if len(thing.links) <= MOST_LINKS:
-            found += [(name, False) for name in thing.links]
+            found += [Choice(name, name, False) for name in thing.links]
+    for place in range(max((len(robot.links) for robot in robots), default=0)):
+        for robot in robots:
+            if place < len(robot.links):
+                name = robot.links[place]
+                label = name if len(robots) > 1 else name.removeprefix(f"{robot.name}/")
+                found.append(Choice(name, label, False, robot.name))
     return tuple(found)
 
 

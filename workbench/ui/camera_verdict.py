@@ -9,7 +9,7 @@ is seen; pressing a step of it shows that moment.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import viser
 
@@ -20,6 +20,7 @@ from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera, StudioView
 from workbench.session.view import SessionView
 from workbench.ui import camera_report_words as words
+from workbench.ui.arrival import Arrival
 from workbench.ui.camera_work import WorkBar
 from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_choice, checked_int
@@ -36,6 +37,18 @@ THUMBNAIL = 128
 """Pixels along the longer side of a picture on the sheet."""
 
 
+@dataclass(frozen=True)
+class Standing:
+    """What a report is worth by now."""
+
+    moved: bool = False
+    """The camera was moved since."""
+    before: bool = False
+    """The camera is being judged anew, and nothing is known of that yet."""
+    new: bool = False
+    """It has just come, and is to come into sight."""
+
+
 class CameraVerdict:
     """The folder in the present container."""
 
@@ -43,6 +56,7 @@ class CameraVerdict:
         self._session = session
         self._drawn: object = None
         self._drawn_sheet: object = None
+        self._report_arrival, self._sheet_arrival = Arrival(), Arrival()
         with server.gui.add_folder("Judge", expand_by_default=False) as self.folder:
             self._over = server.gui.add_dropdown(
                 "Over",
@@ -99,6 +113,7 @@ class CameraVerdict:
                 )
             return
         self._bar.asked()
+        self._report_arrival.asked(self._session.view().studio.report)
         if over == STEPS:
             self._session.studio.judge_steps(key, steps)
         else:
@@ -108,6 +123,7 @@ class CameraVerdict:
         key = self._session.view().studio.selected
         if key is not None:
             self._sheet_bar.asked()
+            self._sheet_arrival.asked(self._session.view().studio.sheet)
             self._session.studio.make_sheet(key)
 
     def _show_moment(self, position: int) -> None:
@@ -141,7 +157,9 @@ class CameraVerdict:
 
     def _draw_report(self, studio: StudioView, camera: StudioCamera | None) -> None:
         report = studio.report if camera is not None and studio.report_of == camera.key else None
-        wanted = (id(report), studio.report_stale, None if camera is None else camera.now)
+        new = self._report_arrival.just_came(report)
+        now = None if camera is None else camera.now
+        wanted = (id(report), studio.report_stale, studio.report_before, new, now)
         if wanted == self._drawn:
             return
         self._drawn = wanted
@@ -158,15 +176,15 @@ class CameraVerdict:
             }
             for i, moment in enumerate(studio.report_moments)
         ]
-        fill(
-            self._report, report_html(report, camera, studio.report_stale, studio.report_seeds, uses, seen_at)
-        )
+        how = Standing(studio.report_stale, studio.report_before, new)
+        fill(self._report, report_html(report, camera, how, studio.report_seeds, uses, seen_at))
 
     def _draw_sheet(self, view: SessionView, camera: StudioCamera | None) -> None:
         studio = view.studio
         sheet = studio.sheet
         mine = camera is not None and bool(sheet) and (sheet[0].kind, sheet[0].camera) == camera.key
-        wanted = (id(sheet) if mine else None, id(studio.report), view.selected_env)
+        new = self._sheet_arrival.just_came(sheet)
+        wanted = (id(sheet) if mine else None, id(studio.report), view.selected_env, new)
         if wanted == self._drawn_sheet:
             return
         self._drawn_sheet = wanted
@@ -174,9 +192,12 @@ class CameraVerdict:
         if not mine or camera is None:
             return
         judged = studio.report_of == camera.key and not studio.report_seeds and not studio.report_moments
-        fill(self._pictures, self._sheet_html(sheet, studio.report if judged else None, view.selected_env))
+        report = studio.report if judged else None
+        fill(self._pictures, self._sheet_html(sheet, report, view.selected_env, new))
 
-    def _sheet_html(self, sheet: tuple[Picture, ...], report: CameraReport | None, selected: int) -> str:
+    def _sheet_html(
+        self, sheet: tuple[Picture, ...], report: CameraReport | None, selected: int, new: bool
+    ) -> str:
         places = {} if report is None else {env: i for i, env in enumerate(report.envs)}
         cells = [
             {
@@ -194,7 +215,7 @@ class CameraVerdict:
         note = ("worst first, " if report is not None else "") + "press one to select its env"
         if len(sheet) > MOST_PICTURES:
             note = f"{MOST_PICTURES} of {len(sheet)}; {note}"
-        return render("camera_sheet", cells=cells, note=note)
+        return render("camera_sheet", cells=cells, note=note, new=new)
 
     def _thumbnail(self, picture: Picture) -> str:
         return "" if picture.rgb is None else data_address(picture.rgb, THUMBNAIL)
@@ -208,7 +229,7 @@ class CameraVerdict:
 def report_html(
     report: CameraReport,
     camera: StudioCamera,
-    stale: bool,
+    standing: Standing,
     resets: int,
     uses: dict[str, str],
     moments: Sequence[dict[str, str]] = (),
@@ -242,7 +263,9 @@ def report_html(
     width, height = report.judged_size
     return render(
         "camera_report",
-        stale=stale,
+        stale=standing.moved,
+        before=standing.before,
+        new=standing.new,
         over=over,
         how=f"{report.pictures} pictures of {width} × {height} in {report.milliseconds / 1000:.1f} s",
         unit=unit,

@@ -11,21 +11,22 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import PurePath
 
 import viser
 
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.session.session import Session
-from workbench.session.studio_view import StudioCamera, StudioView, Writing
-from workbench.ui.changed import fill, show
+from workbench.session.studio_view import StudioView, Writing
+from workbench.ui.camera_change import CameraChange
+from workbench.ui.changed import show
 from workbench.ui.checked import checked_text
+from workbench.ui.first_place import first_place, objects_in
 from workbench.ui.fragments import render
 from workbench.ui.placing import Placing
 
 DUPLICATE, RENAME, REMOVE = "Duplicate", "Rename", "Remove"
 ADD_SENSOR, ADD_HUMAN = "Add a sensor", "Add one for people"
-LEAVE, CLOSE = "Leave the file as it is", "Close"
+WHERE = "A new sensor looks at the task's objects from the side that you look from; one for people stands where you look from."
 LONGEST_NAME = 64
 NEW = CameraSettings(
     position=(0.0, 0.0, 0.0),
@@ -39,8 +40,6 @@ NEW = CameraSettings(
     shader_pack="minimal",
 )
 """A camera that is added, but for its place: what ManiSkill's own tasks have."""
-MOODS = {"checked": "good", "undone": "plain", "refused": "warn", "mismatch": "bad"}
-DONE = ("written", "checked", "mismatch")
 
 FromViewer = Callable[[viser.ClientHandle, CameraSettings], CameraSettings]
 
@@ -54,44 +53,34 @@ class CameraWriting:
     def __init__(
         self, server: viser.ViserServer, session: Session, placing: Placing, from_viewer: FromViewer
     ) -> None:
-        self._session, self._placing, self._from_viewer = session, placing, from_viewer
+        self._server, self._session = server, session
+        self._placing, self._from_viewer = placing, from_viewer
         gui = server.gui
         self._planned: tuple[CameraKey, CameraSettings | None] | None = None
         """Whose plan it is, and how that camera was placed then."""
+        self._about = ""
+        """What is said of the plan beside."""
         # Always there: one that came with the first movement would push what is under it out of the hand.
         self._plan = gui.add_button("Show the change", icon=viser.Icon.FILE_DIFF, visible=False)
-        self._text = gui.add_html("", visible=False)
-        self._write = gui.add_button("Write it", icon=viser.Icon.DEVICE_FLOPPY, color="green", visible=False)
-        self._undo = gui.add_button(
-            "Take it back out of the file", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
-        )
-        self._copy = gui.add_button(
-            "Copy the task into my folder",
-            icon=viser.Icon.COPY,
-            visible=False,
-            hint=f"A file of your own in {session.studio.folder}, under a name that is free; the page opens it.",
-        )
-        self._drop = gui.add_button(LEAVE, color="gray", visible=False)
+        self._change = CameraChange(server, session)
+        self._plan.on_click(lambda _: self._plan_write())
         self._name: viser.GuiTextHandle | None = None
         self._with_chosen: viser.GuiButtonGroupHandle | None = None
-        self._plan.on_click(lambda _: self._plan_write())
-        self._write.on_click(lambda _: session.studio.write())
-        self._undo.on_click(lambda _: session.studio.undo_write())
-        self._copy.on_click(lambda _: session.studio.copy_task())
-        self._drop.on_click(lambda _: session.studio.drop_plan())
+        self._member_change: CameraChange | None = None
+        self._of_members = False
+        """The change was asked for in the folder that adds and removes."""
+        self._before: Writing | None = None
+        """What there was when it was asked for, which is not to be shown as its answer."""
 
-    def add_members(self, server: viser.ViserServer) -> None:
+    def add_members(self) -> None:
         """The folder that adds, copies, renames and removes: last in the tab, since it is wanted least."""
-        gui = server.gui
+        gui = self._server.gui
         with gui.add_folder("Add, copy, rename, remove", expand_by_default=False):
             self._name = gui.add_text("New name", "", hint="Letters, digits, - and _.")
             self._with_chosen = gui.add_button_group("", (DUPLICATE, RENAME, REMOVE), visible=False)
             add = gui.add_button_group("", (ADD_SENSOR, ADD_HUMAN))
-            gui.add_html(
-                render(
-                    "note", text="A new camera stands where you look from. The change is shown above first."
-                )
-            )
+            gui.add_html(render("aside", text=WHERE))
+            self._member_change = CameraChange(self._server, self._session)
         self._with_chosen.on_click(self._on_member)
         add.on_click(self._on_member)
 
@@ -100,8 +89,23 @@ class CameraWriting:
     def _plan_write(self) -> None:
         camera = self._placing.camera
         if camera is not None:
-            self._planned = camera.key, camera.now
-            self._session.studio.plan_write(camera.key)
+            self._ask(camera.key, camera.now, lambda: self._session.studio.file.plan_write(camera.key), False)
+
+    def _ask(
+        self,
+        key: CameraKey,
+        placed: CameraSettings | None,
+        ask: Callable[[], None],
+        of_members: bool,
+        about: str = "",
+    ) -> None:
+        """Note what is asked for and where, and then ask: the answer may come at once."""
+        self._planned, self._about = (key, placed), about
+        self._of_members, self._before = of_members, self._session.view().studio.writing
+        change = self._member_change if of_members else self._change
+        if change is not None:
+            change.arrival.asked(self._before)
+        ask()
 
     def _on_member(self, event: viser.GuiEvent) -> None:
         try:
@@ -113,26 +117,25 @@ class CameraWriting:
                 )
 
     def _plan_member(self, what: object, client: viser.ClientHandle | None) -> None:
-        studio = self._session.studio
-        view = self._session.view().studio
-        chosen = view.chosen
+        file, view = self._session.studio.file, self._session.view()
+        chosen = view.studio.chosen
         if what in (ADD_SENSOR, ADD_HUMAN) and client is not None:
             kind = "sensor" if what == ADD_SENSOR else "human"
-            settings = self._from_viewer(
-                client, NEW if kind == "sensor" else replace(NEW, width=512, height=512)
-            )
-            key = (kind, self._checked_name(view, kind))
-            self._planned = key, None
-            studio.plan_add(kind, key[1], settings)
+            key = (kind, self._checked_name(view.studio, kind))
+            if kind == "sensor":
+                place = first_place(self._from_viewer(client, NEW), *objects_in(view))
+                settings, about = place.settings, place.words
+            else:
+                settings, about = self._from_viewer(client, replace(NEW, width=512, height=512)), ""
+            self._ask(key, None, lambda: file.plan_add(kind, key[1], settings), True, about)
         elif chosen is None:
             raise ValueError("Choose the camera first.")
         elif what == REMOVE:
-            self._planned = chosen.key, chosen.now
-            studio.plan_remove(chosen.key)
+            self._ask(chosen.key, chosen.now, lambda: file.plan_remove(chosen.key), True)
         elif what in (DUPLICATE, RENAME):
-            name = self._checked_name(view, chosen.key[0])
-            self._planned = chosen.key, chosen.now
-            (studio.plan_duplicate if what == DUPLICATE else studio.plan_rename)(chosen.key, name)
+            name = self._checked_name(view.studio, chosen.key[0])
+            plan = file.plan_duplicate if what == DUPLICATE else file.plan_rename
+            self._ask(chosen.key, chosen.now, lambda: plan(chosen.key, name), True)
 
     def _checked_name(self, view: StudioView, kind: str) -> str:
         name = checked_text("" if self._name is None else self._name.value, LONGEST_NAME, "name").strip()
@@ -156,26 +159,17 @@ class CameraWriting:
             chosen is not None
             and can_place
             and chosen.moved
-            and (writing.stage not in ("planned", "written") or stale)
+            and writing.stage != "written"
+            and (writing.stage != "planned" or stale or self._of_members)
         )
         # Not at the place of the button that writes: a second press must not write what was not read.
-        show(self._plan, can_place and (writing.stage != "planned" or stale))
+        show(self._plan, can_place and (writing.stage != "planned" or stale or self._of_members))
         if self._plan.disabled == wants_plan:
             self._plan.disabled = not wants_plan
-        show(self._text, writing.stage != "none" or bool(writing.message))
-        show(self._copy, writing.can_copy)
-        show(self._write, writing.stage == "planned" and not stale)
-        show(self._drop, writing.stage in ("planned", "refused", "undone"))
-        show(self._undo, writing.stage in DONE)
-        leave = LEAVE if writing.stage == "planned" else CLOSE
-        if self._drop.label != leave:
-            self._drop.label = leave
-        name = "" if writing.edit is None else writing.edit.names
-        label = f"Write it to {name}" if name else "Write it"
-        if self._write.label != label:
-            self._write.label = label
-        text = writing_html(writing, chosen, stale)
-        fill(self._text, text)
+        for change, here in ((self._change, not self._of_members), (self._member_change, self._of_members)):
+            if change is not None:
+                shown = here and writing is not self._before
+                change.draw(writing if shown else Writing(), stale and shown, self._about)
         if self._with_chosen is not None:
             show(self._with_chosen, chosen is not None)
 
@@ -186,31 +180,3 @@ class CameraWriting:
         key, placed = self._planned
         camera = studio.camera(key)
         return placed is not None and camera is not None and camera.now != placed
-
-
-def writing_html(writing: Writing, chosen: StudioCamera | None, stale: bool) -> str:
-    """How far the change is; every value escaped."""
-    edit, refusal = writing.edit, writing.refusal
-    files = [] if edit is None or writing.stage == "undone" else edit.changes
-    return render(
-        "camera_writing",
-        message="The camera was moved since: show the change again." if stale else writing.message,
-        mood="warn" if stale else MOODS.get(writing.stage, "plain"),
-        files=[(change.file, PurePath(change.file).name, diff_lines(change.diff)) for change in files],
-        folded=writing.stage in DONE,
-        notes=() if edit is None or writing.stage == "undone" else edit.notes,
-        reason="" if refusal is None or refusal.reason in writing.message else refusal.reason,
-        snippet="" if refusal is None else refusal.snippet,
-    )
-
-
-def diff_lines(diff: str) -> list[tuple[str, str]]:
-    """Each line of a unified diff with its kind (``add``, ``del``, ``at``, ``same``), less the names of the files.
-
-    The indentation that all of them have is left out: the panel is narrow.
-    """
-    kinds = {"+": "add", "-": "del", "@": "at"}
-    lines = [(kinds.get(line[:1], "same"), line) for line in diff.splitlines()[2:]]
-    code = [line[1:] for kind, line in lines if kind != "at" and line[1:].strip()]
-    indent = min((len(line) - len(line.lstrip()) for line in code), default=0)
-    return [(kind, line if kind == "at" else line[:1] + " " + line[1 + indent :]) for kind, line in lines]

@@ -80,6 +80,8 @@ class CamerasPanel:
         self._quick = False
         self._studio: CameraKey | None = None
         """The camera that is being placed, whose picture is wanted whether or not it has a tick here."""
+        self.studio_shows = "rgb"
+        """Which kind of picture of that one is on the page beside its colours."""
         self._note = server.gui.add_html(render("note", text="Pictures appear when the task is loaded."))
         self._frustums = server.gui.add_checkbox(
             "In the view",
@@ -200,7 +202,9 @@ class CamerasPanel:
         wanted = camera.wanted()
         if self._quick:
             return wanted  # it is looked through in another size, and need not be drawn in its own
-        return ("rgb", *wanted) if key == self._studio and "rgb" not in wanted else wanted
+        if key != self._studio:
+            return wanted
+        return tuple(m for m in modalities_of(camera.info) if m in ("rgb", self.studio_shows, *wanted))
 
     def _mark_stale(self, view: SessionView) -> None:
         """Say of pictures that are on the page, and are not of the moment that is, that they are not."""

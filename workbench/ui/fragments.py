@@ -28,10 +28,13 @@ def style_sheet() -> str:
 
 @cache
 def _environment() -> jinja2.Environment:
-    return jinja2.Environment(
+    environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(web_assets_folder() / "panels"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    macros = environment.get_template("can_be_pressed.html").module
+    environment.globals.update({name: getattr(macros, name) for name in ("press", "to_copy")})
+    return environment

@@ -215,6 +215,7 @@ class Page:
         self._run.draw(view)
         self._view_panel.draw(view)
         self._version.draw(view)
+        self._cameras.studio_shows = self._studio.shows
         self._cameras.draw(view)
         self._studio.draw(view)
         self._numbers.draw(view)

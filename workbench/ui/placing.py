@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera
-from workbench.ui.camera_moves import USUAL, Floats, Frame, target_of, usual_distance
+from workbench.ui.camera_moves import USUAL, Floats, Frame, looking_at, target_of, usual_distance
 
 PAUSE = 1.2
 """Seconds. What one hand does after a shorter pause belongs to the same step of undo."""
@@ -110,6 +110,22 @@ class Placing:
     def target_in_view(self, camera: StudioCamera, settings: CameraSettings) -> Floats:
         """(3,)"""
         return target_of(self.frame(camera).to_view(settings), self.distance(camera))
+
+    def target(self, camera: StudioCamera, settings: CameraSettings) -> Floats:
+        """(3,) in the frame that the camera's numbers are said in."""
+        return self.frame(camera).point_from_view(self.target_in_view(camera, settings))
+
+    def look(self, camera: StudioCamera, settings: CameraSettings, target: Floats, hand: str) -> None:
+        """Place it where these settings say, turned to a target (3,) in the view; `hand` as in `place`.
+
+        Raises:
+            ValueError: that is where it stands, or it is too far away for any task.
+        """
+        frame = self.frame(camera)
+        pose = frame.to_view(settings)
+        turned = frame.from_view(settings, looking_at(pose, pose[:3], target))
+        self.set_distance(camera.key, turned, float(np.linalg.norm(target - pose[:3])))
+        self.place(camera.key, turned, hand)
 
 
 def _stand(key: CameraKey, settings: CameraSettings) -> tuple[object, ...]:

@@ -14,6 +14,9 @@ A table of thousands of rows, of which a press with shift or control means anoth
 (``choosable.html``): a row has a number, and the number that is written into the input is eight times that, and what
 was held.
 
+Whoever has no mouse walks to such a part with the Tab key and presses it with Enter or Space (``pressed_by_key.js``): the
+templates write both the id and the stop of the Tab key with the macro ``press`` (``can_be_pressed.html``).
+
 The mouse counts when it goes down: a table that is drawn anew a few times a second would lose the click of a
 person whose finger is still on the button. A touch counts as a click, or scrolling would press.
 """

@@ -11,7 +11,6 @@ to the session; `camera_gizmo`, `camera_numbers`, `look_through` and `camera_wri
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import PurePath
 from typing import Any
@@ -22,18 +21,18 @@ from numpy.typing import NDArray
 from viser._messages import HotkeyKey  # the type of add_command's argument (viser 1.1.1)
 
 from workbench.core.camera_settings import CameraKey, CameraSettings
-from workbench.core.pictures import Picture
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera, StudioView
 from workbench.session.view import SessionView
 from workbench.ui.camera_frustums import Placed
 from workbench.ui.camera_gizmo import CameraGizmo
 from workbench.ui.camera_judging import CameraJudging
+from workbench.ui.camera_lens import CameraLens
 from workbench.ui.camera_moves import Floats, Frame, Snap, nudged, panned
 from workbench.ui.camera_numbers import CameraNumbers
 from workbench.ui.camera_pick import CameraPick
 from workbench.ui.camera_writing import CameraWriting
-from workbench.ui.cameras_panel import FASTEST, KIND_NAMES
+from workbench.ui.cameras_panel import KIND_NAMES
 from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_choice
 from workbench.ui.commands import Command
@@ -42,9 +41,11 @@ from workbench.ui.fragments import render
 from workbench.ui.look_through import LookThrough
 from workbench.ui.placing import Placing
 from workbench.ui.presses import Presses
+from workbench.ui.studio_picture import StudioPicture
 
 NOBODY = "none"
 SNAPS = {"none": Snap(), "1 cm, 5°": Snap(0.01, 5.0), "5 cm, 15°": Snap(0.05, 15.0)}
+KINDS = {"rgb": "colour", "segmentation": "bodies"}
 SCALES = {"own size": 1.0, "¼": 0.25, "½": 0.5, "× 2": 2.0}
 STEP = 0.01
 """Metres by which a key moves the camera."""
@@ -60,9 +61,6 @@ class StudioPanel:
         self._placing = Placing(session)
         self._keys: tuple[CameraKey, ...] = ()
         self._names: dict[str, CameraKey | None] = {NOBODY: None}
-        self._picture: viser.GuiImageHandle | None = None
-        self._drawn: tuple[CameraKey, Picture] | None = None
-        self._drawn_at = 0.0
         self._in_its_eye = False
         self._look_at, self._own_axes, self._snap = False, False, Snap()
         gui = server.gui
@@ -74,19 +72,18 @@ class StudioPanel:
             shown=self._name_of,
         )
         self._note = gui.add_html(render("note", text="Cameras appear when the task is loaded."))
-        self._picture_folder = gui.add_folder(None)
-        with self._picture_folder:
-            gui.add_html(render("studio_picture"))
+        self._picture = StudioPicture(server, session)
         self._facts = gui.add_html("", visible=False)
         self._tools = gui.add_html("", visible=False)
         self._look = LookThrough(server, self._placing)
         self._writing = CameraWriting(server, session, self._placing, self._new_from_viewer)
         self._handles = gui.add_html("", visible=False)
-        self._numbers = CameraNumbers(server, self._placing)
-        self._writing.add_members(server)
+        self._numbers = CameraNumbers(server, self._placing, look_at=lambda: self._look_at)
+        self._lens = CameraLens(server, self._placing)
+        self._writing.add_members()
         self._judging = CameraJudging(server, session)
         self._presses = Presses(server)
-        with self._picture_folder:
+        with self._picture.folder:
             self._pick = CameraPick(server, session, self._presses)
         self._gizmo = CameraGizmo(
             server,
@@ -95,6 +92,11 @@ class StudioPanel:
             own_axes=lambda: self._own_axes,
             look_at=lambda: self._look_at,
         )
+
+    @property
+    def shows(self) -> str:
+        """Which kind of picture is to be made of the chosen camera."""
+        return self._picture.shows
 
     # --- chosen ------------------------------------------------------------------------------------------
 
@@ -149,9 +151,10 @@ class StudioPanel:
         show(self._tools, camera is not None)
         show(self._handles, camera is not None)
         self._numbers.draw(camera)
+        self._lens.draw(camera)
         self._writing.draw(studio)
-        self._draw_picture(view)
-        self._pick.draw(view, shown=self._picture is not None and self._picture.visible)
+        self._picture.draw(view)
+        self._pick.draw(view, shown=self._picture.visible)
         self._judging.draw(view)
         if chosen is not None:
             fill(self._facts, self._facts_of(chosen, view))
@@ -184,32 +187,6 @@ class StudioPanel:
         show(self._note, bool(text))
         if text:
             fill(self._note, render("note", text=text))
-
-    def _draw_picture(self, view: SessionView) -> None:
-        key = view.studio.selected
-        picture = None if key is None else view.pictures.get(key)
-        if view.studio.quick_scale != 1.0:
-            picture = view.studio.quick
-            if view.studio.wants_quick:
-                self._session.studio.look()
-        if picture is not None and (picture.env != view.selected_env or picture.rgb is None):
-            picture = None
-        if self._picture is not None:
-            # The last one stays while the next is drawn; that of another camera does not.
-            show(self._picture, self._drawn is not None and self._drawn[0] == key)
-        if key is None or picture is None or picture.rgb is None:
-            return
-        if self._drawn is not None and self._drawn[0] == key and self._drawn[1] is picture:
-            return
-        if time.monotonic() - self._drawn_at < FASTEST:
-            return
-        self._drawn, self._drawn_at = (key, picture), time.monotonic()
-        if self._picture is None:
-            with self._picture_folder:
-                self._picture = self._server.gui.add_image(picture.rgb, format="jpeg", jpeg_quality=80)
-        else:
-            self._picture.image = picture.rgb
-            show(self._picture, True)
 
     def _facts_of(self, camera: StudioCamera, view: SessionView) -> str:
         info = camera.info
@@ -283,17 +260,17 @@ class StudioPanel:
         studio = self._session.studio
         rows = [
             [
-                {"label": "Drag"},
+                {"label": "Place"},
                 self._tool(
                     "move, turn",
-                    "Move and turn the camera.",
+                    "Its pose: move it, and what it looks at goes along; or turn it.",
                     "move",
                     self._sets(look_at=False),
                     not self._look_at,
                 ),
                 self._tool(
-                    "eye, target",
-                    "Move the eye, or what it looks at.",
+                    "eye and target",
+                    "Move the eye and it goes on looking at its target; or move the target.",
                     "look at",
                     self._sets(look_at=True),
                     self._look_at,
@@ -328,7 +305,20 @@ class StudioPanel:
                 ),
             ],
             [
-                {"label": "Picture"},
+                {"label": "Shows"},
+                *(
+                    self._tool(
+                        KINDS.get(kind, kind),
+                        "Of the picture above.",
+                        f"kind {kind}",
+                        lambda _, kind=kind: self._picture.show_kind(kind),
+                        self._picture.shows == kind,
+                    )
+                    for kind in self._picture.kinds
+                ),
+            ],
+            [
+                {"label": "Size"},
                 *(
                     self._tool(
                         name,
@@ -421,7 +411,10 @@ class StudioPanel:
         if camera is not None and camera.now is not None:
             frame = self._placing.frame(camera)
             moved = frame.from_view(camera.now, move(frame.to_view(camera.now)))
-            self._placing.place(camera.key, moved, hand)
+            if self._look_at and moved.position != camera.now.position:
+                self._placing.look(camera, moved, self._placing.target_in_view(camera, camera.now), hand)
+            else:
+                self._placing.place(camera.key, moved, hand)
 
 
 def _placed(camera: StudioCamera) -> CameraSettings:

@@ -1,0 +1,185 @@
+"""What the page asks of the author's file: show what a change would be, make it, take it back.
+
+What takes long (libcst, the disk) is done on a thread of its own, one thing after the other, and what came of it is in
+`view`. What a change means for the placements is settled when the version with it comes in: none is to be lost by it.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+from workbench.core.camera_settings import CameraKey, CameraKind, CameraSettings, differences
+from workbench.session.camera_writing import CameraWriting, Wish, copy, plan
+from workbench.session.messages import TaskDescription
+from workbench.session.studio_cameras import StudioCameras
+from workbench.session.studio_view import Writing
+
+
+class StudioFile:
+    """Thread-safe; every method returns at once.
+
+    Args:
+        on_change: called, on any thread, when there is something new.
+        open_copy: open this class of this file, in a folder of the user's, in place of the task.
+    """
+
+    def __init__(
+        self, cameras: StudioCameras, on_change: Callable[[], None], open_copy: Callable[[Path, str], None]
+    ) -> None:
+        self._cameras, self._note, self._open_copy = cameras, on_change, open_copy
+        self.folder = Path.cwd()
+        """Where a copy of a task goes: where the program was started."""
+        self._writing = CameraWriting()
+        self._thread = ThreadPoolExecutor(1, "studio")
+        self._closing = False
+
+    @property
+    def view(self) -> Writing:
+        return self._writing.view
+
+    def plan_write(self, key: CameraKey) -> None:
+        """Find the edit that writes the placement of a camera; it becomes `StudioView.writing`."""
+        with self._cameras.lock:
+            wish = Wish("edit", key, self._cameras.placements.now(key))
+        self._plan(wish)
+
+    def plan_add(self, kind: CameraKind, name: str, settings: CameraSettings) -> None:
+        """Find the edit that adds a camera."""
+        self._plan(Wish("add", (kind, name), settings))
+
+    def plan_duplicate(self, key: CameraKey, name: str) -> None:
+        """Find the edit that adds a copy of a camera, placed as that one is now."""
+        with self._cameras.lock:
+            wish = Wish("duplicate", key, self._cameras.placements.now(key), name)
+        self._plan(wish)
+
+    def plan_rename(self, key: CameraKey, name: str) -> None:
+        """Find the edit that gives a camera another name."""
+        with self._cameras.lock:
+            wish = Wish("rename", key, self._cameras.placements.now(key), name)
+        self._plan(wish)
+
+    def plan_remove(self, key: CameraKey) -> None:
+        """Find the edit that removes a camera."""
+        self._plan(Wish("remove", key, None))
+
+    def _plan(self, wish: Wish) -> None:
+        self._later(self._find_plan, wish)
+
+    def _find_plan(self, wish: Wish) -> None:
+        with self._cameras.lock:
+            task, info = self._cameras.task, self._cameras.info(wish.key)
+        if task is None:
+            return
+        writing = plan(task, info, wish)
+        with self._cameras.lock:
+            self._writing.planned(wish, writing)
+        self._note()
+
+    def write(self) -> None:
+        """Make the planned edit; the file is reloaded, and the new camera compared with what was written."""
+        self._later(self._write, self._writing.write)
+
+    def undo_write(self) -> None:
+        """Take the edit that was made last out of the file again."""
+        self._later(self._write, self._writing.undo)
+
+    def copy_task(self) -> None:
+        """Copy the task's file into `folder` and open the copy; what was refused before is planned in it then.
+
+        Does nothing unless ``StudioView.writing.can_copy``. Nothing is written over.
+        """
+        self._later(self._copy)
+
+    def _copy(self) -> None:
+        with self._cameras.lock:
+            task, can = self._cameras.task, self._writing.view.can_copy
+        if task is None or not can:
+            return
+        file, view = copy(task, self.folder)
+        with self._cameras.lock:
+            self._writing.copied(file, view)
+        self._note()
+        if file is not None:
+            self._open_copy(file, task.class_name)
+
+    def _write(self, do: Callable[[], bool]) -> None:
+        with self._cameras.lock:  # the version with it must not come in before it is known to be awaited
+            do()
+        self._note()
+
+    def drop_plan(self) -> None:
+        """Forget the plan (or the message about the last one)."""
+        with self._cameras.lock:
+            self._writing.drop()
+        self._note()
+
+    # --- what the studio tells -------------------------------------------------------------------------
+
+    def loaded(self, task: TaskDescription) -> frozenset[CameraKey]:
+        """A version runs, and what was written is compared with it; the lock is held.
+
+        Returns:
+            the cameras that were changed here, if this is the version with that change.
+        """
+        wish = self._writing.wish
+        if wish is None or not self._writing.is_in(task):
+            return frozenset()
+        self._follow_the_file(wish)
+        self._writing.compare(task)
+        return frozenset({wish.key, wish.result})
+
+    def plan_in_copy(self, task: TaskDescription) -> None:
+        """What was refused before is planned in the copy of the task, if this is that; the lock is held."""
+        refused = self._writing.wish_for(task)
+        if refused is not None and not self._closing:
+            self._submit(self._find_plan, refused)
+
+    def _follow_the_file(self, wish: Wish) -> None:
+        """What an edit, or its being taken back, means for the placements: none is to be lost by it."""
+        placements, undone = self._cameras.placements, self._writing.view.stage == "undone"
+        now = placements.now(wish.key)
+        if wish.what == "rename":
+            pair = (wish.result, wish.key) if undone else (wish.key, wish.result)
+            placements.rename(*pair)
+        elif wish.what == "duplicate" and not undone and placements.moved(wish.key) and now is not None:
+            placements.keep(wish.result, now)
+        elif wish.what == "edit" and wish.settings is not None:
+            if undone and not placements.moved(wish.key):
+                placements.keep(wish.key, wish.settings)
+            elif not undone and now is not None and not differences(now, wish.settings):
+                placements.written(wish.key)  # but for what was rounded
+        if not undone and wish.what in ("add", "duplicate", "rename"):
+            self._cameras.selected = wish.result
+
+    def failed_to_load(self) -> None:
+        """A version does not load; the lock is held."""
+        self._writing.failed_to_load()
+
+    def close(self) -> None:
+        """Wait for what is being written."""
+        with self._cameras.lock:
+            self._closing = True
+        self._thread.shutdown(wait=True, cancel_futures=True)
+
+    # --- the thread ------------------------------------------------------------------------------------
+
+    def _later(self, work: Callable[..., None], *args: object) -> None:
+        with self._cameras.lock:
+            if not self._closing:
+                self._submit(work, *args)
+
+    def _submit(self, work: Callable[..., None], *args: object) -> None:
+        self._thread.submit(work, *args).add_done_callback(self._worked)
+
+    def _worked(self, future: Future[None]) -> None:
+        error = None if future.cancelled() else future.exception()
+        if error is None:
+            return
+        traceback.print_exception(error)
+        with self._cameras.lock:
+            self._cameras.problem = f"The workbench itself failed at this, and nothing was done: {error!r}"
+        self._note()

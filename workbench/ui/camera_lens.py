@@ -1,0 +1,202 @@
+"""The chosen camera's lens and picture in numbers: field of view or intrinsic matrix, size, near and far, shader.
+
+It is set once and then left, so its folder is closed. What a lens is can be said in two ways that exclude each other
+in ManiSkill's config; the choice between them is a change of the config, after which the camera sees the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import viser
+
+from workbench.core.camera_frames import (
+    intrinsic_from_fov,
+    intrinsic_of,
+    matrix3,
+    scaled_intrinsic,
+    vertical_fov,
+)
+from workbench.core.camera_settings import CameraSettings
+from workbench.session.studio_view import StudioCamera
+from workbench.ui.camera_moves import kept_where_equal
+from workbench.ui.changed import show
+from workbench.ui.checked import checked_choice, checked_int
+from workbench.ui.controls import Control
+from workbench.ui.fragments import render
+from workbench.ui.number_fields import number_field, pair_field
+from workbench.ui.placing import Placing
+
+FOV, INTRINSIC = "field of view", "intrinsic matrix"
+LENSES = (FOV, INTRINSIC)
+SHADERS: tuple[str, ...] = ("minimal", "default", "rt-fast", "rt-med", "rt")
+"""Those that ManiSkill 3 brings."""
+METRES, DEGREES, RADIANS, PIXELS = 4, 2, 4, 2
+"""Digits that are shown."""
+SMALLEST, LARGEST = 8, 4096
+"""Pixels of a picture's side."""
+VERTICAL = "vertical field of view"
+
+Change = Callable[[CameraSettings], CameraSettings]
+
+
+class CameraLens:
+    """The folder in the present container."""
+
+    def __init__(self, server: viser.ViserServer, placing: Placing) -> None:
+        self._placing = placing
+        gui = server.gui
+        with gui.add_folder("Lens and picture", expand_by_default=False) as self._folder:
+            gui.add_html(render("tight"))
+            self._build_lens(gui)
+            self._build_picture(gui)
+
+    def _build_lens(self, gui: viser.GuiApi) -> None:
+        self._lens = Control(
+            gui.add_dropdown("Lens as", LENSES, initial_value=FOV),
+            read=lambda value: checked_choice(value, LENSES, "way to say a lens"),
+            send=self._set_lens,
+        )
+        self._degrees = number_field(
+            gui,
+            "Degrees high",
+            DEGREES,
+            1.0,
+            1.0,
+            175.0,
+            lambda fov: self._set_fov(math.radians(fov)),
+            VERTICAL,
+        )
+        self._radians = number_field(gui, "Radians", RADIANS, 0.01, 0.02, 3.05, self._set_fov, VERTICAL)
+        self._focal = pair_field(gui, "fx, fy", PIXELS, 1.0, 1.0, 1e5, self._set_focal, "Pixels.")
+        self._centre = pair_field(
+            gui,
+            "cx, cy",
+            PIXELS,
+            1.0,
+            -1e5,
+            1e5,
+            self._set_centre,
+            "Pixels from the picture's upper left corner to the optical axis.",
+        )
+
+    def _build_picture(self, gui: viser.GuiApi) -> None:
+        self._size = pair_field(
+            gui, "Width, height", 0, 1.0, SMALLEST, LARGEST, self._set_size, "Pixels of the picture."
+        )
+        self._range = pair_field(
+            gui,
+            "Near, far",
+            METRES,
+            0.01,
+            1e-4,
+            1e4,
+            self._set_range,
+            "Metres. What is nearer or farther is not drawn.",
+        )
+        self._shader = Control(
+            gui.add_dropdown(
+                "Shader",
+                SHADERS,
+                initial_value="minimal",
+                hint="minimal is what ManiSkill trains with; the rt ones trace rays, slowly.",
+            ),
+            read=lambda value: checked_choice(value, self._shader.handle.options, "shader"),
+            send=lambda name: self._change("shader", lambda s: replace(s, shader_pack=name)),
+        )
+
+    def draw(self, camera: StudioCamera | None) -> None:
+        """Show this camera's; None hides all."""
+        show(self._folder, camera is not None)
+        if camera is not None and camera.now is not None:
+            self._draw_lens(camera.now)
+
+    def _draw_lens(self, now: CameraSettings) -> None:
+        by_matrix = now.intrinsic is not None
+        self._lens.show(INTRINSIC if by_matrix else FOV)
+        for control, shown in (
+            (self._degrees, not by_matrix),
+            (self._radians, not by_matrix),
+            (self._focal, by_matrix),
+            (self._centre, by_matrix),
+        ):
+            show(control.handle, shown)
+        k = intrinsic_of(now)
+        if by_matrix:
+            self._focal.show((k[0, 0], k[1, 1]))
+            self._centre.show((k[0, 2], k[1, 2]))
+        else:
+            fov = vertical_fov(k, now.height)
+            self._degrees.show(math.degrees(fov))
+            self._radians.show(fov)
+        self._size.show((now.width, now.height))
+        self._range.show((now.near, now.far))
+        if now.shader_pack not in self._shader.handle.options:
+            # A task may bring a shader pack of its own.
+            self._shader.handle.options = (*SHADERS, now.shader_pack)
+        self._shader.show(now.shader_pack)
+
+    # --- what is typed -----------------------------------------------------------------------------------
+
+    def _change(self, hand: str, change: Change) -> None:
+        camera, now, _ = self._placing.require()
+        changed = change(now)
+        if changed != now:
+            self._placing.place(camera.key, changed, hand)
+
+    def _set_lens(self, said: str) -> None:
+        def change(s: CameraSettings) -> CameraSettings:
+            if said == INTRINSIC and s.intrinsic is None:
+                return replace(s, fov=None, intrinsic=matrix3(intrinsic_of(s)))
+            if said == FOV and s.fov is None:
+                return replace(s, fov=vertical_fov(intrinsic_of(s), s.height), intrinsic=None)
+            return s
+
+        self._change("lens", change)
+
+    def _set_fov(self, fov: float) -> None:
+        def change(s: CameraSettings) -> CameraSettings:
+            intrinsic_from_fov(fov, s.width, s.height)  # refuses what is no fov
+            return s if s.fov is None else replace(s, fov=fov)
+
+        self._change("fov", change)
+
+    def _set_focal(self, typed: tuple[float, ...]) -> None:
+        self._set_intrinsic(typed, ((0, 0), (1, 1)))
+
+    def _set_centre(self, typed: tuple[float, ...]) -> None:
+        self._set_intrinsic(typed, ((0, 2), (1, 2)))
+
+    def _set_intrinsic(self, typed: tuple[float, ...], places: tuple[tuple[int, int], ...]) -> None:
+        def change(s: CameraSettings) -> CameraSettings:
+            k = intrinsic_of(s)
+            kept = kept_where_equal([k[place] for place in places], typed, PIXELS)
+            for place, number in zip(places, kept, strict=True):
+                k[place] = number
+            return s if s.intrinsic is None else replace(s, intrinsic=matrix3(k))
+
+        self._change("intrinsic", change)
+
+    def _set_size(self, typed: tuple[float, ...]) -> None:
+        width, height = (checked_int(n, SMALLEST, LARGEST, "number of pixels") for n in typed)
+
+        def change(s: CameraSettings) -> CameraSettings:
+            sized = replace(s, width=width, height=height)
+            if s.intrinsic is None:
+                return sized
+            # In pixels of the other size, so that it shows the same.
+            k = scaled_intrinsic(s.intrinsic, (s.width, s.height), (width, height))
+            return replace(sized, intrinsic=matrix3(k))
+
+        self._change("size", change)
+
+    def _set_range(self, typed: tuple[float, ...]) -> None:
+        def change(s: CameraSettings) -> CameraSettings:
+            near, far = kept_where_equal((s.near, s.far), typed, METRES)
+            if near >= far:
+                raise ValueError("What is near must be nearer than what is far.")
+            return replace(s, near=near, far=far)
+
+        self._change("range", change)

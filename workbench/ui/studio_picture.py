@@ -1,0 +1,122 @@
+"""The chosen camera's picture, above the controls that move it: in colour, or as what else a policy may get of it.
+
+A camera is placed for what comes out of it, and that is often depth or segmentation: a far plane that is too near, or a
+gripper that hides the cube, is seen there first. So the picture that follows the hand is any of them. All kinds may be
+on the Cameras tab at the same time; here is one.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import viser
+from numpy.typing import NDArray
+
+from workbench.core.camera_settings import CameraKey
+from workbench.core.pictures import Picture
+from workbench.session.session import Session
+from workbench.session.view import SessionView
+from workbench.ui.cameras_panel import FASTEST, modalities_of
+from workbench.ui.changed import fill, show
+from workbench.ui.false_colour import (
+    DepthRange,
+    colour_depth,
+    colour_normal,
+    colour_position,
+    colour_segmentation,
+    depth_range,
+    segments_seen,
+)
+from workbench.ui.fragments import render
+
+COLOUR = "rgb"
+
+
+class StudioPicture:
+    """The picture in the present container; what lies over it goes into `folder`."""
+
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+        self._server, self._session = server, session
+        self._picture: viser.GuiImageHandle | None = None
+        self._drawn: tuple[CameraKey, Picture, str] | None = None
+        self._drawn_at = 0.0
+        self._wanted = COLOUR
+        self.kinds: tuple[str, ...] = (COLOUR,)
+        """That the chosen camera gives; `rgb` first."""
+        self.folder = server.gui.add_folder(None)
+        with self.folder:
+            server.gui.add_html(render("studio_picture"))
+        self._caption = server.gui.add_html("", visible=False)
+
+    @property
+    def shows(self) -> str:
+        """Which kind of picture is to be made of the chosen camera."""
+        return self._wanted if self._wanted in self.kinds else COLOUR
+
+    def show_kind(self, kind: str) -> None:
+        self._wanted = kind
+
+    @property
+    def visible(self) -> bool:
+        return self._picture is not None and self._picture.visible
+
+    def draw(self, view: SessionView) -> None:
+        studio, key = view.studio, view.studio.selected
+        chosen = studio.chosen
+        quick = studio.quick_scale != 1.0
+        # The quick look has colours only.
+        self.kinds = (COLOUR,) if chosen is None or quick else modalities_of(chosen.info)
+        picture = None if key is None else view.pictures.get(key)
+        if quick:
+            picture = studio.quick
+            if studio.wants_quick:
+                self._session.studio.look()
+        if self._picture is not None:
+            # The last one stays while the next is drawn; that of another camera does not.
+            show(self._picture, self._drawn is not None and self._drawn[0] == key)
+        show(self._caption, self.visible and bool(self._caption.content))
+        kind = self.shows
+        if key is None or picture is None or picture.env != view.selected_env or view.task is None:
+            return
+        if self._drawn is not None and (self._drawn[0], self._drawn[2]) == (key, kind):
+            if self._drawn[1] is picture or time.monotonic() - self._drawn_at < FASTEST:
+                return
+        coloured = in_colours(picture, kind, view.task.segmentation)
+        if coloured is None:
+            return  # it is not there yet
+        self._drawn, self._drawn_at = (key, picture, kind), time.monotonic()
+        self._put(kind, *coloured)
+
+    def _put(self, kind: str, pixels: NDArray[np.uint8], caption: str) -> None:
+        # Flat colours of a segmentation would get halos from JPEG.
+        form = "png" if kind == "segmentation" else "jpeg"
+        if self._picture is None:
+            with self.folder:
+                self._picture = self._server.gui.add_image(pixels, format=form, jpeg_quality=80)
+        else:
+            if self._picture.format != form:
+                self._picture.format = form
+            self._picture.image = pixels
+            show(self._picture, True)
+        fill(self._caption, caption)
+
+
+def in_colours(picture: Picture, kind: str, names: dict[int, str]) -> tuple[NDArray[np.uint8], str] | None:
+    """One kind of a picture as colours, with what they mean; None if the picture has it not."""
+    if kind == "depth" and picture.depth is not None:
+        span = depth_range(picture.depth) or DepthRange(0.0, 1.0)
+        caption = render("depth_caption", near=f"{span.near:.2f}", far=f"{span.far:.2f}")
+        return colour_depth(picture.depth, span), caption
+    if kind == "segmentation" and picture.segmentation is not None:
+        legend, more = segments_seen(picture.segmentation, names)
+        return colour_segmentation(picture.segmentation), render(
+            "segmentation_caption", legend=legend, more=more
+        )
+    if kind == "position" and picture.position is not None:
+        return colour_position(picture.position), ""
+    if kind == "normal" and picture.normal is not None:
+        return colour_normal(picture.normal), ""
+    if kind == "albedo" and picture.albedo is not None:
+        return picture.albedo, ""
+    return None if kind != COLOUR or picture.rgb is None else (picture.rgb, "")
