@@ -21,6 +21,7 @@ from workbench.session.recorded_scene import SceneProcess
 from workbench.session.review import Review
 from workbench.ui.pages import Pages
 from workbench.ui.review_page import ReviewOffers, ReviewPage
+from workbench.ui.stage import Stage
 
 if TYPE_CHECKING:
     # What a live env needs is not needed for looking at recordings.
@@ -59,7 +60,8 @@ class Workplace:
         self._mending: threading.Thread | None = None
         self._offers: Callable[[Workplace, ReviewOffers], ReviewOffers] = lambda _, offers: offers
         self.session = session
-        self.pages = Pages(server, {"review": self._review_page})
+        self._stage = Stage(server)
+        self.pages = Pages(server, self._stage, {"review": self._review_page})
         if session is not None:
             self.go_live_with(session)
 
@@ -115,7 +117,7 @@ class Workplace:
         from workbench.ui.page import Page
 
         assert self.session is not None, "a live page is offered with its session"
-        return Page(self._server, self.session, dark, on_review=lambda: self.pages.show("review"))
+        return Page(self._server, self.session, dark, lambda: self.pages.show("review"), self._stage)
 
     def _review_page(self, dark: bool) -> ReviewPage:
         shelf = self.shelf
@@ -123,4 +125,6 @@ class Workplace:
         offers = ReviewOffers(
             on_back=(lambda: self.pages.show("live")) if self.pages.can_show("live") else None
         )
-        return ReviewPage(self._server, shelf.review, shelf.library, self._offers(self, offers), dark)
+        return ReviewPage(
+            self._server, shelf.review, shelf.library, self._offers(self, offers), dark, self._stage
+        )

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import viser
-import viser.uplot as uplot
 
 from workbench.session import rescore_words as words
 from workbench.session.rescore_messages import EpisodeFile, Verdict
@@ -21,10 +20,10 @@ from workbench.session.rescorer import Rescorer, RescoreView
 from workbench.session.review import Review
 from workbench.session.review_view import ReviewView
 from workbench.ui.changed import fill, show
-from workbench.ui.curves_panel import LONGEST, value_span
+from workbench.ui.curves_panel import LONGEST
 from workbench.ui.fragments import render
-from workbench.ui.judgement_panel import SERIES
 from workbench.ui.presses import Presses
+from workbench.ui.then_and_now import ThenAndNow
 
 REDRAW_EVERY = 0.2
 MOST_ROWS = 10
@@ -83,8 +82,7 @@ class RescorePanel:
         self._status = gui.add_html("")
         self._list = gui.add_html("")
         self._presses = Presses(server)
-        self._folder = gui.add_folder(None)
-        self._chart: viser.GuiUplotHandle | None = None
+        self._chart = ThenAndNow(server)
         self._first = 0
         self._listed: list[Verdict] = []
         self._selected: str | None = None
@@ -179,8 +177,7 @@ class RescorePanel:
     def _draw_chart(self) -> None:
         chosen = next((v for v in self._listed if v.file.id == self._selected), None)
         if chosen is None or len(chosen.new_reward) < 2:
-            if self._chart is not None:
-                show(self._chart, False)
+            self._chart.hide()
             return
         end = min(len(chosen.new_reward), len(chosen.old_reward))
         if chosen.first_difference is not None:
@@ -188,24 +185,8 @@ class RescorePanel:
         part = slice(max(0, end - LONGEST), end)
         steps = np.arange(1, len(chosen.new_reward) + 1, dtype=np.float64)[part]
         data = (steps, *(np.asarray(v[part], np.float64) for v in (chosen.old_reward, chosen.new_reward)))
-        scales = {"x": uplot.Scale(time=False), "y": uplot.Scale(range=value_span(data[1:]))}
         title = f"reward of {f'seed {chosen.seed}' if chosen.seed >= 0 else chosen.file.name}, then and now"
-        if self._chart is None:
-            with self._folder:
-                self._chart = self._server.gui.add_uplot(
-                    data,
-                    SERIES,
-                    title=title,
-                    scales=scales,
-                    axes=(uplot.Axis(size=30), uplot.Axis(size=46)),
-                    legend=uplot.Legend(show=True),
-                    height=160,
-                    padding=(6, 12, 0, 0),
-                )
-            return
-        with self._server.atomic():
-            self._chart.scales, self._chart.title, self._chart.data = scales, title, data
-        show(self._chart, True)
+        self._chart.draw(title, data)
 
 
 def in_order(verdicts: Sequence[Verdict]) -> list[Verdict]:
