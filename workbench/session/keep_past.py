@@ -99,7 +99,10 @@ class PastKeeper:
         steps = sum(episode.steps for episode in what.episodes)
         if kept < len(made):
             raise JobFailed(self._finisher.finished.problem or "its files could not be written")
-        self._say(f"kept {kept} episode{'' if kept == 1 else 's'}, {steps} steps")
+        unfinished = sum(not episode.ended for episode in what.episodes)
+        self._say(
+            f"kept {kept} episode{'' if kept == 1 else 's'}, {steps} steps{_not_ended(unfinished, kept)}"
+        )
 
     def _capture_all(self, job: Job, what: WhatToKeep, writers: dict[int, GatheredEpisode]) -> None:
         names = [dimension.name for dimension in what.task.actions]
@@ -186,6 +189,14 @@ class PastKeeper:
         with self._lock:
             self._said, self._failed = words, False
         self._on_change()
+
+
+def _not_ended(count: int, kept: int) -> str:
+    if not count:
+        return ""
+    if kept == 1:
+        return "; it had not ended"
+    return "; none of them had ended" if count == kept else f"; {count} of them had not ended"
 
 
 def _discard(writers: dict[int, GatheredEpisode]) -> None:

@@ -98,6 +98,12 @@ class Workplace:
         self.session = session
         self.pages.offer("live", self._live_page)
 
+    def task_files(self) -> tuple[Path, ...]:
+        """The task files that this program was started with, or has open."""
+        task = None if self.session is None else self.session.view().task
+        live = () if task is None or task.file is None else (Path(task.file),)
+        return tuple(file.absolute() for file in (*live, *self._tasks))
+
     def offer(self, add: Callable[[Workplace, ReviewOffers], ReviewOffers]) -> None:
         """Let `add` put more into what the review page offers; it is asked whenever that page is built."""
         before = self._offers

@@ -22,13 +22,13 @@ from workbench.session.review_view import ReviewView
 from workbench.ui.changed import fill, show
 from workbench.ui.curves_panel import LONGEST
 from workbench.ui.fragments import render
+from workbench.ui.judged_with import RECORDED, TODAYS, codes_for
 from workbench.ui.presses import Presses
 from workbench.ui.then_and_now import ThenAndNow
 
 REDRAW_EVERY = 0.2
 MOST_ROWS = 10
 """Of the list, at a time."""
-TODAYS, RECORDED = "today's", "as recorded"
 RUNNING = ("loading", "judging")
 
 
@@ -38,6 +38,8 @@ class RescoreChoices:
 
     recorded_source: bool = False
     use_env_states: bool = False
+    file: Path | None = None
+    """Asked before the files that the recordings name."""
 
 
 class RescorePanel:
@@ -49,6 +51,7 @@ class RescorePanel:
         review: Shows the episode of a row, and says what is open.
         find: The files of recordings by their ids in the library; ids that are gone are left out.
         choices: What was chosen before.
+        known: Task files that the server knows of besides those that recordings name.
     """
 
     def __init__(
@@ -58,19 +61,24 @@ class RescorePanel:
         review: Review,
         find: Callable[[Sequence[str]], list[EpisodeFile]],
         choices: RescoreChoices,
+        known: Callable[[], Sequence[Path]] = tuple,
     ) -> None:
         self._server, self._rescorer, self._review = server, rescorer, review
-        self._find, self._choices = find, choices
+        self._find, self._choices, self._known = find, choices, known
         gui = server.gui
         self._begin = gui.add_button("Judge what is open", icon=viser.Icon.GAVEL, visible=False)
         self._begin.on_click(lambda _: self.judge([one.id for one in review.view().opened]))
-        self._code = gui.add_dropdown(
+        self._codes = codes_for((), ())
+        self._codes_of: object = None
+        labels = tuple(code.label for code in self._codes)
+        self._code: viser.GuiDropdownHandle = gui.add_dropdown(
             "Code",
-            (TODAYS, RECORDED),
+            labels,
             initial_value=RECORDED if choices.recorded_source else TODAYS,
-            hint="Today's code of the task, or the text that the recording was made with",
+            hint="Today's code of the task, the text that the recording was made with, or a task file that is open here",
         )
         self._code.on_update(lambda _: self._chosen())
+        self._told = gui.add_html("")
         self._states = gui.add_checkbox(
             "Recorded states",
             choices.use_env_states,
@@ -95,18 +103,21 @@ class RescorePanel:
         self._first, self._selected = 0, None
         self._rescorer.start(
             files,
+            file=self._choices.file,
             recorded_source=self._choices.recorded_source,
             use_env_states=self._choices.use_env_states,
         )
 
     def _chosen(self) -> None:
         # What a page sends as its choice may be anything.
-        self._choices.recorded_source = self._code.value == RECORDED
+        code = next((code for code in self._codes if code.label == self._code.value), self._codes[0])
+        self._choices.recorded_source, self._choices.file = code.recorded, code.file
         self._choices.use_env_states = self._states.value is True
 
     # --- drawing -----------------------------------------------------------------------------------
 
     def draw(self, view: ReviewView) -> None:
+        self._draw_codes(view)
         told = self._rescorer.view
         wanted = (told.serial, view.opened_serial, view.selected, self._first, self._selected)
         if wanted == self._drawn or time.monotonic() - self._drawn_at < REDRAW_EVERY:
@@ -119,6 +130,32 @@ class RescorePanel:
         self._listed = in_order(told.verdicts)
         self._draw_list()
         self._draw_chart()
+
+    def _draw_codes(self, view: ReviewView) -> None:
+        known = tuple(self._known())
+        wanted = (
+            tuple(one.id for one in view.opened),
+            known,
+            self._choices.recorded_source,
+            self._choices.file,
+        )
+        if wanted == self._codes_of:
+            return
+        self._codes_of = wanted
+        self._codes = codes_for([one.episode.info for one in view.opened], known)
+        choices = self._choices
+        of_choice = [
+            c for c in self._codes if (c.recorded, c.file) == (choices.recorded_source, choices.file)
+        ]
+        chosen = of_choice[0] if of_choice else self._codes[0]
+        # What is not among the choices any more is not judged with, unseen.
+        choices.recorded_source, choices.file = chosen.recorded, chosen.file
+        labels = tuple(code.label for code in self._codes)
+        if self._code.options != labels:
+            self._code.options = labels
+        if self._code.value != chosen.label:
+            self._code.value = chosen.label
+        fill(self._told, render("note", text=chosen.told))
 
     def _draw_list(self) -> None:
         count = len(self._listed)

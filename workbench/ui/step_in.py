@@ -217,6 +217,7 @@ class Judging:
                 shelf.review,
                 lambda ids: episode_files(shelf.library, ids),
                 self._choices,
+                self._place.task_files,
             )
         return self._panel
 
