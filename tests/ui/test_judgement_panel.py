@@ -134,7 +134,11 @@ def test_the_new_line_lies_over_the_recorded_one(panel: JudgementPanel) -> None:
     assert panel._chart.handle is not None and panel._chart.handle.visible
     _, old, new = panel._chart.handle.data
     assert (old == 3).all() and (new == 6).all()
-    assert [series.get("label") for series in panel._chart.handle.series] == ["step", "as recorded", "judged again"]
+    assert [series.get("label") for series in panel._chart.handle.series] == [
+        "step",
+        "as recorded",
+        "judged again",
+    ]
     draw(panel, done(summary(), serial=2), selected_env=3)
     assert not panel._chart.handle.visible and not panel._name.visible
 
