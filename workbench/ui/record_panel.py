@@ -131,14 +131,12 @@ def what_keeping_means(view: SessionView, all_envs: bool) -> str:
     if steps is None or view.task is None:
         return ""
     if view.timeline.shown is not None:
-        return "Keeps the whole episode round the moment that is shown."
+        return f"{KEEP} takes the whole episode round the moment that is shown."
     count = f"{steps} step{'' if steps == 1 else 's'} so far"
     if all_envs and view.task.num_envs > 1:
-        return (
-            f"Keeps the episodes that run, also those that have not ended (env {view.selected_env}: {count})."
-        )
+        return f"{KEEP} takes the episodes that run, ended or not (env {view.selected_env}: {count})."
     which = "episode" if view.task.num_envs == 1 else f"episode of env {view.selected_env}"
-    return f"Keeps the {which} that runs: {count}, and not ended."
+    return f"{KEEP} takes the {which} that runs: {count}, and not ended."
 
 
 def recording_html(recording: RecordingStatus) -> str:
