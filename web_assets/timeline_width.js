@@ -7,9 +7,11 @@
   const GAP = 12; // as timeline_panel.py has it
   const resized = new ResizeObserver(([view]) => {
     const panel = document.querySelector(".wb-timeline")?.closest(".mantine-Paper-root");
-    if (!panel) return;
-    // From its left edge: that is where it will be at once, while the view takes some frames to get there.
-    const most = view.target.getBoundingClientRect().right - panel.getBoundingClientRect().left - GAP;
+    const inView = view.target.getBoundingClientRect();
+    // From its left edge: that is where it will be at once, while the view takes some frames to get there. While one
+    // page takes the other's place there is no timeline, and the view may not change any more once there is one.
+    const left = panel ? panel.getBoundingClientRect().left : inView.left + GAP;
+    const most = inView.right - left - GAP;
     document.documentElement.style.setProperty("--wb-timeline-most", `${most}px`);
   });
   const looked = new MutationObserver(() => {

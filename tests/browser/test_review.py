@@ -28,7 +28,7 @@ LATE = "Tried to update non-existent component"
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("recordings")
-    write(folder, made(20, success_from=15, seed=1))
+    write(folder, made(20, success_from=15, seed=1, written_at="2026-11-21T10:00:00+00:00"))
     write(folder, made(12, seed=2, speed=0.03, source_hash="1" * 12, source={"push.py": "reward = 2\n"}))
     return folder
 
@@ -130,6 +130,10 @@ def test_compares_two_and_says_where_they_part(desk: tuple[Page, list[str]]) -> 
     expect(page.get_by_text(re.compile("They part at step 1"))).to_be_visible()
     page.locator("tr", has=page.get_by_text("bodies", exact=True)).click()
     says(page, "step 1 /")
+    page.get_by_role("button", name="Swap A and B").click()
+    page.get_by_role("tab", name="Review").click()
+    rows = page.locator(".wb-opened-list tr", has=page.locator(".wb-letter"))
+    expect(rows.last).to_contain_text("210.00")  # the older one, which was A: the sum of 1 to 20
     assert [e for e in errors if LATE not in e] == []
 
 

@@ -12,9 +12,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import expect, sync_playwright
+from playwright.sync_api import Page, expect, sync_playwright
 
-from tests.browser.opened import TASK, launch, new_page
+from tests.browser.opened import TASK, launch, new_page, until
 from workbench.session.messages import TaskOptions
 from workbench.session.record import RecordOptions, record
 
@@ -61,6 +61,18 @@ def address(author: Path) -> Iterator[str]:
     assert not list(author.glob("workbench-recorded-*"))
 
 
+COUNT_BODIES = """() => {
+    window.fewest = Infinity;
+    const bodies = () => Object.keys(window.__viserSceneTree.getState()).filter((name) => name.startsWith("/envs/"));
+    setInterval(() => (window.fewest = Math.min(window.fewest, bodies().length)), 5);
+}"""
+
+
+def timeline_width(page: Page) -> float:
+    panel = "document.querySelector('.wb-timeline')?.closest('.mantine-Paper-root')"
+    return page.evaluate(f"() => {panel}?.getBoundingClientRect().width ?? 0")
+
+
 def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
     address: str, author: Path, chromium_path: str
 ) -> None:
@@ -74,6 +86,7 @@ def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
         expect(live).to_be_visible(timeout=PATIENT)
 
         page.get_by_role("tab", name="Judge").click()
+        expect(page.get_by_text(f"With {author / 'push_cube.py'} as it is now.")).to_be_visible()
         page.get_by_role("button", name="Judge what is open").click()
         expect(page.get_by_text("1 of 1 episode differs")).to_be_visible(timeout=PATIENT)
         page.get_by_text("reward by up to").click()
@@ -82,9 +95,16 @@ def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
         page.get_by_role("tab", name="Review").click()
         page.keyboard.press("ArrowRight")
         expect(page.get_by_text("step 2 / 15").first).to_be_visible()
+        page.keyboard.press("b")  # the library is open: there is little room for the timeline
+        until(lambda: timeline_width(page) < 500, "the narrow timeline")
+        page.evaluate(COUNT_BODIES)
         live.click()
+        expect(page.get_by_text("loading WorkbenchPushCube-v1 at step 2")).to_be_visible()
+        expect(page.get_by_role("button", name="Stay here")).to_be_visible()
         told = page.get_by_text("WorkbenchPushCube-v1, seed 5, step 2: its actions were made again")
         expect(told).to_be_visible(timeout=PATIENT)
+        assert page.evaluate("window.fewest") > 5, "the view was empty for a while"
+        until(lambda: timeline_width(page) > 700, "the wide timeline")
         expect(told).to_contain_text("to the last bit")
         expect(page.get_by_role("button", name="undo going live")).to_be_visible()
 

@@ -14,6 +14,7 @@ from workbench.recording.episode import Episode
 from workbench.recording.read_episode import read_episode
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
+from workbench.session.view import SessionView
 
 STEPS = 4
 
@@ -35,6 +36,10 @@ def steps_made(session: Session, count: int) -> None:
         then = session.view().step_serial + 1
         session.step()
         wait_until(session, lambda view, then=then: view.step_serial >= then, "a step")
+
+
+def elapsed(view: SessionView) -> int:
+    return -1 if view.step is None else int(view.step.elapsed_steps[0])
 
 
 def written(session: Session, count: int) -> list[Episode]:
@@ -76,13 +81,26 @@ def test_what_was_kept_after_the_fact_is_what_recording_it_gave(session: Session
     live = written(session, 2)
     session.keep_past()
     wait_until(session, lambda view: bool(view.recording.keeping.said), "the keeping")
-    assert session.view().recording.keeping.said == f"kept 2 episodes, {2 * STEPS} steps"
+    said = f"kept 2 episodes, {2 * STEPS} steps; none of them had ended"
+    assert session.view().recording.keeping.said == said
     every = written(session, 4)
     kept = {episode.info.env_index: episode for episode in every[2:]}
     assert kept.keys() == {0, 1}
     for episode in live:
         assert episode.length == STEPS
         assert_same(episode, kept[episode.info.env_index])
+
+
+def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> None:
+    count = session.view().recording.episodes_written
+    for steps in (3, 1):
+        session.reset()
+        for _ in range(steps):
+            session.step()
+        wait_until(session, lambda view, n=steps: elapsed(view) == n, "the steps")
+    session.keep_past((0,), before=True)
+    kept = written(session, count + 1)[-1]
+    assert kept.length == 3 and kept.info.env_index == 0
 
 
 def test_the_next_episode_waits_for_its_reset_and_ends_with_it(session: Session) -> None:

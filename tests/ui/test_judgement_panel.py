@@ -120,7 +120,7 @@ def test_a_problem_is_told_with_file_and_line_and_escaped() -> None:
 def test_nothing_is_shown_before_the_first_judgement(panel: JudgementPanel) -> None:
     draw(panel, JudgementView())
     assert not any(h.visible for h in (panel._status, panel._stop, panel._name, panel._list))
-    assert panel._chart is None
+    assert panel._chart.handle is None
 
 
 def test_only_what_runs_can_be_stopped(panel: JudgementPanel) -> None:
@@ -131,19 +131,23 @@ def test_only_what_runs_can_be_stopped(panel: JudgementPanel) -> None:
 
 def test_the_new_line_lies_over_the_recorded_one(panel: JudgementPanel) -> None:
     draw(panel, done(summary(episode(3))), selected_env=3)
-    assert panel._chart is not None and panel._chart.visible
-    _, old, new = panel._chart.data
+    assert panel._chart.handle is not None and panel._chart.handle.visible
+    _, old, new = panel._chart.handle.data
     assert (old == 3).all() and (new == 6).all()
-    assert [series.get("label") for series in panel._chart.series] == ["step", "as recorded", "judged again"]
+    assert [series.get("label") for series in panel._chart.handle.series] == [
+        "step",
+        "as recorded",
+        "judged again",
+    ]
     draw(panel, done(summary(), serial=2), selected_env=3)
-    assert not panel._chart.visible and not panel._name.visible
+    assert not panel._chart.handle.visible and not panel._name.visible
 
 
 def test_a_choice_that_is_none_draws_the_reward(panel: JudgementPanel) -> None:
     draw(panel, done(summary(episode(1))))
     panel._name.value = "../../etc"
     draw(panel, done(summary(episode(1)), serial=2))
-    assert panel._chart is not None and str(panel._chart.title).startswith("reward of env")
+    assert panel._chart.handle is not None and str(panel._chart.handle.title).startswith("reward of env")
 
 
 def test_rows_go_to_their_moment_and_forgotten_moments_only_to_their_env(panel: JudgementPanel) -> None:

@@ -138,7 +138,7 @@ def test_a_row_opens_its_episode_at_the_first_difference(
     view = review.view()
     assert view.opened[0].id == rows[2].id and view.states == (3,)
     draw(panel, replace(panel._rescorer.view, serial=2))
-    assert panel._chart is not None and panel._chart.visible and panel._begin.visible
+    assert panel._chart.handle is not None and panel._chart.handle.visible and panel._begin.visible
     assert "wb-selected" in panel._list.content
 
 

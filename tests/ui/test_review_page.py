@@ -55,8 +55,8 @@ def open_seeds(page: ReviewPage, *seeds: int) -> None:
 
 def draw(page: ReviewPage) -> None:
     # Each part is drawn as often as can be read; a test does not wait for that.
-    page._curves._drawn_at = page._curves._numbers_at = page._timeline._drawn_at = 0.0
-    page._cameras._drawn_at = page._status_at = 0.0
+    page._curves._drawn_at = page._curves._numbers_at = 0.0
+    page._cameras._drawn_at = page._told_at = 0.0
     page.redraw()
 
 
@@ -69,7 +69,7 @@ def test_says_what_to_do_while_nothing_is_open(page: ReviewPage) -> None:
 
 def test_an_opened_recording_fills_every_part(page: ReviewPage) -> None:
     open_seeds(page, 1)
-    cube = next(handle for handle in page._scene.handles if "cube" in handle.name)
+    cube = next(handle for handle in page._in_3d.bodies.handles if "cube" in handle.name)
     assert np.allclose(cube.batched_positions[:, 0], 0.0)
     page._review.seek(7)
     draw(page)
@@ -90,16 +90,16 @@ def test_two_recordings_are_compared_and_aligned(page: ReviewPage) -> None:
     assert page._panel.ghosts and page._panel._arrange.visible
     page._review.seek(5)
     draw(page)
-    ghost = [h for h in page._scene.handles if "cube" in h.name]
+    ghost = [h for h in page._in_3d.bodies.handles if "cube" in h.name]
     assert sorted(float(h.batched_positions[0, 0]) for h in ghost if h.visible) == pytest.approx([0.05, 0.15])
     assert "They part at step 1" in page._compare._html.content
     assert "reward = 2" in page._compare._html.content
     assert len(page._curves._charts["reward"].series) == 4, "step, two lines and the dot"
     page._panel.toggle_arrangement()
     draw(page)
-    (cubes,) = (h for h in page._scene.handles if "cube" in h.name)
-    assert len(cubes.batched_positions) == 2 and page._mark._label is not None
-    assert page._mark._label.text == "A, seed 1"
+    (cubes,) = (h for h in page._in_3d.bodies.handles if "cube" in h.name)
+    assert len(cubes.batched_positions) == 2 and page._in_3d._mark._label is not None
+    assert page._in_3d._mark._label.text == "A, seed 1"
     page._review.align("first success")
     draw(page)
     assert "B has no success" in page._panel._never.content
@@ -129,5 +129,5 @@ def test_many_recordings_stand_side_by_side(page: ReviewPage, folder: Path) -> N
     library_of(page).refresh()
     open_seeds(page, *range(20, 26))
     assert not page._panel.ghosts and not page._panel._arrange.visible
-    (cubes,) = (h for h in page._scene.handles if "cube" in h.name)
+    (cubes,) = (h for h in page._in_3d.bodies.handles if "cube" in h.name)
     assert len(cubes.batched_positions) == 6

@@ -35,6 +35,20 @@ def test_whole_box_is_in_the_picture_above_what_is_covered(
     assert (np.abs(corners @ right) <= np.tan(FOV / 2) * aspect * depth).all()
 
 
+def test_the_human_camera_s_picture_is_above_what_is_covered() -> None:
+    geometry, poses = table_scene(1)
+    pose = np.array([1.5, 0.2, 0.4, 0, 0, 0, 1], np.float32)
+    picture, covered, fovy = Picture("render_camera", "human", 0, pose), 0.3, 1.0
+    viewpoint = frame_one(lay_out(geometry, poses), picture, 1.25, covered, fovy)
+    layout = lay_out(geometry, poses)
+    depth = 1.5 - float(layout.low[0] + layout.high[0]) / 2
+    away = viewpoint.position[0] - (1.5 - depth)
+    for part, place in ((0.0, covered), (1.0, 1.0), (-1.0, -(1 - 2 * covered))):
+        # A point of the middle plane at the picture's middle, top and bottom: where it is in the view, -1 to 1.
+        z = 0.4 + part * depth * np.tan(fovy / 2)
+        assert abs((z - viewpoint.position[2]) / (away * np.tan(FOV / 2)) - place) < 1e-5
+
+
 def test_more_envs_are_seen_from_further_away() -> None:
     def distance(num_envs: int) -> float:
         geometry, poses = table_scene(num_envs)

@@ -97,7 +97,9 @@ class PastKeeper:
         if problems:
             raise JobFailed(problems[0])
         steps = sum(episode.steps for episode in what.episodes)
-        self._say(f"kept {len(made)} episode{'' if len(made) == 1 else 's'}, {steps} steps")
+        unfinished = sum(not episode.ended for episode in what.episodes)
+        kept = f"kept {len(made)} episode{'' if len(made) == 1 else 's'}, {steps} steps"
+        self._say(kept + _not_ended(unfinished, len(made)))
 
     def _capture_all(self, job: Job, what: WhatToKeep, writers: dict[int, GatheredEpisode]) -> None:
         names = [dimension.name for dimension in what.task.actions]
@@ -170,6 +172,14 @@ class PastKeeper:
         with self._lock:
             self._said, self._failed = words, False
         self._on_change()
+
+
+def _not_ended(count: int, kept: int) -> str:
+    if not count:
+        return ""
+    if kept == 1:
+        return "; it had not ended"
+    return "; none of them had ended" if count == kept else f"; {count} of them had not ended"
 
 
 def _discard(writers: dict[int, GatheredEpisode]) -> None:

@@ -336,14 +336,19 @@ class LiveState:
         return history.stretch_at(self.selected_env, history.last if shown is None else shown.serial)
 
     def what_to_keep(
-        self, env_idx: tuple[int, ...] | None, load: Load | None, placed: tuple[PlaceCamera, ...]
+        self,
+        env_idx: tuple[int, ...] | None,
+        load: Load | None,
+        placed: tuple[PlaceCamera, ...],
+        before: bool = False,
     ) -> WhatToKeep | str:
         """See `Session.keep_past`; in a sentence why there is nothing to keep."""
         if self.task is None or self.timeline is None or load is None:
             return "no task is loaded"
         history, shown = self.timeline.history, self.timeline.shown
         envs = range(self.task.num_envs) if env_idx is None else env_idx
-        found = {env: episode_round(history, env, None if shown is None else shown.serial) for env in envs}
+        serial = None if shown is None else shown.serial
+        found = {env: episode_round(history, env, serial, before) for env in envs}
         episodes = tuple(episode for episode in found.values() if isinstance(episode, PastEpisode))
         if not episodes:
             env, why = next(iter(found.items()))

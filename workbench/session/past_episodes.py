@@ -33,6 +33,13 @@ class PastEpisode:
         return len(self.moments) - 1
 
     @property
+    def ended(self) -> bool:
+        """Whether the task ended it; else it runs, or was reset before."""
+        moment, env = self.moments[-1]
+        step = moment.as_recorded
+        return bool(step.terminated[env] or step.truncated[env])
+
+    @property
     def success(self) -> bool | None:
         """At its last moment; None for a task that says nothing of it."""
         moment, env = self.moments[-1]
@@ -54,22 +61,29 @@ class WhatToKeep:
     """Of their moments, by serial."""
 
 
-def episode_round(history: History, env: int, serial: int | None) -> PastEpisode | str:
+def episode_round(history: History, env: int, serial: int | None, before: bool = False) -> PastEpisode | str:
     """The episode of this env round a moment, to where it ended; or in a sentence why there is none to keep.
 
     Args:
         serial: None for what was just seen: the episode that runs, or the one before if that has no step yet.
+        before: the one before that.
     """
     if not len(history):
         return "nothing was seen yet"
     found = _until(history, env, history.stretch_at(env, history.last if serial is None else serial)[1])
     if isinstance(found, PastEpisode) and found.steps == 0 and serial is None:
-        begin = found.moments[0][0].serial
-        if begin > history.first:
-            found = _until(history, env, begin - 1)
+        found = _before(history, env, found) or found
+    if before and isinstance(found, PastEpisode):
+        found = _before(history, env, found) or "there is no episode before it in memory"
     if isinstance(found, PastEpisode) and found.steps == 0:
         return "its episode has no step yet"
     return found
+
+
+def _before(history: History, env: int, episode: PastEpisode) -> PastEpisode | str | None:
+    """The one before; None where that is not in memory any more."""
+    begin = episode.moments[0][0].serial
+    return _until(history, env, begin - 1) if begin > history.first else None
 
 
 def _until(history: History, env: int, last: int) -> PastEpisode | str:

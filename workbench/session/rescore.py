@@ -28,7 +28,7 @@ from workbench.recording.side_files import side_files_in_words
 from workbench.session.judgement import SAME_REWARD
 from workbench.session.messages import TaskOptions
 from workbench.session.rescore_messages import EpisodeFile, Verdict
-from workbench.session.step_back import options_of, reference_of
+from workbench.session.step_back import class_in, options_of, reference_of
 
 
 @dataclass(frozen=True)
@@ -135,6 +135,7 @@ def group_episodes(
     base: TaskOptions | None = None,
     *,
     task: str | None = None,
+    file: Path | None = None,
     recorded_source: bool = False,
 ) -> tuple[list[Group], list[Verdict]]:
     """Which env each episode is judged in; and those that cannot be read, with the reason.
@@ -142,27 +143,28 @@ def group_episodes(
     Args:
         num_envs: at most so many at once.
         task: is opened for all of them, in place of what each names.
+        file: is opened for those whose task is in it.
         recorded_source: each is judged by the text that it was recorded with.
     """
     groups: dict[str, Group] = {}
     unread: list[Verdict] = []
-    for file in files:
+    for episode in files:
         try:
-            info = _info_of(file)
+            info = _info_of(episode)
         except (UnreadableRecording, OSError) as error:
-            unread.append(Verdict(file, why_not=str(error)))
+            unread.append(Verdict(episode, why_not=str(error)))
             continue
         if recorded_source and not info.source:
-            unread.append(Verdict(file, task=info.task, why_not="it does not hold the text of its task"))
+            unread.append(Verdict(episode, task=info.task, why_not="it does not hold the text of its task"))
             continue
         options, note = judging_options(options_of(info, 1, base))
         if recorded_source and (besides := side_files_in_words(info.source_file, info.side_files)):
             note = f"{note}. {besides}" if note else besides
-        reference = task or reference_of(info)
+        reference = task or (file and class_in(file, info.task)) or reference_of(info)
         about = [reference, info.task, options.env_kwargs, info.source_hash if recorded_source else ""]
         key = json.dumps(about, sort_keys=True, default=str)
         group = groups.get(key) or Group(reference, options, info, (), note)
-        groups[key] = replace(group, files=(*group.files, file))
+        groups[key] = replace(group, files=(*group.files, episode))
     return [
         replace(g, options=replace(g.options, num_envs=max(1, min(num_envs, len(g.files)))))
         for g in groups.values()

@@ -21,12 +21,14 @@ from workbench.session.lane import Job, JobFailed, Lane, Stopped
 from workbench.session.messages import Failed, Load, Loaded, TaskOptions
 from workbench.session.rescore import Group, group_episodes, not_judged, with_renderer
 from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored, Verdict
-from workbench.session.step_back import CannotStepIn, write_source
+from workbench.session.step_back import CannotStepIn, file_of, write_source
 
 MOST_AT_ONCE = 16
 """Envs."""
 IDLE_SECONDS = 300.0
 """How long the process is kept without work."""
+MOST_NAMED = 3
+"""Of the versions that are judged with, where there are many."""
 
 RescoreState = Literal["none", "loading", "judging", "done", "stopped", "failed"]
 
@@ -61,6 +63,7 @@ class RescoreView:
 class _Asked:
     files: tuple[EpisodeFile, ...]
     base: TaskOptions | None
+    file: Path | None
     recorded_source: bool
     use_env_states: bool
 
@@ -90,13 +93,14 @@ class Rescorer:
         files: Sequence[EpisodeFile],
         *,
         base: TaskOptions | None = None,
+        file: Path | None = None,
         recorded_source: bool = False,
         use_env_states: bool = False,
     ) -> None:
         """Judge these; see `group_episodes` for the arguments."""
         if not files:
             return
-        asked = _Asked(tuple(files), base, recorded_source, use_env_states)
+        asked = _Asked(tuple(files), base, file, recorded_source, use_env_states)
         with self._lock:
             # Under the lock, or the job might tell how far it is before it is said that it begins.
             self._lane.start("judging", lambda job: self._run(job, asked))
@@ -126,9 +130,16 @@ class Rescorer:
     def _run(self, job: Job, asked: _Asked) -> None:
         try:
             groups, unread = group_episodes(
-                asked.files, MOST_AT_ONCE, asked.base, recorded_source=asked.recorded_source
+                asked.files,
+                MOST_AT_ONCE,
+                asked.base,
+                file=asked.file,
+                recorded_source=asked.recorded_source,
             )
-            self._tell(job, verdicts=tuple(unread), notes=tuple({g.note for g in groups if g.note}))
+            notes = [f"with {_judged_with(group, asked)}" for group in groups[:MOST_NAMED]]
+            notes += [f"and {len(groups) - MOST_NAMED} more"] if len(groups) > MOST_NAMED else []
+            notes += dict.fromkeys(g.note for g in groups if g.note)
+            self._tell(job, verdicts=tuple(unread), notes=tuple(notes))
             failed = 0
             for group in groups:
                 try:
@@ -157,8 +168,7 @@ class Rescorer:
         try:
             if asked.recorded_source:
                 folder, reference = write_source(group.info)
-            shown = group.info.task + (" as it was recorded" if asked.recorded_source else "")
-            self._tell(job, state="loading", task=shown)
+            self._tell(job, state="loading", task=_judged_with(group, asked))
             # Never patched into what the last episodes were judged in.
             process.send(Load(reference, group.options, level="rebuilt"))
             told = process.answer(job, Loaded, Failed)
@@ -196,3 +206,11 @@ class Rescorer:
                 return
             self._view = replace(self._view, serial=self._view.serial + 1, **values)  # type: ignore[arg-type]
         self._on_change()
+
+
+def _judged_with(group: Group, asked: _Asked) -> str:
+    """What is opened, in words."""
+    if asked.recorded_source:
+        return f"{group.info.task} as it was recorded"
+    file = file_of(group.reference)
+    return f"{group.info.task} as it is installed" if file is None else f"{group.info.task} of {file}"

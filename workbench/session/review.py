@@ -146,7 +146,7 @@ class Review:
     # --- opening -------------------------------------------------------------------------------------
 
     def open(self, ids: Sequence[str], state: int | None = None) -> None:
-        """Show these recordings instead of what is open.
+        """Show these recordings instead of what is open; the one that was recorded first comes first.
 
         Args:
             ids: rows of the library; more than `MOST_OPEN` are left out, and that is said.
@@ -186,6 +186,20 @@ class Review:
                 self._opening += 1
                 self._put(kept, min(selected, max(len(kept) - 1, 0)), self._view.align)
 
+    def exchange(self, index: int, other: int) -> None:
+        """Let two opened recordings change places; what each of them shows stays."""
+        with self._changed:
+            view = self._view
+            if not {index, other} <= set(range(len(view.opened))):
+                return
+            self._advance()
+            order = list(range(len(view.opened)))
+            order[index], order[other] = other, index
+            position = self._view.position
+            self._opening += 1
+            self._put([view.opened[k] for k in order], order.index(view.selected), view.align)
+            self._seek(position)
+
     def close(self) -> None:
         """Nothing is opened any more; returns when the thread that opens has ended."""
         with self._changed:
@@ -214,6 +228,8 @@ class Review:
                 # A page that stays on "opening" says nothing; and the file is whatever somebody put there.
                 log.exception("%s could not be opened.", row.name)
                 said.append(f"{row.name} could not be opened ({type(error).__name__}: {error}).")
+        # A table is most often sorted by date, the newest at its top; but one asks what became of the older one.
+        opened.sort(key=lambda one: one.episode.info.written_at)
         with self._changed:
             if number != self._opening:
                 return

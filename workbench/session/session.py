@@ -285,16 +285,19 @@ class Session:
         self._recorder.stop()
         self._note()
 
-    def keep_past(self, env_idx: tuple[int, ...] | None = None) -> None:
+    def keep_past(self, env_idx: tuple[int, ...] | None = None, before: bool = False) -> None:
         """Record after the fact: the episode of each of these envs (of all if None) round the moment that is shown.
 
         Live, that is the episode that runs, or the one before if that has no step yet. `SessionView.recording` says how
         far it is and what came of it.
+
+        Args:
+            before: the episode before that one.
         """
         load = self._versions.same_again()
         placed = self.studio.placed_cameras()
         with self._lock:
-            what = self._state.what_to_keep(env_idx, load, placed)
+            what = self._state.what_to_keep(env_idx, load, placed, before)
         if isinstance(what, str):
             self._keeper.refuse(what)
         else:

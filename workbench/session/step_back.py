@@ -78,6 +78,22 @@ def reference_of(info: EpisodeInfo) -> str:
     return _with_class(str(file), text, info.task)
 
 
+def class_in(file: Path, env_id: str) -> str | None:
+    """What would be opened for this task of this file; None if the file has no such task, or cannot be read."""
+    try:
+        reference = _with_class(str(file), file.read_text(encoding="utf-8"), env_id)
+    except (OSError, UnicodeDecodeError):
+        return None
+    return None if reference == str(file) else reference
+
+
+def file_of(reference: str) -> Path | None:
+    """The file of what is opened; None where that is an id."""
+    file, colon, _ = reference.rpartition(":")
+    name = file if colon and file.endswith(".py") else reference
+    return Path(name) if name.endswith(".py") else None
+
+
 def options_of(info: EpisodeInfo, num_envs: int, base: TaskOptions | None = None) -> TaskOptions:
     """How the recording's task is made: with its own robot, modes and control."""
     kwargs = dict(info.env_kwargs)

@@ -16,11 +16,11 @@ from workbench.session.view import SessionView
 from workbench.ui.busy_banner import is_shown as busy_is_shown
 from workbench.ui.changed import show
 from workbench.ui.fragments import render
+from workbench.ui.over_the_view import GAP, FitsTheView
 
 WIDEST, NARROWEST = 520, 240
 """Pixels. Between them it is as wide as the narrowest open view leaves room for: over the controls it
 would hide the very buttons that the last good version is still used with."""
-GAP = 12
 
 DOING = {
     "syntax": "cannot be read",
@@ -62,7 +62,7 @@ class Banner:
         # From the right edge of the view: on the left are viser's own notices.
         self._panel.float(x=-GAP, y=GAP, width=WIDEST)
         self._server = server
-        self._width = WIDEST
+        self._fits = FitsTheView(server, self._panel, WIDEST, NARROWEST)
         self._reload.on_click(lambda _: reload())
         self._restart.on_click(lambda _: restart())
         self._drawn: tuple[int, str] | None = None
@@ -74,7 +74,7 @@ class Banner:
                 self._panel.visible = False
             self._drawn = None
             return
-        self._fit_views()
+        self._fits.fit()
         stopped = view.state == "stopped"
         show(self._restart, stopped)
         # Written once a problem: a new text would close the traceback that someone has open.
@@ -84,14 +84,6 @@ class Banner:
             self._html.content = banner_html(problem, view)
             self._panel.visible = True
             self._panel.expand()
-
-    def _fit_views(self) -> None:
-        views = [client.camera.image_width for client in self._server.get_clients().values()]
-        narrowest = min((width for width in views if width > 0), default=WIDEST)
-        width = int(min(max(narrowest - 2 * GAP, NARROWEST), WIDEST))
-        if width != self._width:
-            self._width = width
-            self._panel.set_width(width)
 
 
 def banner_html(problem: Problem, view: SessionView) -> str:

@@ -1,7 +1,7 @@
 """Every action that matters, with a key and a name in the command palette (Ctrl+K).
 
 Keys work while no text field has the focus. A slider that has the focus takes the arrows too, and one press would
-count twice, so the commands on arrows ask first whether one did (`Control.touched_within`). The list is one table, so that the page, the palette and
+count twice, so the commands on arrows ask first whether one did (`Control.took_the_key`). The list is one table, so that the page, the palette and
 the help that is made from it cannot disagree.
 """
 

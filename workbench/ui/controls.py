@@ -20,6 +20,8 @@ import viser
 T = TypeVar("T")
 Handle = TypeVar("Handle", bound=viser.GuiInputHandle)
 
+KEY_SETTLES = 0.03
+"""Seconds. An input that has the focus takes the arrow keys too, and what it says comes in any order with the key."""
 HANDS_OFF = 0.5
 """Seconds after a person touched an input in which it is not written to."""
 
@@ -57,9 +59,10 @@ class Control(Generic[Handle, T]):
         handle.on_update(self._on_update)
 
     @staticmethod
-    def touched_within(seconds: float) -> bool:
-        """Whether a person touched any input so lately: then it has the focus, and takes the arrow keys."""
-        return time.monotonic() - Control._last_touch < seconds
+    def took_the_key() -> bool:
+        """For a command of the arrow keys: whether an input that has the focus took the key as well. Sleeps a moment."""
+        time.sleep(KEY_SETTLES)
+        return time.monotonic() - Control._last_touch < 10 * KEY_SETTLES
 
     def show(self, value: T) -> None:
         """Show what the session says, unless someone has their hand on the input; send what settled."""

@@ -28,6 +28,8 @@ WIDER = 1.4
 """A view is wider than it is tall, and depth is foreshortened in it."""
 MARGIN = 0.35
 """Metres between two envs at rest; a robot that reaches out uses some of it."""
+ACTING_MARGIN = np.float32(0.08)
+"""Metres round the frames of robots' links and of things."""
 
 
 @dataclass(frozen=True)
@@ -120,6 +122,27 @@ def lay_out(geometry: SceneGeometry, poses: NDArray[np.float32]) -> EnvLayout:
         floor_height=floor,
         has_floor=bool(floors),
     )
+
+
+def acting_box(
+    geometry: SceneGeometry, poses: NDArray[np.float32], layout: EnvLayout
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Lowest and highest corner, in the env's frame, of what acts: robots, and bodies that can be moved.
+
+    The table and the walls round them are left out, and so is what flies out of the env. All of the env where nothing
+    acts.
+
+    Args:
+        poses: (K, B, 7): of one env at some moments, or of several envs.
+    """
+    acting = [row for row, kind in enumerate(geometry.body_kinds) if kind in ("link", "dynamic")]
+    places = poses[:, acting, :3].reshape(-1, 3)
+    places = places[np.isfinite(places).all(axis=1)]
+    places = np.clip(places, layout.low, layout.high)
+    if not len(places):
+        return layout.low, layout.high
+    # What is known is where their frames are, and they are larger than that.
+    return places.min(axis=0) - ACTING_MARGIN, places.max(axis=0) + ACTING_MARGIN
 
 
 def grid_offsets(num_envs: int, spacing: NDArray) -> NDArray[np.float32]:

@@ -26,6 +26,12 @@ class Framing:
         self._server = server
         self._arrivals: dict[int, float] = {}
         self._pointed: dict[int, tuple[np.ndarray, float]] = {}
+        self._framed: object = None
+
+    def is_new(self, what: object) -> bool:
+        """Whether this is something else than was asked about last: then it is to be framed anew."""
+        new, self._framed = what != self._framed, what
+        return new
 
     def follow(self) -> int:
         """Note which pages are open, and return how many."""

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import viser
-import viser.uplot as uplot
 from numpy.typing import NDArray
 
 from workbench.session.judge import JudgementView
@@ -22,14 +21,14 @@ from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui import judged_in_words as words
 from workbench.ui.changed import fill, show
-from workbench.ui.curves_panel import CURSOR, LONGEST, SELECTED_COLOUR, value_span
+from workbench.ui.curves_panel import LONGEST
 from workbench.ui.fragments import render
 from workbench.ui.presses import Presses
+from workbench.ui.then_and_now import ThenAndNow
 
 REDRAW_EVERY = 0.25
 MOST_ROWS = 8
 """Of the list, at a time."""
-RECORD_COLOUR = "#adb5bd"
 
 
 class JudgementPanel:
@@ -45,8 +44,7 @@ class JudgementPanel:
             visible=False,
             hint="Which number is drawn, as recorded and as the new code has it",
         )
-        self._folder = server.gui.add_folder(None)
-        self._chart: viser.GuiUplotHandle | None = None
+        self._chart = ThenAndNow(server)
         self._list = server.gui.add_html("", visible=False)
         self._presses = Presses(server)
         self._first = 0
@@ -85,31 +83,11 @@ class JudgementPanel:
         curve = self._session.judged_curve(name, view.selected_env) if differs else None
         show(self._name, curve is not None)
         if curve is None or len(curve.tick) < 2:
-            if self._chart is not None:
-                show(self._chart, False)
+            self._chart.hide()
             return
-        data = chart_data(curve, view.timeline.shown)
-        series = SERIES if len(data) == 3 else (*SERIES, CURSOR)
-        scales = {"x": uplot.Scale(time=False), "y": uplot.Scale(range=value_span(data[1:]))}
-        title = f"{name} of env {view.selected_env}, before and now"
-        if self._chart is None:
-            with self._folder:
-                self._chart = self._server.gui.add_uplot(
-                    data,
-                    series,
-                    title=title,
-                    scales=scales,
-                    axes=(uplot.Axis(size=30), uplot.Axis(size=46)),
-                    legend=uplot.Legend(show=True),
-                    height=160,
-                    padding=(6, 12, 0, 0),
-                )
-            return
-        # The data must fit the series in every state that the browser may see.
-        with self._server.atomic():
-            self._chart.series, self._chart.scales, self._chart.title = series, scales, title
-            self._chart.data = data
-        show(self._chart, True)
+        self._chart.draw(
+            f"{name} of env {view.selected_env}, before and now", chart_data(curve, view.timeline.shown)
+        )
 
     # --- the list ------------------------------------------------------------------------------------
 
@@ -179,13 +157,6 @@ class JudgementPanel:
         place = (here + by) % len(listed)
         self._first = place // MOST_ROWS * MOST_ROWS
         self._show_episode(listed[place])
-
-
-SERIES = (
-    uplot.Series(label="step"),
-    uplot.Series(label="as recorded", stroke=RECORD_COLOUR, width=1.2, points={"show": False}),
-    uplot.Series(label="judged again", stroke=SELECTED_COLOUR, width=1.8, points={"show": False}),
-)
 
 
 def chart_data(curve: JudgedCurve, shown: int | None) -> tuple[NDArray[np.float64], ...]:

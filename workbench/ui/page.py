@@ -1,7 +1,6 @@
-"""The page: its parts put together, and the one loop that redraws them.
+"""The page: its parts put together, and redrawn as the session goes on (`redraw_loop`).
 
-The session lives by its own clock and the browsers by theirs. Between them is this loop: it waits
-until the session has something new, takes one immutable snapshot and lets every part compare it with
+Whenever the session has something new, one immutable snapshot is taken, and every part compares it with
 what it drew last. So a part is a function of the snapshot, nothing is sent twice, and callbacks of the
 page, which run in any thread and any order, only ever ask the session for something.
 
@@ -10,9 +9,6 @@ With no page open nothing is drawn, and the session is told so that it renders n
 
 from __future__ import annotations
 
-import logging
-import threading
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -27,20 +23,19 @@ from workbench.ui.camera_frustums import LARGE, SMALL, CameraFrustums, without_t
 from workbench.ui.cameras_panel import CamerasPanel
 from workbench.ui.commands import Command, register
 from workbench.ui.curves_panel import CurvesPanel
-from workbench.ui.env_layout import EnvLayout, env_under_ray, lay_out
+from workbench.ui.env_layout import EnvLayout, acting_box, env_under_ray, lay_out
 from workbench.ui.env_panel import EnvPanel
 from workbench.ui.force_arrows import ForceArrows
 from workbench.ui.fragments import render, style_sheet
-from workbench.ui.framing import Framing
 from workbench.ui.inspect_panel import InspectPanel
 from workbench.ui.judgement_panel import JudgementPanel
-from workbench.ui.lights import light
 from workbench.ui.log_panel import LogPanel
 from workbench.ui.numbers_panel import NumbersPanel
 from workbench.ui.record_panel import RecordPanel
+from workbench.ui.redraw_loop import RedrawLoop, draw_apart
 from workbench.ui.run_panel import RunPanel
-from workbench.ui.scene_view import SceneView
 from workbench.ui.selection_mark import SelectionMark
+from workbench.ui.stage import Stage
 from workbench.ui.status_line import StatusLine
 from workbench.ui.studio_panel import StudioPanel
 from workbench.ui.terms_panel import TermsPanel
@@ -49,14 +44,7 @@ from workbench.ui.timeline_panel import TimelinePanel
 from workbench.ui.version_panel import VersionPanel
 from workbench.ui.view_panel import ViewPanel
 from workbench.ui.viewpoint import FOV, Viewpoint, frame_all, frame_one
-from workbench.ui.viser_seam import wait_until_taken
 
-log = logging.getLogger(__name__)
-
-FRAME = 1 / 30
-"""Seconds. Faster pushes make a browser slower (measured: 350 a second leave it 13 to 30)."""
-SENT_WITHIN = 0.01
-"""Seconds, of the time for a frame, that the view may wait for the panels to be on their way."""
 PANEL_WIDTH = 340
 ENVS_WIDTH = 520
 
@@ -69,6 +57,7 @@ class Page:
         session: What is shown and asked.
         dark: How it begins.
         on_review: Called when a person wants to see the recordings; None leaves the button out.
+        stage: The 3-D view; None makes one.
     """
 
     def __init__(
@@ -77,32 +66,44 @@ class Page:
         session: Session,
         dark: bool = True,
         on_review: Callable[[], None] | None = None,
+        stage: Stage | None = None,
     ) -> None:
         self._server = server
         self._session = session
-        self._stopping = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._on_review = on_review
+        self._loop = RedrawLoop(server, "page", session.wait, lambda: self._count_clients() > 0, self.redraw)
         self._layout: EnvLayout | None = None
         self._scene_serial = -1
         self._built: tuple[bool, int] | None = None
-        self._framed: object = None
         self._waits_for_human = False
-        self._framing = Framing(server)
         self._clients = 0
+        stage = stage or Stage(server)
+        self._scene, self._framing = stage.scene, stage.framing
 
-        server.scene.set_up_direction("+z")
-        light(server)
-        server.initial_camera.fov = FOV
-        # Depth is 24 bit: with viser's near plane of a centimetre a goal that is painted a millimetre
-        # above a table flickers from a few metres on.
-        server.initial_camera.near = 0.05
-        server.initial_camera.far = 300.0
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(PANEL_WIDTH)
         server.gui.set_panel_label("Workbench")
 
         server.gui.add_html(style_sheet())
         self._status = StatusLine(server)
+        run_tab = self._add_tabs(dark)
+        self._timeline = TimelinePanel(server, session)
+        self._add_table_of_envs()
+        self._banner = Banner(server, session.reload, session.restart_worker)
+        self._busy_banner = BusyBanner(server, session.interrupt, session.restart_worker)
+
+        self._mark = SelectionMark(server)
+        self._frustums = CameraFrustums(server, self._on_frustum)
+        self._forces = ForceArrows(server)
+        commands = self._commands()
+        register(server, commands)
+        with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
+            server.gui.add_html(render("keys", commands=commands))
+        server.scene.on_click()(self._on_scene_click)
+
+    def _add_tabs(self, dark: bool) -> viser.GuiTabHandle:
+        """Returns the Run tab, which other parts put something into."""
+        server, session, on_review = self._server, self._session, self._on_review
         tabs = server.gui.add_tab_group()
         run_tab = tabs.add_tab("Run", viser.Icon.PLAYER_PLAY)
         with run_tab:
@@ -122,48 +123,32 @@ class Page:
             self._inspect = InspectPanel(server, session)
         with tabs.add_tab("Episodes", viser.Icon.MOVIE):
             self._record = RecordPanel(server, session)
-            self._on_review = on_review
             if on_review is not None:
                 review = server.gui.add_button("Review recordings", icon=viser.Icon.LIST_DETAILS)
                 review.on_click(lambda _: on_review())
         with tabs.add_tab("Log", viser.Icon.TERMINAL_2):
             self._log = LogPanel(server, session.clear_printed)
-        self._timeline = TimelinePanel(server, session)
-        self._env_window = server.gui.add_panel(order=5.0)
+        return run_tab
+
+    def _add_table_of_envs(self) -> None:
+        self._env_window = self._server.gui.add_panel(order=5.0)
         with self._env_window.add_tab("Envs", viser.Icon.LIST_DETAILS):
-            self._envs = EnvPanel(server, session)
+            self._envs = EnvPanel(self._server, self._session)
         self._env_window.dock_left()
         self._env_window.set_width(ENVS_WIDTH)
         # A strip at the edge until somebody wants it: it takes half of a small screen's view.
         self._env_window.minimize()
         self._envs_open = False
-        self._banner = Banner(server, session.reload, session.restart_worker)
-        self._busy_banner = BusyBanner(server, session.interrupt, session.restart_worker)
-
-        self._scene = SceneView(server)
-        self._mark = SelectionMark(server)
-        self._frustums = CameraFrustums(server, self._on_frustum)
-        self._forces = ForceArrows(server)
-        commands = self._commands()
-        register(server, commands)
-        with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
-            server.gui.add_html(render("keys", commands=commands))
-        server.scene.on_click()(self._on_scene_click)
 
     # --- life ------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Begin to redraw, in a thread of its own."""
-        if self._thread is not None:
-            raise RuntimeError("The page was started already.")
-        self._thread = threading.Thread(target=self._redraw_for_ever, name="page", daemon=True)
-        self._thread.start()
+        """Draw it, and go on with that in a thread of its own."""
+        self._loop.start()
 
     def stop(self) -> None:
         """Stop to redraw; returns when the loop has ended."""
-        self._stopping.set()
-        if self._thread is not None:
-            self._thread.join(timeout=5.0)
+        self._loop.stop()
         # The session may live on under another page, and nobody looks at what it would render.
         self._session.set_clients(0)
 
@@ -171,42 +156,10 @@ class Page:
     def dark(self) -> bool:
         return self._view_panel.dark
 
-    def _redraw_for_ever(self) -> None:
-        seen = -1
-        while not self._stopping.is_set():
-            began = time.monotonic()
-            seen = self._session.wait(seen, timeout=0.1)
-            if self._count_clients():
-                try:
-                    self.redraw()
-                except Exception:
-                    # A page that stands still and looks alive is worse than one that says so.
-                    log.exception("The page could not be drawn; trying again.")
-                    self._say_broken()
-                    self._stopping.wait(1.0)
-            self._stopping.wait(max(0.0, FRAME - (time.monotonic() - began)))
-
-    def _say_broken(self) -> None:
-        for client in self._server.get_clients().values():
-            client.add_notification(
-                "This page could not be drawn",
-                "The reason is in the terminal of the workbench. It is tried again.",
-                color="red",
-                auto_close_seconds=5.0,
-            )
-
     def redraw(self) -> None:
         """Draw the session as it is now."""
         view = self._session.view()
-        # Panels first, and apart: a page takes a batch as a whole, and one with anything of the 3-D view in it waits
-        # for the browser's next frame of that view, which may take long. Numbers and buttons need not.
-        with self._server.atomic():
-            self._draw_panels(view)
-        self._server.flush()
-        wait_until_taken(self._server, SENT_WITHIN)
-        with self._server.atomic():
-            self._draw_scene(view)
-        self._server.flush()
+        draw_apart(self._server, lambda: self._draw_panels(view), lambda: self._draw_scene(view))
 
     def _draw_panels(self, view: SessionView) -> None:
         self._status.draw(view)
@@ -282,9 +235,8 @@ class Page:
         self._forces.draw(self._inspect.forces(view), offset)
         # A scene of another size is framed anew; a reload that keeps the size never moves the view.
         size = np.round(np.concatenate([self._layout.low, self._layout.high]), 0).tobytes()
-        framing = (task.env_id, task.num_envs, one, size)
-        if framing != self._framed:
-            self._framed, self._waits_for_human = framing, alone
+        if self._framing.is_new((task.env_id, 1 if alone else task.num_envs, size)):
+            self._waits_for_human = alone
             self.frame(view)
         if self._waits_for_human and any(kind == "human" for kind, _ in view.pictures):
             # The human camera's place comes with its first picture, after the scene.
@@ -301,7 +253,11 @@ class Page:
         assert self._layout is not None and view.task is not None, "asked only where a scene is drawn"
         if self._view_panel.only_selected or view.task.num_envs == 1:
             human = next((p for (kind, _), p in view.pictures.items() if kind == "human"), None)
-            return frame_one(self._layout, human, aspect, TIMELINE_HEIGHT / height)
+            fovy = next((c.fovy for c in view.task.cameras if human and c.name == human.camera), FOV)
+            acting = None
+            if human is None and view.step is not None:
+                acting = acting_box(view.task.geometry, view.step.poses, self._layout)
+            return frame_one(self._layout, human, aspect, TIMELINE_HEIGHT / height, fovy, acting)
         return frame_all(self._layout, aspect, TIMELINE_HEIGHT / height)
 
     def _on_frustum(self, key: CameraKey) -> None:

@@ -3,7 +3,8 @@
 viser has one page a server, and two sets of panels in it would mean hiding half of everything. So a page is taken
 away whole, handles, commands and all, and the other is built in its place; every browser that is open follows. What
 a page shows lives elsewhere: the session plays and records on while its page is away, and the review keeps what is
-open in it.
+open in it. The bodies in the 3-D view stay (`stage`), and nothing of it is sent before the new page has been drawn
+once: controls that say nothing yet, or something else than is so, are never seen.
 
 Swaps are asked for by buttons and keys of the very pages that they take away. So they are done by a thread of their
 own, one after the other.
@@ -18,13 +19,18 @@ from typing import Literal, Protocol
 
 import viser
 
+from workbench.ui.stage import Stage
+
 log = logging.getLogger(__name__)
 
 Which = Literal["live", "review"]
 
 
 class AnyPage(Protocol):
-    def start(self) -> None: ...
+    def start(self) -> None:
+        """Draw it, and go on with that."""
+        ...
+
     def stop(self) -> None: ...
     @property
     def dark(self) -> bool: ...
@@ -34,11 +40,14 @@ class Pages:
     """
     Args:
         server: Of viser, already behind its door.
+        stage: The 3-D view that the pages share.
         make: Builds a page on the (empty) server: by its name, given whether it is to be dark.
     """
 
-    def __init__(self, server: viser.ViserServer, make: dict[Which, Callable[[bool], AnyPage]]) -> None:
-        self._server, self._make = server, dict(make)
+    def __init__(
+        self, server: viser.ViserServer, stage: Stage, make: dict[Which, Callable[[bool], AnyPage]]
+    ) -> None:
+        self._server, self._stage, self._make = server, stage, dict(make)
         self._wake = threading.Condition()
         self._wish: Which | None = None
         self._shown: Which | None = None
@@ -103,17 +112,14 @@ class Pages:
         dark = self._page.dark if self._page is not None else True
         if self._page is not None:
             self._page.stop()
-            self._clear()
-        self._page = self._make[which](dark)
-        self._page.start()
+        with self._server.atomic():
+            if self._page is not None:
+                # Nothing of the page that went is left: handles, commands, callbacks, nodes.
+                self._stage.clear()
+                self._server.gui.reset()
+            self._page = self._make[which](dark)
+            self._page.start()
+        self._server.flush()
         with self._wake:
             self._shown = which
             self._wake.notify_all()
-
-    def _clear(self) -> None:
-        """Nothing of the page that went is left: handles, commands, callbacks, nodes."""
-        # Callbacks first: a click that comes now is nobody's.
-        self._server.scene.remove_click_callback("all")
-        self._server.gui.reset()
-        self._server.scene.reset()
-        self._server.flush()

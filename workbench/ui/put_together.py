@@ -21,6 +21,7 @@ from workbench.session.recorded_scene import SceneProcess
 from workbench.session.review import Review
 from workbench.ui.pages import Pages
 from workbench.ui.review_page import ReviewOffers, ReviewPage
+from workbench.ui.stage import Stage
 
 if TYPE_CHECKING:
     # What a live env needs is not needed for looking at recordings.
@@ -59,7 +60,8 @@ class Workplace:
         self._mending: threading.Thread | None = None
         self._offers: Callable[[Workplace, ReviewOffers], ReviewOffers] = lambda _, offers: offers
         self.session = session
-        self.pages = Pages(server, {"review": self._review_page})
+        self._stage = Stage(server)
+        self.pages = Pages(server, self._stage, {"review": self._review_page})
         if session is not None:
             self.go_live_with(session)
 
@@ -96,6 +98,12 @@ class Workplace:
         self.session = session
         self.pages.offer("live", self._live_page)
 
+    def task_files(self) -> tuple[Path, ...]:
+        """The task files that this program was started with, or has open."""
+        task = None if self.session is None else self.session.view().task
+        live = () if task is None or task.file is None else (Path(task.file),)
+        return tuple(file.absolute() for file in (*live, *self._tasks))
+
     def offer(self, add: Callable[[Workplace, ReviewOffers], ReviewOffers]) -> None:
         """Let `add` put more into what the review page offers; it is asked whenever that page is built."""
         before = self._offers
@@ -115,7 +123,7 @@ class Workplace:
         from workbench.ui.page import Page
 
         assert self.session is not None, "a live page is offered with its session"
-        return Page(self._server, self.session, dark, on_review=lambda: self.pages.show("review"))
+        return Page(self._server, self.session, dark, lambda: self.pages.show("review"), self._stage)
 
     def _review_page(self, dark: bool) -> ReviewPage:
         shelf = self.shelf
@@ -123,4 +131,6 @@ class Workplace:
         offers = ReviewOffers(
             on_back=(lambda: self.pages.show("live")) if self.pages.can_show("live") else None
         )
-        return ReviewPage(self._server, shelf.review, shelf.library, self._offers(self, offers), dark)
+        return ReviewPage(
+            self._server, shelf.review, shelf.library, self._offers(self, offers), dark, self._stage
+        )

@@ -20,6 +20,7 @@ from workbench.ui.fragments import render
 
 THIS_ENV, ALL_ENVS = "the selected env", "all envs"
 RECORD, NEXT, KEEP = "Record", "Record the next episode", "Keep what I just saw"
+KEEP_BEFORE = "Keep the episode before"
 STOP, STOP_WAITING, STOP_KEEPING = "Stop recording", "Stop waiting", "Stop keeping"
 
 
@@ -49,10 +50,19 @@ class RecordPanel:
             icon=viser.Icon.HISTORY,
             hint="Record after the fact: the episode at the moment that is shown (shift+C)",
         )
+        self._before = server.gui.add_button(
+            KEEP_BEFORE,
+            icon=viser.Icon.PLAYER_TRACK_PREV,
+            color="gray",
+            visible=False,
+            hint="The episode that ended before the one that is shown",
+        )
+        self._about = server.gui.add_html("")
         self._status = server.gui.add_html("")
         self._button.on_click(lambda _: self.toggle())
         self._next.on_click(lambda _: session.start_recording(self._envs, next_episode=True))
         self._keep.on_click(lambda _: self.keep())
+        self._before.on_click(lambda _: session.keep_past(self._envs, before=True))
 
     @property
     def _envs(self) -> tuple[int, ...] | None:
@@ -92,7 +102,41 @@ class RecordPanel:
         _disable(self._keep, view.timeline.moments == 0 and not keeping.active)
         _disable(self._which, not can_record)
         show(self._which, view.task is None or view.task.num_envs > 1)
+        about = what_keeping_means(view, self._which.value == ALL_ENVS)
+        fill(self._about, render("note", text=about) if about and not keeping.active else "")
+        show(self._before, has_one_before(view) and not keeping.active)
         fill(self._status, recording_html(recording))
+
+
+def runs_since(view: SessionView) -> int | None:
+    """Steps of the selected env's episode up to what is shown, if that has not ended there; else None."""
+    step, env = view.step, view.selected_env
+    if step is None or view.timeline.moments == 0 or env >= len(step.elapsed_steps):
+        return None
+    if step.terminated[env] or step.truncated[env] or not step.elapsed_steps[env]:
+        return None
+    return int(step.elapsed_steps[env])
+
+
+def has_one_before(view: SessionView) -> bool:
+    """Whether there are moments before an episode that has not ended."""
+    steps, past = runs_since(view), view.timeline
+    at = past.last if past.shown is None else past.shown
+    return steps is not None and at - past.first > steps
+
+
+def what_keeping_means(view: SessionView, all_envs: bool) -> str:
+    """Which episode *Keep what I just saw* takes, where that is one that has not ended."""
+    steps = runs_since(view)
+    if steps is None or view.task is None:
+        return ""
+    if view.timeline.shown is not None:
+        return f"{KEEP} takes the whole episode round the moment that is shown."
+    count = f"{steps} step{'' if steps == 1 else 's'} so far"
+    if all_envs and view.task.num_envs > 1:
+        return f"{KEEP} takes the episodes that run, ended or not (env {view.selected_env}: {count})."
+    which = "episode" if view.task.num_envs == 1 else f"episode of env {view.selected_env}"
+    return f"{KEEP} takes the {which} that runs: {count}, and not ended."
 
 
 def recording_html(recording: RecordingStatus) -> str:

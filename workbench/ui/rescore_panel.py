@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 import viser
-import viser.uplot as uplot
 
 from workbench.session import rescore_words as words
 from workbench.session.rescore_messages import EpisodeFile, Verdict
@@ -21,15 +20,15 @@ from workbench.session.rescorer import Rescorer, RescoreView
 from workbench.session.review import Review
 from workbench.session.review_view import ReviewView
 from workbench.ui.changed import fill, show
-from workbench.ui.curves_panel import LONGEST, value_span
+from workbench.ui.curves_panel import LONGEST
 from workbench.ui.fragments import render
-from workbench.ui.judgement_panel import SERIES
+from workbench.ui.judged_with import RECORDED, TODAYS, codes_for
 from workbench.ui.presses import Presses
+from workbench.ui.then_and_now import ThenAndNow
 
 REDRAW_EVERY = 0.2
 MOST_ROWS = 10
 """Of the list, at a time."""
-TODAYS, RECORDED = "today's", "as recorded"
 RUNNING = ("loading", "judging")
 
 
@@ -39,6 +38,8 @@ class RescoreChoices:
 
     recorded_source: bool = False
     use_env_states: bool = False
+    file: Path | None = None
+    """Asked before the files that the recordings name."""
 
 
 class RescorePanel:
@@ -50,6 +51,7 @@ class RescorePanel:
         review: Shows the episode of a row, and says what is open.
         find: The files of recordings by their ids in the library; ids that are gone are left out.
         choices: What was chosen before.
+        known: Task files that the server knows of besides those that recordings name.
     """
 
     def __init__(
@@ -59,19 +61,24 @@ class RescorePanel:
         review: Review,
         find: Callable[[Sequence[str]], list[EpisodeFile]],
         choices: RescoreChoices,
+        known: Callable[[], Sequence[Path]] = tuple,
     ) -> None:
         self._server, self._rescorer, self._review = server, rescorer, review
-        self._find, self._choices = find, choices
+        self._find, self._choices, self._known = find, choices, known
         gui = server.gui
         self._begin = gui.add_button("Judge what is open", icon=viser.Icon.GAVEL, visible=False)
         self._begin.on_click(lambda _: self.judge([one.id for one in review.view().opened]))
-        self._code = gui.add_dropdown(
+        self._codes = codes_for((), ())
+        self._codes_of: object = None
+        labels = tuple(code.label for code in self._codes)
+        self._code: viser.GuiDropdownHandle = gui.add_dropdown(
             "Code",
-            (TODAYS, RECORDED),
+            labels,
             initial_value=RECORDED if choices.recorded_source else TODAYS,
-            hint="Today's code of the task, or the text that the recording was made with",
+            hint="Today's code of the task, the text that the recording was made with, or a task file that is open here",
         )
         self._code.on_update(lambda _: self._chosen())
+        self._told = gui.add_html("")
         self._states = gui.add_checkbox(
             "Recorded states",
             choices.use_env_states,
@@ -83,8 +90,7 @@ class RescorePanel:
         self._status = gui.add_html("")
         self._list = gui.add_html("")
         self._presses = Presses(server)
-        self._folder = gui.add_folder(None)
-        self._chart: viser.GuiUplotHandle | None = None
+        self._chart = ThenAndNow(server)
         self._first = 0
         self._listed: list[Verdict] = []
         self._selected: str | None = None
@@ -97,18 +103,21 @@ class RescorePanel:
         self._first, self._selected = 0, None
         self._rescorer.start(
             files,
+            file=self._choices.file,
             recorded_source=self._choices.recorded_source,
             use_env_states=self._choices.use_env_states,
         )
 
     def _chosen(self) -> None:
         # What a page sends as its choice may be anything.
-        self._choices.recorded_source = self._code.value == RECORDED
+        code = next((code for code in self._codes if code.label == self._code.value), self._codes[0])
+        self._choices.recorded_source, self._choices.file = code.recorded, code.file
         self._choices.use_env_states = self._states.value is True
 
     # --- drawing -----------------------------------------------------------------------------------
 
     def draw(self, view: ReviewView) -> None:
+        self._draw_codes(view)
         told = self._rescorer.view
         wanted = (told.serial, view.opened_serial, view.selected, self._first, self._selected)
         if wanted == self._drawn or time.monotonic() - self._drawn_at < REDRAW_EVERY:
@@ -121,6 +130,32 @@ class RescorePanel:
         self._listed = in_order(told.verdicts)
         self._draw_list()
         self._draw_chart()
+
+    def _draw_codes(self, view: ReviewView) -> None:
+        known = tuple(self._known())
+        wanted = (
+            tuple(one.id for one in view.opened),
+            known,
+            self._choices.recorded_source,
+            self._choices.file,
+        )
+        if wanted == self._codes_of:
+            return
+        self._codes_of = wanted
+        self._codes = codes_for([one.episode.info for one in view.opened], known)
+        choices = self._choices
+        of_choice = [
+            c for c in self._codes if (c.recorded, c.file) == (choices.recorded_source, choices.file)
+        ]
+        chosen = of_choice[0] if of_choice else self._codes[0]
+        # What is not among the choices any more is not judged with, unseen.
+        choices.recorded_source, choices.file = chosen.recorded, chosen.file
+        labels = tuple(code.label for code in self._codes)
+        if self._code.options != labels:
+            self._code.options = labels
+        if self._code.value != chosen.label:
+            self._code.value = chosen.label
+        fill(self._told, render("note", text=chosen.told))
 
     def _draw_list(self) -> None:
         count = len(self._listed)
@@ -179,8 +214,7 @@ class RescorePanel:
     def _draw_chart(self) -> None:
         chosen = next((v for v in self._listed if v.file.id == self._selected), None)
         if chosen is None or len(chosen.new_reward) < 2:
-            if self._chart is not None:
-                show(self._chart, False)
+            self._chart.hide()
             return
         end = min(len(chosen.new_reward), len(chosen.old_reward))
         if chosen.first_difference is not None:
@@ -188,24 +222,8 @@ class RescorePanel:
         part = slice(max(0, end - LONGEST), end)
         steps = np.arange(1, len(chosen.new_reward) + 1, dtype=np.float64)[part]
         data = (steps, *(np.asarray(v[part], np.float64) for v in (chosen.old_reward, chosen.new_reward)))
-        scales = {"x": uplot.Scale(time=False), "y": uplot.Scale(range=value_span(data[1:]))}
         title = f"reward of {f'seed {chosen.seed}' if chosen.seed >= 0 else chosen.file.name}, then and now"
-        if self._chart is None:
-            with self._folder:
-                self._chart = self._server.gui.add_uplot(
-                    data,
-                    SERIES,
-                    title=title,
-                    scales=scales,
-                    axes=(uplot.Axis(size=30), uplot.Axis(size=46)),
-                    legend=uplot.Legend(show=True),
-                    height=160,
-                    padding=(6, 12, 0, 0),
-                )
-            return
-        with self._server.atomic():
-            self._chart.scales, self._chart.title, self._chart.data = scales, title, data
-        show(self._chart, True)
+        self._chart.draw(title, data)
 
 
 def in_order(verdicts: Sequence[Verdict]) -> list[Verdict]:

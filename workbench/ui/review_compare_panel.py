@@ -35,6 +35,14 @@ class ReviewComparePanel:
         self._other: viser.GuiDropdownHandle = gui.add_dropdown(
             "A against", ("B",), initial_value="B", visible=False
         )
+        self._swap = gui.add_button(
+            "Swap",
+            icon=viser.Icon.ARROWS_EXCHANGE,
+            color="gray",
+            visible=False,
+            hint="A becomes the other one",
+        )
+        self._swap.on_click(lambda _: self._change_places())
         self._tolerance = gui.add_dropdown(
             "Moved from",
             tuple(TOLERANCE_NAMES),
@@ -57,6 +65,10 @@ class ReviewComparePanel:
             self._other.value = before if before in letters else letters[0]
         show(self._other, len(letters) > 1)
         show(self._tolerance, several)
+        show(self._swap, several)
+        label = f"Swap A and {self._other.value}" if len(letters) > 1 else "Swap A and B"
+        if self._swap.label != label:
+            self._swap.label = label
         if not several:
             self._drawn = None
             fill(self._html, render("note", text="Open two recordings, and this says where they part."))
@@ -104,6 +116,12 @@ class ReviewComparePanel:
             "most": parting.most,
             "press": press,
         }
+
+    def _change_places(self) -> None:
+        count = len(self._review.view().opened)
+        letters = [letter(index) for index in range(count)]
+        if self._other.value in letters[1:]:
+            self._review.exchange(0, letters.index(self._other.value))
 
     def _go(self, number: int) -> None:
         if number in self._places:

@@ -28,7 +28,7 @@ from workbench.ui.review_scene import COLOURS, letter
 from workbench.ui.terms_panel import COLOURS as LINE_COLOURS
 
 REDRAW_EVERY = 0.15
-_NUMBERS_EVERY = 0.12
+_NUMBERS_EVERY = 0.09
 Lines = dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
 
 

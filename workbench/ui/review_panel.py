@@ -24,7 +24,7 @@ from workbench.ui.review_scene import COLOURS, letter
 
 SPEED_NAMES = {f"{speed:g} ×": speed for speed in SPEEDS}
 GHOSTS, GRID = "over each other", "side by side"
-GO_LIVE = "Go on live from here"
+GO_LIVE, STAY = "Go on live from here", "Stay here"
 
 
 class ReviewPanel:
@@ -33,7 +33,7 @@ class ReviewPanel:
         server: The page.
         review: What is shown and asked.
         on_step_back: Called with the id of the selected recording and the state that is shown, when a person wants to
-            go on from there live; None leaves the button out.
+            go on from there live, and again when they would rather stay; None leaves the button out.
     """
 
     def __init__(
@@ -100,11 +100,18 @@ class ReviewPanel:
         if view.opened:
             self._review.select((view.selected + step) % len(view.opened))
 
-    def draw(self, view: ReviewView) -> None:
+    def draw(self, view: ReviewView, going: bool = False) -> None:
+        """
+        Args:
+            going: Whether the live env is being waited for.
+        """
         there = bool(view.opened)
         for handle in (self._play, self._speed.handle, self._loop.handle):
             show(handle, there)
         show(self._live, there and self._on_step_back is not None)
+        live = STAY if going else GO_LIVE
+        if self._live.label != live:
+            self._live.label = live
         label = "Pause" if view.playing else "Play"
         if self._play.label != label:
             self._play.label = label

@@ -6,8 +6,6 @@ nothing is added to it. With several recordings each has a line of its own on th
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import viser
 
@@ -17,10 +15,9 @@ from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_int
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
+from workbench.ui.over_the_view import GAP, FitsTheView
 from workbench.ui.review_scene import COLOURS, letter
 from workbench.ui.timeline_panel import (
-    GAP,
-    KEY_SETTLES,
     LAST_EVENT,
     LAST_STEP,
     NARROWEST,
@@ -32,7 +29,6 @@ from workbench.ui.timeline_strip import MOST_MARKS, reward_lines
 
 PLAY, PAUSE = "play", "pause"
 FIRST, LAST = "first", "last"
-REDRAW_EVERY = 0.1
 NAMES = {
     "success": "success",
     "fail": "fail",
@@ -57,30 +53,25 @@ class ReviewTimeline:
             self._walk = gui.add_button_group("", walk(False))
         self._walk.on_click(lambda event: self._on_walk(event.target.value))
         self._panel.float(x=GAP, y=-GAP, width=WIDEST)
-        self._width = WIDEST
+        self._fits = FitsTheView(server, self._panel, WIDEST, NARROWEST)
         self._ends = (0, 1)
         self._shown = 0
         self._before_slider = 0
         self._drawn: object = None
-        self._drawn_at = 0.0
         self._fixed: tuple[object, dict[str, object]] = (None, {})
 
     # --- what buttons and keys do --------------------------------------------------------------------
 
     def step_by(self, steps: int) -> None:
         """An arrow key."""
-        if not self._slider_took_it():
+        if not Control.took_the_key():
             self._review.seek_by(steps)
 
     def to_event(self, direction: int) -> None:
         """An arrow key with shift; what a slider that has the focus made of it is taken back."""
-        if self._slider_took_it():
+        if Control.took_the_key():
             self._review.seek(self._before_slider)
         self._review.seek_event(direction)
-
-    def _slider_took_it(self) -> bool:
-        time.sleep(KEY_SETTLES)
-        return Control.touched_within(10 * KEY_SETTLES)
 
     def _seek(self, value: int) -> None:
         self._before_slider = self._shown
@@ -104,7 +95,7 @@ class ReviewTimeline:
         show(self._panel, bool(view.opened))
         if not view.opened:
             return
-        self._fit_views()
+        self._fits.fit()
         self._shown = view.position
         handle = self._slider.handle
         low, high = view.first, max(view.last, view.first + 1)
@@ -116,21 +107,13 @@ class ReviewTimeline:
         if self._walk.options != walk(view.playing):
             self._walk.options = walk(view.playing)
         wanted = (view.position, view.selected, view.opened_serial, view.anchors, view.align)
-        if wanted == self._drawn or time.monotonic() - self._drawn_at < REDRAW_EVERY:
+        if wanted == self._drawn:
             return
-        self._drawn, self._drawn_at = wanted, time.monotonic()
+        self._drawn = wanted
         # Only the cursor and the words follow the position.
         if self._fixed[0] != wanted[1:]:
             self._fixed = (wanted[1:], strip_values(view))
         fill(self._strip, render("review_timeline", **self._fixed[1], **cursor_values(view)))
-
-    def _fit_views(self) -> None:
-        views = [client.camera.image_width for client in self._server.get_clients().values()]
-        narrowest = min((width for width in views if width > 0), default=WIDEST)
-        width = int(min(max(narrowest - 2 * GAP, NARROWEST), WIDEST))
-        if width != self._width:
-            self._width = width
-            self._panel.set_width(width)
 
 
 def walk(playing: bool) -> tuple[str, ...]:

@@ -23,6 +23,9 @@ from workbench.core.shared_shapes import fingerprint
 from workbench.ui.env_layout import EnvLayout, place_of_plane, plane_normal
 from workbench.ui.meshes_as_glb import WornTogether, as_glb, face_limit, group_by_wearers
 
+NAMES = ("/envs", "/floor")
+"""Below which all of it is in viser's tree."""
+
 
 class SceneView:
     """The batched nodes of one scene under ``/envs``."""

@@ -2,7 +2,7 @@
 
 Where the task of the recording is open already, its selected env (or all) is put into the recorded state. Where it is
 not, or where the recorded text is wanted, another session is opened for it beside the one that is open, which goes on as it
-is and can be gone back to. Sessions that are opened here are closed here, with the folder of a recorded text.
+is and can be gone back to. The review stays until the live env is there (`going_live`). Sessions that are opened here are closed here, with the folder of a recorded text.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from workbench.session.step_back import (
 )
 from workbench.ui.changed import fill, show
 from workbench.ui.fragments import render
+from workbench.ui.going_live import GoingLive, begin_to_go
 from workbench.ui.put_together import Workplace
 from workbench.ui.rescore_panel import RescoreChoices, RescorePanel
 from workbench.ui.review_page import Places, ReviewOffers
@@ -57,9 +58,13 @@ class StepIn:
         self._own: tuple[Session, Path | None] | None = None
         self.recorded_source, self.everywhere = False, False
         self._server: viser.ViserServer | None = None
+        self._going: GoingLive | None = None
 
     def go(self, id: str, state: int) -> None:
-        """Go on live from a state of an opened recording."""
+        """Go on live from a state of an opened recording; on the way there, stay in the review after all."""
+        if self._going is not None:
+            self._going = None
+            return
         review = self._place.shelf.review.view()
         one = next((one for one in review.opened if one.id == id), None)
         if one is None:
@@ -85,13 +90,23 @@ class StepIn:
         except CannotStepIn as error:
             self._say(str(error))
             return
-        session.step_back(run, self.everywhere)
         self._place.go_live_with(session)
-        self._place.pages.show("live")
+        self._going = begin_to_go(session, run, self.everywhere, info.task, state)
+
+    def going(self) -> str:
+        """What is waited for on the way to the live env; empty while nobody is on it."""
+        going = self._going
+        return "" if going is None else going.words(going.session.view())
+
+    def change_pages_when_there(self) -> None:
+        going = self._going
+        if going is not None and going.is_over(going.session.view()):
+            self._going = None
+            self._place.pages.show("live")
 
     def part(self, server: viser.ViserServer, places: Places) -> StepInPart:
         """The choices, for the review page."""
-        self._server = server
+        self._server, self._going = server, None
         with places.review:
             return StepInPart(server, self)
 
@@ -171,6 +186,7 @@ class StepInPart:
         self._home.on_click(lambda _: step_in.go_home())
 
     def draw(self, view: ReviewView) -> None:
+        self._step_in.change_pages_when_there()
         home = self._step_in.can_go_home()
         show(self._folder, bool(view.opened) or home)
         show(self._home, home)
@@ -213,6 +229,7 @@ class Judging:
                 shelf.review,
                 lambda ids: episode_files(shelf.library, ids),
                 self._choices,
+                self._place.task_files,
             )
         return self._panel
 
@@ -256,6 +273,7 @@ def offer_going_back_in(
         return replace(
             offers,
             on_step_back=step_in.go,
+            going=step_in.going,
             on_rescore=judging.judge,
             parts=(*offers.parts, step_in.part, judging.part),
         )

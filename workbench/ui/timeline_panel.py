@@ -22,11 +22,10 @@ from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_int
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
+from workbench.ui.over_the_view import GAP, FitsTheView
 from workbench.ui.timeline_strip import strip_values
 
 WIDEST, NARROWEST = 760, 280
-GAP = 12
-"""Pixels, as of the banner."""
 HEIGHT = 205
 """Pixels of the view that it lies over, for whoever frames a scene."""
 REDRAW_EVERY = 0.2
@@ -34,8 +33,6 @@ RANGE_EVERY = 0.5
 """Seconds. A slider whose ends move at every step cannot be held."""
 STANDS_STILL = 0.35
 """Seconds at one moment after which its pictures are drawn: less, and every drag would draw some."""
-KEY_SETTLES = 0.03
-"""Seconds. A slider that has the focus takes the arrows too, and what it says comes in any order with the key."""
 LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, NOW = "‹ event", "‹ step", "step ›", "event ›", "now"
 EPISODE, EVERYTHING = "zoom to episode", "zoom out"
 SCOPES: tuple[Scope, ...] = ("this", "all", "into all")
@@ -66,7 +63,7 @@ class TimelinePanel:
         self._travel.on_click(lambda event: self._on_travel(event.target.value))
         # Across the bottom of the view: viser docks panels at the sides only.
         self._panel.float(x=GAP, y=-GAP, width=WIDEST)
-        self._width = WIDEST
+        self._fits = FitsTheView(server, self._panel, WIDEST, NARROWEST)
         self._episode_only = False
         self._range = (0, 0)
         """Serials of the slider's ends."""
@@ -83,12 +80,12 @@ class TimelinePanel:
 
     def step_by(self, steps: int) -> None:
         """An arrow key."""
-        if not self._slider_took_it():
+        if not Control.took_the_key():
             self._session.seek_by(steps)
 
     def to_event(self, direction: int) -> None:
         """An arrow key with shift; what a slider that has the focus made of it is taken back."""
-        if self._slider_took_it():
+        if Control.took_the_key():
             self._session.seek(self._before_slider)
         self._session.seek_event(direction)
 
@@ -101,10 +98,6 @@ class TimelinePanel:
 
     def go_on(self) -> None:
         self._session.go_on("this")
-
-    def _slider_took_it(self) -> bool:
-        time.sleep(KEY_SETTLES)
-        return Control.touched_within(10 * KEY_SETTLES)
 
     def _seek(self, value: int) -> None:
         self._before_slider = self._shown
@@ -137,7 +130,7 @@ class TimelinePanel:
         if not there or view.task is None:
             return
         self._shown = past.shown
-        self._fit_views()
+        self._fits.fit()
         self._draw_slider(view)
         self._draw_buttons(view)
         self._draw_strip(view)
@@ -194,14 +187,6 @@ class TimelinePanel:
             self._stood = (at, time.monotonic())
         elif view.timeline.wants_pictures and time.monotonic() - self._stood[1] > STANDS_STILL:
             self._session.draw_past()
-
-    def _fit_views(self) -> None:
-        views = [client.camera.image_width for client in self._server.get_clients().values()]
-        narrowest = min((width for width in views if width > 0), default=WIDEST)
-        width = int(min(max(narrowest - 2 * GAP, NARROWEST), WIDEST))
-        if width != self._width:
-            self._width = width
-            self._panel.set_width(width)
 
 
 def go_on_labels(view: SessionView) -> tuple[str, ...]:

@@ -73,14 +73,38 @@ def frame_all(layout: EnvLayout, aspect: float = USUAL_ASPECT, covered: float = 
 
 
 def frame_one(
-    layout: EnvLayout, picture: Picture | None, aspect: float = USUAL_ASPECT, covered: float = 0.0
+    layout: EnvLayout,
+    picture: Picture | None,
+    aspect: float = USUAL_ASPECT,
+    covered: float = 0.0,
+    fovy: float = FOV,
+    acting: tuple[NDArray, NDArray] | None = None,
 ) -> Viewpoint:
-    """The view of one env at the origin: the task's own human camera where there is one."""
+    """The view of one env at the origin, above what is covered.
+
+    It is what the task's own human camera sees, where there is one: from its direction, as far away as makes its
+    picture as high (and wide) as what is left of the view, and so that the middle of the picture is in the middle of that.
+
+    Args:
+        picture: Of the human camera; only its pose is looked at.
+        covered: As of `frame_box`.
+        fovy: The human camera's vertical field of view, radians.
+        acting: Box of what is to be seen where there is no human camera; None takes all that stands in the env.
+    """
     if picture is None:
-        return frame_box(layout.low, layout.high, aspect, covered)
+        low, high = (layout.low, layout.high) if acting is None else acting
+        return frame_box(low, high, aspect, covered)
+    covered = float(np.clip(covered, 0.0, MOST_COVERED))
     position = picture.pose[:3].astype(np.float64)
     forward = rotate(picture.pose[3:].astype(np.float64), np.array([1.0, 0.0, 0.0]))
     centre = (layout.low + layout.high) / 2
     # The page turns about what it looks at, so that has to be at the depth of the env.
     depth = max(float((centre - position) @ forward), 0.2)
-    return Viewpoint(position=position, look_at=position + forward * depth)
+    tall = float(np.tan(FOV / 2))
+    left = min(1 - covered, float(np.clip(aspect, 0.3, 4.0)))
+    away = depth * float(np.tan(fovy / 2)) / (tall * left)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    length = float(np.linalg.norm(right))
+    up = np.cross(right / length, forward) if length > 1e-6 else np.zeros(3)
+    look_at = position + forward * depth - up * covered * tall * away
+    return Viewpoint(position=look_at - forward * away, look_at=look_at)

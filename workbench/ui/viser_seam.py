@@ -91,6 +91,7 @@ PRIVATE_ATTRIBUTES = (
     "_websock_server._server_thread",
     "_websock_server._broadcast_buffer.message_counter",
     "_websock_server._broadcast_buffer.generator_cursors",
+    "scene._handle_from_node_name",
 )
 """Attributes of a `viser.ViserServer` that this module relies on."""
 
@@ -129,6 +130,15 @@ def wait_until_taken(server: viser.ViserServer, patience: float) -> None:
         if time.monotonic() > end:
             return
         time.sleep(0.0005)
+
+
+def remove_nodes_but(server: viser.ViserServer, kept: tuple[str, ...]) -> None:
+    """Remove every node of the 3-D view but those at and below these names, as ``scene.reset`` removes all."""
+    for name, handle in list(server.scene._handle_from_node_name.items()):
+        stays = name == "/WorldAxes" or any(name == root or name.startswith(f"{root}/") for root in kept)
+        # A child goes with its parent.
+        if not stays and not handle._impl.removed:
+            handle.remove()
 
 
 def _missing(root: object, dotted: tuple[str, ...]) -> list[str]:

@@ -1,0 +1,32 @@
+from __future__ import annotations
+
+import viser
+
+from tests.ui.scenes import table_scene
+from workbench.ui.env_layout import lay_out
+from workbench.ui.stage import Stage
+
+
+def test_bodies_and_light_outlive_a_page_and_nothing_else_does(server: viser.ViserServer) -> None:
+    stage = Stage(server)
+    geometry, poses = table_scene(2)
+    layout = lay_out(geometry, poses)
+    stage.scene.build(geometry, layout, poses)
+    bodies = stage.scene.handles
+    label = server.scene.add_label("/labels/0", "A")
+    server.scene.add_frame("/labels/0/below")
+    stage.clear()
+    assert label._impl.removed and not any(body._impl.removed for body in bodies)
+    names = set(server.scene._handle_from_node_name)
+    assert {name.split("/")[1] for name in names if name} <= {"envs", "floor", "lights", "WorldAxes"}
+    assert any(name.startswith("/lights/") for name in names)
+    # The next page draws the same: nothing of it is sent again.
+    stage.scene.build(geometry, layout, poses)
+    assert stage.scene.handles == bodies
+
+
+def test_where_one_looks_from_stays_while_the_same_is_seen(server: viser.ViserServer) -> None:
+    framing = Stage(server).framing
+    assert framing.is_new(("Push-v1", 1))
+    assert not framing.is_new(("Push-v1", 1))
+    assert framing.is_new(("Push-v1", 4))
