@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.session.recordings import made, poses_of, write
+from workbench.core.shared_shapes import SharedShapes
 from workbench.recording.episode import Episode
 from workbench.recording.library import Library
 from workbench.recording.read_episode import UnreadableRecording
@@ -46,7 +47,7 @@ class Shelf:
     def rows(self) -> list[Row]:
         return [Row(id, self.extra.get(id, ())) for id in self.episodes]
 
-    def read(self, row: Row) -> Episode:
+    def read(self, row: Row, shapes: SharedShapes) -> Episode:
         found = self.episodes[row.id]
         if isinstance(found, Exception):
             raise found

@@ -60,14 +60,14 @@ class Shelf(Protocol):
     def rows(self) -> Sequence[Row]: ...
 
 
-def read_row(row: Row) -> Episode:
-    """The recording of a row. Raises as `read_episode`."""
+def read_row(row: Row, shapes: SharedShapes | None = None) -> Episode:
+    """The recording of a row, with those shapes where it looks the same. Raises as `read_episode`."""
     if row.kind == "lerobot" and row.trajectory is not None:
         return read_lerobot(row.paths[0].parents[1], int(row.trajectory))
     if row.trajectory is not None:
         # The library opens it by its .json, which is where the words are.
         return read_maniskill(row.paths[0].with_suffix(".h5"), row.trajectory)
-    return read_episode(row.paths[0])
+    return read_episode(row.paths[0], shapes)
 
 
 def shared(episode: Episode, shapes: SharedShapes) -> Episode:
@@ -101,14 +101,14 @@ class Review:
     def __init__(
         self,
         library: Shelf,
-        read: Callable[[Row], Episode] = read_row,
+        read: Callable[[Row, SharedShapes], Episode] = read_row,
         make_scene: SceneMaker | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """
         Args:
             library: knows recordings by their ids.
-            read: reads the recording of a row; raises OSError or UnreadableRecording with a sentence.
+            read: reads the recording of a row, with shapes of others; raises OSError or UnreadableRecording with a sentence.
             make_scene: for recordings without a scene; None leaves them without.
             clock: seconds.
         """
@@ -205,7 +205,7 @@ class Review:
                 self._change(loading=_opening_words(rows, done))
             stamps = {path: (row.name, _stamp(path)) for path in row.paths}
             try:
-                episode = shared(self._read(row), shapes)
+                episode = shared(self._read(row, shapes), shapes)
                 opened.append(Opened(row.id, row.name, episode, happenings(episode)))
                 files.update(stamps)
             except (OSError, UnreadableRecording) as error:
