@@ -81,7 +81,7 @@ def test_what_a_press_changes_on_the_panels_comes_apart_from_the_view(
 ) -> None:
     # A browser applies a batch with anything of the view in it at its next frame of the view, which may take long.
     wait_until(page._session, lambda view: view.task is not None, "the load")
-    monkeypatch.setattr("workbench.ui.page.SENT_WITHIN", 10.0)
+    monkeypatch.setattr("workbench.ui.drawn_apart.SENT_WITHIN", 10.0)
     page._session.select_env(0)
     page.redraw()
     address, options = handshake(f"http://127.0.0.1:{page._server.get_port()}")

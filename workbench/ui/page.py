@@ -27,6 +27,7 @@ from workbench.ui.camera_frustums import LARGE, SMALL, CameraFrustums, without_t
 from workbench.ui.cameras_panel import CamerasPanel
 from workbench.ui.commands import Command, register
 from workbench.ui.curves_panel import CurvesPanel
+from workbench.ui.drawn_apart import draw_apart
 from workbench.ui.env_layout import EnvLayout, env_under_ray, lay_out
 from workbench.ui.env_panel import EnvPanel
 from workbench.ui.force_arrows import ForceArrows
@@ -49,14 +50,11 @@ from workbench.ui.timeline_panel import TimelinePanel
 from workbench.ui.version_panel import VersionPanel
 from workbench.ui.view_panel import ViewPanel
 from workbench.ui.viewpoint import FOV, Viewpoint, frame_all, frame_one
-from workbench.ui.viser_seam import wait_until_taken
 
 log = logging.getLogger(__name__)
 
 FRAME = 1 / 30
 """Seconds. Faster pushes make a browser slower (measured: 350 a second leave it 13 to 30)."""
-SENT_WITHIN = 0.01
-"""Seconds, of the time for a frame, that the view may wait for the panels to be on their way."""
 PANEL_WIDTH = 340
 ENVS_WIDTH = 520
 
@@ -198,15 +196,7 @@ class Page:
     def redraw(self) -> None:
         """Draw the session as it is now."""
         view = self._session.view()
-        # Panels first, and apart: a page takes a batch as a whole, and one with anything of the 3-D view in it waits
-        # for the browser's next frame of that view, which may take long. Numbers and buttons need not.
-        with self._server.atomic():
-            self._draw_panels(view)
-        self._server.flush()
-        wait_until_taken(self._server, SENT_WITHIN)
-        with self._server.atomic():
-            self._draw_scene(view)
-        self._server.flush()
+        draw_apart(self._server, lambda: self._draw_panels(view), lambda: self._draw_scene(view))
 
     def _draw_panels(self, view: SessionView) -> None:
         self._status.draw(view)

@@ -122,6 +122,7 @@ class RerunView:
         self._lock = threading.Lock()
         self._problem = ""
         self._waiting = False
+        self._drawn: object = None
         self._button = server.gui.add_button("Open in rerun", icon=viser.Icon.APP_WINDOW, disabled=True)
         self._words = server.gui.add_html("")
         self._button.on_click(lambda _: self.open())
@@ -133,6 +134,10 @@ class RerunView:
         disabled = not self._paths or self._waiting
         if self._button.disabled != disabled:
             self._button.disabled = disabled
+        wanted = (self._paths, self._chosen, self._waiting, self._problem)
+        if wanted == self._drawn:
+            return
+        self._drawn = wanted
         words = render(
             "rerun",
             address=self._pages.address(self._paths) if self._paths else None,

@@ -30,9 +30,11 @@ from workbench.ui.camera_frustums import SMALL, CameraFrustums, without_the_view
 from workbench.ui.cameras_panel import CamerasPanel
 from workbench.ui.changed import fill
 from workbench.ui.commands import Command, register
+from workbench.ui.drawn_apart import draw_apart
 from workbench.ui.env_layout import env_under_ray
 from workbench.ui.fragments import render, style_sheet
 from workbench.ui.framing import Framing
+from workbench.ui.ground_numbers import GroundNumbers
 from workbench.ui.library_panel import LibraryPanel
 from workbench.ui.lights import light
 from workbench.ui.review_as_session import as_session_view
@@ -128,8 +130,6 @@ class ReviewPage:
         self._drawn_scene: ReviewScene | None = None
         self._scene_of: object = None
         self._framed: object = None
-        self._labels: list[viser.LabelHandle] = []
-        self._labelled: object = None
         self._had_opened = tuple(one.id for one in review.view().opened)
         self._status_at = 0.0
         self._built_for = 0
@@ -191,6 +191,7 @@ class ReviewPage:
 
         self._scene = SceneView(server)
         self._mark = SelectionMark(server)
+        self._numbers = GroundNumbers(server)
         self._frustums = CameraFrustums(server)
         commands = [*self._commands(offers), *offers.commands]
         if self._library is not None:
@@ -250,9 +251,9 @@ class ReviewPage:
         """Draw the review as it is now."""
         view = self._review.view()
         self._take_pictures(view)
-        with self._server.atomic():
-            self._draw_scene(view)
-        self._server.flush()
+        draw_apart(self._server, lambda: self._draw_panels(view), lambda: self._draw_scene(view))
+
+    def _draw_panels(self, view: ReviewView) -> None:
         self._make_way_for_the_first(view)
         if time.monotonic() - self._status_at >= STATUS_EVERY:
             self._status_at = time.monotonic()
@@ -327,7 +328,7 @@ class ReviewPage:
             self._scene.clear()
             self._mark.clear()
             self._frustums.clear()
-            self._draw_labels(view, None)
+            self._draw_numbers(view, None)
             self._framed = None
             return
         if self._built_for != self._view_panel.triangles:
@@ -335,7 +336,7 @@ class ReviewPage:
         self._scene.move(scene.poses(view.states), scene.layout, None)
         in_grid = len(view.opened) > 1 and not scene.ghosts
         self._mark.draw(scene.layout, view.selected, shown=in_grid, name=caption(view, view.selected))
-        self._draw_labels(view, scene if in_grid else None)
+        self._draw_numbers(view, scene if in_grid else None)
         self._draw_frustums(view, scene)
         size = np.round(np.concatenate([scene.layout.low, scene.layout.high]), 0).tobytes()
         framing = (len(view.opened), scene.ghosts, size)
@@ -363,27 +364,13 @@ class ReviewPage:
             self._reader.cameras(chosen.episode), pictures, scene.layout.offsets[view.selected], SMALL
         )
 
-    def _draw_labels(self, view: ReviewView, scene: ReviewScene | None) -> None:
+    def _draw_numbers(self, view: ReviewView, scene: ReviewScene | None) -> None:
         """The names of those that are not selected; the selected one's is on its frame."""
-        wanted = (view.opened_serial, view.selected, None if scene is None else id(scene))
-        if wanted == self._labelled:
-            return
-        self._labelled = wanted
-        for label in self._labels:
-            label.remove()
-        self._labels = []
         if scene is None:
+            self._numbers.clear()
             return
-        for index in range(len(view.opened)):
-            if index != view.selected:
-                x = scene.layout.high[0] + scene.layout.offsets[index][0]
-                y = (scene.layout.low[1] + scene.layout.high[1]) / 2 + scene.layout.offsets[index][1]
-                z = max(scene.layout.floor_height, min(0.0, float(scene.layout.high[2]))) + 0.01
-                self._labels.append(
-                    self._server.scene.add_label(
-                        f"/labels/{index}", letter(index), position=(x, y, z), anchor="top-center"
-                    )
-                )
+        names = ("" if index == view.selected else letter(index) for index in range(len(view.opened)))
+        self._numbers.draw(scene.layout, tuple(names))
 
     def frame(self) -> None:
         """Point every open page, and those to come, at the scene."""
