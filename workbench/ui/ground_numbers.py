@@ -1,7 +1,9 @@
-"""What stands where, written on the ground before each place of the grid, all as one thing to draw.
+"""What stands where, on a plate before each place of the grid, all as one thing to draw.
 
-A label of viser's is text that is laid out anew at every frame of the view: with sixty of them the browser draws little
-else. So the words are painted into one picture, and each place has a rectangle of the ground that shows its part of it.
+A label of viser's is text that is laid out anew at every frame of the view: with sixty of them the browser draws half
+as often (measured). So the words are painted into one picture, and each place has a plate that shows its part of it.
+Plates lean back below the edge of a table, where they hide nothing and face whoever looks at the grid as it is framed
+at first; where the ground is at that height they lie on it.
 """
 
 from __future__ import annotations
@@ -19,13 +21,15 @@ from trimesh.visual.material import PBRMaterial
 
 from workbench.ui.env_layout import MARGIN, EnvLayout
 
-DEPTH = 0.85 * MARGIN
+DEPTH = MARGIN
 """Metres of the way between two places that the words take."""
 _PIXELS = 64
 """How high a word is painted."""
-_WIDE = 2
+_WIDE = 1.5
 """Times as wide as high."""
-_PLATE, _INK = (240, 240, 240, 255), (25, 25, 25, 255)
+LEAN = 0.55
+"""Metres that the lower edge of a plate is below its upper one."""
+_PLATE, _INK = (240, 240, 240), (10, 10, 10)
 
 
 class GroundNumbers:
@@ -62,9 +66,10 @@ def ground_glb(layout: EnvLayout, words: Sequence[str]) -> bytes:
     places = [index for index, word in enumerate(words) if word]
     # Where the selection's frame lies: on the ground it would be hidden by the tables in front.
     z = max(layout.floor_height, min(0.0, float(layout.high[2]))) + 0.01
-    x = float(layout.high[0]) + (MARGIN - DEPTH) / 2
-    y = float(layout.low[1] + layout.high[1]) / 2
+    x = float(layout.high[0])
     half = DEPTH * _WIDE / 2
+    # At the end of the edge: in its middle robots in front would stand before it.
+    y = float(layout.low[1]) + half
     # Read from the side that the grid is looked at from: up is away from there, along -x.
     corners = np.array(
         [(x + DEPTH, y - half, z), (x + DEPTH, y + half, z), (x, y + half, z), (x, y - half, z)]
@@ -93,9 +98,10 @@ def ground_glb(layout: EnvLayout, words: Sequence[str]) -> bytes:
 
 
 def _painted(words: Sequence[str], across: int, down: int) -> Image.Image:
-    picture = Image.new("RGBA", (across * _WIDE * _PIXELS, down * _PIXELS), _PLATE)
-    pen, font = ImageDraw.Draw(picture), ImageFont.load_default(size=0.8 * _PIXELS)
+    wide = int(_WIDE * _PIXELS)
+    picture = Image.new("RGB", (across * wide, down * _PIXELS), _PLATE)
+    pen, font = ImageDraw.Draw(picture), ImageFont.load_default(size=0.85 * _PIXELS)
     for index, word in enumerate(words):
-        middle = ((index % across + 0.5) * _WIDE * _PIXELS, (index // across + 0.5) * _PIXELS)
-        pen.text(middle, word, fill=_INK, font=font, anchor="mm")
-    return picture.convert("RGB")
+        middle = ((index % across + 0.5) * wide, (index // across + 0.5) * _PIXELS)
+        pen.text(middle, word, fill=_INK, font=font, anchor="mm", stroke_width=2)
+    return picture
