@@ -100,6 +100,7 @@ def test_two_recordings_are_compared_and_aligned(page: ReviewPage) -> None:
     (cubes,) = (h for h in page._scene.handles if "cube" in h.name)
     assert len(cubes.batched_positions) == 2 and page._mark._label is not None
     assert page._mark._label.text == "A, seed 1"
+    assert page._numbers._drawn is not None and page._numbers._drawn[1] == ("", "B")
     page._review.align("first success")
     draw(page)
     assert "B has no success" in page._panel._never.content

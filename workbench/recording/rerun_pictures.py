@@ -46,6 +46,10 @@ class OpenFile:
         if hasattr(self, "_descriptor"):
             os.close(self._descriptor)
 
+    def __reduce__(self) -> str:
+        # The number of a descriptor means another file in another process, which would be closed with it.
+        raise TypeError("An open recording cannot be sent to another process; send its path.")
+
     def chunk(self, place: IndexedChunk) -> pa.RecordBatch:
         """Raises OSError where it is no chunk."""
         content = os.pread(self._descriptor, place.end - place.begin, place.begin)
