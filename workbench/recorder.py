@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,7 @@ from workbench.core.step import StepResult
 from workbench.core.step_pictures import step_pictures
 from workbench.core.task_env import TaskEnv
 from workbench.recording.episode import NO_SEED
+from workbench.recording.episode_writer import EpisodeFiles
 from workbench.recording.recover import recover
 from workbench.recording.rrd import RecordingError
 from workbench.session.episode_files import EpisodeFinisher
@@ -86,6 +88,8 @@ class Recorder(gym.Wrapper):
             recover(self._folder)
         self._task = TaskEnv(base)
         self._finisher = EpisodeFinisher()
+        self._made: list[Future[EpisodeFiles | str]] = []
+        """Episodes that are over, and not known to have their files."""
         self._gatherer: EpisodeGatherer | None = None
         self._scene: Any = None
         self._description: TaskDescription | None = None
@@ -190,7 +194,7 @@ class Recorder(gym.Wrapper):
         self._say_what_failed()
 
     def _over(self, episode: GatheredEpisode) -> None:
-        self._finisher.finish(episode)
+        self._made.append(self._finisher.finish(episode))
 
     def _end(self) -> None:
         gatherer, self._gatherer = self._gatherer, None
@@ -198,8 +202,10 @@ class Recorder(gym.Wrapper):
             gatherer.finish()
 
     def _say_what_failed(self) -> None:
-        problem = self._finisher.finished.problem
-        if problem is not None and self.problem is None:
-            self.problem = problem
+        done = [future for future in self._made if future.done()]
+        self._made = [future for future in self._made if future not in done]
+        problems = [result for future in done if isinstance(result := future.result(), str)]
+        if problems and self.problem is None:
+            self.problem = problems[0]
             self._gatherer = None
-            warnings.warn(f"the recording ended: {problem}", stacklevel=4)
+            warnings.warn(f"the recording ended: {self.problem}", stacklevel=4)

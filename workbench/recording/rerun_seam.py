@@ -208,3 +208,14 @@ def _varint(content: memoryview) -> tuple[int, memoryview]:
             return value, content[place + 1 :]
         shift += 7
     raise ValueError("a number without an end")
+
+
+def store_id(path: Path) -> str:
+    """What rerun's viewer calls the recording in `path` when it is told something about it (rerun's
+    ``viewer_control.proto``). Raises ValueError or OSError where there is none.
+    """
+    recordings = RrdReader(path).recordings()
+    if not recordings:
+        raise ValueError(f"{path.name} holds no recording")
+    application = recordings[0].application_id.replace("\\", "\\\\").replace(":", "\\:")
+    return f"Recording:{application}:{recordings[0].recording_id}"
