@@ -110,7 +110,10 @@ def review(browser: Browser, folder: Path, options: Options) -> list[tuple[float
         began = time.monotonic()
         page.get_by_text("Side by side", exact=True).click()
         expect(page.locator(".wb-timeline")).to_be_visible()
-        print(f"  {options.envs} recordings opened in {time.monotonic() - began:.1f} s")
+        first = time.monotonic() - began
+        expect(page.get_by_text("paused", exact=True)).to_be_visible()
+        opened = time.monotonic() - began
+        print(f"  {options.envs} recordings: the first seen after {first:.1f} s, all after {opened:.1f} s")
         return measured(page, options)
 
 

@@ -1,4 +1,4 @@
-"""A long episode with cameras takes no more memory than a short one, neither while it happens nor when its files are made."""
+"""A long episode with cameras takes no more memory than a short one, while it happens, when its files are made, and when it is looked at."""
 
 from __future__ import annotations
 
@@ -67,6 +67,26 @@ print(json.dumps(dict(appended=appended, finished=peak(), files=sizes, rrd=str(f
 """
 
 
+READER = """
+import json, sys, time
+from pathlib import Path
+import rerun.chunk  # noqa: F401  (not what is measured)
+from workbench.recording.read_episode import read_episode
+
+def peak():
+    (line,) = [line for line in open("/proc/self/status") if line.startswith("VmHWM")]
+    return int(line.split()[1]) / 1024
+
+before, began = peak(), time.perf_counter()
+episode = read_episode(Path(sys.argv[1]))
+opened, seconds = peak(), time.perf_counter() - began
+for state in range(0, len(episode.reward), 61):
+    for camera in episode.cameras:
+        assert camera.rgb[state].shape == (128, 128, 3)
+print(json.dumps(dict(opened=opened - before, looked=peak() - before, seconds=seconds)))
+"""
+
+
 def peaks(folder: Path, steps: int) -> dict:
     child = subprocess.run(
         [sys.executable, "-c", CHILD, str(folder), str(steps)], check=True, capture_output=True, text=True
@@ -82,3 +102,10 @@ def test_ten_thousand_steps_at_four_cameras_do_not_grow_the_process(tmp_path: Pa
     assert long["appended"] - short["appended"] < 40
     assert long["finished"] - short["finished"] < 60
     assert verify_rrd(Path(long["rrd"]), timeout=300) is None
+    child = subprocess.run(
+        [sys.executable, "-c", READER, long["rrd"]], check=True, capture_output=True, text=True
+    )
+    read = json.loads(child.stdout)
+    print(read)
+    assert read["opened"] < 100, "most of it are pictures, and nobody has looked at one"
+    assert read["looked"] < 220, "only what was looked at last is kept"

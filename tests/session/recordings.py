@@ -74,12 +74,12 @@ def begin(folder: Path, episode: Episode) -> None:
     writer.close()
 
 
-def write(folder: Path, episode: Episode, pictures: bool = True) -> Path:
-    """Its files in `folder`, with a camera whose picture at state k is k * 20 bright; returns the .json."""
-    return appended(folder, episode, pictures).finish().json
+def write(folder: Path, episode: Episode, pictures: bool = True, every: int = 1) -> Path:
+    """Its files in `folder`, with a camera whose picture at state k, of each of so many, is k * 20 bright; returns the .json."""
+    return appended(folder, episode, pictures, every).finish().json
 
 
-def appended(folder: Path, episode: Episode, pictures: bool) -> EpisodeWriter:
+def appended(folder: Path, episode: Episode, pictures: bool, every: int = 1) -> EpisodeWriter:
     cameras = (camera(),) if pictures else ()
     writer = EpisodeWriter(
         folder, episode.info, geometry_of(episode), episode.segmentation, episode.action_names, cameras
@@ -102,7 +102,7 @@ def appended(folder: Path, episode: Episode, pictures: bool) -> EpisodeWriter:
                 reward=float(episode.reward[state - 1]) if state else 0.0,
                 terminated=bool(episode.terminated[state - 1]) if state else False,
                 truncated=bool(episode.truncated[state - 1]) if state else False,
-                pictures=(seen,) if pictures else (),
+                pictures=(seen,) if pictures and state % every == 0 else (),
             )
         )
     return writer

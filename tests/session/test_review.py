@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.session.recordings import made, poses_of, write
+from workbench.core.shared_shapes import SharedShapes
 from workbench.recording.episode import Episode
 from workbench.recording.library import Library
 from workbench.recording.read_episode import UnreadableRecording
@@ -46,7 +48,7 @@ class Shelf:
     def rows(self) -> list[Row]:
         return [Row(id, self.extra.get(id, ())) for id in self.episodes]
 
-    def read(self, row: Row) -> Episode:
+    def read(self, row: Row, shapes: SharedShapes) -> Episode:
         found = self.episodes[row.id]
         if isinstance(found, Exception):
             raise found
@@ -201,6 +203,59 @@ def test_files_that_change_or_go_are_said_and_stay_open(tmp_path: Path) -> None:
     said = " ".join(review.view().problems)
     assert "a.rrd has changed" in said and "a.h5 was deleted" in said
     assert len(review.view().opened) == 1
+
+
+def test_the_first_are_seen_while_others_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("workbench.session.review.FIRST_SHOWN", 0.0)
+    review, shelf = review_of(a=made(10), b=made(20), c=made(10), d=made(30, success_from=9), e=made(10))
+    reached, go_on = threading.Event(), threading.Event()
+
+    def read(row: Row, shapes: SharedShapes) -> Episode:
+        if row.id == "d":
+            reached.set()
+            assert go_on.wait(60)
+        return shelf.read(row, shapes)
+
+    review = Review(shelf, read, clock=shelf.clock)  # type: ignore[arg-type]
+    review.open("abcde", state=4)
+    assert reached.wait(60)
+    view = until(review, lambda view: len(view.opened) == 3, "the first three")
+    assert view.loading == "opening 4 of 5: file d" and view.position == 4
+    review.select(1)
+    review.seek(15)
+    review.toggle_play()
+    review.close_one(0)
+    view = review.view()
+    assert [o.id for o in view.opened] == ["b", "c"] and view.selected == 0
+    review.seek(15)
+    review.toggle_play()
+    go_on.set()
+    view = until(review, lambda view: not view.loading, "the others")
+    assert [o.id for o in view.opened] == ["b", "c", "d", "e"], "what was closed does not come back"
+    assert (view.selected, view.position, view.playing, view.last) == (0, 15, True, 30)
+    assert "first success" in view.alignments
+
+
+def test_another_opening_ends_one_that_has_shown_something(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("workbench.session.review.FIRST_SHOWN", 0.0)
+    shelf = Shelf({"a": made(10), "b": made(20), "c": made(30)})
+    reached, go_on = threading.Event(), threading.Event()
+
+    def read(row: Row, shapes: SharedShapes) -> Episode:
+        if row.id == "b":
+            reached.set()
+            assert go_on.wait(60)
+        return shelf.read(row, shapes)
+
+    review = Review(shelf, read, clock=shelf.clock)  # type: ignore[arg-type]
+    review.open("ab")
+    assert reached.wait(60)
+    first = review._thread
+    opened(review, "c")
+    go_on.set()
+    assert first is not None
+    first.join(60)
+    assert [o.id for o in review.view().opened] == ["c"] and not review.view().loading
 
 
 def test_waits_for_the_next_position_while_it_plays() -> None:

@@ -100,6 +100,8 @@ def test_two_recordings_are_compared_and_aligned(page: ReviewPage) -> None:
     (cubes,) = (h for h in page._in_3d.bodies.handles if "cube" in h.name)
     assert len(cubes.batched_positions) == 2 and page._in_3d._mark._label is not None
     assert page._in_3d._mark._label.text == "A, seed 1"
+    numbers = page._in_3d._numbers
+    assert numbers._drawn is not None and numbers._drawn[1] == ("", "B")
     page._review.align("first success")
     draw(page)
     assert "B has no success" in page._panel._never.content

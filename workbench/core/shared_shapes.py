@@ -8,7 +8,7 @@ seen of it.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -34,12 +34,33 @@ class SharedShapes:
 
     def __init__(self) -> None:
         self._known: dict[str, tuple[Mesh, Material]] = {}
+        self._marked: dict[Hashable, tuple[str, Mesh, Material]] = {}
+        self._kept: dict[tuple[int, int], tuple[Mesh, Material]] = {}
+        """By the ids of the two: those that are given out, which need not be looked at again."""
 
     def share(self, geometry: SceneGeometry) -> SceneGeometry:
         """The same scene, with meshes and materials of earlier ones where they look the same."""
         return replace(geometry, visuals=tuple(self._shared(geometry.visuals)))
 
+    def shared(self, mesh: Mesh, material: Material) -> tuple[Mesh, Material]:
+        """An earlier mesh and material that look the same, or these."""
+        kept = self._kept.get((id(mesh), id(material)))
+        if kept is None:
+            none = np.zeros(0, np.int32)
+            looks = fingerprint((Visual("", mesh, material, none, none),))
+            kept = self._known.setdefault(looks, (mesh, material))
+            self._kept[id(kept[0]), id(kept[1])] = kept
+        return kept
+
+    def learn(self, mark: Hashable, name: str, mesh: Mesh, material: Material) -> None:
+        """What lies in a file under this mark, for who meets the mark again."""
+        self._marked[mark] = (name, mesh, material)
+
+    def known(self, mark: Hashable) -> tuple[str, Mesh, Material] | None:
+        """What was learnt of that mark: the visual's name and its looks."""
+        return self._marked.get(mark)
+
     def _shared(self, visuals: Iterable[Visual]) -> Iterable[Visual]:
         for visual in visuals:
-            mesh, material = self._known.setdefault(fingerprint((visual,)), (visual.mesh, visual.material))
+            mesh, material = self.shared(visual.mesh, visual.material)
             yield replace(visual, mesh=mesh, material=material)

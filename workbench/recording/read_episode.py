@@ -4,7 +4,7 @@ The ``.json`` says what the episode is, the ``.rrd`` holds what there is to see 
 what there is to compute with (env states, observations, actions). Each is read for what it holds best, and a file that is missing takes only its
 own with it: a lone ``.rrd`` that somebody was sent can be looked at, though nobody can step into it.
 
-Pictures stay as they lie in the file, encoded, until one is asked for.
+Pictures stay in the file until one is asked for.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.geometry import SceneGeometry
+from workbench.core.shared_shapes import SharedShapes
 from workbench.recording.columns import Column
 from workbench.recording.description import columns_from, info_from
 from workbench.recording.encoded_pictures import EncodedPictures, Modality
@@ -34,8 +35,10 @@ from workbench.recording.rerun_table import RerunTable, wxyz_from_optical
 from workbench.recording.survey import camera_from
 
 
-def read_episode(path: Path) -> Episode:
+def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
     """The episode of our own files; `path` is its .rrd, .h5 or .json, and the others are found beside it.
+
+    With `shapes`, meshes are those of other recordings that were read with it, where they look the same.
 
     What a missing file would have held is empty: without the .rrd no geometry, poses and pictures, without the .h5 no env
     states. The geometry is that of this env alone, as env 0 of 1.
@@ -49,7 +52,7 @@ def read_episode(path: Path) -> Episode:
     if not there:
         raise UnreadableRecording(f"{path.name} is not there any more.")
     try:
-        table = RerunTable(there[".rrd"]) if ".rrd" in there else None
+        table = RerunTable(there[".rrd"], shapes) if ".rrd" in there else None
     except (OSError, ValueError, RuntimeError) as error:
         raise UnreadableRecording(f"{files['.rrd'].name} is no .rrd that can be read: {error}") from error
     said = _description(there.get(".json"), table, path)

@@ -23,10 +23,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import pyarrow as pa
 import rerun as rr
 import rerun.blueprint as rrb
 import rerun_bindings
-from rerun.chunk import RrdReader
+from rerun.chunk import LazyStore, RrdReader
 
 
 @contextmanager
@@ -104,19 +105,109 @@ class IndexedChunk:
     entity: str
     rows: int
     static: bool
+    begin: int
+    """Where in the file its bytes begin."""
     end: int
-    """Where in the file its bytes end."""
+    """Where they end."""
+    id: bytes
+    """Rerun's own, unique for ever: the same chunk in two files is the same content."""
+    unpacked: int
+    """How many bytes it is when it is not compressed."""
+    components: tuple[str, ...]
+    """That it has rows of."""
+    steps: tuple[int, int] | None
+    """The first and last of a timeline; None where it has none of them."""
 
 
 def read_index(path: Path) -> list[IndexedChunk]:
     """The chunks of the recording in `path`; none of them is decoded. Raises ValueError or OSError where there is no index."""
-    _, index = RrdReader(path).store()._internal._chunk_index()
-    names = ("entity_path", "num_rows", "is_static", "byte_offset", "byte_size")
+    return index_of(RrdReader(path).store())
+
+
+def index_of(store: LazyStore, timeline: str | None = None) -> list[IndexedChunk]:
+    """The chunks of an ``.rrd``; none of them is decoded.
+
+    Args:
+        timeline: of which `IndexedChunk.steps` and, of chunks that are not static, `IndexedChunk.components` are asked.
+    """
+    _, index = store._internal._chunk_index()
+    names = (
+        "entity_path",
+        "num_rows",
+        "is_static",
+        "byte_offset",
+        "byte_size",
+        "id",
+        "byte_size_uncompressed",
+    )
     columns = [index.column(f"chunk_{name}").to_pylist() for name in names]
+    components: list[list[str]] = [[] for _ in range(index.num_rows)]
+    steps: list[tuple[int, int] | None] = [None] * index.num_rows
+    if timeline is not None and f"{timeline}:start" in index.schema.names:
+        ends = (index.column(f"{timeline}:{end}").cast(pa.int64()).to_pylist() for end in ("start", "end"))
+        steps = [None if first is None else (first, last) for first, last in zip(*ends)]
+        counted = f"{timeline}:", ":num_rows"
+        for name in index.schema.names:
+            if name.startswith(counted[0]) and name.endswith(counted[1]):
+                component = name[len(counted[0]) : -len(counted[1])]
+                for chunk, count in enumerate(index.column(name).to_pylist()):
+                    if count:
+                        components[chunk].append(component)
     return [
-        IndexedChunk(entity, rows, static, offset + size)
-        for entity, rows, static, offset, size in zip(*columns)
+        IndexedChunk(entity, rows, static, offset, offset + size, id, unpacked, tuple(held), span)
+        for (entity, rows, static, offset, size, id, unpacked), held, span in zip(
+            zip(*columns), components, steps, strict=True
+        )
     ]
+
+
+_COMPRESSION, _UNPACKED, _ENCODING, _PAYLOAD = 2, 3, 4, 5
+"""Fields of ``ArrowMsg`` in rerun's ``log_msg.proto``."""
+_LZ4, _ARROW_IPC = 2, 1
+_NUMBER, _BYTES = 0, 2
+"""How a field of protobuf is written."""
+
+
+def decode_chunk(message: bytes) -> pa.RecordBatch:
+    """The bytes in a file from `IndexedChunk.begin` to its end as the table that they are.
+
+    Rerun's own reader gives all chunks of an entity or none, and a camera's are hundreds of megabytes. What lies there is
+    a protobuf message with an Arrow stream in it (``rerun/proto/rerun/v1alpha1/log_msg.proto``).
+
+    Raises:
+        ValueError: they are no chunk.
+    """
+    fields: dict[int, int | memoryview] = {}
+    rest = memoryview(message)
+    try:
+        while len(rest):
+            key, rest = _varint(rest)
+            if key & 7 == _NUMBER:
+                fields[key >> 3], rest = _varint(rest)
+            elif key & 7 == _BYTES:
+                length, rest = _varint(rest)
+                fields[key >> 3], rest = rest[:length], rest[length:]
+            else:
+                raise ValueError("a field of a kind that rerun does not write")
+        payload, unpacked = fields[_PAYLOAD], fields.get(_UNPACKED)
+        if fields.get(_ENCODING) != _ARROW_IPC or isinstance(payload, int):
+            raise ValueError("in another encoding")
+        content = pa.py_buffer(payload)
+        if fields.get(_COMPRESSION) == _LZ4 and isinstance(unpacked, int):
+            content = pa.decompress(content, decompressed_size=unpacked, codec="lz4_raw")
+        return pa.ipc.open_stream(content).read_next_batch()
+    except (KeyError, StopIteration, ValueError, OSError) as error:
+        raise ValueError(f"its bytes are no chunk of rerun's ({error})") from error
+
+
+def _varint(content: memoryview) -> tuple[int, memoryview]:
+    value = shift = 0
+    for place, byte in enumerate(content[:10]):
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, content[place + 1 :]
+        shift += 7
+    raise ValueError("a number without an end")
 
 
 def store_id(path: Path) -> str:

@@ -1,13 +1,16 @@
 """An ``.rrd`` of ours as arrays, entity by entity.
 
 Rerun's own query engine is an extra of 100 MB. The chunks of a file are plain Arrow tables, though, and what `layout` put
-in by columns comes out by columns. Values are looked at without a Python object a row; pictures are slices of the
-decompressed chunk.
+in by columns comes out by columns. Values are looked at without a Python object a row.
+
+Most of a file is not read at all. Its pictures stay where they are until one is looked at (`rerun_pictures`). And a mesh
+is in every recording of its scene, often as the very same chunk: one that another recording has brought already is
+known by the chunk's id, in the index, and neither read nor compared again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,22 +18,41 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from rerun.chunk import RrdReader
+from rerun.chunk import Chunk, LazyStore, RrdReader
 
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo
-from workbench.recording.encoded_pictures import EncodedPictures, Modality, encode
+from workbench.core.shared_shapes import SharedShapes
+from workbench.recording.encoded_pictures import EncodedPictures, Modality
 from workbench.recording.rerun_log import STEP
+from workbench.recording.rerun_pictures import PICTURE_COMPONENTS, IdsInFile, OpenFile, PicturesInFile
+from workbench.recording.rerun_seam import IndexedChunk, index_of
 
 _PROPERTIES = "/__properties"
+_ALL = ("+ /**", f"+ {_PROPERTIES}/**")
+"""What rerun keeps for itself is not among all."""
 
 
 class RerunTable:
-    def __init__(self, path: Path) -> None:
-        """Raises OSError, ValueError or RuntimeError where `path` is no ``.rrd``."""
+    def __init__(self, path: Path, shapes: SharedShapes | None = None) -> None:
+        """
+        Args:
+            shapes: of other recordings, to be shared.
+
+        Raises OSError, ValueError or RuntimeError where `path` is no ``.rrd``.
+        """
+        self._shapes = SharedShapes() if shapes is None else shapes
         self._timed: dict[tuple[str, str], list[tuple[NDArray[np.int64], pa.Array]]] = {}
         self._static: dict[tuple[str, str], pa.Array] = {}
-        for chunk in RrdReader(path).stream():
+        self._file = OpenFile(path)
+        self._pictures: dict[tuple[str, str], list[IndexedChunk]] = {}
+        self._known: dict[str, tuple[str, Mesh, Material]] = {}
+        """What entities wear that is not read, as another recording has it."""
+        self._alone: dict[str, IndexedChunk] = {}
+        """The static chunk of an entity that has one and no more."""
+        store = RrdReader(path).store()
+        self._look(index_of(store, STEP))
+        for chunk in self._chunks(store):
             batch = chunk.to_record_batch()
             steps = None
             if not chunk.is_static:
@@ -46,6 +68,31 @@ class RerunTable:
                     self._timed.setdefault(key, []).append((steps, column))
                 elif len(column) and column[len(column) - 1].is_valid:
                     self._static[key] = column[len(column) - 1].values
+
+    def _look(self, index: Sequence[IndexedChunk]) -> None:
+        """Find in the index what need not be read."""
+        several = set()
+        for place in index:
+            if not place.static:
+                for component in set(place.components) & set(PICTURE_COMPONENTS.values()):
+                    self._pictures.setdefault((place.entity, component), []).append(place)
+            elif place.entity in self._alone:
+                several.add(place.entity)
+            else:
+                self._alone[place.entity] = place
+        for entity in several:
+            del self._alone[entity]
+        for entity, place in self._alone.items():
+            known = self._shapes.known(_mark(place))
+            if known is not None:
+                self._known[entity] = known
+
+    def _chunks(self, store: LazyStore) -> Iterator[Chunk]:
+        # Entity by entity, which is what rerun's reader can leave out before it reads.
+        pictures = [f"- {entity}" for entity in {entity for entity, _ in self._pictures}]
+        yield from store.stream().filter(content=[*_ALL, *pictures], is_static=False)
+        known = [f"- {entity}" for entity in self._known]
+        yield from store.stream().filter(content=[*_ALL, *known], is_static=True)
 
     def property(self, name: str, component: str) -> Any:
         """A property's value, a list if there are several, None if there is none."""
@@ -97,31 +144,23 @@ class RerunTable:
     def pictures(
         self, entity: str, modality: Modality, info: CameraInfo
     ) -> tuple[NDArray[np.int64], EncodedPictures] | None:
-        """States and pictures of ``<camera>/<modality>``; None where the camera has none."""
-        component = {
-            "rgb": "EncodedImage:blob",
-            "depth": "EncodedDepthImage:blob",
-            "segmentation": "SegmentationImage:buffer",
-        }[modality]
-        found = sorted(self._timed.get((entity, component), []), key=lambda part: int(part[0][0]))
-        if not found:
+        """States and pictures of ``<camera>/<modality>``; None where the camera has none. Raises OSError."""
+        places = self._pictures.get((entity, PICTURE_COMPONENTS[modality]), [])
+        if not places:
             return None
-        frames = np.concatenate([steps for steps, _ in found])
-        blobs = _Blobs([column for _, column in found])
-        if modality == "segmentation":
-            return frames, EncodedPictures(modality, _Ids(blobs, info.height, info.width))
-        return frames, EncodedPictures(modality, blobs)
+        places = sorted(places, key=lambda place: (place.steps or (0, 0))[0])
+        pictures = PicturesInFile(self._file, places, modality)
+        blobs = IdsInFile(pictures, info.height, info.width) if modality == "segmentation" else pictures
+        return pictures.frames(), EncodedPictures(modality, blobs)
 
     def geometry(self, bare: SceneGeometry, entities: Sequence[str]) -> SceneGeometry:
-        """`bare` with the meshes that its bodies wear; `entities` are theirs."""
+        """`bare` with the meshes that its bodies wear, shared with other recordings; `entities` are theirs."""
         visuals: dict[str, tuple[Mesh, Material, list[int]]] = {}
         for body, entity in enumerate(entities):
             number = 0
-            while (mesh := self._mesh(f"{entity}/{number}")) is not None:
-                name = str(self._one(f"{entity}/{number}", "visual", f"{bare.body_names[body]}/{number}"))
-                if name not in visuals:
-                    visuals[name] = (mesh, self._material(f"{entity}/{number}"), [])
-                visuals[name][2].append(body)
+            while (worn := self._worn(f"{entity}/{number}", f"{bare.body_names[body]}/{number}")) is not None:
+                name, mesh, material = worn
+                visuals.setdefault(name, (mesh, material, []))[2].append(body)
                 number += 1
         return replace(
             bare,
@@ -130,6 +169,19 @@ class RerunTable:
                 for name, (mesh, material, bodies) in visuals.items()
             ),
         )
+
+    def _worn(self, entity: str, otherwise: str) -> tuple[str, Mesh, Material] | None:
+        """The name of a visual, by default `otherwise`, and what it looks like; None if there is none."""
+        if entity in self._known:
+            return self._known[entity]
+        mesh = self._mesh(entity)
+        if mesh is None:
+            return None
+        name = str(self._one(entity, "visual", otherwise))
+        mesh, material = self._shapes.shared(mesh, self._material(entity))
+        if entity in self._alone and (entity, "visual") in self._static:
+            self._shapes.learn(_mark(self._alone[entity]), name, mesh, material)
+        return name, mesh, material
 
     def _mesh(self, entity: str) -> Mesh | None:
         vertices = self._static.get((entity, "Mesh3D:vertex_positions"))
@@ -168,43 +220,9 @@ class RerunTable:
         return otherwise if values is None else values[0].as_py()
 
 
-class _Blobs(Sequence[bytes]):
-    """The rows of columns of one blob each."""
-
-    def __init__(self, columns: Sequence[pa.Array]) -> None:
-        self._columns = columns
-        self._ends = np.cumsum([len(column) for column in columns])
-
-    def __len__(self) -> int:
-        return int(self._ends[-1])
-
-    def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        number = range(len(self))[index]
-        part = int(np.searchsorted(self._ends, number, side="right"))
-        column = self._columns[part]
-        row = column[number - int(self._ends[part]) + len(column)].values[0]
-        return row.values.to_numpy().tobytes()
-
-
-class _Ids(Sequence[bytes]):
-    """Plain ids as the PNG that they were, or would have been."""
-
-    def __init__(self, blobs: _Blobs, height: int, width: int) -> None:
-        self._blobs = blobs
-        self._shape = (height, width)
-
-    def __len__(self) -> int:
-        return len(self._blobs)
-
-    def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
-        content = self._blobs[index]
-        wide = len(content) == 4 * self._shape[0] * self._shape[1]
-        ids = np.frombuffer(content, np.int32 if wide else np.uint16).reshape(self._shape)
-        return encode("segmentation", ids.astype(np.int32))
+def _mark(place: IndexedChunk) -> tuple[bytes, int, int]:
+    """Of one content. Rerun's ids are unique; the sizes are for a file that somebody made by hand."""
+    return (place.id, place.end - place.begin, place.unpacked)
 
 
 def _plain(values: pa.Array) -> NDArray:

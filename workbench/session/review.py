@@ -35,8 +35,15 @@ MOST_COMPARED = 4
 """Recordings that are drawn over each other; more cannot be told apart."""
 MOST_OPEN = 64
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
+FIRST_SHOWN = 0.4
+"""Seconds after which the recordings that are read are shown while others are read; then after twice that, and so on:
+each time a scene is built."""
 _LOOK_EVERY = 2.0
 """Seconds between two looks at whether the files are still what was read."""
+
+
+Stamp = tuple[str, tuple[int, int] | None]
+"""Of a file that was read: whose it is, and its size and time of change then."""
 
 
 class Row(Protocol):
@@ -60,14 +67,14 @@ class Shelf(Protocol):
     def rows(self) -> Sequence[Row]: ...
 
 
-def read_row(row: Row) -> Episode:
-    """The recording of a row. Raises as `read_episode`."""
+def read_row(row: Row, shapes: SharedShapes | None = None) -> Episode:
+    """The recording of a row, with those shapes where it looks the same. Raises as `read_episode`."""
     if row.kind == "lerobot" and row.trajectory is not None:
         return read_lerobot(row.paths[0].parents[1], int(row.trajectory))
     if row.trajectory is not None:
         # The library opens it by its .json, which is where the words are.
         return read_maniskill(row.paths[0].with_suffix(".h5"), row.trajectory)
-    return read_episode(row.paths[0])
+    return read_episode(row.paths[0], shapes)
 
 
 def shared(episode: Episode, shapes: SharedShapes) -> Episode:
@@ -101,14 +108,14 @@ class Review:
     def __init__(
         self,
         library: Shelf,
-        read: Callable[[Row], Episode] = read_row,
+        read: Callable[[Row, SharedShapes], Episode] = read_row,
         make_scene: SceneMaker | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """
         Args:
             library: knows recordings by their ids.
-            read: reads the recording of a row; raises OSError or UnreadableRecording with a sentence.
+            read: reads the recording of a row, with shapes of others; raises OSError or UnreadableRecording with a sentence.
             make_scene: for recordings without a scene; None leaves them without.
             clock: seconds.
         """
@@ -118,8 +125,12 @@ class Review:
         self._walk: _Walk | None = None
         self._opening = 0
         """Number of the newest opening: what an earlier one brings is dropped."""
+        self._begun = False
+        """It has shown something."""
+        self._closed: set[str] = set()
+        """What was closed again since then: the opening may still bring more."""
         self._thread: threading.Thread | None = None
-        self._files: dict[Path, tuple[str, tuple[int, int] | None]] = {}
+        self._files: dict[Path, Stamp] = {}
         """Of the opened ones: whose it is, and its size and time of change when it was read."""
         self._unread: tuple[str, ...] = ()
         self._looked = -math.inf
@@ -168,6 +179,8 @@ class Review:
         with self._changed:
             self._opening += 1
             number = self._opening
+            self._begun = False
+            self._closed.clear()
             if not wanted:
                 self._change(problems=tuple(said), loading="")
                 return
@@ -183,7 +196,8 @@ class Review:
             if 0 <= index < len(self._view.opened):
                 kept = [o for number, o in enumerate(self._view.opened) if number != index]
                 selected = self._view.selected - (self._view.selected > index)
-                self._opening += 1
+                if self._begun:
+                    self._closed.add(self._view.opened[index].id)
                 self._put(kept, min(selected, max(len(kept) - 1, 0)), self._view.align)
 
     def exchange(self, index: int, other: int) -> None:
@@ -211,15 +225,19 @@ class Review:
     def _open(self, number: int, rows: list[Row], said: list[str], state: int | None) -> None:
         opened: list[Opened] = []
         shapes = SharedShapes()
-        files: dict[Path, tuple[str, tuple[int, int] | None]] = {}
+        files: dict[Path, Stamp] = {}
+        shown_at, wait = time.monotonic(), FIRST_SHOWN
         for done, row in enumerate(rows):
             with self._changed:
                 if number != self._opening:
                     return
+                if opened and time.monotonic() - shown_at > wait:
+                    self._show(opened, files, state)
+                    shown_at, wait = time.monotonic(), 2 * wait
                 self._change(loading=_opening_words(rows, done))
             stamps = {path: (row.name, _stamp(path)) for path in row.paths}
             try:
-                episode = shared(self._read(row), shapes)
+                episode = shared(self._read(row, shapes), shapes)
                 opened.append(Opened(row.id, row.name, episode, happenings(episode)))
                 files.update(stamps)
             except (OSError, UnreadableRecording) as error:
@@ -235,17 +253,31 @@ class Review:
                 return
             self._unread = tuple(said)
             if opened:
-                self._files = files
-                self._put(opened, 0, START)
-                if state is not None:
-                    self._seek(state)
+                self._show(opened, files, state)
             self._change(loading="", problems=self._unread)
-        without = {index: one for index, one in enumerate(opened) if not one.has_scene}
-        self._give_scenes(number, without, shapes)
+        self._give_scenes(number, [one for one in opened if not one.has_scene], shapes)
 
-    def _give_scenes(self, number: int, without: Mapping[int, Opened], shapes: SharedShapes) -> None:
+    def _show(self, opened: Sequence[Opened], files: Mapping[Path, Stamp], state: int | None) -> None:
+        """Put on the page what an opening has brought so far, less what was closed again; under the lock.
+
+        Whoever has begun to look is left at what they look at.
+        """
+        self._files = dict(files)
+        kept = [one for one in opened if one.id not in self._closed]
+        chosen = self._view.chosen if self._begun else None
+        selected = next((index for index, one in enumerate(kept) if one is chosen), 0)
+        if self._begun:
+            self._put(kept, selected, self._view.align, stay=True)
+        else:
+            self._begun = True
+            self._put(kept, 0, START)
+            if state is not None:
+                self._seek(state)
+
+    def _give_scenes(self, number: int, without: Sequence[Opened], shapes: SharedShapes) -> None:
         def say(index: int, words: str, making: bool = True) -> None:
-            self._replace_opened(number, index, lambda now: replace(now, scene=words, making=making))
+            one = without[index]
+            self._replace_opened(number, one.id, lambda now: replace(now, scene=words, making=making))
 
         def end(index: int, made: Episode | SceneError, missed: tuple[str, ...]) -> None:
             if isinstance(made, SceneError):
@@ -254,34 +286,44 @@ class Review:
             made = shared(made, shapes)
             words = f"Not put back: {'; '.join(missed)}." if missed else ""
             self._replace_opened(
-                number, index, lambda now: replace(now, episode=made, scene=words, making=False)
+                number, without[index].id, lambda now: replace(now, episode=made, scene=words, making=False)
             )
 
-        wanted = {index: one.episode for index, one in without.items() if one.episode.env_states}
-        for index in without:
+        def stop() -> bool:
+            return number != self._opening or all(one.id in self._closed for one in without)
+
+        wanted = {index: one.episode for index, one in enumerate(without) if one.episode.env_states}
+        for index in range(len(without)):
             if index not in wanted or self._make_scene is None:
                 say(index, "This recording holds no scene to draw.", False)
             else:
                 say(index, "its scene is made next")
         if wanted and self._make_scene is not None:
             try:
-                self._make_scene(wanted, lambda: number != self._opening, say, end)
+                self._make_scene(wanted, stop, say, end)
             except OSError as error:
                 for index in wanted:
                     say(index, f"The process that makes its scene could not be started: {error}.", False)
 
-    def _replace_opened(self, number: int, index: int, change: Callable[[Opened], Opened]) -> None:
+    def _replace_opened(self, number: int, id: str, change: Callable[[Opened], Opened]) -> None:
         with self._changed:
-            if number == self._opening:
+            index = next((index for index, one in enumerate(self._view.opened) if one.id == id), None)
+            if number == self._opening and index is not None:
                 opened = list(self._view.opened)
                 got_scene = not opened[index].has_scene
                 opened[index] = change(opened[index])
                 got_scene &= opened[index].has_scene
                 self._change(opened=tuple(opened), opened_serial=self._view.opened_serial + got_scene)
 
-    def _put(self, opened: Sequence[Opened], selected: int, align: str) -> None:
-        """Show these; under the lock."""
-        self._walk = None
+    def _put(self, opened: Sequence[Opened], selected: int, align: str, stay: bool = False) -> None:
+        """Show these, from the first position on, or where one is if one is to `stay`; under the lock."""
+        if stay:
+            self._advance()
+        else:
+            self._walk = None
+            self._change(playing=False)
+        stay = stay and bool(self._view.opened) and bool(opened)
+        state = self._view.states[self._view.selected] if stay else None
         names = dict.fromkeys(h.name for o in opened for h in o.happenings if h.style != "reset")
         alignments = (START, *(f"first {name}" for name in names))
         self._change(
@@ -289,9 +331,8 @@ class Review:
             opened_serial=self._view.opened_serial + 1,
             selected=selected,
             alignments=alignments,
-            playing=False,
         )
-        self._align(align if align in alignments else START, position=None)
+        self._align(align if align in alignments else START, position=state)
 
     def say(self, sentence: str) -> None:
         """Let the page say this, until something is opened."""

@@ -192,6 +192,7 @@ class RerunView:
         self._lock = threading.Lock()
         self._problem = ""
         self._waiting = False
+        self._drawn: object = None
         self._width = LEAST
         self._asked_at: float | None = None
         """When a page last asked for what is in the panel, if the panel has got no width since."""
@@ -213,14 +214,17 @@ class RerunView:
         disabled = not self._paths or self._waiting
         if self._button.disabled != disabled:
             self._button.disabled = disabled
-        words = render(
-            "rerun",
-            address=self._address(self._paths) if self._paths else None,
-            lacking=self._chosen > len(self._paths),
-            waiting=self._waiting,
-            problem=self._problem,
-        )
-        fill(self._words, words)
+        wanted = (self._paths, self._chosen, self._waiting, self._problem)
+        if wanted != self._drawn:
+            self._drawn = wanted
+            words = render(
+                "rerun",
+                address=self._address(self._paths) if self._paths else None,
+                lacking=self._chosen > len(self._paths),
+                waiting=self._waiting,
+                problem=self._problem,
+            )
+            fill(self._words, words)
         self._widen()
 
     def _widen(self) -> None:

@@ -1,4 +1,4 @@
-"""Opened recordings in the 3-D view: their scene, marks and labels, and where one looks from."""
+"""Opened recordings in the 3-D view: their scene, marks and names, and where one looks from."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from workbench.session.review import Review
 from workbench.session.review_view import ReviewView
 from workbench.ui.camera_frustums import SMALL, CameraFrustums, without_the_viewpoint
 from workbench.ui.env_layout import acting_box, env_under_ray
+from workbench.ui.ground_numbers import GroundNumbers
 from workbench.ui.review_scene import ReviewScene, letter, review_scene
 from workbench.ui.selection_mark import SelectionMark
 from workbench.ui.stage import Stage
@@ -28,16 +29,15 @@ class ReviewIn3D:
     """
 
     def __init__(self, server: viser.ViserServer, review: Review, stage: Stage) -> None:
-        self._server, self._review = server, review
+        self._review = review
         self.bodies, self._framing = stage.scene, stage.framing
         self._mark = SelectionMark(server)
+        self._numbers = GroundNumbers(server)
         self._frustums = CameraFrustums(server)
         self._scene: ReviewScene | None = None
         self._scene_of: object = None
         self._triangles = 0
         """How many the bodies were built for."""
-        self._labels: list[viser.LabelHandle] = []
-        self._labelled: object = None
         server.scene.on_click()(self._on_click)
 
     def draw(
@@ -70,7 +70,7 @@ class ReviewIn3D:
         self.bodies.move(scene.poses(view.states), scene.layout, None)
         in_grid = len(view.opened) > 1 and not scene.ghosts
         self._mark.draw(scene.layout, view.selected, shown=in_grid, name=caption(view, view.selected))
-        self._draw_labels(view, scene if in_grid else None)
+        self._draw_names(view, scene if in_grid else None)
         self._draw_frustums(view, scene, cameras, pictures)
         self._frame_what_is_new(view, scene, in_grid)
         self._framing.frame_arrivals(self._viewpoint)
@@ -84,7 +84,7 @@ class ReviewIn3D:
         self.bodies.clear()
         self._mark.clear()
         self._frustums.clear()
-        self._draw_labels(view, None)
+        self._draw_names(view, None)
         self._framing.is_new(None)
 
     def _frame_what_is_new(self, view: ReviewView, scene: ReviewScene, in_grid: bool) -> None:
@@ -109,27 +109,13 @@ class ReviewIn3D:
             )
         self._frustums.draw(cameras, pictures, scene.layout.offsets[view.selected], SMALL)
 
-    def _draw_labels(self, view: ReviewView, scene: ReviewScene | None) -> None:
+    def _draw_names(self, view: ReviewView, scene: ReviewScene | None) -> None:
         """The names of those that are not selected; the selected one's is on its frame."""
-        wanted = (view.opened_serial, view.selected, None if scene is None else id(scene))
-        if wanted == self._labelled:
-            return
-        self._labelled = wanted
-        for label in self._labels:
-            label.remove()
-        self._labels = []
         if scene is None:
+            self._numbers.clear()
             return
-        for index in range(len(view.opened)):
-            if index != view.selected:
-                x = scene.layout.high[0] + scene.layout.offsets[index][0]
-                y = (scene.layout.low[1] + scene.layout.high[1]) / 2 + scene.layout.offsets[index][1]
-                z = max(scene.layout.floor_height, min(0.0, float(scene.layout.high[2]))) + 0.01
-                self._labels.append(
-                    self._server.scene.add_label(
-                        f"/labels/{index}", letter(index), position=(x, y, z), anchor="top-center"
-                    )
-                )
+        names = ("" if index == view.selected else letter(index) for index in range(len(view.opened)))
+        self._numbers.draw(scene.layout, tuple(names))
 
     def _viewpoint(self, aspect: float, height: float) -> Viewpoint:
         scene, view = self._scene, self._review.view()
