@@ -12,7 +12,7 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 import workbench
-from workbench.recording.episode import Episode
+from workbench.recording.episode import NO_SEED, Episode
 from workbench.recording.read_episode import read_episode, read_maniskill, trajectories
 
 TASKS = Path(__file__).parents[1] / "tasks"
@@ -35,8 +35,19 @@ def test_auto_resets_end_an_episode_and_begin_the_next(tmp_path: Path) -> None:
     env.close()
     read = episodes_in(tmp_path)
     assert [(e.info.env_index, e.length) for e in read] == [(0, 3), (0, 1), (1, 3), (1, 1)]
-    assert [e.info.seed for e in read if e.length == 3] == [7, 8]
+    assert [e.info.seed for e in read] == [7, NO_SEED, 8, NO_SEED]  # an auto-reset has no seed
     assert read[0].info.max_episode_steps == 3 and bool(read[0].truncated[-1])
+
+
+def test_the_seed_that_a_reset_draws_itself_is_kept(tmp_path: Path) -> None:
+    env = workbench.make("PushCube-v1", 2, enhanced_determinism=True, **OPTIONS)
+    env = workbench.Recorder(env, tmp_path, env_idx=[1])
+    env.reset(seed=[7, 8])
+    env.reset(options={"env_idx": torch.tensor([1])})
+    drawn = int(env.unwrapped._episode_seed[1])  # type: ignore[attr-defined]
+    env.step(env.action_space.sample())
+    env.close()
+    assert [e.info.seed for e in episodes_in(tmp_path)] == [drawn] and drawn != 8
 
 
 def test_it_keeps_what_maniskills_own_recorder_keeps(tmp_path: Path) -> None:
@@ -57,7 +68,8 @@ def test_it_keeps_what_maniskills_own_recorder_keeps(tmp_path: Path) -> None:
     assert sorted(e.length for e in read) == sorted(e.length for e in theirs) == [2, 3, 5]
     for one in read:
         (other,) = [e for e in theirs if e.length == one.length]
-        assert one.info.seed == other.info.seed
+        # The partial reset had no seed; RecordEpisode goes on saying the one of the episode before.
+        assert one.info.seed == (NO_SEED if one.length == 2 else other.info.seed)
         for name in ("action", "reward", "terminated", "truncated"):
             np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
         assert one.env_states.keys() == other.env_states.keys()

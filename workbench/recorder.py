@@ -33,11 +33,12 @@ from workbench.authoring.load import task_of_class
 from workbench.core import actions
 from workbench.core.open_env import open_env
 from workbench.core.pictures import Picture
-from workbench.core.seams import task_class
+from workbench.core.seams import draws_its_own_seeds, task_class
 from workbench.core.state_columns import read_state_columns
 from workbench.core.step import StepResult
 from workbench.core.step_pictures import step_pictures
 from workbench.core.task_env import TaskEnv
+from workbench.recording.episode import NO_SEED
 from workbench.recording.recover import recover
 from workbench.recording.rrd import RecordingError
 from workbench.session.episode_files import EpisodeFinisher
@@ -88,6 +89,7 @@ class Recorder(gym.Wrapper):
         self._gatherer: EpisodeGatherer | None = None
         self._scene: Any = None
         self._description: TaskDescription | None = None
+        self._seeds = np.full(base.num_envs, NO_SEED, np.int64)
         self._finished = False
         self.problem: str | None = None
         """Why the recording ended, if it did."""
@@ -102,6 +104,7 @@ class Recorder(gym.Wrapper):
         mask = np.zeros(count, bool)
         chosen = (options or {}).get("env_idx")
         mask[slice(None) if chosen is None else np.asarray([int(i) for i in chosen])] = True
+        self._seeds[mask] = self._seeds_of_reset(seed)[mask]
         step = self._task.result_of(info, np.zeros(count), np.zeros(count, bool), np.zeros(count, bool), None)
         if self._scene is not self._task.env.scene and not self._finished:
             self._begin()
@@ -110,6 +113,20 @@ class Recorder(gym.Wrapper):
             self._gatherer.reset_options = kept
         self._take(step, mask)
         return obs, info
+
+    def _seeds_of_reset(self, seed: Any) -> np.ndarray:
+        """(N,) what each env of a reset was seeded with.
+
+        A reset without a seed, as auto-resets are, draws on from wherever the generators stand, and ManiSkill goes on
+        saying the seed of an earlier episode.
+        """
+        task = self._task
+        if seed is None and not draws_its_own_seeds(task.env):
+            return np.full(task.num_envs, NO_SEED, np.int64)
+        said = (
+            task.episode_seeds
+        )  # (N,), or shorter: one for each env of a partial reset, which ManiSkill counts from 0
+        return np.concatenate([said, np.full(max(0, task.num_envs - len(said)), NO_SEED, np.int64)])
 
     def step(self, action: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         task = self._task
@@ -165,7 +182,7 @@ class Recorder(gym.Wrapper):
                 pictures += step_pictures(task, env, wanted)
         columns = read_state_columns(task)
         try:
-            gatherer.take(Stepped(step, reset_mask, pictures, task.episode_seeds, columns=columns))
+            gatherer.take(Stepped(step, reset_mask, pictures, self._seeds.copy(), columns=columns))
         except (RecordingError, ValueError) as error:
             self._end()
             self._gatherer, self.problem = None, str(error)

@@ -184,6 +184,11 @@ def episode_seeds(env: BaseEnv) -> np.ndarray | None:
     return env._episode_seed
 
 
+def draws_its_own_seeds(env: BaseEnv) -> bool:
+    """Whether a reset without a seed draws one for each env: ``enhanced_determinism``."""
+    return env._enhanced_determinism
+
+
 def set_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: list[int]) -> None:
     """Seed the numpy randomness of some envs, and leave the others' as it is.
 

@@ -25,6 +25,10 @@ def _now() -> str:
     return datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
 
 
+NO_SEED = -1
+"""An episode's seed where it has none: it began wherever the random generators stood."""
+
+
 @dataclass(frozen=True)
 class EpisodeInfo:
     """What is needed to know an episode again, and to make it again."""
@@ -32,7 +36,7 @@ class EpisodeInfo:
     task: str
     env_index: int
     seed: int
-    """Episode seed; below 0 where it is not known."""
+    """Episode seed; `NO_SEED` where none was given, or it is not known."""
     source_file: str | None
     """The task's own file. Of a recording that was read: its path where it is still there, else its name alone."""
     source_hash: str

@@ -26,7 +26,7 @@ from workbench.recording.encoded_pictures import (
     Modality,
     encode,
 )
-from workbench.recording.episode import CameraTrack, Episode, EpisodeInfo
+from workbench.recording.episode import NO_SEED, CameraTrack, Episode, EpisodeInfo
 
 _PICTURES = ("sensor_data", "sensor_param")
 _UNKNOWN_DT = 0.05
@@ -118,7 +118,7 @@ def _episode(
     info = EpisodeInfo(
         task=str(env_info.get("env_id") or "unknown task"),
         env_index=0,
-        seed=-1 if seed is None else int(seed),
+        seed=NO_SEED if seed is None else int(seed),
         source_file=None,
         source_hash="",
         source={},
