@@ -123,6 +123,7 @@ class EpisodeGatherer:
         """
         assert self._ends == "reset"
         successes = columns.get("evaluate/success")
+        lost: ValueError | None = None
         for names in {episode.state_names for episode in self.under_way}:
             chosen = [(n, v) for n, v in columns.items() if n[:6] != STATE or n[6:] in names]
             layout, rows = self._packer.pack_steps(chosen)
@@ -139,7 +140,9 @@ class EpisodeGatherer:
                     if successes is not None:
                         episode.success = bool(np.any(successes[good - 1, env]))
                 if len(wrong):
-                    raise _lost(env, episode.steps + 1, int(elapsed[good, env]))
+                    lost = lost or _lost(env, episode.steps + 1, int(elapsed[good, env]))
+        if lost is not None:
+            raise lost
 
     def finish(self) -> None:
         """End the episodes under way where they are."""
