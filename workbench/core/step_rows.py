@@ -12,7 +12,7 @@ that only some envs have, simulation on a GPU, where each of these tensors would
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -55,7 +55,8 @@ class StepRows:
     ) -> list[tuple[str, NDArray]]:
         """The step that was just made, `action` (N, A) included: names, and arrays that are good until the next one."""
         task = self._task
-        env, px = task.env, task.env.scene.px
+        env = task.env
+        px: Any = env.scene.px
         task.obs = obs = seams.last_observation(env)
         count = env.num_envs
         found: list[tuple[str, NDArray]] = [
@@ -86,8 +87,9 @@ class StepRows:
             found += [(name, _array(value)) for name, value in observed(task)]
         return found
 
-    def learn(self, found: list[tuple[str, NDArray]]) -> None:
-        """Find out whatever `columns` will have to know of steps like this one. Runs the author's hooks, the first time."""
+    def learn(self, found: Sequence[tuple[str, NDArray]]) -> None:
+        """Find out whatever `columns` will have to know of steps like `found`, which was read just now. Runs the author's
+        hooks, the first time."""
         for name, value in observed(self._task):
             self._parts[name, value.shape[-1]] = parts_of(self._task, name, value)
 

@@ -153,10 +153,10 @@ class EpisodeWriter:
             self._given[index] = tuple(modality for modality in MODALITIES if modality in images)
             self._encoded[index] = form
         assert index is not None
-        entries = [(f"picture/{index}/{name}", state, name, image) for name, image in images.items()]
+        entry = Entry(f"camera/{index}", state, np.asarray(pose, dtype=np.float32).tobytes())
         return [
-            Entry(f"camera/{index}", state, np.asarray(pose, dtype=np.float32).tobytes()),
-            encode_soon(entries),
+            entry,
+            encode_soon([(f"picture/{index}/{m}", state, m, image) for m, image in images.items()]),
         ]
 
     def append_packed(self, layout: Layout, packed: bytes, pictures: Sequence[Picture] = ()) -> None:
@@ -248,8 +248,11 @@ class EpisodeWriter:
         for (index, modalities), picture in zip(seen.items(), pictures):
             pose = np.asarray(picture.pose, dtype=np.float32).tobytes()
             items.append(Entry(f"camera/{index}", self._states, pose))
-            asked = [(f"picture/{index}/{m}", self._states, m, getattr(picture, m)) for m in modalities]
-            items.append(encode_soon(asked))
+            items.append(
+                encode_soon(
+                    [(f"picture/{index}/{m}", self._states, m, getattr(picture, m)) for m in modalities]
+                )
+            )
         return seen, items
 
     def _check(self, picture: Picture, seen: Mapping[int, object]) -> int:

@@ -17,7 +17,7 @@ from workbench.core.step_pictures import observed_pictures
 from workbench.core.step_rows import ELAPSED, StepRows
 from workbench.core.take_pictures import Request
 from workbench.core.task_env import TaskEnv
-from workbench.recording.encoded_pictures import MODALITIES
+from workbench.recording.encoded_pictures import MODALITIES, Modality
 from workbench.recording.journal import Item, before_writing
 from workbench.recording.step_ring import StepRing, Steps
 from workbench.session.episodes import EpisodeGatherer
@@ -71,7 +71,9 @@ class LaterSteps:
             env = episode.env
             items[env] = held = []
             for camera in seen:
-                images = {name: camera.images[name][env] for name in MODALITIES if name in camera.images}
+                images: dict[Modality, NDArray] = {
+                    name: camera.images[name][env] for name in MODALITIES if name in camera.images
+                }
                 held += episode.writer.encode(
                     elapsed[env], ("sensor", camera.camera), camera.poses[env], images
                 )
