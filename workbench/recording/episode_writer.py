@@ -222,6 +222,7 @@ class EpisodeWriter:
         try:
             self._finished = make_files(self._journal.path, self._header, self._folder, self._states)
         except Exception:
+            self._journal.sync()
             self.close()
             raise
         self.discard()

@@ -157,28 +157,32 @@ class Journal:
 
     def sync(self) -> None:
         """Write what was committed and make it last, also through a power cut. An error is raised by the next `commit`."""
+        self._written(os.fsync)
+
+    def finish(self) -> None:
+        """Write everything and stop writing; the file stays locked until `close`.
+
+        A process that dies loses nothing of it. For a power cut `sync` it, where it is not to be replaced by something better at once.
+        What could not be written before is tried again. Raises OSError where something still cannot.
+        """
+        _keeper.forget(self)
+        self._error = None
+        self._written(lambda _: None)
+        if self._error is not None:
+            raise self._error
+
+    def _written(self, last: Callable[[int], None]) -> None:
         self.write()
         with self._writing:
             if self._error is not None or not self._closer.alive:
                 return
             try:
-                os.fsync(self._descriptor)
+                last(self._descriptor)
                 if os.fstat(self._descriptor).st_nlink == 0:
                     gone = "the folder, or the file in it, was removed during the recording"
                     raise FileNotFoundError(errno.ENOENT, gone)
             except OSError as error:
                 self._error = error
-
-    def finish(self) -> None:
-        """Write everything and stop writing; the file stays locked until `close`.
-
-        What could not be written before is tried again. Raises OSError where something still cannot.
-        """
-        _keeper.forget(self)
-        self._error = None
-        self.sync()
-        if self._error is not None:
-            raise self._error
 
     def close(self) -> None:
         """Let go of the file."""

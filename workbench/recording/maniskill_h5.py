@@ -13,7 +13,6 @@ HDF5 writes into a `SafeFile`, which knows whether the disk took every byte, and
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -161,8 +160,6 @@ def write_json(survey: Survey, path: Path, folder: Path) -> None:
     content = json.dumps(_document(survey, folder), indent=2, default=str).encode()
     with path.open("xb") as file:
         file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
 
 
 def _document(survey: Survey, folder: Path) -> dict[str, Any]:
