@@ -27,8 +27,10 @@ from workbench.session.record import Progress, Recorded, RecordOptions, record, 
 class _StopAtInterrupt:
     """Ctrl-C while episodes are made ends the recording in good order; before that, or a second time, at once."""
 
-    def __init__(self) -> None:
+    def __init__(self, say: Callable[[str], None]) -> None:
+        """`say` is told what the first one did: whoever waits for a step that never ends has to know of the second."""
         self.asked = self.making = False
+        self._say = say
 
     def __enter__(self) -> _StopAtInterrupt:
         self._before = signal.signal(signal.SIGINT, self._on_signal)
@@ -41,6 +43,7 @@ class _StopAtInterrupt:
         if self.asked or not self.making:
             raise KeyboardInterrupt
         self.asked = True
+        self._say("ending after this step; Ctrl-C again ends at once")
 
 
 def record_in_terminal(
@@ -63,15 +66,15 @@ def record_in_terminal(
         mended = recover(what.out) if what.out.is_dir() else []
         if mended:
             console.print(f"{_episodes(len(mended))} that an earlier recording left half written: mended")
-        with _StopAtInterrupt() as interrupt, Bar(*columns, console=console) as bar:
+        with Bar(*columns, console=console) as bar:
             row = bar.add_task("opening", total=asked.successes or asked.episodes)
-            rate = _Rate(bar, row, interrupt)
-            recorded = record(
-                what,
-                lambda activity: bar.update(row, description=activity),
-                rate.show,
-                lambda: interrupt.asked,
-            )
+            with _StopAtInterrupt(lambda words: bar.update(row, description=words)) as interrupt:
+                recorded = record(
+                    what,
+                    lambda activity: bar.update(row, description=activity),
+                    _Rate(bar, row, interrupt).show,
+                    lambda: interrupt.asked,
+                )
             bar.update(row, completed=len(recorded.written), description="recorded")
     except TaskError as error:
         say_problem(error.problem)
@@ -93,8 +96,10 @@ class _Rate:
             self._interrupt.making = True
             self._began = time.monotonic()
         seconds = max(time.monotonic() - self._began, 1e-3)
-        words = f"recording, {now.steps / seconds:.0f} steps a second"
-        self._bar.update(self._row, completed=now.kept, description=words)
+        self._bar.update(self._row, completed=now.kept)
+        if not self._interrupt.asked:
+            words = f"recording, {now.steps / seconds:.0f} steps a second"
+            self._bar.update(self._row, description=words)
 
 
 def _say(asked: RecordOptions, recorded: Recorded, refuse: Callable[[str], int]) -> int:
@@ -115,7 +120,8 @@ def _say(asked: RecordOptions, recorded: Recorded, refuse: Callable[[str], int])
     if recorded.stopped:
         return refuse("interrupted; episodes that had ended are kept")
     if asked.successes is not None and kept < asked.successes:
-        return refuse(f"{asked.successes} successes were asked for; given up after {recorded.tried} episodes")
+        wanted = "1 success was" if asked.successes == 1 else f"{asked.successes} successes were"
+        return refuse(f"{wanted} asked for; given up after {_episodes(recorded.tried)}")
     return 0
 
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +41,7 @@ from workbench.core.step_pictures import step_pictures
 from workbench.core.take_pictures import Request
 from workbench.core.task_env import TaskEnv
 from workbench.recording.episode import NO_SEED
+from workbench.recording.episode_writer import EpisodeFiles
 from workbench.recording.recover import recover
 from workbench.recording.rrd import RecordingError
 from workbench.session.episode_files import EpisodeFinisher
@@ -88,6 +90,8 @@ class Recorder(gym.Wrapper):
             recover(self._folder)
         self._task = TaskEnv(base)
         self._finisher = EpisodeFinisher()
+        self._made: list[Future[EpisodeFiles | str]] = []
+        """Episodes that are over, and not known to have their files."""
         self._gatherer: EpisodeGatherer | None = None
         self._later: LaterSteps | None = None
         self._scene: Any = None
@@ -230,7 +234,7 @@ class Recorder(gym.Wrapper):
         warnings.warn(f"the recording ended: {error}", stacklevel=4)
 
     def _over(self, episode: GatheredEpisode) -> None:
-        self._finisher.finish(episode)
+        self._made.append(self._finisher.finish(episode))
 
     def _end(self) -> None:
         self._catch_up()
@@ -240,8 +244,10 @@ class Recorder(gym.Wrapper):
             gatherer.finish()
 
     def _say_what_failed(self) -> None:
-        problem = self._finisher.finished.problem
-        if problem is not None and self.problem is None:
-            self.problem = problem
+        done = [future for future in self._made if future.done()]
+        self._made = [future for future in self._made if future not in done]
+        problems = [result for future in done if isinstance(result := future.result(), str)]
+        if problems and self.problem is None:
+            self.problem = problems[0]
             self._gatherer = self._later = None
-            warnings.warn(f"the recording ended: {problem}", stacklevel=4)
+            warnings.warn(f"the recording ended: {self.problem}", stacklevel=4)

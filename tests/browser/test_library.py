@@ -117,8 +117,11 @@ def test_words_are_looked_for_as_they_are_typed(shown: Shown) -> None:
     field = shown.page.get_by_role("textbox").first
     field.fill("even r1")
     until(lambda: shown.seeds() == [18, 16, 14, 12, 10], "what has those words")
-    field.fill("")
+    field.fill("zebra")
+    expect(shown.page.get_by_text("No recording has “zebra”.")).to_be_visible()
+    shown.page.get_by_text("Clear the filter").click()
     until(lambda: len(shown.seeds()) == 50, "all of them")
+    expect(field).to_have_value("")
 
 
 def test_a_recording_is_tagged_and_deleted_and_comes_back(shown: Shown) -> None:
@@ -134,6 +137,7 @@ def test_a_recording_is_tagged_and_deleted_and_comes_back(shown: Shown) -> None:
     page.wait_for_timeout(100)  # viser sends the last of two messages within 50 ms
     page.keyboard.press("Enter")
     expect(shown.row(1).locator(".wb-library-tag")).to_have_text(["wobbly", "good"])
+    expect(shown.row(1).locator(".wb-library-name")).to_have_text("r01")
     expect(save).to_be_hidden()
     page.keyboard.press("Delete")
     expect(page.get_by_text("Delete 1 recording (3 files")).to_be_visible()
@@ -154,7 +158,9 @@ def test_a_recording_is_tagged_and_deleted_and_comes_back(shown: Shown) -> None:
     until(lambda: shown.seeds()[:2] == [0, 1], "the row again")
 
 
-def test_a_new_recording_appears_by_itself(shown: Shown) -> None:
-    describe(shown.library.folder, "new", id="new", seed=99, written_at="2026-11-21T12:00:00")
+def test_a_new_recording_appears_by_itself_with_all_of_its_seed(shown: Shown) -> None:
+    largest = 2**31 - 1
+    describe(shown.library.folder, "new", id="new", seed=largest, written_at="2026-11-21T12:00:00")
     shown.page.locator("[data-press]", has_text="date").first.click()
-    until(lambda: shown.seeds()[0] == 99, "the new row")
+    until(lambda: shown.seeds()[0] == largest, "the new row")
+    assert shown.row(0).locator("td").nth(4).evaluate("cell => cell.scrollWidth <= cell.clientWidth")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import signal
@@ -12,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from tests.browser.opened import close_notice, launch, new_page, open_workbench, until
@@ -128,6 +130,24 @@ def test_compares_two_and_says_where_they_part(desk: tuple[Page, list[str]]) -> 
     expect(page.get_by_text(re.compile("They part at step 1"))).to_be_visible()
     page.locator("tr", has=page.get_by_text("bodies", exact=True)).click()
     says(page, "step 1 /")
+    assert [e for e in errors if LATE not in e] == []
+
+
+def test_what_is_shared_is_named_made_and_fetched(desk: tuple[Page, list[str]]) -> None:
+    page, errors = desk
+    page.get_by_role("tab", name="Share").click()
+    expect(page.get_by_text("Selected in the library, 2 recordings")).to_be_visible()
+    page.get_by_role("textbox", name="Make").click()
+    page.get_by_role("option", name="Sheet of pictures (png)").click()
+    expect(page.get_by_text(re.compile("Makes 2 files"))).to_be_visible()
+    page.get_by_role("button", name="Make", exact=True).click()
+    links = page.locator("a[download]")
+    expect(links).to_have_count(2)
+    for link in links.all():
+        address = link.evaluate("link => link.href")
+        sheet = Image.open(io.BytesIO(page.request.get(address).body()))
+        assert sheet.format == "PNG" and sheet.width > 100
+        assert address.endswith(f"{link.inner_text()}") and ".sheet.png" in address
     assert [e for e in errors if LATE not in e] == []
 
 

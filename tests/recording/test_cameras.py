@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from tests.recording.read_rrd import Column, read_rrd
 from workbench.recording.layout import optical_pose
-from workbench.recording.read import Column, read_rrd
 
 
 @pytest.fixture(scope="module")

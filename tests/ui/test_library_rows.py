@@ -17,6 +17,7 @@ from workbench.ui.library_rows import (
     chosen,
     in_words,
     newest_sources,
+    none_like_that,
     ordered,
 )
 
@@ -151,3 +152,9 @@ def test_files_of_several_trajectories_are_counted_once() -> None:
     rows = [row("a", paths=both, trajectory="traj_0"), row("b", paths=both, trajectory="traj_1"), row("c")]
     assert in_words(rows) == "3 recordings (4 files, 2 KB)"
     assert in_words(rows[:1]) == "1 recording (2 files, 1 KB)"
+
+
+def test_an_empty_list_says_which_filter_emptied_it() -> None:
+    assert none_like_that(" zebra ", "all", None) == "No recording has “zebra”."
+    assert none_like_that("", "failed", "Push-v1") == "There is no failed recording of Push-v1."
+    assert none_like_that("x", "success", "Push-v1") == "No successful recording of Push-v1 has “x”."

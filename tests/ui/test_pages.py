@@ -90,9 +90,9 @@ def test_an_episode_whose_writer_was_killed_is_mended_and_said(
         place.close()
 
 
-def test_looking_at_recordings_needs_no_simulator() -> None:
+def test_serving_the_pages_needs_no_simulator() -> None:
     said = subprocess.run(
-        [sys.executable, "-c", "import sys, workbench.ui.put_together; print(*sys.modules)"],
+        [sys.executable, "-c", "import sys, workbench.page_command; print(*sys.modules)"],
         check=True,
         capture_output=True,
         text=True,

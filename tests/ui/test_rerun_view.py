@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import http.client
+import threading
 import urllib.parse
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,8 +25,9 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recordings") / "Push ä <b>.rrd"
     stream = rr.RecordingStream("workbench", recording_id="one")
     stream.save(path)
-    stream.set_time("step", sequence=0)
-    stream.log("reward", rr.Scalars(1.0))
+    for step in range(30):
+        stream.set_time("step", sequence=step)
+        stream.log("reward", rr.Scalars(1.0))
     stream.disconnect()
     return path
 
@@ -69,14 +71,6 @@ def test_a_file_is_sent_whole_and_only_under_the_address_that_was_made(door: Doo
     saved = get(door, offers.address(big, download=True))[1]
     assert saved["Content-Disposition"] == "attachment; filename*=UTF-8''big%20one.rrd"
     big.unlink()
-    assert get(door, address)[0] == 404
-
-
-def test_a_withdrawn_file_is_not_to_be_had(door: Door, tmp_path: Path) -> None:
-    offers = Offers(door)
-    (tmp_path / "a.txt").write_text("a")
-    address = offers.address(tmp_path / "a.txt")
-    offers.withdraw(tmp_path / "a.txt")
     assert get(door, address)[0] == 404
 
 
@@ -125,8 +119,19 @@ def test_a_recordings_name_is_text_and_no_script(door: Door, pages: RerunPages, 
 def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
     door: Door, pages: RerunPages, recording: Path, chromium_path: str
 ) -> None:
-    view = RerunView(door.server, pages)
-    view.draw([recording])
+    library = door.server.gui.add_panel()
+    with library.add_tab("Library"):
+        door.server.gui.add_html("...")
+    library.dock_left()
+    library.minimize()
+    view = RerunView(door.server, pages, lambda: 850)
+    stopping = threading.Event()
+
+    def draw() -> None:
+        while not stopping.wait(0.1):
+            view.draw([recording], moments={recording: 12})
+
+    threading.Thread(target=draw, daemon=True).start()
     asked: list[Request] = []
     failed: dict[str, str | None] = {}
     with sync_playwright() as playwright:
@@ -143,9 +148,18 @@ def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
         assert answer.value.status == 200
         frame = tab.frame_locator("iframe.wb-rerun")
         frame.locator("canvas.visible").wait_for(timeout=90_000)
+        # The state of the viewer as it tells it: the cursor of the timeline "step" is at 12.
+        inside = next(frame for frame in tab.frames if "/rerun/viewer-" in frame.url)
+        inside.wait_for_function(
+            "new TextDecoder().decode(window._handle.viewer_state()).includes('step\\x10\\x01\\x1a\\x02\\x08\\x0c')"
+        )
+        tab.get_by_text("from step 12").wait_for()
+        tab.wait_for_function("document.querySelector('iframe.wb-rerun').clientWidth > 500")
+        assert tab.evaluate("document.activeElement.tagName") != "IFRAME", "the keys are the page's"
         tab.get_by_role("button", name="Close rerun").click()
         tab.locator("iframe.wb-rerun").wait_for(state="detached")
         browser.close()
+    stopping.set()
     ours = f"http://127.0.0.1:{door.port}/"
     foreign = {
         r.url for r in asked if not r.url.startswith((ours, f"ws://127.0.0.1:{door.port}", "data:", "blob:"))

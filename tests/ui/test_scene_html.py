@@ -12,6 +12,14 @@ from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.recording.episode import Episode, EpisodeInfo
 from workbench.ui.scene_html import write_scene_html
 
+DRAWN = """step => Object.values(window.__viserSceneTree.getState()).some(node => {
+    const p = node.message?.props?.batched_positions;
+    if (!p) return false;
+    const x = new DataView(p.buffer, p.byteOffset, 4).getFloat32(0, true);
+    return Math.abs(x - (-0.3 + 0.03 * step)) < 1e-4;
+})"""
+"""Whether the cube is drawn where it was at this step."""
+
 
 @pytest.fixture
 def episode() -> Episode:
@@ -55,6 +63,18 @@ def test_it_plays_without_a_server(episode: Episode, tmp_path: Path, chromium_pa
             "document.querySelector('input') && parseFloat(document.querySelector('input').value) > 0.3"
         )
         assert float(time_shown.input_value()) <= 3.2
+        # What is said is the episode's own time, to its end and no further while the last state is held.
+        tab.wait_for_function(
+            "document.querySelector('#wb-time').textContent === 'step 20 of 20, 2.00 of 2.00 s'"
+        )
+        caption = tab.locator(".wb-caption")
+        assert "Made & <b>, seed 7" in caption.inner_text() and "no success" in caption.inner_text()
+        assert not time_shown.is_visible(), "the player's clock runs on while the last state is held"
+        tab.keyboard.press("Space")
+        for _ in range(3):
+            tab.locator(".mantine-Slider-root").first.click(position={"x": 40 + 30 * _, "y": 5})
+            said = int(caption.inner_text().split("step ")[1].split()[0])
+            tab.wait_for_function(DRAWN, arg=said)
         assert tab.title() == "Made & <b>, 20 steps"
         browser.close()
     assert [url for url in asked if not url.startswith(("file:", "data:", "blob:"))] == []

@@ -14,7 +14,7 @@ from workbench.ui.door import Door, DoorOptions, open_door
 from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted
 from workbench.ui.making import Making, MakingView
 from workbench.ui.offers import Offers
-from workbench.ui.share_panel import ALL_CAMERAS, WHAT, Chosen, SharePanel
+from workbench.ui.share_panel import ALL_CAMERAS, MOST_NAMED, WHAT, Chosen, SharePanel, will_make
 
 
 class Noted(Making):
@@ -65,6 +65,22 @@ def test_without_a_recording_there_is_nothing_to_make(panel: SharePanel, making:
     assert panel._make.disabled and "Select recordings" in panel._about.content
     panel._start(None)
     assert making.wanted == []
+
+
+def test_recordings_and_files_are_named_before_they_are_made(
+    panel: SharePanel, making: Noted, tmp_path: Path
+) -> None:
+    panel.draw(Chosen((RECORDING,), ("base_camera", "hand/camera"), selected=True))
+    assert "Selected in the library" in panel._about.content and "Push_seed1" in panel._about.content
+    said = panel._will.content
+    assert "2 files" in said and "Push_seed1.base_camera.mp4" in said and "Push_seed1.hand_camera.mp4" in said
+    many = tuple(Source(Path(f"/recordings/r{k}.json")) for k in range(MOST_NAMED + 2))
+    will = will_make("sheet", Chosen(many), ALL_CAMERAS, tmp_path)
+    assert (will.what, will.files[0], will.more) == (f"{MOST_NAMED + 2} files", "r0.sheet.png", 2)
+    assert str(tmp_path / "datasets") in will_make("lerobot", Chosen(many), ALL_CAMERAS, tmp_path).where
+    panel.draw(Chosen(many))
+    assert "Open in the review" in panel._about.content and "and 2 more" in panel._about.content
+    assert "one film for each camera of these 7 recordings" in panel._will.content
 
 
 def test_a_film_is_of_the_camera_that_was_chosen_or_of_every_one(panel: SharePanel, making: Noted) -> None:

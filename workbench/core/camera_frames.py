@@ -393,20 +393,6 @@ def horizontal_fov(intrinsic: ArrayLike, width: int) -> float:
     return 2 * math.atan(width / 2 / float(checked_intrinsic(intrinsic)[0, 0]))
 
 
-def fov_if_plain(intrinsic: ArrayLike, width: int, height: int, tolerance: float = 1e-3) -> float | None:
-    """The vertical field of view that says all of this matrix, or None if one number cannot.
-
-    Args:
-        tolerance: pixels by which the principal point may be off the middle, and by which the picture's border
-            may move, when the fov is taken in place of the matrix.
-    """
-    k = checked_intrinsic(intrinsic)
-    plain = intrinsic_from_fov(vertical_fov(k, height), width, height)
-    moved = abs(k[0, 0] / k[1, 1] - 1) * width / 2
-    centred = np.abs(k[:2, 2] - plain[:2, 2]).max() <= tolerance
-    return vertical_fov(k, height) if centred and moved <= tolerance else None
-
-
 def scaled_intrinsic(intrinsic: ArrayLike, size: Sequence[int], new_size: Sequence[int]) -> Floats:
     """(3, 3) that shows the same view in a picture of another (width, height); pixels need not stay square."""
     _check_size(*size)

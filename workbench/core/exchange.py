@@ -21,11 +21,6 @@ from workbench.core.snapshot import Snapshot, restore_memory, restore_snapshot, 
 from workbench.core.strict import StrictMixin
 
 
-def task_class(env: BaseEnv) -> type[BaseEnv]:
-    """The author's class of an env, without what the core puts in front of it."""
-    return getattr(env, "_workbench_task", type(env))
-
-
 def put_class(env: BaseEnv, task: type[BaseEnv]) -> None:
     """Let `env` go on as an env of `task`; its state, scene and attributes are untouched.
 

@@ -100,6 +100,11 @@ def ensure_render_device(install: bool) -> RenderProbe:
     return _bring_mesa(probe, install)
 
 
+def use_private_driver() -> None:
+    """Let SAPIEN, in this process and in those that it starts, find the driver of a user who may not install one."""
+    os.environ.update(ensure_render_device(install=False).env)
+
+
 def _install_libraries(probe: RenderProbe) -> RenderProbe:
     try:
         apt_get(["update"])

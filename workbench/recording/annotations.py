@@ -13,15 +13,12 @@ takes along.
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
-import shutil
-import uuid
 from pathlib import Path
 from typing import Any
 
 from workbench.recording.library_row import clean_note, clean_tags
+from workbench.recording.replace_file import replace_file
 
 MOST_BYTES = 64 << 20
 """Of a .json: more is no description of episodes, and would fill the memory."""
@@ -72,7 +69,7 @@ def write_notes(path: Path, trajectory: str | None, tags: tuple[str, ...], note:
         path.unlink(missing_ok=True)
         return
     plain = {name: {"tags": list(tags), "note": note} for name, (tags, note) in sorted(entries.items())}
-    _replace(path, json.dumps({_NOTES: plain}, indent=2, ensure_ascii=False).encode())
+    replace_file(path, json.dumps({_NOTES: plain}, indent=2, ensure_ascii=False).encode())
 
 
 def write_into_description(path: Path, tags: tuple[str, ...], note: str) -> None:
@@ -89,20 +86,4 @@ def write_into_description(path: Path, tags: tuple[str, ...], note: str) -> None
     # Indented as what was read: these files are looked at.
     with path.open("rb") as file:
         indent = 2 if b"\n" in file.read(4) else None
-    _replace(path, json.dumps(described, indent=indent).encode())
-
-
-def _replace(path: Path, content: bytes) -> None:
-    """Let `path` hold `content`: all of it, or what it held before."""
-    path = path.resolve()  # a link stays one
-    temporary = path.with_name(f".{uuid.uuid4().hex}.json.part")
-    try:
-        with temporary.open("xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        with contextlib.suppress(OSError):  # a new .notes has no mode to keep
-            shutil.copymode(path, temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    replace_file(path, json.dumps(described, indent=indent).encode())

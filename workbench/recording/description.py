@@ -9,6 +9,7 @@ neither of the two formats keeps: the types of the entries of ``evaluate()``, th
     source_file     the name of the task's file; null
     source_path     where it lies as seen from the recording's folder; null; not in the .rrd, which is handed on
     source          path as seen from the task's file, to text
+    side_files      what else the task reads and is not held here: path as seen from the task's file, to hash; may lack
     length, return, success, success_once, fail, fail_once       the last four null where the task has no such entry
     action_names, cameras, segmentation, scene, evaluate, obs    what the columns are
     thumbnail       base64 of a JPEG at most 160 pixels wide; null without cameras; in the .json alone
@@ -58,6 +59,7 @@ def describe(survey: Survey) -> dict[str, Any]:
         "source_hash": info.source_hash,
         "source_file": os.path.basename(info.source_file) if info.source_file else None,
         "source": {_relative(path, folder): text for path, text in info.source.items()},
+        "side_files": info.side_files,
         "length": survey.length,
         "return": float(np.sum(survey.reward, dtype=np.float64)),
         "success": _last(survey, "success"),
@@ -118,6 +120,7 @@ def info_from(said: dict[str, Any], folder: Path) -> EpisodeInfo:
         written_at=said["written_at"],
         id=said["id"],
         recovered=said["recovered"],
+        side_files={str(name): str(hashed) for name, hashed in dict(said.get("side_files") or {}).items()},
     )
 
 

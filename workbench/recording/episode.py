@@ -60,6 +60,8 @@ class EpisodeInfo:
     """Unique for ever, whatever the files are called."""
     recovered: bool = False
     """Its writer ended in the middle; the episode is cut where that was."""
+    side_files: dict[str, str] = field(default_factory=dict)
+    """What else the task reads, and the recording does not hold: path as seen from `source_file`'s folder, to hash."""
 
 
 @dataclass

@@ -35,7 +35,7 @@ import pyarrow as pa
 FOLDER = ".writing"
 SYNC_SECONDS = 0.4
 """How long a row may wait before it is written."""
-_BATCH_BYTES = 4 << 20
+_BATCH_BYTES = 2 << 20
 """More than this is written by whoever appends it: memory stays bounded where the disk is slower than the episode."""
 _SCHEMA = pa.schema([("kind", pa.string()), ("number", pa.int32()), ("value", pa.binary())])
 

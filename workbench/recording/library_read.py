@@ -13,6 +13,7 @@ from __future__ import annotations
 import base64
 import binascii
 import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from workbench.recording.annotations import read_json, read_notes
 from workbench.recording.lerobot_read import lerobot_rows
 from workbench.recording.library_row import (
     Facts,
+    Kind,
     clean_note,
     clean_tags,
     moment,
@@ -93,33 +95,38 @@ def _broken(folder: Path, found: Found, what: str) -> Entry:
 
 def _noted(facts: Facts, notes: dict[str, tuple[tuple[str, ...], str]]) -> Facts:
     tags, note = notes.get(facts.trajectory or "", ((), ""))
-    return Facts(**{**vars(facts), "tags": tags, "note": note})
+    return replace(facts, tags=tags, note=note)
 
 
 def _ours(folder: Path, found: Found, described: dict[str, Any]) -> Entry:
     name = Path(found.key).name
     lost = [f"{name}{suffix}" for suffix in (".h5", ".rrd") if suffix not in found.sizes]
-    seed = whole(described.get("seed"))
-    facts = Facts(
-        "workbench",
-        task=text(described.get("task")),
-        uid=text(described.get("id"), 64),
-        written=moment(described.get("written_at")) or found.times[".json"] / 1e9,
-        seed=None if seed is None or seed < 0 else seed,
-        env_index=whole(described.get("env_index")),
-        length=whole(described.get("length")),
-        total_reward=number(described.get("return")),
-        success=truth(described.get("success")),
-        success_once=truth(described.get("success_once")),
-        fail=truth(described.get("fail")),
-        control_mode=text(described.get("control_mode")),
-        source_hash=text(described.get("source_hash"), 64),
-        tags=clean_tags(described.get("tags")),
-        note=clean_note(described.get("note")),
-        recovered=described.get("recovered") is True,
-        problem=f"{' and '.join(lost)} {'is' if len(lost) == 1 else 'are'} missing." if lost else None,
-    )
+    problem = f"{' and '.join(lost)} {'is' if len(lost) == 1 else 'are'} missing." if lost else None
+    facts = replace(_episode("workbench", described, found.times[".json"] / 1e9), problem=problem)
     return facts, _thumbnail(described.get("thumbnail"))
+
+
+def _episode(kind: Kind, said: dict[str, Any], if_undated: float) -> Facts:
+    """Of an episode of ours: its ``.json`` and its ``.rrd`` say the same under the same names."""
+    seed = whole(said.get("seed"))
+    return Facts(
+        kind,
+        task=text(said.get("task")),
+        uid=text(said.get("id"), 64),
+        written=moment(said.get("written_at")) or if_undated,
+        seed=None if seed is None or seed < 0 else seed,
+        env_index=whole(said.get("env_index")),
+        length=whole(said.get("length")),
+        total_reward=number(said.get("return")),
+        success=truth(said.get("success")),
+        success_once=truth(said.get("success_once")),
+        fail=truth(said.get("fail")),
+        control_mode=text(said.get("control_mode")),
+        source_hash=text(said.get("source_hash"), 64),
+        tags=clean_tags(said.get("tags")),
+        note=clean_note(said.get("note")),
+        recovered=said.get("recovered") is True,
+    )
 
 
 def _thumbnail(encoded: object) -> bytes | None:
@@ -234,7 +241,7 @@ def _totals(path: Path, trajectories: list[str]) -> tuple[dict[str, float | None
 
 def _rrd_only(folder: Path, found: Found) -> Entry:
     # It takes rerun along, which is half a second that a library without such files has no need of.
-    from workbench.recording.read import read_properties
+    from workbench.recording.read_properties import read_properties
 
     path = found.path(folder, ".rrd")
     try:
@@ -244,19 +251,4 @@ def _rrd_only(folder: Path, found: Found) -> Entry:
     episode = said.get("episode", {})
     if not episode:
         return _broken(folder, found, "is a recording of rerun, but not of an episode")
-    facts = Facts(
-        "rrd only",
-        task=text(episode.get("task")),
-        uid=text(episode.get("id"), 64),
-        written=moment(episode.get("written_at")) or found.newest / 1e9,
-        seed=whole(episode.get("seed")),
-        env_index=whole(episode.get("env_index")),
-        length=whole(episode.get("length")),
-        total_reward=number(episode.get("return")),
-        success=truth(episode.get("success")),
-        success_once=truth(episode.get("success_once")),
-        fail=truth(episode.get("fail")),
-        control_mode=text(episode.get("control_mode")),
-        source_hash=text(episode.get("source_hash"), 64),
-    )
-    return facts, None
+    return _episode("rrd only", episode, found.newest / 1e9), None

@@ -117,3 +117,14 @@ def read_index(path: Path) -> list[IndexedChunk]:
         IndexedChunk(entity, rows, static, offset + size)
         for entity, rows, static, offset, size in zip(*columns)
     ]
+
+
+def store_id(path: Path) -> str:
+    """What rerun's viewer calls the recording in `path` when it is told something about it (rerun's
+    ``viewer_control.proto``). Raises ValueError or OSError where there is none.
+    """
+    recordings = RrdReader(path).recordings()
+    if not recordings:
+        raise ValueError(f"{path.name} holds no recording")
+    application = recordings[0].application_id.replace("\\", "\\\\").replace(":", "\\:")
+    return f"Recording:{application}:{recordings[0].recording_id}"

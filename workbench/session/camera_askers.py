@@ -8,14 +8,14 @@ wants it; its envs are reset as often as one likes, which is how a camera is jud
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
 from typing import TypeVar
 
+from workbench.session.background import BackgroundProcess
 from workbench.session.camera_messages import CameraAnswer, CameraQuestion, CameraQuestionFailed, Searching
-from workbench.session.lane import Job, JobFailed
+from workbench.session.lane import Job, JobFailed, Stopped
 from workbench.session.messages import (
     Event,
     Failed,
@@ -27,7 +27,6 @@ from workbench.session.messages import (
     Status,
     Stepped,
 )
-from workbench.session.process import WorkerProcess, describe_exit, start_in_background
 
 _LOOK = 0.05
 _PATIENCE = 3.0
@@ -84,27 +83,20 @@ class BackgroundAsker:
 
     def __init__(self) -> None:
         self._numbers = count(1)
-        self._process: WorkerProcess | None = None
+        self._process = BackgroundProcess("that looks at the cameras", "to look with")
         self._loaded: Load | None = None
+        """By the process that is there."""
         self.num_envs = 0
-
-    @property
-    def pid(self) -> int | None:
-        """None while there is no process."""
-        process = self._process
-        return None if process is None else process.pid
 
     def load(self, load: Load, job: Job) -> None:
         """Have that version there, with no more than `MOST_ENVS` envs."""
         load = _for_judging(load)
-        if self._process is not None and self._loaded == load:
-            return
-        if self._process is None:
+        if not self._process.there:
+            self._loaded = None
             job.tell(0, 0, "starting a process to look with")
-            try:
-                self._process = start_in_background()
-            except OSError as error:
-                raise JobFailed(f"no process could be started to look with: {error}") from error
+            self._process.start()
+        if self._loaded == load:
+            return
         job.tell(0, 0, "building envs to look at")
         self._loaded = None
         event = self._request(load, job, Loaded)
@@ -126,9 +118,7 @@ class BackgroundAsker:
 
     def end(self) -> None:
         """End the process, if there is one."""
-        process, self._process, self._loaded = self._process, None, None
-        if process is not None:
-            process.stop(grace=0.0)
+        self._process.end()
 
     def _request(
         self,
@@ -137,38 +127,24 @@ class BackgroundAsker:
         kind: type[Kind],
         on_search: Callable[[Searching], None] = lambda at: None,
     ) -> Kind:
-        assert self._process is not None
         self._process.send(request)
-        try:
-            while not job.stopped:
-                event = self._process.receive(timeout=_LOOK)
-                if isinstance(event, Searching):
-                    on_search(event)
-                elif isinstance(event, kind):
-                    return event
-                elif isinstance(event, CameraQuestionFailed):
-                    raise JobFailed(event.why)
-                elif isinstance(event, Failed):
-                    raise JobFailed(f"the task failed in the background: {event.problem.message}")
-            self._settle()
-        except EOFError:
-            code = None if self._process is None else self._process.exit_code()
-            self.end()
-            if not job.stopped:
-                raise JobFailed(f"the process that looks at the cameras {describe_exit(code)}") from None
-        job.check()
-        raise AssertionError("a job that is stopped raises")
-
-    def _settle(self) -> None:
-        """Have it give up what it does (a search ends at any request), or end it."""
-        assert self._process is not None
-        self._process.send(Play(False))
-        deadline = time.monotonic() + _PATIENCE
-        while time.monotonic() < deadline:
-            # It answers in order: what comes after this belongs to nobody before.
-            if isinstance(self._process.receive(timeout=_LOOK), Status):
-                return
-        self.end()
+        while True:
+            try:
+                event = self._process.answer(job, kind, Searching, CameraQuestionFailed, Failed)
+            except Stopped:
+                # Have it give up what it does: a search ends at any request. It answers in order, so what comes
+                # after the status belongs to nobody before.
+                self._process.send(Play(False))
+                self._process.settle(_PATIENCE, for_this=Status)
+                raise
+            if isinstance(event, Searching):
+                on_search(event)
+            elif isinstance(event, CameraQuestionFailed):
+                raise JobFailed(event.why)
+            elif isinstance(event, Failed):
+                raise JobFailed(f"the task failed in the background: {event.problem.message}")
+            else:
+                return event
 
 
 def _for_judging(load: Load) -> Load:

@@ -101,11 +101,6 @@ class CameraJudging:
     def progress(self) -> Progress | None:
         return self._background_lane.progress or self._live_lane.progress
 
-    @property
-    def background_pid(self) -> int | None:
-        """Of the process in the background; None while there is none."""
-        return self._background.pid
-
     def take(self, answer: CameraAnswer) -> None:
         """The worker that plays answered."""
         self._live.take(answer)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from workbench.core.pictures import Picture
 from workbench.core.state_columns import read_state_columns
 from workbench.core.step_pictures import step_pictures
-from workbench.session.messages import Captured, CaptureMoments
+from workbench.session.moment_messages import Captured, CaptureMoments
 from workbench.session.open_task import OpenedTask, blamed
 from workbench.session.recorded_pictures import recorded_pictures
 

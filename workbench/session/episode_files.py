@@ -53,8 +53,8 @@ class EpisodeFinisher:
         with self._lock:
             return self._waiting
 
-    def finish(self, episode: GatheredEpisode) -> Future[EpisodeFiles | None]:
-        """Make its files; the result is None where that failed, which `finished` then says."""
+    def finish(self, episode: GatheredEpisode) -> Future[EpisodeFiles | str]:
+        """Make its files; the result says why where that failed. `finished` does too, until another one succeeds."""
         with self._lock:
             self._waiting += 1
         return self._pool.submit(self._finish, episode)
@@ -63,20 +63,20 @@ class EpisodeFinisher:
         """Wait for what is under way."""
         self._pool.shutdown(wait=True)
 
-    def _finish(self, episode: GatheredEpisode) -> EpisodeFiles | None:
-        files, problem, size = None, None, 0
+    def _finish(self, episode: GatheredEpisode) -> EpisodeFiles | str:
+        size = 0
+        made: EpisodeFiles | str
         try:
-            files = episode.writer.finish()
-            size = sum(path.stat().st_size for path in (files.rrd, files.h5, files.json))
+            made = episode.writer.finish()
+            size = sum(path.stat().st_size for path in (made.rrd, made.h5, made.json))
         except (RecordingError, OSError, ValueError) as error:
-            problem = f"an episode of env {episode.env} could not be written: {error}"
+            made = f"an episode of env {episode.env} could not be written: {error}"
         with self._lock:
             self._waiting -= 1
             now = self._finished
-            if problem is not None:
-                now = replace(now, problem=problem)
-            if files is not None:
-                now = Finished(now.count + 1, now.bytes_written + size, files, None)
-            self._finished = now
+            if isinstance(made, str):
+                self._finished = replace(now, problem=made)
+            else:
+                self._finished = Finished(now.count + 1, now.bytes_written + size, made, None)
         self._on_change()
-        return files
+        return made

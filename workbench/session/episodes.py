@@ -29,6 +29,7 @@ from workbench.recording.episode import EpisodeInfo
 from workbench.recording.episode_writer import EpisodeWriter
 from workbench.recording.journal import Item as JournalItem
 from workbench.recording.row import EpisodeRow
+from workbench.recording.side_files import side_files
 from workbench.session.messages import Stepped, TaskDescription
 
 _PACKAGES = ("maniskill-workbench", "mani_skill", "sapien", "torch", "rerun-sdk")
@@ -291,6 +292,7 @@ def episode_info(
         env_kwargs=dict(task.env_kwargs),
         reset_options=dict(reset_options or {}),
         max_episode_steps=task.max_episode_steps,
+        side_files=side_files(task.file, task.source),
     )
 
 

@@ -27,6 +27,8 @@ from workbench.core.pictures import CameraKind, Picture
 from workbench.core.snapshot_bytes import WholeSnapshot
 from workbench.core.step import StepResult
 from workbench.session.messages import NO_MOMENT, PastPictures, Pictures, Restored, Stepped
+from workbench.session.moment_rows import MomentRows
+from workbench.session.shared_parts import PartSet, SharedParts
 from workbench.session.standing import Standing
 
 RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, NOT_A_NUMBER = 1, 2, 4, 8, 16, 32
@@ -34,7 +36,6 @@ RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, NOT_A_NUMBER = 1, 2, 4, 8, 16, 32
 _OVERHEAD = 2500
 """Bytes of the objects around a moment's arrays; with it the count is within 2 % of what tracemalloc measures."""
 _PICTURES_SHARE = 0.5
-_FIRST_ROWS = 1024
 _RECENT = 200
 """Moments among which one is looked for that pictures belong to: they come some steps late."""
 
@@ -58,7 +59,7 @@ class Moment:
     number: int
     """`Stepped.number`."""
     snapshot: bytes
-    parts: _PartSet
+    parts: PartSet
     size: int
     """Bytes, without parts and pictures."""
     pictures: dict[tuple[int, CameraKind, str], Picture] = field(default_factory=dict)
@@ -88,15 +89,6 @@ class Stretch:
     """Whether its first moment is the one that it began with; else that was dropped for want of memory."""
 
 
-@dataclass
-class _PartSet:
-    """The parts of a snapshot, shared by all moments that have the same."""
-
-    keys: tuple[int, ...]
-    moments: int = 0
-    complete: bool = True
-
-
 class History:
     """The moments of one built task, oldest first. Not thread-safe: its owner locks."""
 
@@ -110,17 +102,13 @@ class History:
         self.limit = limit
         self._moments: deque[Moment] = deque()
         self._next_serial = first_serial
-        self._parts: dict[int, bytes] = {}
-        self._references: dict[int, int] = {}
-        self._last_set = _PartSet(())
+        self._parts = SharedParts()
         self._used = 0
         self._pictures_used = 0
         self._pictured: deque[int] = deque()
         self._ever = {flag: np.zeros(num_envs, bool) for flag in (SUCCESS, FAIL, NOT_A_NUMBER)}
         self._jumps: deque[Moment] = deque()
-        self._base = first_serial
-        self._happened = np.zeros((_FIRST_ROWS, num_envs), np.uint8)
-        self._reward = np.zeros((_FIRST_ROWS, num_envs), np.float32)
+        self._rows = MomentRows(num_envs, first_serial)
 
     # --- what comes --------------------------------------------------------------------------------
 
@@ -130,7 +118,7 @@ class History:
         A reward is for an action: where there was none (a reset, a going back) the worker says zero, and what is
         kept is NaN, or what was said of the moment that was gone back to, or in the other envs what stood before.
         """
-        parts = self._take_parts(stepped)
+        parts = self._parts.take(stepped.part_keys, stepped.new_parts)
         stepped = replace(stepped, step=self._with_rewards(stepped))
         size = _OVERHEAD + len(stepped.snapshot) + _step_bytes(stepped.step)
         size += Standing.bytes_a_step(self._num_envs)
@@ -147,7 +135,7 @@ class History:
             parts=parts,
             size=size,
         )
-        self._write_row(moment)
+        self._rows.write(moment.serial, self.first, moment.happened, moment.step.reward)
         self._next_serial += 1
         self._moments.append(moment)
         if moment.jumped.any():
@@ -170,7 +158,7 @@ class History:
             moment.size += _step_bytes(step)
             self._used += _step_bytes(step)
         moment.step = step if step.action is not None else replace(step, reward=moment.step.reward)
-        self._write_row(moment)
+        self._rows.write(moment.serial, self.first, moment.happened, moment.step.reward)
         return moment.step
 
     def add_pictures(self, event: Pictures | PastPictures) -> None:
@@ -215,7 +203,7 @@ class History:
     @property
     def used(self) -> int:
         """Bytes."""
-        return self._used
+        return self._used + self._parts.used
 
     @property
     def first(self) -> int:
@@ -245,7 +233,7 @@ class History:
         moment = self.at(serial)
         if moment is None or not moment.snapshot:
             return None
-        return WholeSnapshot(moment.snapshot, tuple(self._parts[key] for key in moment.parts.keys))
+        return WholeSnapshot(moment.snapshot, self._parts.of(moment.parts))
 
     def between(self, low: int, high: int) -> Iterable[Moment]:
         """The kept moments of these serials, both included."""
@@ -254,13 +242,11 @@ class History:
 
     def events(self, env: int, low: int, high: int) -> list[tuple[int, int]]:
         """What happened to this env between two moments, both included: serials and `RESET` ... added up."""
-        low, rows = self._rows(low, high)
-        happened = self._happened[rows, env]
-        return [(low + int(k), int(happened[k])) for k in np.flatnonzero(happened)]
+        return self._rows.events(env, max(low, self.first), min(high, self.last))
 
     def rewards(self, env: int, low: int, high: int) -> NDArray[np.float32]:
         """(K,) of this env at the moments between two, both included; NaN where it was reset."""
-        return self._reward[self._rows(low, high)[1], env].copy()
+        return self._rows.rewards(env, max(low, self.first), min(high, self.last))
 
     def jumps_back(self, env: int) -> list[tuple[int, int]]:
         """Serials of the kept moments at which this env went back, and of those that it went back to."""
@@ -342,64 +328,16 @@ class History:
 
     # --- the inside --------------------------------------------------------------------------------
 
-    def _take_parts(self, stepped: Stepped) -> _PartSet:
-        self._parts.update(stepped.new_parts)
-        keys = stepped.part_keys
-        if keys is None or keys == self._last_set.keys:
-            parts = self._last_set
-        else:
-            # A snapshot whose parts went to another history cannot be put back: it is none.
-            parts = self._last_set = _PartSet(keys, complete=all(key in self._parts for key in keys))
-        if not parts.complete:
-            return parts
-        if parts.moments == 0:
-            for key in parts.keys:
-                self._references[key] = self._references.get(key, 0) + 1
-                if self._references[key] == 1:
-                    self._used += len(self._parts[key])
-        parts.moments += 1
-        return parts
-
-    def _release(self, parts: _PartSet) -> None:
-        parts.moments -= 1
-        if parts.moments == 0 and parts.complete:
-            for key in parts.keys:
-                self._references[key] -= 1
-                if self._references[key] == 0:
-                    self._used -= len(self._parts[key])
-                    del self._references[key]
-                    # The worker will not send it again while the newest moment has it; that one is kept.
-                    del self._parts[key]
-
-    def _rows(self, low: int, high: int) -> tuple[int, slice]:
-        low, high = max(low, self.first), min(high, self.last)
-        return low, slice(low - self._base, max(low, high + 1) - self._base)
-
-    def _write_row(self, moment: Moment) -> None:
-        row = moment.serial - self._base
-        if row == len(self._reward):
-            kept = self._rows(self.first, self.last)[1]
-            rows = max(_FIRST_ROWS, 2 * len(self._moments))
-            for name in ("_happened", "_reward"):
-                old = getattr(self, name)
-                new = np.zeros((rows, self._num_envs), old.dtype)
-                new[: len(self._moments)] = old[kept]
-                setattr(self, name, new)
-            self._base = self.first
-            row = moment.serial - self._base
-        self._happened[row] = moment.happened
-        self._reward[row] = moment.step.reward
-
     def _shrink(self) -> None:
         while self._pictures_used > self.limit * _PICTURES_SHARE and self._pictured:
             moment = self.at(self._pictured.popleft())
             if moment is not None and moment.pictures:
                 self._drop_pictures(moment)
-        while self._used > self.limit and len(self._moments) > 1:
+        while self.used > self.limit and len(self._moments) > 1:
             oldest = self._moments.popleft()
             self._used -= oldest.size
             self._drop_pictures(oldest)
-            self._release(oldest.parts)
+            self._parts.release(oldest.parts)
             if self._jumps and self._jumps[0] is oldest:
                 self._jumps.popleft()
 

@@ -6,7 +6,7 @@ compared with the record. That takes seconds or minutes, and the worker that pla
 a process of its own, with a lower priority, started at the first judgement (0.75 GB for 16 PushCube envs, and some seconds)
 and ended when none was asked for in a while.
 
-One thread does all of it: it sends some moments, waits for the answer, compares, and sends the next. So one
+A lane's thread does all of it: it sends some moments, waits for the answer, compares, and sends the next. So one
 stops it by not sending more, and a process that does not answer (the new code may loop for ever) is ended.
 """
 
@@ -20,18 +20,16 @@ from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from workbench.authoring.problem import Problem
+from workbench.session.background import BackgroundProcess
 from workbench.session.judgement import JudgedCurve, Judgement, Summary
+from workbench.session.lane import Job, JobFailed, Lane, Stopped
 from workbench.session.messages import (
-    Event,
     Failed,
-    Judged,
-    JudgeMoments,
     Load,
     Loaded,
-    MomentToJudge,
     TaskDescription,
 )
-from workbench.session.process import WorkerProcess, describe_exit, start_in_background
+from workbench.session.moment_messages import Judged, JudgeMoments, MomentToJudge
 
 IDLE_SECONDS = 300.0
 """How long the process is kept without a judgement."""
@@ -42,7 +40,6 @@ _CHUNK_SECONDS = 0.1
 _MOST_AT_ONCE = 64
 _SUMMARY_EVERY = 0.5
 """Seconds; making one takes some milliseconds for a long history."""
-_LOOK = 0.05
 _MOMENT_PATIENCE = 2.0
 _LOAD_PATIENCE = 10.0
 """Seconds after which a process that was told to stop, and is still at a chunk or a load, is ended."""
@@ -89,7 +86,9 @@ def what_a_load_means(
 
 
 @dataclass
-class _Job:
+class _Case:
+    """What is judged, and how far that is."""
+
     load: Load
     judgement: Judgement
     stopped: str = ""
@@ -97,18 +96,6 @@ class _Job:
     not_carried: dict[str, str] = field(default_factory=dict)
     seconds: float = 0.0
     summed: float = 0.0
-
-
-class _Stopped(Exception):
-    """The job is to go no further."""
-
-
-class _Failure(Exception):
-    """The job cannot go on."""
-
-    def __init__(self, why: str, problem: Problem | None = None) -> None:
-        super().__init__(why)
-        self.why, self.problem = why, problem
 
 
 class Judge:
@@ -120,15 +107,14 @@ class Judge:
             on_change: called on the judge's thread when `view` has something new.
         """
         self._on_change = on_change
-        self._wake = threading.Condition()
-        self._waiting: _Job | None = None
-        self._job: _Job | None = None
+        self._lock = threading.Lock()
+        self._case: _Case | None = None
+        """What is shown: what is being judged, or was last."""
         self._view = JudgementView()
         self._closing = False
-        self._process: WorkerProcess | None = None
-        self._owed: type[Judged] | type[Loaded] | None = None
-        self._thread = threading.Thread(target=self._run, name="judge", daemon=True)
-        self._started = False
+        self._process = BackgroundProcess("that judges", "to judge with")
+        # Changes and failures are told by `_tell`, with all that there is to them.
+        self._lane = Lane("judge", lambda: None, lambda why: None, IDLE_SECONDS, self._process.end)
 
     @property
     def view(self) -> JudgementView:
@@ -137,13 +123,12 @@ class Judge:
     @property
     def pid(self) -> int | None:
         """Of the process that judges; None while there is none."""
-        process = self._process
-        return None if process is None else process.pid
+        return self._process.pid
 
     def curve(self, name: str, env: int) -> JudgedCurve | None:
         """See `Judgement.curve`; None also while nothing is judged."""
-        with self._wake:
-            return None if self._job is None else self._job.judgement.curve(name, env)
+        with self._lock:
+            return None if self._case is None else self._case.judgement.curve(name, env)
 
     def judge(self, load: Load, judgement: Judgement) -> None:
         """Begin, in place of whatever was judged before.
@@ -152,190 +137,112 @@ class Judge:
             load: the new code.
             judgement: of the record; it is this object's from now on.
         """
-        with self._wake:
-            if self._closing or judgement.steps == 0:
-                return
-            self._stop_job("another version was loaded")
-            self._waiting = _Job(load, judgement)
-            self._wake.notify_all()
-            if not self._started:
-                self._started = True
-                self._thread.start()
+        if judgement.steps == 0:
+            return
+        case = _Case(load, judgement)
+        with self._lock:
+            self._stop("another version was loaded")
+            self._lane.start("judging", lambda job: self._run(job, case))
 
     def stop(self, why: str) -> None:
         """Go no further with what is under way; what is known by then stays to be seen."""
-        with self._wake:
-            self._waiting = None
-            self._stop_job(why)
+        with self._lock:
+            self._stop(why)
 
     def forget(self) -> None:
         """Stop, and have nothing to show: the record is gone."""
-        with self._wake:
-            self._waiting = None
-            self._stop_job("the episodes are gone")
-            self._job = None
+        with self._lock:
+            self._stop("the episodes are gone")
+            self._case = None
             self._view = JudgementView(serial=self._view.serial + 1)
         self._on_change()
 
     def close(self) -> None:
         """End the process; returns when the thread has ended."""
-        with self._wake:
-            self._closing = True
-            self._stop_job("closing")
-            self._wake.notify_all()
-        if self._started:
-            self._thread.join()
+        self._closing = True
+        self.stop("closing")
+        self._lane.close()
 
-    def _stop_job(self, why: str) -> None:
-        if self._job is not None and not self._job.stopped:
-            self._job.stopped = why
+    def _stop(self, why: str) -> None:
+        if self._case is not None and not self._case.stopped:
+            self._case.stopped = why
+        self._lane.stop()
 
-    # --- the thread --------------------------------------------------------------------------------
+    # --- on the lane ---------------------------------------------------------------------------------
 
-    def _run(self) -> None:
-        while (job := self._next_job()) is not None:
-            try:
-                self._load(job)
-                for rows in job.judgement.runs():
-                    self._live_through(job, rows)
-                self._tell(job, "done")
-            except _Stopped:
-                self._tell(job, "stopped", job.stopped)
-                self._settle()
-            except EOFError:
-                code = None if self._process is None else self._process.exit_code()
-                self._end_process()
-                self._tell(job, "failed", f"the process that judges {describe_exit(code)}")
-            except _Failure as failure:
-                self._tell(job, "failed", failure.why, failure.problem)
-            with self._wake:
-                job.judgement.let_go()
-        self._end_process()
+    def _run(self, job: Job, case: _Case) -> None:
+        with self._lock:
+            job.check()  # stopped before it began: what was judged before stays to be seen
+            self._case, self._view = case, JudgementView(serial=self._view.serial)
+        try:
+            self._load(job, case)
+            for rows in case.judgement.runs():
+                self._live_through(job, case, rows)
+            self._tell(case, "done")
+        except Stopped:
+            self._tell(case, "stopped", case.stopped)
+            patience = _LOAD_PATIENCE if self._process.owes(Loaded) else _MOMENT_PATIENCE
+            self._process.settle(patience, lambda: self._closing)
+        except JobFailed as failure:
+            self._tell(case, "failed", str(failure), failure.problem)
+        with self._lock:
+            case.judgement.let_go()
 
-    def _next_job(self) -> _Job | None:
-        """The next one; None when all is to end."""
-        with self._wake:
-            while self._waiting is None and not self._closing:
-                if not self._wake.wait(IDLE_SECONDS):
-                    self._end_process()
-            if self._closing:
-                return None
-            job, self._waiting = self._waiting, None
-            assert job is not None
-            self._job = job
-            self._view = JudgementView(serial=self._view.serial)
-        return job
-
-    def _load(self, job: _Job) -> None:
-        self._tell(job, "loading")
-        if self._process is None:
-            try:
-                self._process = start_in_background()
-            except OSError as error:
-                raise _Failure(f"no process could be started to judge with: {error}") from error
+    def _load(self, job: Job, case: _Case) -> None:
+        self._tell(case, "loading")
+        if not self._process.there:
+            self._process.start()
         else:
             # A version is tried at the moment at which the env stands, which is where the judgement before
             # ended: there the new code may raise or loop though it runs from the beginnings in the record.
-            self._owed = Judged
-            self._process.send(JudgeMoments((self._to_judge(job, job.judgement.runs()[0].start),)))
-            self._answer(job)
-        event = self._ask_to_load(job, job.load)
+            begin = _to_judge(case.judgement, case.judgement.runs()[0].start)
+            self._process.send(JudgeMoments((begin,)))
+            self._process.answer(job, Judged, Failed)
+        event = self._ask_to_load(job, case.load)
         if isinstance(event, Failed):
-            event = self._ask_to_load(job, replace(job.load, level="rebuilt"))
+            event = self._ask_to_load(job, replace(case.load, level="rebuilt"))
         if isinstance(event, Failed):
-            raise _Failure("the new code could not be loaded to judge with", event.problem)
+            raise JobFailed("the new code could not be loaded to judge with", event.problem)
 
-    def _ask_to_load(self, job: _Job, load: Load) -> Event:
-        assert self._process is not None
-        self._owed = Loaded
+    def _ask_to_load(self, job: Job, load: Load) -> Loaded | Failed:
         self._process.send(load)
-        return self._answer(job)
+        return self._process.answer(job, Loaded, Failed)
 
-    def _live_through(self, job: _Job, rows: range) -> None:
-        assert self._process is not None
+    def _live_through(self, job: Job, case: _Case, rows: range) -> None:
         at, count = rows.start, 2
         while at < rows.stop:
             chunk = range(at, min(at + count, rows.stop))
             began = time.monotonic()
-            self._owed = Judged
-            self._process.send(JudgeMoments(tuple(self._to_judge(job, row) for row in chunk)))
-            answer = self._answer(job)
+            self._process.send(JudgeMoments(tuple(_to_judge(case.judgement, row) for row in chunk)))
+            answer = self._process.answer(job, Judged, Failed)
             took = time.monotonic() - began
             if isinstance(answer, Failed):
-                raise _Failure("the episodes could not be run again", answer.problem)
-            assert isinstance(answer, Judged)
-            with self._wake:
+                raise JobFailed("the episodes could not be run again", answer.problem)
+            with self._lock:
                 for row, step in zip(chunk, answer.steps, strict=False):
                     try:
-                        job.judgement.add(row, step)
+                        case.judgement.add(row, step)
                     except ValueError as error:
-                        raise _Failure(f"the episodes cannot be compared: {error}") from error
-                job.not_carried |= answer.not_carried
-                job.seconds += took
+                        raise JobFailed(f"the episodes cannot be compared: {error}") from error
+                case.not_carried |= answer.not_carried
+                case.seconds += took
             if answer.problem is not None:
-                raise _Failure("the new code raised", answer.problem)
-            self._tell(job, "judging")
+                raise JobFailed("the new code raised", answer.problem)
+            self._tell(case, "judging")
             wanted = count * _CHUNK_SECONDS / max(took, 1e-3)
             count = max(1, min(int(wanted), 2 * count, _MOST_AT_ONCE))
             at = chunk.stop
 
-    def _to_judge(self, job: _Job, row: int) -> MomentToJudge:
-        jump = job.judgement.snapshot(row)
-        if jump is None:
-            return MomentToJudge(job.judgement.moment(row).step.action)
-        whole, envs = jump
-        return MomentToJudge(None, pickle.dumps(whole), envs)
-
-    def _answer(self, job: _Job) -> Event:
-        """What the process owes us.
-
-        Raises:
-            _Stopped: the job is to stop; what is owed then still is.
-            EOFError: the process died.
-        """
-        while not job.stopped:
-            event = self._receive()
-            if event is not None:
-                return event
-        raise _Stopped
-
-    def _settle(self) -> None:
-        """Take the answer that is still owed, or end the process that does not give it in time."""
-        patience = _LOAD_PATIENCE if self._owed is Loaded else _MOMENT_PATIENCE
-        deadline = time.monotonic() + patience
-        try:
-            while self._owed is not None and not self._closing:
-                if time.monotonic() > deadline:
-                    self._end_process()
-                    return
-                self._receive()
-        except EOFError:
-            self._end_process()  # of what it was asked for last; the next judgement starts another
-
-    def _receive(self) -> Event | None:
-        """The event that is owed, or that it cannot be had; None if it has not come yet."""
-        assert self._process is not None and self._owed is not None
-        event = self._process.receive(timeout=_LOOK)
-        if not isinstance(event, (self._owed, Failed)):
-            return None
-        self._owed = None
-        return event
-
-    def _end_process(self) -> None:
-        if self._process is not None:
-            self._process.stop(grace=0.0)
-        self._process = self._owed = None
-
-    def _tell(self, job: _Job, state: JudgeState, why: str = "", problem: Problem | None = None) -> None:
-        with self._wake:
-            if self._job is not job:
+    def _tell(self, case: _Case, state: JudgeState, why: str = "", problem: Problem | None = None) -> None:
+        with self._lock:
+            if self._case is not case:
                 return  # it was forgotten
-            before, judgement = self._view, job.judgement
+            before, judgement = self._view, case.judgement
             now = time.monotonic()
             summary = before.summary
-            if state != "judging" or now - job.summed > _SUMMARY_EVERY:
+            if state != "judging" or now - case.summed > _SUMMARY_EVERY:
                 summary = judgement.summary() if judgement.judged_steps else None
-                job.summed = now
+                case.summed = now
             self._view = replace(
                 before,
                 state=state,
@@ -344,8 +251,16 @@ class Judge:
                 total=judgement.steps,
                 why=why,
                 problem=problem,
-                not_carried=tuple(f"{what}: {reason}" for what, reason in job.not_carried.items()),
-                steps_per_second=judgement.judged_steps / job.seconds if job.seconds else 0.0,
+                not_carried=tuple(f"{what}: {reason}" for what, reason in case.not_carried.items()),
+                steps_per_second=judgement.judged_steps / case.seconds if case.seconds else 0.0,
                 summary=summary,
             )
         self._on_change()
+
+
+def _to_judge(judgement: Judgement, row: int) -> MomentToJudge:
+    jump = judgement.snapshot(row)
+    if jump is None:
+        return MomentToJudge(judgement.moment(row).step.action)
+    whole, envs = jump
+    return MomentToJudge(None, pickle.dumps(whole), envs)

@@ -11,7 +11,7 @@ import pickle
 
 from workbench.authoring.problem import TaskError
 from workbench.core.step import StepResult
-from workbench.session.messages import Judged, JudgeMoments
+from workbench.session.moment_messages import Judged, JudgeMoments
 from workbench.session.open_task import OpenedTask, restore_checked, step_checked
 
 

@@ -20,27 +20,24 @@ from typing import TypeVar
 
 from workbench.recording.episode_writer import EpisodeWriter
 from workbench.recording.rrd import RecordingError
+from workbench.session.background import BackgroundProcess
 from workbench.session.episode_files import EpisodeFinisher
 from workbench.session.episodes import GatheredEpisode, episode_info, first_row, next_row
 from workbench.session.keep_status import KeepStatus
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
 from workbench.session.messages import (
-    Captured,
-    CaptureMoments,
     Failed,
     Load,
     Loaded,
-    MomentToCapture,
     PlaceCamera,
     Placed,
     Request,
 )
+from workbench.session.moment_messages import Captured, CaptureMoments, MomentToCapture
 from workbench.session.past_episodes import PastEpisode, WhatToKeep, moments_of
-from workbench.session.process import WorkerProcess, describe_exit, start_in_background
 
 _IDLE_SECONDS = 60.0
 """How long the process stays when nothing is kept: it holds some 0.75 GB."""
-_LOOK = 0.05
 _Answer = TypeVar("_Answer", Captured, Loaded, Placed)
 
 
@@ -51,9 +48,10 @@ class PastKeeper:
         self._folder, self._finisher, self._on_change = folder, finisher, on_change
         self._lock = threading.Lock()
         self._said, self._failed = "", False
-        self._process: WorkerProcess | None = None
+        self._process = BackgroundProcess("that draws it", "to draw it with")
         self._loaded: tuple[Load, tuple[PlaceCamera, ...]] | None = None
-        self._lane = Lane("keep-past", on_change, self._fail, _IDLE_SECONDS, self._end_process)
+        """By the process that is there."""
+        self._lane = Lane("keep-past", on_change, self._fail, _IDLE_SECONDS, self._process.end)
 
     def keep(self, what: WhatToKeep) -> None:
         """Begin; what was under way is given up."""
@@ -95,11 +93,11 @@ class PastKeeper:
             raise
         job.tell(1, 1, "writing the files")
         made = [self._finisher.finish(episode) for episode in writers.values()]
-        kept = sum(future.result() is not None for future in made)
+        problems = [result for future in made if isinstance(result := future.result(), str)]
+        if problems:
+            raise JobFailed(problems[0])
         steps = sum(episode.steps for episode in what.episodes)
-        if kept < len(made):
-            raise JobFailed(self._finisher.finished.problem or "its files could not be written")
-        self._say(f"kept {kept} episode{'' if kept == 1 else 's'}, {steps} steps")
+        self._say(f"kept {len(made)} episode{'' if len(made) == 1 else 's'}, {steps} steps")
 
     def _capture_all(self, job: Job, what: WhatToKeep, writers: dict[int, GatheredEpisode]) -> None:
         names = [dimension.name for dimension in what.task.actions]
@@ -139,12 +137,10 @@ class PastKeeper:
 
     def _have_loaded(self, job: Job, what: WhatToKeep) -> None:
         if self._loaded is not None and self._loaded[1] != what.placed:
-            self._end_process()  # a camera that was put back to the file would stay where it was placed
-        if self._process is None:
-            try:
-                self._process = start_in_background()
-            except OSError as error:
-                raise JobFailed(f"no process could be started to draw it with: {error}") from error
+            self._process.end()  # a camera that was put back to the file would stay where it was placed
+        if not self._process.there:
+            self._loaded = None
+            self._process.start()
         if self._loaded == (what.load, what.placed):
             return
         job.tell(0, 0, "building the envs to draw it with")
@@ -155,28 +151,16 @@ class PastKeeper:
         self._loaded = what.load, what.placed
 
     def _ask(self, job: Job, request: Request, kind: type[_Answer]) -> _Answer:
-        process = self._process
-        assert process is not None
-        process.send(request)
+        self._process.send(request)
         try:
-            while not job.stopped:
-                event = process.receive(timeout=_LOOK)
-                if isinstance(event, kind):
-                    return event
-                if isinstance(event, Failed):
-                    where = "" if event.problem.line is None else f" (line {event.problem.line})"
-                    raise JobFailed(f"it could not be drawn again: {event.problem.message}{where}")
-        except EOFError:
-            code = process.exit_code()
-            self._end_process()
-            raise JobFailed(f"the process that draws it {describe_exit(code)}") from None
-        self._end_process()  # what it was asked for last belongs to nobody
-        raise Stopped
-
-    def _end_process(self) -> None:
-        process, self._process, self._loaded = self._process, None, None
-        if process is not None:
-            process.stop(grace=0.0)
+            event = self._process.answer(job, kind, Failed)
+        except Stopped:
+            self._process.end()  # what it was asked for last belongs to nobody
+            raise
+        if isinstance(event, Failed):
+            where = "" if event.problem.line is None else f" (line {event.problem.line})"
+            raise JobFailed(f"it could not be drawn again: {event.problem.message}{where}")
+        return event
 
     def _fail(self, why: str) -> None:
         with self._lock:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
+from workbench.authoring.problem import Problem
 from workbench.session.studio_view import Progress
 
 
@@ -17,7 +18,11 @@ class Stopped(Exception):
 
 
 class JobFailed(Exception):
-    """The job cannot go on; its text is for the reader."""
+    """The job cannot go on; its text is for the reader, and `problem` is what the author's code raised, if it did."""
+
+    def __init__(self, why: str, problem: Problem | None = None) -> None:
+        super().__init__(why)
+        self.problem = problem
 
 
 class Job:

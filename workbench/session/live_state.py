@@ -17,7 +17,7 @@ from workbench.core.inspection import Inspection
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.snapshot_bytes import WholeSnapshot
 from workbench.core.step import StepResult
-from workbench.session.env_table import EnvTable
+from workbench.session.chronicle import Chronicle
 from workbench.session.judge import JudgementView
 from workbench.session.kept_worker import Death, Vitals
 from workbench.session.last_words import Busy, death_problem, own_files_of
@@ -48,44 +48,11 @@ from workbench.session.messages import (
     TaskOptions,
     WatchCameras,
 )
-from workbench.session.past import Past
 from workbench.session.past_episodes import PastEpisode, WhatToKeep, episode_round, moments_of
 from workbench.session.printed import Printed
 from workbench.session.recovery import Wanted
-from workbench.session.reward_terms import TermHistory
 from workbench.session.timeline import Timeline, TimelineView
-from workbench.session.view import Curves, RecordingStatus, SessionView, State
-
-
-class Chronicle:
-    """What the batch lived through since its scene was built."""
-
-    def __init__(self, task: TaskDescription, first: StepResult, limit: int, first_serial: int) -> None:
-        """
-        Args:
-            first: the state that the task was loaded with.
-            limit: bytes that the moments may take.
-            first_serial: the number of the first moment.
-        """
-        self.timeline = Timeline(task.num_envs, limit, first_serial)
-        self.table = EnvTable(task, first)
-        self.terms = TermHistory(task.num_envs)
-        self._past = Past(task.num_envs)
-        self._curves: Curves | None = None
-
-    def add(self, event: Stepped) -> StepResult:
-        """Take an event; returns its result as it is kept (see `History.add`)."""
-        self._past.add(event)
-        moment = self.timeline.add(event, max(0, self._past.count - 1))
-        self.table.add(event, self.timeline.history)
-        self.terms.add(event)
-        return moment.step
-
-    def curves(self) -> Curves:
-        """Copied once for every control step, however often they are asked for."""
-        if self._curves is None or self._curves.serial != self._past.count:
-            self._curves = self._past.curves()
-        return self._curves
+from workbench.session.view import RecordingStatus, SessionView, State
 
 
 @dataclass

@@ -8,6 +8,7 @@ victim. Should the kernel be quicker all the same, the worker has told it to be 
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from pathlib import Path
@@ -35,15 +36,20 @@ def parse_memory(text: str) -> int | None:
         return None
     if word == "auto":
         return max(_LEAST, int(_SHARE * total_memory()))
-    found = _SIZE.fullmatch(word)
-    if found is None:
+    size = size_in_bytes(word)
+    if size is None or math.isinf(size):
         raise ValueError(f"--memory-limit takes a size such as 8GB, auto, or none; got {text!r}")
-    size = int(float(found["number"]) * _UNITS[found["unit"].lower()])
     if size < _LEAST:
         raise ValueError(
             f"--memory-limit must be at least 1GB: a worker that has built nothing uses half of it, not {text}"
         )
-    return size
+    return int(size)
+
+
+def size_in_bytes(text: str) -> float | None:
+    """Of ``8GB``, ``1.5 GiB``, ``800m`` (all count by 1024) or a plain number; None for what is no size."""
+    found = _SIZE.fullmatch(text.strip())
+    return None if found is None else float(found["number"]) * _UNITS[found["unit"].lower()]
 
 
 def total_memory() -> int:

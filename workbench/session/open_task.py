@@ -230,8 +230,10 @@ class blamed:
             # the author's on the traceback is then only their call of super().__init__().
             try:
                 returned = env.evaluate()
-            except Exception as second:
-                return problem_from_exception(second, self._stage, loaded.source_files, loaded.cls)
+            except Exception:
+                # It cannot be asked, as where an unknown keyword ended the constructor and no scene is there:
+                # telling that would hide what happened.
+                return problem_from_exception(error, self._stage, loaded.source_files, loaded.cls)
             blamed = check_step_returns(loaded.cls, env.num_envs, returned, None, loaded.source_files)
             if blamed is not None:
                 return blamed

@@ -12,7 +12,6 @@ it is, it says from a signal handler into a file in memory, whatever its interpr
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import errno
 import fcntl
@@ -52,7 +51,6 @@ _PIECE = 1 << 20
 _FLOOD_PAUSE = 0.005
 """Seconds between two reads of a flood: with pieces of a megabyte that drains 200 MB a second."""
 _F_SETPIPE_SZ = 1031
-_NICENESS = 10
 
 Output = Callable[[str, bytes], bool]
 """Gets ``stdout`` or ``stderr`` and the bytes that came (none at its end); True asks for a little rest."""
@@ -266,20 +264,6 @@ def describe_exit(code: int | None) -> str:
     if code < 0:
         return f"was killed by {signal.Signals(-code).name}"
     return f"ended with exit code {code}"
-
-
-def start_in_background() -> WorkerProcess:
-    """A worker that works beside the one that plays, and after it where there are fewer cores than work.
-
-    What the author's code prints in it is heard of the other one, and not said twice.
-
-    Raises:
-        OSError: no process could be started.
-    """
-    process = WorkerProcess(lambda stream, piece: False)
-    with contextlib.suppress(ProcessLookupError, PermissionError):
-        os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
-    return process
 
 
 def signal_main_thread(pid: int, number: signal.Signals) -> None:

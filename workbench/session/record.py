@@ -10,6 +10,7 @@ all make a step, and what is over waits for the word that it is kept.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
@@ -24,6 +25,7 @@ from workbench.core.state_columns import read_state_columns
 from workbench.core.state_names import states_of
 from workbench.core.step import StepResult
 from workbench.core.step_pictures import step_pictures
+from workbench.recording.episode_writer import EpisodeFiles
 from workbench.recording.rrd import RecordingError
 from workbench.session.acting import Acting
 from workbench.session.dealer import Dealer
@@ -251,7 +253,7 @@ class _Share:
         """Number of the episode in each env that has one."""
         self._steps: dict[int, int] = {}
         self._undecided: dict[int, GatheredEpisode] = {}
-        self._made: list[tuple[int, GatheredEpisode, object]] = []
+        self._made: list[tuple[int, GatheredEpisode, Future[EpisodeFiles | str]]] = []
         self.put_right = 0
 
     def run(self, on_steps: Callable[[int], None], stop: Callable[[], bool]) -> None:
@@ -299,12 +301,12 @@ class _Share:
         """
         waiting = []
         for index, episode, future in self._made:
-            if not future.done():  # type: ignore[attr-defined]
+            if not future.done():
                 waiting.append((index, episode, future))
                 continue
-            files = future.result()  # type: ignore[attr-defined]
-            if files is None:
-                raise RecordingError(self._finisher.finished.problem or "an episode could not be written")
+            files = future.result()
+            if isinstance(files, str):
+                raise RecordingError(files)
             self._on_written(
                 Written(index, files.rrd, episode.seed, episode.steps, episode.total_reward, episode.success)
             )

@@ -48,6 +48,10 @@ def record_in_processes(
     parent = _Parent(workers, dealer, on_activity, on_progress)
     try:
         parent.serve(stop)
+    except KeyboardInterrupt:
+        # Asked for a second time: they may be where nothing reaches them. What they had written is mended later.
+        parent.kill()
+        raise
     finally:
         parent.end()
     parent.written.sort(key=lambda episode: episode.index)
@@ -113,6 +117,10 @@ class _Parent:
                         f"a process that records {describe_exit(self._exit_code(connection))}; what was over is kept"
                     ) from None
                 self._hear(connection, word, value)
+
+    def kill(self) -> None:
+        for process in self._workers.values():
+            process.kill()
 
     def end(self) -> None:
         for connection in self._busy:

@@ -29,8 +29,8 @@ from workbench.core.exchange import (
     keep_observation_space,
     put_class,
     rehearse_hooks,
-    task_class,
 )
+from workbench.core.seams import task_class
 from workbench.core.snapshot import RestoreReport, Snapshot, restore_snapshot
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import list_cameras

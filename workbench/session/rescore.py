@@ -24,6 +24,7 @@ from workbench.core.recorded_run import RecordedRun
 from workbench.recording.description import info_from
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.read_episode import UnreadableRecording, trajectories
+from workbench.recording.side_files import side_files_in_words
 from workbench.session.judgement import SAME_REWARD
 from workbench.session.messages import TaskOptions
 from workbench.session.rescore_messages import EpisodeFile, Verdict
@@ -155,6 +156,8 @@ def group_episodes(
             unread.append(Verdict(file, task=info.task, why_not="it does not hold the text of its task"))
             continue
         options, note = judging_options(options_of(info, 1, base))
+        if recorded_source and (besides := side_files_in_words(info.source_file, info.side_files)):
+            note = f"{note}. {besides}" if note else besides
         reference = task or reference_of(info)
         about = [reference, info.task, options.env_kwargs, info.source_hash if recorded_source else ""]
         key = json.dumps(about, sort_keys=True, default=str)

@@ -6,15 +6,15 @@ import csv
 import io
 import json
 import math
-import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from workbench.recording.replace_file import replace_file
 from workbench.session.lengths import length
+from workbench.session.otherwise import counted, turned
 from workbench.session.rescore_messages import Verdict
 
 
@@ -23,7 +23,7 @@ def what_changed(verdict: Verdict) -> str:
     if verdict.why_not:
         return f"not judged: {verdict.why_not}"
     flags = (("success", verdict.success), ("fail", verdict.fail))
-    told = [_moved(name, was, now) for name, (was, now) in flags if was != now]
+    told = [turned(name, was, now) for name, (was, now) in flags if was != now]
     if told:
         return ", ".join(told)
     if verdict.differs:
@@ -54,9 +54,9 @@ def summary(verdicts: Sequence[Verdict]) -> str:
         return "No episode could be judged."
     differing = sum(verdict.differs for verdict in judged)
     sentence = (
-        f"{differing} of {_count(len(judged), 'episode')} {'differs' if differing == 1 else 'differ'}"
+        f"{differing} of {counted(len(judged), 'episode')} {'differs' if differing == 1 else 'differ'}"
         if differing
-        else f"Nothing differs in {_count(len(judged), 'episode')}: reward, success and fail are as they were"
+        else f"Nothing differs in {counted(len(judged), 'episode')}: reward, success and fail are as they were"
     )
     if any(verdict.has_success for verdict in judged):
         was, now = (sum(verdict.success[k] is not None for verdict in judged) for k in (0, 1))
@@ -64,7 +64,7 @@ def summary(verdicts: Sequence[Verdict]) -> str:
     was, now = (f"{sum(v.returns[k] for v in judged) / len(judged):.4g}" for k in (0, 1))
     sentence += f"; mean return {was}" + ("" if was == now else f" → {now}")
     skipped = len(verdicts) - len(judged)
-    return sentence + (f"; {_count(skipped, 'episode')} not judged" if skipped else "") + "."
+    return sentence + (f"; {counted(skipped, 'episode')} not judged" if skipped else "") + "."
 
 
 def doubts(verdicts: Sequence[Verdict]) -> str:
@@ -74,7 +74,7 @@ def doubts(verdicts: Sequence[Verdict]) -> str:
         return ""
     worst = max(verdict.metres or 0.0 for verdict in far)
     return (
-        f"In {_count(len(far), 'episode')} bodies came up to {length(worst)} from where they were: what differs there "
+        f"In {counted(len(far), 'episode')} bodies came up to {length(worst)} from where they were: what differs there "
         "may come of that, and not of the code. With the recorded states put in at every step nothing drifts."
     )
 
@@ -135,28 +135,7 @@ def write_table(path: Path, text: str) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        mask = os.umask(0)
-        os.umask(mask)
-        os.chmod(name, 0o666 & ~mask)
-        os.replace(name, path)
-    except BaseException:
-        os.unlink(name)
-        raise
-
-
-def _moved(name: str, was: int | None, now: int | None) -> str:
-    before = "never" if was is None else f"at step {was}"
-    return f"{name} never now, was {before}" if now is None else f"{name} now at step {now}, was {before}"
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"
+    replace_file(path, text.encode())
 
 
 def _finite(value: Any) -> Any:

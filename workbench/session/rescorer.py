@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Literal
 
 from workbench.authoring.problem import Problem
-from workbench.session.lane import Job, Lane, Stopped
-from workbench.session.messages import Event, Failed, Load, Loaded, TaskOptions
-from workbench.session.process import WorkerProcess, describe_exit, start_in_background
+from workbench.session.background import BackgroundProcess
+from workbench.session.lane import Job, JobFailed, Lane, Stopped
+from workbench.session.messages import Failed, Load, Loaded, TaskOptions
 from workbench.session.rescore import Group, group_episodes, with_renderer
 from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored, Verdict
 from workbench.session.step_back import CannotStepIn, write_source
@@ -27,7 +27,6 @@ MOST_AT_ONCE = 16
 """Envs."""
 IDLE_SECONDS = 300.0
 """How long the process is kept without work."""
-_LOOK = 0.1
 
 RescoreState = Literal["none", "loading", "judging", "done", "stopped", "failed"]
 
@@ -66,12 +65,6 @@ class _Asked:
     use_env_states: bool
 
 
-class _Failure(Exception):
-    def __init__(self, why: str, problem: Problem | None = None) -> None:
-        super().__init__(why)
-        self.why, self.problem = why, problem
-
-
 class Rescorer:
     """One judgement at a time; a new one takes the place of the one before. All methods return at once."""
 
@@ -84,10 +77,9 @@ class Rescorer:
         self._lock = threading.Lock()
         """Of `view`: what a job that was stopped still has to say is not heard."""
         self._view = RescoreView()
-        self._process: WorkerProcess | None = None
-        """The lane's own."""
+        self._process = BackgroundProcess("that judges", "to judge with")
         # `_run` tells of failures itself, with what the code raised.
-        self._lane = Lane("rescore", on_change, lambda why: None, IDLE_SECONDS, self._end_process)
+        self._lane = Lane("rescore", on_change, lambda why: None, IDLE_SECONDS, self._process.end)
 
     @property
     def view(self) -> RescoreView:
@@ -141,22 +133,14 @@ class Rescorer:
                 self._judge(job, asked, group)
             self._tell(job, state="done")
         except Stopped:
-            self._end_process()
+            self._process.end()
             raise
-        except EOFError:
-            code = None if self._process is None else self._process.exit_code()
-            self._end_process()
-            self._tell(job, state="failed", why=f"the process that judges {describe_exit(code)}")
-        except _Failure as failure:
-            self._tell(job, state="failed", why=failure.why, problem=failure.problem)
-
-    def _end_process(self) -> None:
-        process, self._process = self._process, None
-        if process is not None:
-            process.stop(grace=0.0)
+        except JobFailed as failure:
+            self._tell(job, state="failed", why=str(failure), problem=failure.problem)
 
     def _judge(self, job: Job, asked: _Asked, group: Group) -> None:
-        process = self._process = self._process or _start()
+        process = self._process
+        process.start()
         folder: Path | None = None
         reference = group.reference
         try:
@@ -166,20 +150,19 @@ class Rescorer:
             self._tell(job, state="loading", task=shown)
             # Never patched into what the last episodes were judged in.
             process.send(Load(reference, group.options, level="rebuilt"))
-            told = self._answer(job, process, Loaded)
+            told = process.answer(job, Loaded, Failed)
             if isinstance(told, Failed):
                 process.send(Load(reference, with_renderer(group.options), level="rebuilt"))
-                told = self._answer(job, process, Loaded)
+                told = process.answer(job, Loaded, Failed)
             if isinstance(told, Failed):
-                raise _Failure(f"{group.info.task} could not be opened to judge with", told.problem)
+                raise JobFailed(f"{group.info.task} could not be opened to judge with", told.problem)
             self._tell(job, state="judging")
             process.send(Rescore(group.files, asked.use_env_states))
             began, before, steps = time.monotonic(), self._view.seconds, self._view.steps
             while True:
-                told = self._answer(job, process, Rescored)
+                told = process.answer(job, Rescored, Failed)
                 if isinstance(told, Failed):
-                    raise _Failure("the episodes could not be run again", told.problem)
-                assert isinstance(told, Rescored)
+                    raise JobFailed("the episodes could not be run again", told.problem)
                 self._tell(
                     job,
                     verdicts=(*self._view.verdicts, *told.verdicts),
@@ -187,27 +170,14 @@ class Rescorer:
                     seconds=before + time.monotonic() - began,
                 )
                 if told.problem is not None:
-                    raise _Failure(f"the code of {group.info.task} raised", told.problem)
+                    raise JobFailed(f"the code of {group.info.task} raised", told.problem)
                 if told.finished:
                     return
         except CannotStepIn as error:
-            raise _Failure(str(error)) from error
+            raise JobFailed(str(error)) from error
         finally:
             if folder is not None:
                 shutil.rmtree(folder, ignore_errors=True)
-
-    def _answer(self, job: Job, process: WorkerProcess, kind: type) -> Event:
-        """The next event of this kind, or that it cannot be had.
-
-        Raises:
-            Stopped: nobody waits for it any more.
-            EOFError: the process died.
-        """
-        while True:
-            job.check()
-            event = process.receive(timeout=_LOOK)
-            if event is not None and isinstance(event, (kind, Failed)):
-                return event
 
     def _tell(self, job: Job, **values: object) -> None:
         with self._lock:
@@ -215,10 +185,3 @@ class Rescorer:
                 return
             self._view = replace(self._view, serial=self._view.serial + 1, **values)  # type: ignore[arg-type]
         self._on_change()
-
-
-def _start() -> WorkerProcess:
-    try:
-        return start_in_background()
-    except OSError as error:
-        raise _Failure(f"no process could be started to judge with: {error}") from error

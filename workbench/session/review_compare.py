@@ -85,10 +85,8 @@ def difference(
         slice(begin + anchors[1], begin + anchors[1] + count),
     )
     bodies, body, apart = _bodies(a, b, rows, begin, tolerance)
-    numbers = [_numbers("action", *_steps(a.action, b.action, rows), begin, adds_up=False)]
-    numbers.append(
-        _numbers("reward", *_steps(a.reward, b.reward, rows), begin, adds_up=True, whole=(a.reward, b.reward))
-    )
+    numbers = [_numbers("action", *_steps(a.action, b.action, rows), begin)]
+    numbers.append(_numbers("reward", *_steps(a.reward, b.reward, rows), begin, whole=(a.reward, b.reward)))
     for name in dict.fromkeys([*a.evaluate, *b.evaluate]):
         if name in a.evaluate and name in b.evaluate:
             numbers.append(_numbers(name, a.evaluate[name][rows[0]], b.evaluate[name][rows[1]], begin))
@@ -187,7 +185,6 @@ def _numbers(
     a: NDArray,
     b: NDArray,
     begin: int,
-    adds_up: bool = False,
     whole: tuple[NDArray, NDArray] | None = None,
 ) -> Parting:
     totals = "" if whole is None else f"{float(np.sum(whole[0])):.4g} → {float(np.sum(whole[1])):.4g}"

@@ -5,19 +5,17 @@ the env. The worker's events come one by one on one thread and change the `LiveS
 `Session.view` makes a snapshot. When the worker dies, `KeptWorker` starts another, which is greeted with
 the last version that ran, and the page never goes away.
 
-What is done here is to bring those together: the lock, and who is told of what. What an event means is in
-`live_state`, what a worker is asked to load in `recovery`.
+What is done here is to bring those together: who is asked, and who is told of what. What an event means is in
+`live_state`, which version is loaded, and when, in `versions`.
 """
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
-from workbench.authoring.watch import SourceWatcher
 from workbench.core.inspection import Section
 from workbench.core.recorded_run import RecordedRun
 from workbench.session.camera_judging import ShownMoment
@@ -38,7 +36,6 @@ from workbench.session.messages import (
     Event,
     Failed,
     Inspect,
-    Load,
     Loaded,
     LoadLevel,
     Placed,
@@ -58,9 +55,10 @@ from workbench.session.messages import (
 )
 from workbench.session.printed import PrintedLine, PrintedLog
 from workbench.session.record_live import LiveRecorder
-from workbench.session.recovery import Recovery, Wanted, is_on_disk
 from workbench.session.reward_terms import TermCurves
+from workbench.session.shared_state import SharedState
 from workbench.session.timeline import Scope, Strip, Timeline
+from workbench.session.versions import Versions
 from workbench.session.view import SessionView
 
 HISTORY_BYTES = 256 * 1024**2
@@ -93,23 +91,23 @@ class Session:
         """
         self._on_event = on_event
         self._print = on_line
-        self._lock = threading.Lock()
-        self._changed = threading.Condition(self._lock)
-        self._change = 0
         self._state = LiveState(task, options, history_bytes)
-        self._closing = False
+        self._shared = SharedState(self._state)
+        self._lock, self._note = self._shared.lock, self._shared.note
         self._step_in: tuple[RecordedRun, bool] | None = None
         """What is to be gone into as soon as a task is there."""
-        self._recovery = Recovery(self._state.newest_moment)
         self._printed = PrintedLog(self._on_lines)
+        self._versions = Versions(
+            self._shared, self._send, lambda: self._worker.replace(), on_save=self._on_save
+        )
         self._worker = KeptWorker(
             worker or WorkerOptions(),
             WarmUp(options),
-            greet=self._greeting,
+            greet=self._versions.greeting,
             on_event=self._handle,
             on_death=self._on_death,
             on_busy=self._on_busy,
-            own_files=self._own_files,
+            own_files=self._versions.own_files,
             output=self._printed.feed,
         )
         self._recorder = LiveRecorder(
@@ -121,13 +119,12 @@ class Session:
             self._send,
             self._note,
             self._shown_moment,
-            self._same_version,
+            self._versions.same_again,
             self._episode_moments,
             self.open_file,
         )
         """Cameras placed by hand."""
-        self._watcher = SourceWatcher(self._on_files_changed)
-        self._follow((), {})
+        self._versions.start()
         self._worker.start()
 
     # --- what the page reads -----------------------------------------------------------------------
@@ -154,9 +151,7 @@ class Session:
 
     def wait(self, seen: int, timeout: float) -> int:
         """Block until something changed since the counter `seen`; returns the counter as it is now."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._change != seen or self._closing, timeout)
-            return self._change
+        return self._shared.wait(seen, timeout)
 
     @property
     def worker_pid(self) -> int | None:
@@ -170,27 +165,15 @@ class Session:
 
         A worker that does not take it up (an endless loop) is interrupted or replaced.
         """
-        with self._lock:
-            request = self._state.load_request(self._recovery.file_asked(), level)
-            stopped = self._state.state == "stopped"
-        if stopped:
-            self._worker.replace()  # it will be greeted with the file
-        else:
-            self._send(request)
+        self._versions.reload(level)
 
     def choose_class(self, name: str) -> None:
         """Another task class of the same file, one that `TaskDescription.others` names."""
-        with self._lock:
-            chosen = self._state.choose_class(name)
-        if chosen:
-            self.reload()
+        self._versions.choose_class(name)
 
     def open_file(self, file: Path, class_name: str) -> None:
         """Open a task class of another file in place of the one that is open, and follow that file."""
-        with self._lock:
-            self._state.open_file(file, class_name)
-        self._follow((), {})
-        self.reload()
+        self._versions.open_file(file, class_name)
 
     def interrupt(self) -> None:
         """Have the author's code left where it is, if it is at work; its traceback becomes the problem."""
@@ -198,9 +181,7 @@ class Session:
 
     def restart_worker(self) -> None:
         """End the worker, whatever it is doing, and start another with the last good version where it was."""
-        with self._lock:
-            self._recovery.restart_asked()
-        self._worker.replace()
+        self._versions.restart_worker()
 
     def clear_printed(self) -> None:
         """Forget what the author's code printed."""
@@ -209,11 +190,11 @@ class Session:
 
     def play(self) -> None:
         self.seek(None)
-        self._set(playing=True, wants_play=True)
+        self._shared.set(playing=True, wants_play=True)
         self._send(Play(True))
 
     def pause(self) -> None:
-        self._set(playing=False, wants_play=False)
+        self._shared.set(playing=False, wants_play=False)
         self._send(Play(False))
 
     def step(self) -> None:
@@ -235,20 +216,20 @@ class Session:
 
     def set_speed(self, speed: float) -> None:
         """Simulated seconds per wall second; ``math.inf`` for as fast as the machine can."""
-        self._set(speed=speed)
+        self._shared.set(speed=speed)
         self._send(SetSpeed(speed))
 
     def set_episode_end(self, rule: EpisodeEnd) -> None:
-        self._set(episode_end=rule)
+        self._shared.set(episode_end=rule)
         self._send(SetEpisodeEnd(rule))
 
     def set_action_source(self, source: ActionSource, policy: str | None = None) -> None:
-        self._set(action_source=source, policy=policy)
+        self._shared.set(action_source=source, policy=policy)
         self._send(self._state.action_request())
 
     def set_sliders(self, action: tuple[float, ...]) -> None:
         """The action (A,) that every env gets while the action source is ``sliders``."""
-        self._set(sliders=action)
+        self._shared.set(sliders=action)
         self._send(SetSliders(action))
 
     def select_env(self, env: int) -> None:
@@ -310,7 +291,7 @@ class Session:
         Live, that is the episode that runs, or the one before if that has no step yet. `SessionView.recording` says how
         far it is and what came of it.
         """
-        load = self._same_version()
+        load = self._versions.same_again()
         placed = self.studio.placed_cameras()
         with self._lock:
             what = self._state.what_to_keep(env_idx, load, placed)
@@ -418,10 +399,8 @@ class Session:
 
     def close(self) -> None:
         """End the worker and the watcher, and wait for episodes that are being written."""
-        with self._changed:
-            self._closing = True
-            self._changed.notify_all()
-        self._watcher.stop()
+        self._shared.close()
+        self._versions.close()
         self._worker.stop()
         self._judge.close()
         self.studio.close()
@@ -430,29 +409,10 @@ class Session:
 
     # --- what the worker says, on the session's thread -------------------------------------------
 
-    def _greeting(self) -> list[Request]:
-        """Everything that a worker before this one knew."""
-        with self._lock:
-            s = self._state
-            requests = s.settings()
-            wanted = self._recovery.wanted()
-            if wanted is not None:
-                requests.append(self._state.load_request(wanted))
-            else:
-                s.waits_for_the_file()
-            if s.wants_play:
-                requests.append(Play(True))
-            return [*requests, s.watch_request()]
-
     def _on_death(self, death: Death) -> None:
         self._recorder.stop()
         self.studio.interrupted()
-        with self._lock:
-            s = self._state
-            while_loading = self._recovery.loading
-            self._recovery.died(death.file_waits)
-            problem = s.died(death, while_loading, self._printed.tail(20))
-            kept = s.task is not None
+        problem, kept = self._versions.died(death, self._printed.tail(20))
         self._note()
         if problem is not None:
             self._on_event(Failed(problem, kept))
@@ -463,10 +423,6 @@ class Session:
                 return
             self._state.busy = busy
         self._note()
-
-    def _own_files(self) -> list[str]:
-        with self._lock:
-            return self._state.own_files()
 
     def _handle(self, event: Event) -> None:
         if isinstance(event, Failed) and self._worker.load_waits and "Interrupted:" in event.problem.message:
@@ -483,13 +439,9 @@ class Session:
             if isinstance(event, get_args(CameraAnswer)):
                 self.studio.answered(event)  # type: ignore[arg-type]
             if isinstance(event, Failed):
-                self._bring_back(event)
+                self._versions.failed(event)
                 if not self._state.problem_at_run:
                     self.studio.failed_to_load()
-            if isinstance(event, Failed) and event.problem.file is not None:
-                # A module beside the task that broke before the task had ever imported it whole.
-                known = self._state.task.source_files if self._state.task is not None else ()
-                self._follow((*known, event.problem.file), {})
         self._note()
         self._on_event(event)
 
@@ -501,21 +453,21 @@ class Session:
             self._recorder.stop()
         with self._lock:
             s = self._state
-            restored = self._recovery.restoring
-            self._recovery.loaded(event.task)
+            restored, stale = self._versions.came_in(event.task)
             meaning = what_a_load_means(s.task, event, self._judge.view)
             judgement = None
             if meaning == "judge" and s.timeline is not None:
                 judgement = Judgement(s.timeline.history)
-            stale = restored and not is_on_disk(event.task.source)
             s.loaded(event, restored=restored, stale=stale)
             level = None if event.reload is None else event.reload.level
             placed = self.studio.loaded(event.task, level)
         if judgement is not None:
-            self._judge.judge(self._state.load_request(Wanted(dict(event.task.source), None)), judgement)
+            load = self._versions.same_again()
+            assert load is not None
+            self._judge.judge(load, judgement)
         elif meaning == "forget":
             self._judge.forget()
-        self._follow(event.task.source_files, {} if stale else event.task.source)
+        self._versions.follow(event.task, stale)
         self._watch()
         self.studio.ask_for(placed)
         if recording:
@@ -557,41 +509,16 @@ class Session:
             at = history.last if shown is None else shown.serial
             return moments_of_episode(history, s.selected_env, at, most)
 
-    def _same_version(self) -> Load | None:
-        """How another worker gets the version that runs."""
-        with self._lock:
-            task = self._state.task
-            return None if task is None else self._state.load_request(Wanted(dict(task.source), None))
-
-    def _on_files_changed(self, paths: set[Path]) -> None:
+    def _on_save(self) -> None:
         self._judge.stop(FILE_SAVED)
         self.studio.interrupted()
-        with self._lock:
-            self._state.stale = True
-        self._note()
-        self.reload()
 
     def _on_lines(self, lines: list[PrintedLine], dropped: int) -> None:
         self._note()
         for line in lines:
             self._print(line.text)
 
-    def _follow(self, paths: Iterable[str], texts: Mapping[str, str]) -> None:
-        """Watch the task's own file, whether or not it ever loaded, and `paths` beside it."""
-        own_file = self._state.own_file
-        if own_file is None:
-            return
-        beside = [Path(p) for p in paths if Path(p).is_relative_to(own_file.parent)]
-        self._watcher.follow({own_file, *beside}, texts)
-
     # --- small things --------------------------------------------------------------------------------
-
-    def _bring_back(self, failed: Failed) -> None:
-        """A fresh worker could not load the file: it is to have the last good version."""
-        with self._lock:
-            wanted = self._recovery.wanted() if self._recovery.failed(failed.kept) else None
-        if wanted is not None:
-            self._send(self._state.load_request(wanted))
 
     def _watch(self) -> None:
         with self._lock:
@@ -600,14 +527,3 @@ class Session:
 
     def _send(self, request: Request) -> None:
         self._worker.send(request)
-
-    def _set(self, **values: object) -> None:
-        with self._lock:
-            for name, value in values.items():
-                setattr(self._state, name, value)
-        self._note()
-
-    def _note(self) -> None:
-        with self._changed:
-            self._change += 1
-            self._changed.notify_all()

@@ -4,7 +4,7 @@ A recording names its task by id and by file, and holds the text that it was mad
 is a choice: today's code of it, that a person is about to try on an old situation; or the recorded text, to see again
 what happened. The text is written into a folder of its own, which goes when whoever opened it is done; so it can be
 looked at, even edited, and nobody's file is touched. What lay beside the file and is no Python (meshes, say) is
-not in a recording, and such a task must be opened where it is.
+not in a recording, but named there: where it still lies beside the task it is linked into that folder, as it is today.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import numpy as np
 
 from workbench.core.recorded_run import RecordedRun
 from workbench.recording.episode import Episode, EpisodeInfo
+from workbench.recording.side_files import folder_of, place_of
 from workbench.session.messages import TaskDescription, TaskOptions
 
 
@@ -117,10 +118,20 @@ def write_source(info: EpisodeInfo) -> tuple[Path, str]:
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(text, encoding="utf-8")
+        _link_side_files(info, folder)
     except OSError as error:
         shutil.rmtree(folder, ignore_errors=True)
         raise CannotStepIn(f"the recorded text cannot be written: {error}") from error
     return folder, _with_class(str(folder / main), texts[main], info.task)
+
+
+def _link_side_files(info: EpisodeInfo, folder: Path) -> None:
+    """Those that are there; that one is not, or is another now, is said where the recorded text is offered."""
+    for name in info.side_files:
+        there, here = place_of(folder_of(info.source_file), name), place_of(folder, name)
+        if there is not None and here is not None and there.is_file() and not here.exists():
+            here.parent.mkdir(parents=True, exist_ok=True)
+            here.symlink_to(there)
 
 
 def _below_one_folder(main: str, source: Mapping[str, str]) -> tuple[str, dict[str, str]]:

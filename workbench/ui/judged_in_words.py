@@ -7,6 +7,7 @@ import math
 from workbench.session.judge import JudgementView
 from workbench.session.judgement import EpisodeDifference, Summary
 from workbench.session.lengths import length
+from workbench.session.otherwise import counted, turned
 
 FAR_METRES = 1e-3
 FAR_RADIANS = 1e-2
@@ -20,8 +21,8 @@ def headline(view: JudgementView) -> str:
         return ""
     so_far = "" if view.state == "done" else " so far"
     if summary.differing:
-        return f"{summary.differing} of {_count(summary.episodes, 'episode')} differ{so_far}."
-    sentence = f"Nothing differs in {_count(summary.episodes, 'episode')}{so_far}: reward, success and fail are as they were."
+        return f"{summary.differing} of {counted(summary.episodes, 'episode')} differ{so_far}."
+    sentence = f"Nothing differs in {counted(summary.episodes, 'episode')}{so_far}: reward, success and fail are as they were."
     others = sorted(summary.differing_names)[:4]
     return sentence + (f" Other entries differ: {', '.join(others)}." if others else "")
 
@@ -58,7 +59,7 @@ def drift(summary: Summary) -> str:
 def difference(episode: EpisodeDifference) -> list[str]:
     """What is otherwise in one episode: success and fail, or else the reward."""
     flags = (("success", episode.success), ("fail", episode.fail))
-    lines = [_moved(name, was, now) for name, (was, now) in flags if was != now]
+    lines = [turned(name, was, now) for name, (was, now) in flags if was != now]
     return lines or [f"reward by up to {_short(episode.largest)}"]
 
 
@@ -66,14 +67,5 @@ def change(was: float, now: float) -> str:
     return f"{_short(was)} → {_short(now)}"
 
 
-def _moved(name: str, was: int | None, now: int | None) -> str:
-    before = "never" if was is None else f"at step {was}"
-    return f"{name} never now, was {before}" if now is None else f"{name} now at step {now}, was {before}"
-
-
 def _short(value: float) -> str:
     return f"{value:.4g}"
-
-
-def _count(number: int, what: str) -> str:
-    return f"{number} {what}{'' if number == 1 else 's'}"

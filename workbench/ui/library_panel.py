@@ -39,6 +39,7 @@ from workbench.ui.library_rows import (
     chosen,
     has_outcome,
     newest_sources,
+    none_like_that,
     size_in_words,
 )
 from workbench.ui.presses import Presses
@@ -270,6 +271,7 @@ class LibraryPanel:
                 numbers=self._numbers,
                 some=bool(view.rows),
                 none_so=self._none_so(view),
+                clear=self._press("clear", self._clear_filter),
                 head=[self._head(column) for column in COLUMNS],
                 second=[self._head(column) for column in SECOND_LINE],
                 rows=[
@@ -285,7 +287,7 @@ class LibraryPanel:
 
     def _none_so(self, view: LibraryView) -> str:
         if view.rows:
-            return "No recording is like that. Press all, or look for something else."
+            return none_like_that(self._list.words, self._list.outcome, self._list.task)
         if view.problem is not None or view.reading is not None:
             return ""
         return (
@@ -408,6 +410,13 @@ class LibraryPanel:
 
     def _on_task(self) -> None:
         self._list.look_for(self._list.words, self._tasks.value)
+
+    def _clear_filter(self) -> None:
+        with self._lock:
+            self._typed_at = None
+        self._find.value, self._tasks.value = "", ALL_TASKS
+        self._list.choose("all")
+        self._list.look_for("", None)
 
     def _tell(self) -> None:
         """Say which are selected, if others are."""

@@ -14,9 +14,9 @@ from typing import Literal
 from workbench.recording.library_row import LibraryRow
 
 Column = Literal["task", "date", "seed", "steps", "return", "success", "version", "tags", "note", "name"]
-COLUMNS: tuple[Column, ...] = ("task", "date", "seed", "steps", "return", "success", "version")
+COLUMNS: tuple[Column, ...] = ("task", "date", "seed", "steps", "return", "success")
 """Of a row's first line."""
-SECOND_LINE: tuple[Column, ...] = ("tags", "note", "name")
+SECOND_LINE: tuple[Column, ...] = ("name", "version", "tags", "note")
 HINTS: dict[Column, str] = {
     "task": "Env id of the task",
     "date": "When it was recorded",
@@ -112,6 +112,16 @@ def chosen(
         for row in rows
         if (task is None or row.task == task) and has_outcome(row, outcome) and has_words(row, wanted)
     ]
+
+
+def none_like_that(words: str, outcome: Outcome, task: str | None) -> str:
+    """What is said where a filter lets nothing through."""
+    wanted = f" of {task}" if task is not None else ""
+    kind = {"all": "recording", "success": "successful recording", "failed": "failed recording"}.get(
+        outcome, f"{outcome} recording"
+    )
+    words = words.strip()
+    return f"No {kind}{wanted} has \u201c{words}\u201d." if words else f"There is no {kind}{wanted}."
 
 
 def begins_descending(column: Column) -> bool:

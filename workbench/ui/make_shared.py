@@ -78,15 +78,21 @@ def make(wanted: Wanted, on_progress: OnProgress = lambda done, doing: None) -> 
     return Made(tuple(paths), f"{len(paths)} file{'' if len(paths) == 1 else 's'}")
 
 
+def file_name(what: What, source: str, camera: str = "") -> str:
+    """Of what is made from the recording that is called `source`, and of its `camera` where it is a film of one."""
+    suffix = {"film": f".{camera.replace('/', '_')}.mp4", "scene": ".scene.mp4", "page": ".html"}
+    return source + suffix.get(what, ".sheet.png")
+
+
 def _of_one(wanted: Wanted, source: Source, episode: Episode, on_progress: OnProgress) -> list[Path]:
-    begin, name, fps = wanted.folder / source.name, source.name, _rate(episode)
+    name, fps = source.name, _rate(episode)
     if wanted.what == "film":
         cameras = [wanted.camera] if wanted.camera != EVERY_CAMERA else list(cameras_by_name(episode))
         if not cameras:
             raise ValueError(f"{name} was recorded without pictures, so there is no film of it.")
         paths = []
         for number, camera in enumerate(cameras):
-            path = _beside(begin, f".{camera.replace('/', '_')}.mp4")
+            path = wanted.folder / file_name("film", name, camera)
             seen = (enlarged(picture) for picture in frames(episode, camera_of(episode, camera)))
 
             def told(done: float, doing: str, number: int = number) -> None:
@@ -95,17 +101,15 @@ def _of_one(wanted: Wanted, source: Source, episode: Episode, on_progress: OnPro
             write_mp4(path, _counted(seen, episode, f"{name}: {camera}", told), fps)
             paths.append(path)
         return paths
+    path = wanted.folder / file_name(wanted.what, name)
     if wanted.what == "scene":
-        path = _beside(begin, ".scene.mp4")
         seen = _counted(scene_frames(episode, wanted.eye), episode, f"{name}: the 3-D view", on_progress)
         write_mp4(path, seen, fps)
     elif wanted.what == "page":
-        path = _beside(begin, ".html")
         write_scene_html(
             path, episode, wanted.eye, lambda done: on_progress(done, f"{name}: the moving page")
         )
     else:
-        path = _beside(begin, ".sheet.png")
         with new_file(path) as temporary:
             contact_sheet(episode).save(temporary, format="PNG")
     return [path]
@@ -123,11 +127,6 @@ def _dataset(wanted: Wanted, on_progress: OnProgress) -> Made:
     if made.left_out:
         words += f"; {made.left_out} without success left out"
     return Made((made.folder,), " ".join([words + ".", *made.notes]))
-
-
-def _beside(begin: Path, suffix: str) -> Path:
-    """Not `with_suffix`, to which the fraction of a second in a name is a suffix."""
-    return begin.parent / (begin.name + suffix)
 
 
 def _rate(episode: Episode) -> float:

@@ -45,13 +45,6 @@ class Offers:
             self._files[key] = reply
         return f"{PREFIX}{key}/{urllib.parse.quote(path.name, safe='')}"
 
-    def withdraw(self, path: Path) -> None:
-        """The file at `path` is not to be had any more; its address answers 404."""
-        path = Path(path).resolve()
-        with self._lock:
-            for reply in [known for known in self._ids if known.path == path]:
-                del self._files[self._ids.pop(reply)]
-
     def _answer(self, asked: str) -> tuple[int, str, bytes] | FileReply:
         with self._lock:
             reply = self._files.get(asked.partition("/")[0])

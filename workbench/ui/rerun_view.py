@@ -8,6 +8,11 @@ security policy lets it talk to nobody else.
 Which recordings it opens stands in its address, and has to be a whole address there, host and port included. What
 host a browser sees is known in the browser alone (behind ``ssh -L`` it is another one), so the page that is opened
 is a small one of ours that puts the addresses together and goes on to rerun's.
+
+The moment that it opens at cannot stand there: rerun takes one in the address of its own servers' recordings only. So
+a few lines of ours in its page tell it when it has the recording, through the way in that it has for that
+(``viewer_control``, rerun 0.41: one message of protobuf's, written by hand). If another rerun knows no such message, it
+opens at the first moment, which the panel's heading then still tells apart.
 """
 
 from __future__ import annotations
@@ -15,14 +20,19 @@ from __future__ import annotations
 import gzip
 import html
 import json
+import logging
+import math
 import secrets
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
+from types import MappingProxyType
 
 import viser
 
+from workbench.recording.rerun_seam import store_id
 from workbench.recording.web_viewer import VIEWER_FILES, VIEWER_POLICY, is_kept, viewer_file
 from workbench.ui.changed import fill
 from workbench.ui.door import Door
@@ -30,8 +40,14 @@ from workbench.ui.file_reply import FileReply
 from workbench.ui.fragments import render
 from workbench.ui.offers import Offers
 
-WIDTH = 760
-"""Pixels of the panel; rerun's own panels are folded away in our recordings."""
+log = logging.getLogger(__name__)
+
+SHARE, LEAST = 0.66, 480
+"""Of the width between the other panels; and pixels. The rest is the scene's, with the timeline under it."""
+SETTLES = 0.5
+"""Seconds until a page has placed a panel."""
+Moments = Mapping[Path, int]
+"""The step at which a recording is looked at."""
 
 _SHOW = "/rerun/show/"
 _VIEWER = f"/rerun/viewer-{version('rerun-sdk')}/"
@@ -41,6 +57,8 @@ _GO_ON = """<!doctype html><meta charset="utf-8"><title>Workbench: {title}</titl
 <script>
 const query = new URLSearchParams([["hide_welcome_screen", "1"], ["persist", "0"]]);
 for (const path of {paths}) query.append("url", location.origin + path);
+for (const moment of {moments}) query.append("at", moment);
+query.append("title", {title_text});
 // Dark or light as the page that this is in.
 let theme = "dark";
 try {{ theme = parent.document.documentElement.dataset.mantineColorScheme || theme; }} catch {{ }}
@@ -51,11 +69,43 @@ location.replace({viewer} + "index.html?" + query);
 </script>
 """
 
-_WITH_COOKIE = b"""<script>
+_IN_ITS_PAGE = b"""<script>
+// rerun fetches recordings without cookies (0.41), and the door lets nobody in without.
 const fetch_as_told = window.fetch;
 window.fetch = (what, how) => fetch_as_told(what, { ...how, credentials: "same-origin" });
+{
+  const asked = new URLSearchParams(location.search);
+  const varint = (n) => { const out = []; for (; n > 127; n = Math.floor(n / 128)) out.push((n % 128) | 128); return [...out, n]; };
+  const field = (number, bytes) => [number * 8 + 2, ...varint(bytes.length), ...bytes];
+  const text = (string) => [...new TextEncoder().encode(string)];
+  // ViewerControlRequest.set_time_cursor = 6: store_id = 1, timeline.name = 2.1, time.time = 3.1, play_state = 5 (paused).
+  const set_time = (recording, step) => new Uint8Array(field(6, [
+    ...field(1, text(recording)), ...field(2, field(1, text("step"))), ...field(3, [8, ...varint(step)]), 40, 1]));
+  const go = async (recording, step) => {
+    // It is refused until the recording has been read so far.
+    for (let tries = 0; tries < 300; tries++) {
+      await new Promise((done) => setTimeout(done, 200));
+      try {
+        await window._handle.viewer_control(set_time(recording, step));
+        return;
+      } catch { }
+    }
+    console.warn("rerun was not told to open at step " + step);
+  };
+  for (const moment of asked.getAll("at")) {
+    const end = moment.lastIndexOf("@");
+    go(moment.slice(0, end), Number(moment.slice(end + 1)));
+  }
+  if (parent !== window) {
+    // It takes the keyboard when it starts; in a panel the keys are the page's until somebody presses into it.
+    const focus = HTMLElement.prototype.focus;
+    let pressed = false;
+    addEventListener("pointerdown", () => { pressed = true; }, true);
+    HTMLElement.prototype.focus = function (...how) { if (pressed) focus.apply(this, how); };
+  }
+  addEventListener("load", () => { document.title = asked.get("title") || document.title; });
+}
 </script>"""
-"""rerun fetches recordings without cookies (0.41), and the door lets nobody in without."""
 
 
 class RerunPages:
@@ -64,33 +114,52 @@ class RerunPages:
     def __init__(self, door: Door, offers: Offers) -> None:
         self._offers = offers
         self._lock = threading.Lock()
-        self._shown: dict[str, tuple[Path, ...]] = {}
+        self._shown: dict[str, tuple[tuple[Path, ...], Callable[[], Moments]]] = {}
         self._keys: dict[tuple[Path, ...], str] = {}
         headers = {"Content-Security-Policy": VIEWER_POLICY, "Cache-Control": "private, max-age=604800"}
         door.add_route(_VIEWER, _viewer_file, headers)
         door.add_route(_SHOW, self._go_on, {**headers, "Cache-Control": "no-store"})
 
-    def address(self, recordings: Sequence[Path]) -> str:
-        """The address, from the root of the server, that opens these ``.rrd`` files together."""
+    def address(self, recordings: Sequence[Path], moments: Callable[[], Moments] = dict) -> str:
+        """The address, from the root of the server, that opens these ``.rrd`` files together.
+
+        Args:
+            moments: asked when the address is opened: the step at which each of them begins, where that is not the first.
+        """
         paths = tuple(Path(path).resolve() for path in recordings)
         with self._lock:
             key = self._keys.setdefault(paths, secrets.token_urlsafe(16))
-            self._shown[key] = paths
+            self._shown[key] = paths, moments
         return f"{_SHOW}{key}/"
 
     def _go_on(self, asked: str) -> tuple[int, str, bytes]:
         with self._lock:
-            paths = self._shown.get(asked.partition("/")[0])
-        if paths is None:
+            shown = self._shown.get(asked.partition("/")[0])
+        if shown is None:
             return 404, "text/plain; charset=utf-8", b"There is no such recording."
+        paths, moments = shown
         names = ", ".join(path.stem for path in paths)
         page = _GO_ON.format(
             title=html.escape(names),
-            # "</script>" in a file's name would end the script.
-            paths=json.dumps([self._offers.address(path) for path in paths]).replace("<", "\\u003c"),
-            viewer=json.dumps(_VIEWER),
+            title_text=_in_script(names),
+            paths=_in_script([self._offers.address(path) for path in paths]),
+            moments=_in_script([f"{store}@{step}" for store, step in _stores(moments()) if step > 0]),
+            viewer=_in_script(_VIEWER),
         )
         return 200, "text/html; charset=utf-8", page.encode()
+
+
+def _in_script(value: object) -> str:
+    # "</script>" in a file's name would end the script.
+    return json.dumps(value).replace("<", "\\u003c")
+
+
+def _stores(moments: Moments) -> Iterator[tuple[str, int]]:
+    for path, step in moments.items():
+        try:
+            yield store_id(path), step
+        except (ValueError, OSError, RuntimeError) as error:
+            log.warning("rerun cannot be told to open %s at step %d: %s", path.name, step, error)
 
 
 def _viewer_file(name: str) -> tuple[int, str, bytes] | FileReply:
@@ -99,7 +168,7 @@ def _viewer_file(name: str) -> tuple[int, str, bytes] | FileReply:
     if name == "index.html":
         page = gzip.decompress(viewer_file(name).read_bytes())
         before, head, after = page.partition(b"<head>")
-        return 200, VIEWER_FILES[name], before + head + _WITH_COOKIE + after
+        return 200, VIEWER_FILES[name], before + head + _IN_ITS_PAGE + after
     return FileReply(viewer_file(name), VIEWER_FILES[name], gzipped=True)
 
 
@@ -109,25 +178,37 @@ class RerunView:
     Args:
         server: The page.
         pages: Where rerun is served.
-        make_way: Called before the panel comes, to make room for it.
+        make_way: Called before the panel comes, to make room for it; says how many pixels there are between the
+            other panels then.
     """
 
     def __init__(
-        self, server: viser.ViserServer, pages: RerunPages, make_way: Callable[[], None] = lambda: None
+        self, server: viser.ViserServer, pages: RerunPages, make_way: Callable[[], int] = lambda: 0
     ) -> None:
         self._server, self._pages, self._make_way = server, pages, make_way
         self._paths: tuple[Path, ...] = ()
+        self._moments: Moments = {}
         self._chosen = 0
         self._panel: viser.PanelHandle | None = None
         self._lock = threading.Lock()
         self._problem = ""
         self._waiting = False
+        self._width = LEAST
+        self._seen: dict[int, float] = {}
+        """Since when each page has the panel; minus infinity for one on which it has its width."""
         self._button = server.gui.add_button("Open in rerun", icon=viser.Icon.APP_WINDOW, disabled=True)
         self._words = server.gui.add_html("")
         self._button.on_click(lambda _: self.open())
 
-    def draw(self, paths: Sequence[Path], chosen: int | None = None) -> None:
-        """From now on the buttons are about these ``.rrd`` files, of as many recordings as are `chosen`."""
+    def draw(
+        self, paths: Sequence[Path], chosen: int | None = None, moments: Moments = MappingProxyType({})
+    ) -> None:
+        """From now on the buttons are about these ``.rrd`` files, of as many recordings as are `chosen`.
+
+        Args:
+            moments: the step at which each is looked at, of those that are.
+        """
+        self._moments = moments
         self._chosen = len(paths) if chosen is None else chosen
         self._paths = tuple(paths)
         disabled = not self._paths or self._waiting
@@ -135,40 +216,64 @@ class RerunView:
             self._button.disabled = disabled
         words = render(
             "rerun",
-            address=self._pages.address(self._paths) if self._paths else None,
+            address=self._address(self._paths) if self._paths else None,
             lacking=self._chosen > len(self._paths),
             waiting=self._waiting,
             problem=self._problem,
         )
         fill(self._words, words)
+        self._widen()
+
+    def _widen(self) -> None:
+        """Give the panel its width on pages that have had it for a moment.
+
+        viser gives 300 pixels to what is docked beside another panel, whatever width it is docked with; only one that
+        is there takes a width. So does one on a page that is opened later.
+        """
+        with self._lock:
+            if self._panel is None:
+                return
+            now, here = time.monotonic(), self._server.get_clients().keys()
+            self._seen = {id: self._seen.get(id, now) for id in here}
+            ripe = [id for id, since in self._seen.items() if math.inf > now - since > SETTLES]
+            if ripe:
+                self._panel.set_width(self._width)
+                self._seen.update(dict.fromkeys(ripe, -math.inf))
+
+    def _address(self, paths: tuple[Path, ...]) -> str:
+        return self._pages.address(paths, lambda: {path: self._moments.get(path, 0) for path in paths})
 
     def open(self) -> None:
         """Show the recordings in a panel beside the scene; returns when the viewer is there to be loaded."""
-        paths = self._paths
+        paths, moments = self._paths, self._moments
         with self._lock:
             if not paths or self._waiting:
                 return
             self._waiting, self._problem = not is_kept(), ""
         try:
             if self._waiting:
-                self.draw(paths, self._chosen)
+                self.draw(paths, self._chosen, moments)
                 viewer_file("index.html")
         except RuntimeError as error:
             self._problem = str(error)
             return
         finally:
             self._waiting = False
-            self.draw(self._paths, self._chosen)
+            self.draw(self._paths, self._chosen, self._moments)
         self.close()
-        self._make_way()
+        room = self._make_way()
         with self._lock:
             self._panel = panel = self._server.gui.add_panel(order=6.0)
         with panel.add_tab("rerun", viser.Icon.APP_WINDOW):
-            self._server.gui.add_html(render("rerun_frame", address=self._pages.address(paths)))
-            self._server.gui.add_button("Close rerun", icon=viser.Icon.X).on_click(lambda _: self.close())
-        # Over the scene and not beside it: beside the library a small window has no room for a third column. Who
-        # has a larger one docks it.
-        panel.float(x=12, y=12, width=WIDTH)
+            self._server.gui.add_button("Close rerun", icon=viser.Icon.X, color="gray").on_click(
+                lambda _: self.close()
+            )
+            begins = {path: moments.get(path, 0) for path in paths}
+            heading = [(path.stem, begins[path]) for path in paths]
+            self._server.gui.add_html(render("rerun_frame", address=self._address(paths), heading=heading))
+        # Beside the scene, with a border that can be dragged.
+        panel.dock_left()
+        self._width, self._seen = max(LEAST, round(SHARE * room)), {}
 
     def close(self) -> None:
         """Take the panel away, and the program that runs in it."""

@@ -75,8 +75,9 @@ class Places:
     """For a tab of its own."""
     library: LibraryPanel | None
     """Says which recordings are selected, and takes further buttons for them (`LibraryPanel.add_action`)."""
-    make_way: Callable[[], None] = lambda: None
-    """Folds the table of recordings, for a part that opens a panel of its own."""
+    make_way: Callable[[], int] = lambda: 0
+    """Folds the table of recordings, for a part that opens a panel of its own; says how many pixels of the smallest
+    page are between the panels then."""
 
 
 Part = Callable[[viser.ViserServer, Places], "Drawn | None"]
@@ -180,9 +181,7 @@ class ReviewPage:
         self._library_open = True
         if self._had_opened:
             self._show_library(False)
-        places = Places(
-            review_tab, compare_tab, share_tab, tabs, self._library, lambda: self._show_library(False)
-        )
+        places = Places(review_tab, compare_tab, share_tab, tabs, self._library, self._make_way)
         made = [part(server, places) for part in offers.parts]
         self._parts = tuple(part for part in made if part is not None)
         with review_tab:
@@ -272,9 +271,18 @@ class ReviewPage:
         ids = tuple(one.id for one in view.opened)
         if ids != self._had_opened:
             self._had_opened = ids
-            widths = [client.camera.image_width for client in self._server.get_clients().values()]
-            if not ids or min((width for width in widths if width), default=0) < NARROW:
+            if not ids or self._smallest_view() < NARROW:
                 self._show_library(not ids)
+
+    def _make_way(self) -> int:
+        width = self._smallest_view() + (LIBRARY_WIDTH if self._library_open else 0)
+        self._show_library(False)
+        return width
+
+    def _smallest_view(self) -> int:
+        """Pixels that the view is wide, on the page on which it is smallest; 0 where nobody looks."""
+        widths = [client.camera.image_width for client in self._server.get_clients().values()]
+        return min((width for width in widths if width), default=0)
 
     def _show_library(self, shown: bool) -> None:
         self._library_open = shown

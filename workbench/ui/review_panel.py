@@ -176,6 +176,11 @@ def facts(one: Opened) -> list[tuple[str, str, str]]:
         rows.append(("reset options", short(info.reset_options), short(info.reset_options, 2000)))
     if info.source_hash:
         rows.append(("source", info.source_hash, info.source_file or ""))
+    if info.side_files:
+        names = ", ".join(info.side_files)
+        rows.append(
+            ("not held", short_text(names), f"What else the task reads, as it was named by its text: {names}")
+        )
     rows.append(("ran on", info.backend, ", ".join(f"{k} {v}" for k, v in info.versions.items())))
     if info.control_mode:
         rows.append(("control mode", info.control_mode, ""))
@@ -188,7 +193,12 @@ def facts(one: Opened) -> list[tuple[str, str, str]]:
 
 
 def short(values: dict[str, object], longest: int = 120) -> str:
-    text = ", ".join(f"{name}={shlex.quote(str(value))}" for name, value in values.items())
+    return short_text(
+        ", ".join(f"{name}={shlex.quote(str(value))}" for name, value in values.items()), longest
+    )
+
+
+def short_text(text: str, longest: int = 120) -> str:
     return text if len(text) <= longest else text[: longest - 1] + "…"
 
 

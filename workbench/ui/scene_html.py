@@ -3,6 +3,10 @@
 viser's page can play what its server would have sent, from a recording that stands in the page itself. So the scene is
 built as for a page that nobody looks at, moved from state to state with the pauses between them, and written down. The
 player has a time line, a pause button and speeds; the view is turned and moved as live.
+
+The player begins anew at the end without a pause, so the last state is held for a while, and its clock runs on. What
+time and step it is in the episode is therefore said by a caption of ours, with what the recording is; the player's own
+clock is not shown.
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ import viser
 from workbench.recording.episode import Episode
 from workbench.recording.new_file import new_file
 from workbench.recording.scene_eye import Eye, usual_eye
+from workbench.session.review_events import success_words
 from workbench.ui.door import DoorOptions, open_door
 from workbench.ui.env_layout import lay_out
 from workbench.ui.scene_view import SceneView
@@ -27,6 +32,29 @@ TRIANGLES = 80_000
 
 PAUSE = 1.0
 """Seconds at the end."""
+
+_CAPTION = """<style>
+.mantine-NumberInput-root { display: none; }
+.wb-caption { position: fixed; left: 1em; top: 1em; z-index: 2; padding: 0.5em 0.8em; border-radius: 0.4em;
+  font: 13px/1.5 system-ui, sans-serif; color: #eee; background: rgba(20, 20, 20, 0.72); font-variant-numeric: tabular-nums; }
+</style>
+<div class="wb-caption"><b>{about}</b><br>{ended}<br><span id="wb-time"></span></div>
+<script>
+{{
+  // The player puts its seconds into an input, with one digit; its slider has them all.
+  const dt = {dt}, steps = {steps}, said = document.getElementById("wb-time");
+  const tell = () => {{
+    const slider = document.querySelector(".mantine-Slider-root [aria-valuenow]");
+    if (slider !== null) {{
+      const step = Math.min(steps, Math.floor(slider.getAttribute("aria-valuenow") / dt + 1e-3));
+      const now = `step ${{step}} of ${{steps}}, ${{(step * dt).toFixed(2)}} of ${{(steps * dt).toFixed(2)}} s`;
+      if (said.textContent !== now) said.textContent = now;
+    }}
+    requestAnimationFrame(tell);
+  }};
+  tell();
+}}
+</script>"""
 
 
 def write_scene_html(
@@ -58,9 +86,25 @@ def write_scene_html(
         finally:
             door.close()
         title = f"{episode.info.task}, {episode.length} steps"
+        page = page.replace("</body>", _caption(episode) + "</body>", 1)
         page = re.sub(r"<title>.*?</title>", lambda _: f"<title>{html.escape(title)}</title>", page, count=1)
         temporary.write_text(page, encoding="utf-8")
     on_progress(1.0)
+
+
+def _seconds_a_step(episode: Episode) -> float:
+    return episode.info.control_dt if episode.info.control_dt > 0 else 0.05
+
+
+def _caption(episode: Episode) -> str:
+    info = episode.info
+    about = f"{info.task}, seed {info.seed}" if info.seed >= 0 else info.task
+    return _CAPTION.format(
+        about=html.escape(about),
+        ended=html.escape(success_words(episode)[0]),
+        dt=_seconds_a_step(episode),
+        steps=episode.length,
+    )
 
 
 def _recorded(
@@ -84,7 +128,7 @@ def _recorded(
     for state, now in enumerate(poses):
         batch[env] = now
         scene.move(batch, layout, env)
-        recording.insert_sleep(max(episode.info.control_dt, 1e-3))
+        recording.insert_sleep(_seconds_a_step(episode))
         on_progress(0.9 * state / len(poses))
     # It begins anew by itself; without a pause one does not see how it ended.
     recording.insert_sleep(PAUSE)

@@ -16,7 +16,7 @@ from workbench.recording.scene_eye import Eye
 from workbench.recording.sources import Source
 from workbench.ui.changed import fill, show
 from workbench.ui.fragments import render
-from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted, What
+from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted, What, file_name
 from workbench.ui.making import Making, MakingView
 from workbench.ui.offers import Offers
 
@@ -30,6 +30,8 @@ WHAT: dict[str, What] = {
 ALL_CAMERAS = "every camera"
 MOST_SHOWN = 6
 """Made things in the list; the newest ones."""
+MOST_NAMED = 5
+"""Recordings and files that are named before they are made; of the others their number is said."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,9 @@ class Chosen:
 
     sources: tuple[Source, ...] = ()
     cameras: tuple[str, ...] = ()
-    """Those that are known of them."""
+    """Those that are known of them: of recordings that are not open none is."""
+    selected: bool = False
+    """They are those that are selected in the library, and not those that are open."""
     in_view: bool = False
     """It is the one recording that the 3-D view shows: a film of the view is made from where the page looks."""
 
@@ -66,6 +70,7 @@ class SharePanel:
         self._task = server.gui.add_text(
             "Task", "", hint="In words, for policies that read; empty: the task's id"
         )
+        self._will = server.gui.add_html("")
         self._make = server.gui.add_button("Make", icon=viser.Icon.SPARKLES)
         self._stop = server.gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, visible=False)
         self._made = server.gui.add_html("")
@@ -76,12 +81,22 @@ class SharePanel:
         self._chosen = chosen
         view = self._making.view()
         what = WHAT.get(self._what.value)
-        now = (chosen, view, what)
+        camera = self._camera.value
+        now = (chosen, view, what, camera)
         if now == self._drawn:
             return
         self._drawn = now
         names = [source.name for source in chosen.sources]
-        fill(self._about, render("share_about", count=len(names), name=names[0] if names else ""))
+        fill(
+            self._about,
+            render(
+                "share_about",
+                count=len(names),
+                names=names[:MOST_NAMED],
+                more=len(names[MOST_NAMED:]),
+                selected=chosen.selected,
+            ),
+        )
         options = _names(chosen.cameras)
         if self._camera.options != options:
             self._camera.options = options
@@ -92,6 +107,12 @@ class SharePanel:
         show(self._stop, view.running)
         if self._make.disabled != (not chosen.sources):
             self._make.disabled = not chosen.sources
+        will = (
+            None
+            if view.running or not names or what is None
+            else will_make(what, chosen, camera, self._folder)
+        )
+        fill(self._will, "" if will is None else render("share_will", will=will))
         fill(self._made, self._html(view))
 
     def _start(self, client: viser.ClientHandle | None) -> None:
@@ -130,6 +151,36 @@ class SharePanel:
             if path.is_file()
         ]
         return {"links": links, "words": made.words, "folder": ", ".join(map(str, made.paths))}
+
+
+@dataclass(frozen=True)
+class WillMake:
+    """What a press on *Make* makes, as far as it is known before the recordings are read."""
+
+    what: str
+    files: tuple[str, ...] = ()
+    more: int = 0
+    """Further files."""
+    where: str = ""
+    """The folder that they go into; empty for files that the page offers to save."""
+
+
+def will_make(what: What, chosen: Chosen, camera: str, folder: Path) -> WillMake:
+    names = [source.name for source in chosen.sources]
+    of = "of it" if len(names) == 1 else f"of these {len(names)} recordings"
+    if what == "lerobot":
+        return WillMake(f"one dataset {of}", where=f"{folder / 'datasets'}/lerobot_\u2039date and time\u203a")
+    if what != "film":
+        files = [file_name(what, name) for name in names]
+    elif camera in chosen.cameras:
+        files = [file_name(what, name, camera) for name in names]
+    elif chosen.cameras and len(names) == 1:
+        files = [file_name(what, name, known) for name in names for known in chosen.cameras]
+    else:
+        known = f" ({', '.join(chosen.cameras)})" if chosen.cameras else ""
+        return WillMake(f"one film for each camera{known} {of}")
+    count = f"{len(files)} file{'' if len(files) == 1 else 's'}"
+    return WillMake(count, tuple(files[:MOST_NAMED]), len(files[MOST_NAMED:]))
 
 
 def _names(cameras: tuple[str, ...]) -> tuple[str, ...]:

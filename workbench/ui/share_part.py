@@ -71,8 +71,12 @@ class SharePart:
         rows = [row for row in rows if row.problem is None]
         cameras = {name: None for row in rows if row.id in opened for name in cameras_by_name(opened[row.id])}
         alone = len(rows) == 1 and len(view.opened) == 1 and rows[0].id in opened
-        self._share.draw(Chosen(tuple(map(source_of, rows)), tuple(cameras), in_view=alone))
-        self._rerun.draw(rerun_files(rows), len(rows))
+        self._share.draw(
+            Chosen(tuple(map(source_of, rows)), tuple(cameras), selected=bool(ids), in_view=alone)
+        )
+        states = {one.id: state for one, state in zip(view.opened, view.states)}
+        moments = {path: states[row.id] for row in rows if row.id in states for path in rerun_files((row,))}
+        self._rerun.draw(rerun_files(rows), len(rows), moments)
 
 
 def source_of(row: LibraryRow) -> Source:

@@ -16,6 +16,7 @@ from pathlib import Path
 import viser
 
 from workbench.recording.library import Library
+from workbench.recording.side_files import side_files_in_words
 from workbench.session.messages import TaskOptions
 from workbench.session.rescore_messages import EpisodeFile
 from workbench.session.rescorer import Rescorer
@@ -29,7 +30,8 @@ from workbench.session.step_back import (
     why_not_into,
     write_source,
 )
-from workbench.ui.changed import show
+from workbench.ui.changed import fill, show
+from workbench.ui.fragments import render
 from workbench.ui.put_together import Workplace
 from workbench.ui.rescore_panel import RescoreChoices, RescorePanel
 from workbench.ui.review_page import Places, ReviewOffers
@@ -143,6 +145,8 @@ class StepInPart:
 
     def __init__(self, server: viser.ViserServer, step_in: StepIn) -> None:
         self._step_in = step_in
+        self._about: object = None
+        """Which recording and code the note below the code was made for."""
         gui = server.gui
         self._folder = gui.add_folder("Going on live", expand_by_default=False, visible=False)
         with self._folder:
@@ -152,6 +156,7 @@ class StepInPart:
                 initial_value=RECORDED if step_in.recorded_source else TODAYS,
                 hint="Today's code of the task, or the recorded text, opened from a folder that goes when you are done",
             )
+            self._besides = gui.add_html("")
             self._envs = gui.add_dropdown(
                 "Into",
                 (ONE, ALL),
@@ -169,6 +174,13 @@ class StepInPart:
         home = self._step_in.can_go_home()
         show(self._folder, bool(view.opened) or home)
         show(self._home, home)
+        info = None if view.chosen is None else view.chosen.episode.info
+        if self._about != (info and info.id, self._step_in.recorded_source):
+            self._about = info and info.id, self._step_in.recorded_source
+            words = ""
+            if info is not None and self._step_in.recorded_source:
+                words = side_files_in_words(info.source_file, info.side_files)
+            fill(self._besides, render("note", text=words) if words else "")
 
     def _chosen(self) -> None:
         # What a page sends as its choice may be anything.

@@ -1,8 +1,8 @@
-"""Read an ``.rrd`` back into arrays: what tests compare, and what a review is shown from.
+"""An ``.rrd`` as rerun sees it, entity by entity and component by component: what a test compares with what was put in.
 
-Rerun's own query engine is an extra of 100 MB (datafusion). The chunks of a file are plain Arrow
-tables, though, and a table a component is all that anyone needs here. A file without a footer (its
-writer was killed) is read as far as it goes.
+Not through `rerun_table`, which is under test as well. Rerun's own query engine is an extra of 100 MB (datafusion); the
+chunks of a file are plain Arrow tables, though, and a table a component is all that anyone needs here. A file without a
+footer (its writer was killed) is read as far as it goes.
 """
 
 from __future__ import annotations
@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from workbench.recording.rerun_log import STEP
-
-_PROPERTIES = "/__properties"
 
 
 @dataclass(frozen=True)
@@ -66,26 +64,6 @@ def read_rrd(path: Path) -> dict[str, dict[str, Column]]:
             column = Column(None, [value for _, value in pairs])
         recording.setdefault(entity, {})[component] = column
     return recording
-
-
-def read_properties(path: Path) -> dict[str, dict[str, Any]]:
-    """The properties of the first recording in `path`, by name and then by component.
-
-    A component of one value is that value, a longer one a list. Raises as `read_rrd`.
-    """
-    found: dict[str, dict[str, Any]] = {}
-    for chunk in RrdReader(path).stream():
-        if not chunk.entity_path.startswith(_PROPERTIES):
-            continue
-        name = chunk.entity_path[len(_PROPERTIES) :].lstrip("/")
-        batch = chunk.to_record_batch()
-        for field, column in zip(batch.schema, batch.columns):
-            if (field.metadata or {}).get(b"rerun:kind") == b"data" and batch.num_rows:
-                value = column[batch.num_rows - 1].as_py()
-                if value is not None:
-                    component = field.name.rsplit(":", 1)[-1]
-                    found.setdefault(name, {})[component] = value[0] if len(value) == 1 else value
-    return found
 
 
 def _rows(column: pa.Array) -> list[Any]:

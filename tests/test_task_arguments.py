@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import pytest
 
-from workbench.cli import _bytes
+from workbench.task_arguments import history_bytes
 
 
 @pytest.mark.parametrize(
     ("text", "size"), [("256MB", 2**28), ("2gb", 2**31), (" 1.5 G ", 3 * 2**29), ("1048576", 2**20)]
 )
 def test_a_size_is_read_as_people_write_it(text: str, size: int) -> None:
-    assert _bytes(text) == size
+    assert history_bytes(text) == size
 
 
 @pytest.mark.parametrize("text", ["", "0", "many", "-3MB", "12XB", "1e9MB", "10", "nan GB", "9" * 400 + "GB"])
 def test_a_size_that_is_none_is_refused_with_an_example(text: str) -> None:
     with pytest.raises(ValueError, match="such as 256MB or 2GB"):
-        _bytes(text)
+        history_bytes(text)

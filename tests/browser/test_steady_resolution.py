@@ -1,0 +1,98 @@
+"""The resolution of the view: steady where the browser draws in software, viser's own affair where it does not."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+from playwright.sync_api import Page, sync_playwright
+
+from tests.browser.opened import launch
+from workbench.ui.door import Door, DoorOptions, open_door
+
+pytestmark = pytest.mark.browser
+A_CARD = """
+const ask = WebGL2RenderingContext.prototype.getParameter, UNMASKED_RENDERER = 0x9246;
+WebGL2RenderingContext.prototype.getParameter = function (what) {
+    return what === UNMASKED_RENDERER ? 'NVIDIA GeForce RTX 3060' : ask.call(this, what);
+};
+"""
+SLOW_FRAMES = """
+const soon = window.requestAnimationFrame.bind(window);
+let last = 0;
+window.framesSeen = 0;
+window.requestAnimationFrame = (draw) => soon(() => setTimeout(() => {
+    const now = performance.now();
+    if (now - last > 40) { window.framesSeen += 1; last = now; }
+    draw(now);
+}, 60));
+"""
+ENOUGH_FRAMES = 90
+"""viser decides after ten quarters of a second in which frames follow each other."""
+CANVAS = "document.querySelector('canvas[data-engine]')"
+Show = Callable[..., Page]
+
+
+@pytest.fixture(scope="module")
+def door() -> Iterator[Door]:
+    door = open_door(DoorOptions(port=0))
+    yield door
+    door.close()
+
+
+@pytest.fixture(scope="module")
+def show(door: Door, chromium_path: str) -> Iterator[Show]:
+    """Opens the page on a screen of twice the usual resolution, and waits for its view."""
+    with sync_playwright() as playwright:
+        browser = launch(playwright, chromium_path)
+
+        def opened(*scripts: str, wish: str = "") -> Page:
+            page = browser.new_page(viewport={"width": 640, "height": 400}, device_scale_factor=2)
+            for script in scripts:
+                page.add_init_script(script)
+            page.goto(door.url + wish)
+            # Made with 300 x 150, as every canvas; the view's size comes some frames later.
+            page.wait_for_function(f"{CANVAS}?.clientWidth === 640 && {CANVAS}.width !== 300", timeout=60_000)
+            return page
+
+        yield opened
+        browser.close()
+
+
+def draw_until(door: Door, page: Page, reached: str) -> None:
+    """Something moves in the view until this is true in the page."""
+    node, deadline = door.server.scene.add_frame("/moved"), time.monotonic() + 60
+    while not page.evaluate(reached):
+        assert time.monotonic() < deadline, f"{reached} did not come"
+        node.position = (time.monotonic() % 1, 0, 0)
+        page.wait_for_timeout(50)
+
+
+def width(page: Page) -> int:
+    return page.evaluate(f"{CANVAS}.width")
+
+
+def test_a_page_drawn_in_software_keeps_its_resolution_while_frames_come_slowly(
+    door: Door, show: Show
+) -> None:
+    page = show(SLOW_FRAMES)
+    assert width(page) == 2 * 640
+    draw_until(door, page, f"framesSeen > {ENOUGH_FRAMES}")
+    assert width(page) == 2 * 640
+    assert page.url == door.url.partition("?")[0]
+    page.close()
+
+
+def test_a_page_with_a_graphics_card_is_sharp_and_still_adapts(door: Door, show: Show) -> None:
+    page = show(A_CARD, SLOW_FRAMES)
+    assert width(page) == 2 * 640
+    draw_until(door, page, f"{CANVAS}.width < {2 * 640}")
+    page.close()
+
+
+def test_a_resolution_that_the_address_asks_for_is_left_alone(show: Show) -> None:
+    page = show(wish="&fixedDpr=1.5")
+    page.wait_for_function(f"{CANVAS}.width === 960")
+    assert page.url.endswith("?fixedDpr=1.5")
+    page.close()

@@ -1,0 +1,68 @@
+"""Files beside a task that are no Python: which are named, and what is said of them later."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.session.recordings import made, write
+from workbench.recording.read_episode import read_episode
+from workbench.recording.side_files import side_files, side_files_in_words
+
+TEXT = """
+'''See notes.txt.'''
+ROOT = Path(__file__).parent
+mesh = ROOT / "meshes" / "part.obj"
+loader.load(str(ROOT / "robots/arm.urdf"))
+for k in range(2):
+    load(f"{ROOT}/shapes/piece_{k}.ply", "shapes")
+"""
+
+
+@pytest.fixture
+def task(tmp_path: Path) -> Path:
+    for name, text in {
+        "meshes/part.obj": "v 0 0 0",
+        "meshes/other.obj": "v 1 1 1",
+        "robots/arm.urdf": '<mesh filename="visual/hand.stl"/>',
+        "robots/visual/hand.stl": "solid",
+        "shapes/piece_0.ply": "ply",
+        "notes.txt": "mine",
+        "recordings/part.obj": "not this one",
+        "unnamed.bin": "",
+    }.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    (tmp_path / "task.py").write_text(TEXT)
+    return tmp_path / "task.py"
+
+
+def test_what_the_text_names_is_named_and_what_that_names_in_turn(task: Path) -> None:
+    found = side_files(str(task), {str(task): TEXT})
+    assert {"meshes/part.obj", "robots/arm.urdf", "robots/visual/hand.stl", "shapes/piece_0.ply"} <= set(
+        found
+    )
+    assert not {"notes.txt", "unnamed.bin", "recordings/part.obj"} & set(found)
+    assert side_files(None, {"task.py": TEXT}) == {}
+    assert side_files(str(task), {str(task): "not python ("}) == {}
+
+
+def test_what_has_changed_or_gone_since_is_said(task: Path) -> None:
+    text = "load('meshes/part.obj', 'notes.txt')"
+    recorded = side_files(str(task), {str(task): text})
+    assert list(recorded) == ["meshes/part.obj", "notes.txt"]
+    assert "which the recording does not hold: they are as then." in side_files_in_words(str(task), recorded)
+    (task.parent / "meshes/part.obj").write_text("v 9 9 9 9")
+    (task.parent / "notes.txt").unlink()
+    said = side_files_in_words(str(task), recorded)
+    assert "meshes/part.obj has changed since; notes.txt is not there." in said
+    assert "is not there" in side_files_in_words("task.py", recorded), "read where the task is not"
+    assert "is not there" in side_files_in_words(str(task), {"../../etc/hostname": "0" * 12})
+    assert side_files_in_words(str(task), {}) == ""
+
+
+def test_a_recording_says_them(tmp_path: Path) -> None:
+    json = write(tmp_path, made(3, side_files={"meshes/part.obj": "0123456789ab"}), pictures=False)
+    assert read_episode(json).info.side_files == {"meshes/part.obj": "0123456789ab"}
+    assert read_episode(json.with_suffix(".rrd")).info.side_files == {"meshes/part.obj": "0123456789ab"}

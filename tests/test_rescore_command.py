@@ -1,0 +1,31 @@
+"""What ``workbench rescore`` prints, on terminals that are wide and narrow."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from workbench.rescore_command import print_verdicts
+from workbench.session.rescore_messages import EpisodeFile, Verdict
+
+NAME = "WorkbenchPushCube-v1_seed626610453_env00_2026-11-22T01-07-22"
+VERDICTS = [
+    Verdict(
+        EpisodeFile("a", NAME, Path("a.json")), seed=626610453, length=30, returns=(3.268, 4.902), metres=0.0
+    ),
+    Verdict(EpisodeFile("b", NAME + "-2", Path("b.json")), why_not="it does not hold the text of its task"),
+]
+
+
+@pytest.mark.parametrize("width", [60, 80, 200])
+def test_names_are_whole_on_a_terminal_of_any_width(width: int) -> None:
+    out = io.StringIO()
+    print_verdicts(VERDICTS, Console(file=out, width=width))
+    lines = out.getvalue().splitlines()
+    beginnings = [line for line in lines if line.startswith("Workbench")]
+    assert [line.split()[0] for line in beginnings] == [NAME, NAME + "-2"]
+    assert "3.268 → 4.902" in out.getvalue() and "626610453" in out.getvalue()
+    assert (lines[0].split()[0] == "episode") == (width == 200), "a table where there is room for one"

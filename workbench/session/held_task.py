@@ -1,0 +1,93 @@
+"""The task that the worker holds open, and what happens when its author's code raises or is left by hand.
+
+Whichever part of the worker calls into the task does it through here, so that each failure ends the same way: the steps
+that wait are dropped if somebody interrupted, the server is told with the author's line, and the batch stands again
+where the last step ended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from workbench.authoring.problem import Problem, TaskError, problem_from_exception
+from workbench.core.snapshot import restore_snapshot
+from workbench.session.interrupts import Interrupted, Interrupts
+from workbench.session.messages import Failed
+from workbench.session.open_task import OpenedTask
+from workbench.session.pulse import Doing, PulseWriter
+from workbench.session.server_line import ServerLine
+from workbench.session.step_events import StepEvents
+
+_STAGE: dict[Doing, str] = {"loading": "build", "stepping": "step", "resetting": "reset"}
+
+
+class HeldTask:
+    """See the module's text."""
+
+    def __init__(
+        self,
+        line: ServerLine,
+        interrupts: Interrupts,
+        pulse: PulseWriter,
+        steps: StepEvents,
+        on_failure: Callable[[], None],
+    ) -> None:
+        """
+        Args:
+            steps: has the moment that is gone back to.
+            on_failure: called when the server has been told of one.
+        """
+        self._line, self._interrupts, self._pulse, self._steps = line, interrupts, pulse, steps
+        self._on_failure = on_failure
+        self.opened: OpenedTask | None = None
+
+    def at_work(self, doing: Doing | None, work: Callable[[], None]) -> None:
+        """Do `work`; if the author's code is at work in it, it can be left."""
+        if doing is None:
+            work()
+            return
+        self._pulse.begin(doing)
+        try:
+            self._interrupts.run(work)
+        except Interrupted as error:
+            # Outside of what knows its task: between two hooks, or in the workbench's own code.
+            self._line.drop_steps()
+            known = () if self.opened is None else self.opened.loaded.source_files
+            self.fail(problem_from_exception(error, _STAGE.get(doing, "step"), known))
+            self.back_to_the_moment()
+        finally:
+            self._pulse.begin("idle")
+
+    def guarded(self, do: Callable[[OpenedTask], None]) -> None:
+        """Do it with the task, if there is one; what raises a TaskError has failed."""
+        if self.opened is None:
+            return
+        try:
+            do(self.opened)
+        except TaskError as error:
+            left = self.drop_steps_if_left(error)
+            self.fail(error.problem)
+            if left:
+                self.back_to_the_moment()
+
+    def drop_steps_if_left(self, error: TaskError) -> bool:
+        """Whether somebody had the author's code left; then the steps that wait are dropped."""
+        left = isinstance(error.__cause__, Interrupted)
+        if left:
+            self._line.drop_steps()
+        return left
+
+    def fail(self, problem: Problem) -> None:
+        """Tell the server, and stop playing."""
+        self._line.send(Failed(problem, kept=self.opened is not None))
+        self._on_failure()
+
+    def back_to_the_moment(self) -> None:
+        """After a step was left half done: the batch stands again where the last one ended."""
+        if self.opened is None or self._steps.moment is None:
+            return
+        try:
+            # Not `TaskEnv.restore`: that calls `evaluate`, which may be what would not end.
+            restore_snapshot(self.opened.env.env, self._steps.moment)
+        except (RuntimeError, ValueError, TypeError) as error:
+            self.fail(problem_from_exception(error, "reset", self.opened.loaded.source_files))

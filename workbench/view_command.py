@@ -1,0 +1,52 @@
+"""``workbench view`` in a terminal: rerun's own viewer, in a window or, where there is no screen, in a page."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+from workbench.recording.viewer import has_screen, open_window, recordings_among
+from workbench.terminal import refuse, warn
+
+
+def view_in_terminal(files: Sequence[Path], web: bool, host: str, port: int) -> int:
+    """Show them until the window is closed or Ctrl-C comes; returns the exit code."""
+    try:
+        if web or not has_screen(os.environ):
+            return _in_page(recordings_among(files), host, port)
+        viewer = open_window(files)
+    except (OSError, ValueError, RuntimeError) as error:
+        return refuse(str(error))
+    try:
+        viewer.wait()
+    except RuntimeError as error:
+        return refuse(str(error))
+    except KeyboardInterrupt:
+        print("closing", flush=True)
+    finally:
+        viewer.close()
+    return 0
+
+
+def _in_page(files: Sequence[Path], host: str, port: int) -> int:
+    from workbench.recording.web_viewer import web_viewer_folder
+    from workbench.ui.door import DoorOptions, open_door
+    from workbench.ui.offers import Offers
+    from workbench.ui.rerun_view import RerunPages
+
+    web_viewer_folder()
+    door = open_door(DoorOptions(host=host, port=port))
+    try:
+        address = RerunPages(door, Offers(door)).address(files)
+        if door.warning:
+            warn(door.warning)
+        print(f"  page    {door.address(address)}", flush=True)
+        print(f"  remote  {door.ssh_hint}\n  Ctrl-C ends it.", flush=True)
+        threading.Event().wait()
+    except KeyboardInterrupt:
+        print("closing", flush=True)
+    finally:
+        door.close()
+    return 0
