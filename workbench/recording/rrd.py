@@ -39,8 +39,8 @@ class RrdWriter:
 
     def take(self, piece: Piece) -> None:
         """Raises OSError where the file could not be written."""
-        self._recording.flush()  # else what rerun has not yet encoded adds up
         self._log.take(piece)
+        self._recording.flush()  # else what rerun has not yet encoded adds up
         if self._file.error is not None:
             raise self._file.error
 
