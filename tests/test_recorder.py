@@ -90,6 +90,19 @@ def test_a_full_disk_warns_once_and_the_run_goes_on(tmp_path: Path) -> None:
     env.close()
 
 
+def test_what_came_before_an_unseen_reset_is_kept(tmp_path: Path) -> None:
+    env = workbench.Recorder(workbench.make("PushCube-v1", 2, **OPTIONS), tmp_path)
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(env.action_space.sample())
+    env.unwrapped.reset(seed=5)
+    env.step(env.action_space.sample())
+    with pytest.warns(UserWarning, match="step 4 was expected and step 1 came"):
+        env.close()
+    assert env.problem is not None
+    assert sorted(episode.length for episode in episodes_in(tmp_path)) == [3, 3]
+
+
 def test_a_vector_env_is_refused(tmp_path: Path) -> None:
     env = ManiSkillVectorEnv(workbench.make("PushCube-v1", 1, **OPTIONS))
     with pytest.raises(TypeError, match="inside a vector env"):

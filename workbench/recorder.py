@@ -38,6 +38,7 @@ from workbench.core.seams import draws_its_own_seeds, task_class
 from workbench.core.state_columns import read_state_columns
 from workbench.core.step import StepResult
 from workbench.core.step_pictures import step_pictures
+from workbench.core.take_pictures import Request
 from workbench.core.task_env import TaskEnv
 from workbench.recording.episode import NO_SEED
 from workbench.recording.episode_writer import EpisodeFiles
@@ -45,6 +46,7 @@ from workbench.recording.recover import recover
 from workbench.recording.rrd import RecordingError
 from workbench.session.episode_files import EpisodeFinisher
 from workbench.session.episodes import EpisodeGatherer, GatheredEpisode
+from workbench.session.gather_later import LaterSteps
 from workbench.session.messages import Stepped, TaskDescription
 from workbench.session.open_task import describe
 from workbench.session.recorded_pictures import recorded_pictures
@@ -91,6 +93,7 @@ class Recorder(gym.Wrapper):
         self._made: list[Future[EpisodeFiles | str]] = []
         """Episodes that are over, and not known to have their files."""
         self._gatherer: EpisodeGatherer | None = None
+        self._later: LaterSteps | None = None
         self._scene: Any = None
         self._description: TaskDescription | None = None
         self._seeds = np.full(base.num_envs, NO_SEED, np.int64)
@@ -103,6 +106,7 @@ class Recorder(gym.Wrapper):
         return self._finisher.finished.count
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        self._catch_up()
         obs, info = self.env.reset(seed=seed, options=options)
         count = self._task.num_envs
         mask = np.zeros(count, bool)
@@ -140,6 +144,8 @@ class Recorder(gym.Wrapper):
             obs, reward, terminated, truncated, info = given
             if made is None:
                 made = np.zeros((task.num_envs, 0), np.float32)
+            if self._took_later(given, made):
+                return given  # type: ignore[return-value]
             step = task.result_of(info, reward, terminated, truncated, made)
             self._take(step, np.zeros(task.num_envs, bool))
         return given  # type: ignore[return-value]
@@ -171,6 +177,10 @@ class Recorder(gym.Wrapper):
             self._gatherer = EpisodeGatherer(
                 self._description, self._envs, self._folder, self._over, ends="reset"
             )
+            try:
+                self._later = LaterSteps(self._task, self._gatherer, self._wanted())
+            except ValueError:
+                self._later = None  # every step is told in full
 
     def _take(self, step: StepResult, reset_mask: np.ndarray) -> None:
         gatherer, task = self._gatherer, self._task
@@ -178,25 +188,57 @@ class Recorder(gym.Wrapper):
             return
         pictures: tuple[Picture, ...] = ()
         if self._pictures:
-            cameras = self._description.cameras
-            if self._pictures is not True:
-                cameras = [camera for camera in cameras if camera.name in self._pictures]
-            wanted = recorded_pictures(cameras)
+            wanted = self._wanted()
             for env in self._envs:
                 pictures += step_pictures(task, env, wanted)
         columns = read_state_columns(task)
         try:
             gatherer.take(Stepped(step, reset_mask, pictures, self._seeds.copy(), columns=columns))
         except (RecordingError, ValueError) as error:
-            self._end()
-            self._gatherer, self.problem = None, str(error)
-            warnings.warn(f"the recording ended: {error}", stacklevel=3)
+            self._give_up(error)
         self._say_what_failed()
+
+    def _wanted(self) -> Sequence[Request]:
+        if not self._pictures or self._description is None:
+            return ()
+        cameras = self._description.cameras
+        if self._pictures is not True:
+            cameras = [camera for camera in cameras if camera.name in self._pictures]
+        return recorded_pictures(cameras)
+
+    def _took_later(self, given: tuple[Any, ...], made: np.ndarray) -> bool:
+        if self._later is None:
+            return False
+        try:
+            taken = self._later.take(given, made)
+            if not taken:
+                self._later.flush()
+        except (RecordingError, ValueError) as error:
+            self._give_up(error)
+            taken = True
+        self._say_what_failed()
+        return taken
+
+    def _catch_up(self) -> None:
+        """What was taken is with the gatherer, which knows nothing of the steps that wait."""
+        if self._later is not None:
+            try:
+                self._later.flush()
+            except (RecordingError, ValueError) as error:
+                self._give_up(error)
+
+    def _give_up(self, error: Exception) -> None:
+        self._later = None
+        self._end()
+        self.problem = str(error)
+        warnings.warn(f"the recording ended: {error}", stacklevel=4)
 
     def _over(self, episode: GatheredEpisode) -> None:
         self._made.append(self._finisher.finish(episode))
 
     def _end(self) -> None:
+        self._catch_up()
+        self._later = None
         gatherer, self._gatherer = self._gatherer, None
         if gatherer is not None:
             gatherer.finish()
@@ -207,5 +249,5 @@ class Recorder(gym.Wrapper):
         problems = [result for future in done if isinstance(result := future.result(), str)]
         if problems and self.problem is None:
             self.problem = problems[0]
-            self._gatherer = None
+            self._gatherer = self._later = None
             warnings.warn(f"the recording ended: {self.problem}", stacklevel=4)

@@ -3,14 +3,14 @@
 The same env, the same seed, the same actions: inside RecordEpisode, inside `workbench.Recorder`, in turn, several rounds. Both
 recorders keep actions, rewards, flags, state observations and env states. With a camera, both keep the base camera's colour, depth and
 segmentation, which the env observes. Ours keeps more: every pose, what ``evaluate`` returned, the meshes, all in a second file, the
-.rrd, which RecordEpisode does not have; its share is shown by itself.
+.rrd, which RecordEpisode does not have, and which holds our pictures. So there are two verdicts: of the same content, which is all but the .rrd
+without a camera and everything with one, and of everything.
 
 What a recorder takes is what a step takes beyond the env's own, which is measured within the same step: on a machine that others use
-too, two runs differ by more than a recorder takes. It is everything until the files are there, divided by the steps, in two
-parts: while stepping, and when the files are made (RecordEpisode compresses its pictures then, ours while the next step is made, on
-other threads, whose work is counted where the processor is). Each is the median of the rounds by the clock, and the median and the least by
-the processor; the env's own threads are no part of either. Bytes a step are a difference of two lengths, so that neither
-side's fixed parts (the scene's meshes, the sources' texts) count.
+too, two runs differ by more than a recorder takes. Stepping is that; the total is everything until the files are there, divided by the
+steps. (RecordEpisode compresses its pictures when the files are made, ours while the next step is made, on other threads: what these take
+of the processor is a row of its own, as the env may have wanted it.) Times are medians of the rounds. Bytes a step are a difference of two
+lengths, so that neither side's fixed parts (the scene's meshes, the sources' texts) count.
 """
 
 from __future__ import annotations
@@ -47,10 +47,11 @@ class Options:
     """Of an episode."""
     rounds: int = 5
     """Without a camera; 0 leaves it out."""
-    camera_steps: int = 50
-    """PickCube's own episode. RecordEpisode copies all that it has at every step, so its steps grow slower with the episode."""
-    camera_rounds: int = 3
-    """With a camera; 0 leaves it out."""
+    camera_steps: tuple[int, ...] = (50, 16)
+    """With a camera, for each of `num_envs`: drawing them takes a second a step. PickCube's own episode has 50. RecordEpisode copies
+    all that it has at every step, so its steps grow slower with the episode."""
+    camera_rounds: tuple[int, ...] = (3, 1)
+    """With a camera, for each of `num_envs`; 0 leaves it out."""
 
 
 class Timed(gym.Wrapper):
@@ -78,30 +79,24 @@ class Run:
 
     bare: float
     """Of the env's own steps."""
-    clock: float
+    stepping: float
     """That the recorder took while stepping."""
-    processor: float
-    """The same, of the processor, all threads of the recorder."""
-    files_clock: float
+    files: float
     """For making the files."""
-    files_processor: float
     rrd: float
-    """Of `files_processor`, what the .rrd took."""
+    """Of `files`, what the .rrd took."""
+    processor: float
+    """The whole, of the processor, all threads of the recorder."""
     size: dict[str, int]
     """Bytes by suffix."""
 
     @property
-    def whole_clock(self) -> float:
-        return self.clock + self.files_clock
+    def total(self) -> float:
+        return self.stepping + self.files
 
     @property
-    def whole_processor(self) -> float:
-        return self.processor + self.files_processor
-
-    @property
-    def same_processor(self) -> float:
-        """Without the .rrd: what both sides make."""
-        return self.whole_processor - self.rrd
+    def total_without_rrd(self) -> float:
+        return self.total - self.rrd
 
 
 class _Rrd:
@@ -112,11 +107,11 @@ class _Rrd:
     def __init__(self) -> None:
         def timed(call: Any) -> Any:
             def run(*args: Any) -> Any:
-                began = time.process_time()
+                began = time.perf_counter()
                 try:
                     return call(*args)
                 finally:
-                    self.taken += time.process_time() - began
+                    self.taken += time.perf_counter() - began
 
             return run
 
@@ -171,10 +166,9 @@ def run(side: str, env: Any, actions: list[torch.Tensor], camera: bool) -> Run:
     return Run(
         timed.clock,
         clock - timed.clock,
-        processor - timed.processor,
         files_clock,
-        files_processor,
         rrd.taken,
+        processor - timed.processor + files_processor,
         size,
     )
 
@@ -188,9 +182,7 @@ def finish(side: str, wrapped: Any) -> None:
         wrapped.finish()
 
 
-def measure(options: Options, num_envs: int, camera: bool) -> None:
-    steps = options.camera_steps if camera else options.steps
-    rounds = options.camera_rounds if camera else options.rounds
+def measure(options: Options, num_envs: int, camera: bool, steps: int, rounds: int) -> None:
     mode: dict[str, Any] = {"obs_mode": "state", "render_backend": "none"}
     if camera:
         mode = {"obs_mode": "state+rgb+depth+segmentation", "render_backend": "cpu"}
@@ -212,48 +204,38 @@ def measure(options: Options, num_envs: int, camera: bool) -> None:
         sizes[side] = {suffix: (whole[suffix] - half[suffix]) / rest for suffix in whole}
     env.close()
 
-    def took(side: str, what: str, of: Any = statistics.median) -> float:
-        return 1000 * of(getattr(r, what) for r in runs[side]) / steps
+    def took(side: str, what: str) -> float:
+        return 1000 * statistics.median(getattr(r, what) for r in runs[side]) / steps
 
-    about = f"{options.task}, {num_envs} env{'s' if num_envs > 1 else ''}, {'with a camera' if camera else 'states'}"
-    print(
-        f"{about}; {steps} steps of {took('Recorder', 'bare'):.2f} ms without recording; milliseconds a step:"
-    )
-    for side in SIDES:
-        print(
-            f"  {side:14s} stepping {took(side, 'clock'):7.3f}, files {took(side, 'files_clock'):7.3f} by the clock"
-        )
-        for word, of in (("median", statistics.median), ("least", min)):
-            print(
-                f"  {'':14s} stepping {took(side, 'processor', of):7.3f}, files {took(side, 'files_processor', of):7.3f}"
-                f" (of it .rrd {took(side, 'rrd', of):7.3f}), sum {took(side, 'whole_processor', of):7.3f} of the"
-                f" processor, {word}; without .rrd {took(side, 'same_processor', of):7.3f}"
-            )
-        size = sizes[side]
-        print(
-            f"  {'':14s} bytes a step and env: {size['.h5'] + size['.json']:6.0f} in .h5 and .json, {size['.rrd']:6.0f} in .rrd"
-        )
-    theirs, ours = sizes["RecordEpisode"], sizes["Recorder"]
+    def weighs(side: str, *suffixes: str) -> float:
+        return sum(sizes[side][suffix] for suffix in suffixes)
 
-    def ratio(what: str, of: Any = statistics.median) -> str:
-        return f"{took('Recorder', what, of) / took('RecordEpisode', what, of):.2f}"
-
-    print(
-        f"  ratio: stepping {ratio('clock')} by the clock, {ratio('processor')} of the processor ({ratio('processor', min)} least);"
-        f" with the files {ratio('whole_clock')} by the clock, {ratio('whole_processor')} of the processor,"
-        f" {ratio('same_processor')} without the .rrd; bytes {ours['.h5'] / theirs['.h5']:.2f} .h5 to .h5,"
-        f" {sum(ours.values()) / sum(theirs.values()):.2f} all files"
-    )
+    about = f"{num_envs} env{'s' if num_envs > 1 else ''}, {'with a camera' if camera else 'states'}"
+    print(f"{options.task}, {about}; {steps} steps of {took('Recorder', 'bare'):.2f} ms without recording")
+    whole = (".h5", ".json", ".rrd")
+    same, total = (whole, "total") if camera else (whole[:2], "total_without_rrd")
+    rows = [
+        ("ms a step: stepping", lambda side: took(side, "stepping")),
+        ("ms a step: total, same content", lambda side: took(side, total)),
+        ("ms a step: total, everything", lambda side: took(side, "total")),
+        ("ms a step: processor, everything", lambda side: took(side, "processor")),
+        ("bytes a step and env: same content", lambda side: weighs(side, *same)),
+        ("bytes a step and env: everything", lambda side: weighs(side, *whole)),
+    ]
+    print(f"  {'':36s} {'Recorder':>14s} {'RecordEpisode':>14s} {'ratio':>6s}")
+    for name, of in rows:
+        ours, theirs = of("Recorder"), of("RecordEpisode")
+        print(f"  {name:36s} {ours:14.3f} {theirs:14.3f} {ours / theirs:6.2f}", flush=True)
 
 
 def main(options: Options) -> None:
     torch.set_num_threads(1)
     if options.rounds:
         for num_envs in options.num_envs:
-            measure(options, num_envs, camera=False)
-    if options.camera_rounds:
-        for num_envs in options.num_envs:
-            measure(options, num_envs, camera=True)
+            measure(options, num_envs, False, options.steps, options.rounds)
+    for num_envs, steps, rounds in zip(options.num_envs, options.camera_steps, options.camera_rounds):
+        if rounds:
+            measure(options, num_envs, True, steps, rounds)
 
 
 if __name__ == "__main__":

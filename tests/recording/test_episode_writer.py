@@ -319,7 +319,7 @@ def test_rows_that_went_missing_are_noticed(
             send(self, entity, *args, **kwargs)
 
     monkeypatch.setattr(rr.RecordingStream, "send_columns", lossy)
-    with pytest.raises(RecordingError, match="/reward: 0 of 3 rows"):
+    with pytest.raises(RecordingError, match="/reward: 0 of 2 rows"):
         make_episode().write(tmp_path)
 
 

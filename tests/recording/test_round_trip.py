@@ -53,9 +53,14 @@ def assert_same(found: Episode, made: Made) -> None:
 
 
 def scalars(entities: Entities, entity: str) -> tuple[NDArray, NDArray]:
-    column = entities[entity]["Scalars:scalars"]
+    return every_step(entities[entity]["Scalars:scalars"])
+
+
+def every_step(column: Column) -> tuple[NDArray, NDArray]:
+    """With the rows that say nothing new, which are not in the file."""
     assert column.steps is not None
-    return column.steps, np.stack(column.values)
+    steps = np.arange(column.steps[0], column.steps[-1] + 1)
+    return steps, np.stack(column.values)[np.searchsorted(column.steps, steps, side="right") - 1]
 
 
 def test_rerun_itself_finds_nothing_wrong(written: tuple[Made, Path, Entities]) -> None:
@@ -78,16 +83,18 @@ def test_every_body_has_its_poses(written: tuple[Made, Path, Entities]) -> None:
             entities[entity]["Transform3D:translation"],
             entities[entity]["Transform3D:quaternion"],
         )
-        wxyz = np.stack(quaternion.values)[:, 0, [3, 0, 1, 2]]
         expected = episode.poses[:, body]
         if (expected == expected[0]).all():
             assert translation.steps is None  # what never moved is written once
             expected = expected[:1]
+            places, turns = np.stack(translation.values), np.stack(quaternion.values)
         else:
-            np.testing.assert_array_equal(translation.steps, np.arange(len(episode.poses)))
+            steps, places = every_step(translation)
+            turns = every_step(quaternion)[1]
+            np.testing.assert_array_equal(steps, np.arange(len(episode.poses)))
             moved += 1
-        np.testing.assert_array_equal(np.stack(translation.values)[:, 0], expected[:, :3])
-        np.testing.assert_array_equal(wxyz, expected[:, 3:])
+        np.testing.assert_array_equal(places[:, 0], expected[:, :3])
+        np.testing.assert_array_equal(turns[:, 0, [3, 0, 1, 2]], expected[:, 3:])
     assert moved > 8, "the robot did not move, so this test compared nothing"
 
 
@@ -167,6 +174,24 @@ def test_numbers_are_exact(written: tuple[Made, Path, Entities]) -> None:
         np.testing.assert_array_equal(steps, np.arange(len(episode.poses)))
         np.testing.assert_array_equal(values[:, 0], expected)
     np.testing.assert_array_equal(scalars(entities, "/episode/success")[1][:, 0], episode.evaluate["success"])
+
+
+def test_what_stays_as_it_was_is_not_written_again(make_episode: Callable[..., Made], tmp_path: Path) -> None:
+    episode = make_episode(
+        9, evaluate={"success": np.arange(10) > 5, "level": np.array([0.0] * 4 + [np.nan] * 6)}
+    )
+    episode.poses[3:8, 1] = episode.poses[3, 1]
+    entities, again = read_rrd(episode.write(tmp_path).rrd), read_episode(next(tmp_path.glob("*.json")))
+    assert_same(again, episode)
+    kept = {
+        "/evaluate/success": [0, 5, 6, 9],  # a curve through these is the curve through all
+        "/evaluate/level": [0, 3, 4, 9],
+        "/reward": [1, 9],
+    }
+    for entity, steps in kept.items():
+        np.testing.assert_array_equal(entities[entity]["Scalars:scalars"].steps, steps)
+    moved = entities["/world/robot/hand"]["Transform3D:translation"].steps
+    np.testing.assert_array_equal(moved, [0, 1, 2, 3, 7, 8, 9])
 
 
 def test_observations_and_parts_of_the_reward_have_places_of_their_own(
@@ -347,8 +372,10 @@ def test_any_episode_comes_back(
     if np.isnan(episode.poses[:, 1]).all():
         assert "/world/robot/hand" not in entities
     else:
-        translation = np.stack(entities["/world/robot/hand"]["Transform3D:translation"].values)[:, 0]
-        np.testing.assert_array_equal(translation, episode.poses[:, 1, :3])
+        translation = entities["/world/robot/hand"]["Transform3D:translation"]
+        poses = np.stack(translation.values) if translation.steps is None else every_step(translation)[1]
+        held = np.broadcast_to(poses[:, 0], (steps + 1, 3))
+        np.testing.assert_array_equal(held, episode.poses[:, 1, :3])
     if steps:
         np.testing.assert_array_equal(scalars(entities, "/reward")[1][:, 0], episode.reward)
     else:

@@ -44,3 +44,14 @@ class BatchPacker:
             part[...] = values
         size, together = self._rows.itemsize, self._rows.tobytes()
         return layout, [together[i : i + size] for i in range(0, count * size, size)]
+
+    def pack_steps(self, columns: Sequence[tuple[str, NDArray]]) -> tuple[Layout, NDArray]:
+        """The layout and rows (N, K), structured, of K steps of `columns`, each a name and an array (K, N, ...)."""
+        key = tuple([(name, values.dtype, values.shape[2:]) for name, values in columns])
+        layout = self._layouts.setdefault(key, Layout(key))
+        fields = [(f"f{i}", values.dtype, values.shape[2:]) for i, (_, values) in enumerate(columns)]
+        steps, count = columns[0][1].shape[:2]
+        rows = np.empty((count, steps), fields)
+        for (name, *_), (_, values) in zip(fields, columns):
+            rows[name] = values.swapaxes(0, 1)
+        return layout, rows

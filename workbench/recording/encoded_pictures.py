@@ -53,10 +53,12 @@ class EncodedPictures:
 
 
 def encode(modality: Modality, picture: NDArray) -> bytes:
-    """`picture` as in ``EncodedPictures.__getitem__``."""
+    """`picture` as in ``EncodedPictures.__getitem__``; depth may be whole millimetres, none of them below 0."""
     if modality == "rgb":
         return encode_jpeg(picture)
-    return encode_depth_png(picture) if modality == "depth" else encode_segmentation_png(picture)
+    if modality == "depth":
+        return encode_png16(picture) if picture.dtype.kind in "iu" else encode_depth_png(picture)
+    return encode_segmentation_png(picture)
 
 
 def decode(modality: Modality, blob: bytes) -> NDArray:

@@ -22,7 +22,8 @@ from workbench.recording.columns import RowPacker
 from workbench.recording.encode_soon import encode_soon
 from workbench.recording.encoded_pictures import MODALITIES, Modality
 from workbench.recording.episode import EpisodeInfo
-from workbench.recording.journal import FOLDER, Journal
+from workbench.recording.journal import FOLDER, Entry, Journal
+from workbench.recording.journal import Item as JournalItem
 from workbench.recording.landing import RecordingError, reason
 from workbench.recording.make_files import EpisodeFiles as EpisodeFiles
 from workbench.recording.make_files import make_files
@@ -67,6 +68,8 @@ class EpisodeWriter:
         }
         self._given: dict[int, tuple[Modality, ...]] = {}
         self._shared: dict[Layout, int] = {}
+        self._encoded: dict[int | None, object] = {}
+        """By camera, the form of pictures that `encode` has found well."""
         self._states = 0
         self._written = False
         self._finished: EpisodeFiles | None = None
@@ -115,6 +118,47 @@ class EpisodeWriter:
             )
         self._append(*self._packer.pack(row), row.pictures)
 
+    def append_steps(
+        self, layout: Layout, packed: bytes, steps: int, pictures: Sequence[JournalItem] = ()
+    ) -> None:
+        """As `append`, with the rows of several steps one behind the other, and what `encode` gave for them."""
+        if self._states == 0:
+            raise ValueError("the first row is the state after a reset, which no action led to.")
+        number, text = self._shared.get(layout), None
+        if number is None:
+            number, text = self._packer.number_of(layout.key)
+        self._keep(number, packed, text, pictures)
+        self._shared[layout] = number
+        self._states += steps
+
+    def encode(
+        self, state: int, camera: tuple[CameraKind, str], pose: NDArray, images: Mapping[Modality, NDArray]
+    ) -> list[JournalItem]:
+        """The pictures of a state to come, on their way: for `append_steps`. Nobody may write to `images` any more.
+
+        Args:
+            images: as in a `Picture`, all that the camera gives; depth may be whole millimetres.
+
+        Raises:
+            ValueError: they do not fit the episode.
+        """
+        index = self._cameras.get(camera)
+        form = (index, tuple([(name, image.shape, image.dtype) for name, image in images.items()]))
+        if form != self._encoded.get(index):
+            millimetres = images.get("depth")
+            checked = dict(images)
+            if millimetres is not None and millimetres.dtype.kind in "iu":
+                checked["depth"] = millimetres.astype(np.float32)
+            index = self._check(Picture(camera[1], camera[0], self.info.env_index, pose, **checked), {})
+            self._given[index] = tuple(modality for modality in MODALITIES if modality in images)
+            self._encoded[index] = form
+        assert index is not None
+        entry = Entry(f"camera/{index}", state, np.asarray(pose, dtype=np.float32).tobytes())
+        return [
+            entry,
+            encode_soon([(f"picture/{index}/{m}", state, m, image) for m, image in images.items()]),
+        ]
+
     def append_packed(self, layout: Layout, packed: bytes, pictures: Sequence[Picture] = ()) -> None:
         """As `append`, with a row after the first that was packed together with those of other envs."""
         if self._states == 0:
@@ -134,22 +178,30 @@ class EpisodeWriter:
         self._shared[layout] = number
 
     def _append(self, number: int, packed: bytes, layout: str | None, pictures: Sequence[Picture]) -> None:
+        try:
+            given, items = self._pictures_of(pictures) if pictures else ({}, [])
+        except ValueError:
+            if layout is not None:
+                self._packer.forget(number)
+            raise
+        self._keep(number, packed, layout, items)
+        self._given |= given
+        self._states += 1
+
+    def _keep(self, number: int, packed: bytes, layout: str | None, pictures: Sequence[JournalItem]) -> None:
         journal = self._journal
         try:
-            given = self._add_pictures(pictures) if pictures else {}
+            for item in pictures:
+                journal.take(item)
             if layout is not None:
                 journal.add("layout", number, layout.encode())
             journal.add("row", number, packed)
             journal.commit()
-        except (ValueError, OSError) as error:
+        except OSError as error:
             journal.rollback()
             if layout is not None:
                 self._packer.forget(number)
-            if isinstance(error, OSError):
-                raise self._failed(error) from error
-            raise
-        self._given |= given
-        self._states += 1
+            raise self._failed(error) from error
 
     def finish(self) -> EpisodeFiles:
         """Make the files of the episode so far, and be done; again after an error, if the cause is gone.
@@ -170,6 +222,7 @@ class EpisodeWriter:
         try:
             self._finished = make_files(self._journal.path, self._header, self._folder, self._states)
         except Exception:
+            self._journal.sync()
             self.close()
             raise
         self.discard()
@@ -185,24 +238,23 @@ class EpisodeWriter:
         self._scene.unlink(missing_ok=True)
         tidy(self._folder)
 
-    def _add_pictures(self, pictures: Sequence[Picture]) -> dict[int, tuple[Modality, ...]]:
-        """Put `pictures` into the journal; returns what each camera gave."""
+    def _pictures_of(
+        self, pictures: Sequence[Picture]
+    ) -> tuple[dict[int, tuple[Modality, ...]], list[JournalItem]]:
+        """What each camera gave, and what is to go into the journal."""
         seen: dict[int, tuple[Modality, ...]] = {}
         for picture in pictures:
-            index = self._check(picture, seen)
-            seen[index] = _given(picture)
-            self._journal.add(
-                f"camera/{index}", self._states, np.asarray(picture.pose, dtype=np.float32).tobytes()
-            )
-            self._journal.add_later(
+            seen[self._check(picture, seen)] = _given(picture)
+        items: list[JournalItem] = []
+        for (index, modalities), picture in zip(seen.items(), pictures):
+            pose = np.asarray(picture.pose, dtype=np.float32).tobytes()
+            items.append(Entry(f"camera/{index}", self._states, pose))
+            items.append(
                 encode_soon(
-                    [
-                        (f"picture/{index}/{modality}", self._states, modality, getattr(picture, modality))
-                        for modality in seen[index]
-                    ]
+                    [(f"picture/{index}/{m}", self._states, m, getattr(picture, m)) for m in modalities]
                 )
             )
-        return seen
+        return seen, items
 
     def _check(self, picture: Picture, seen: Mapping[int, object]) -> int:
         index = self._cameras.get((picture.kind, picture.camera))

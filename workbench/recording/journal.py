@@ -9,7 +9,7 @@ A journal is an Arrow stream of one table, ``kind``, ``number`` and ``value``, w
 read. A state's pictures come before its row, so a state is there with all of its pictures or not at all:
 
 - ``header``: JSON; the scene's meshes lie beside it (`scene_file`);
-- ``layout`` `number`: the layout's text (`columns`); ``row`` `number`: a row of that layout;
+- ``layout`` `number`: the layout's text (`columns`); ``row`` `number`: a row of that layout, or several one behind the other;
 - ``camera/<i>`` `state`: (7,) float32 pose; ``picture/<i>/<modality>`` `state`: the encoded picture.
 
 A row is on the disk within half a second, and its owner does not wait for that: one thread for all journals of the process writes
@@ -25,7 +25,7 @@ import os
 import threading
 import time
 import weakref
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from pathlib import Path
 from typing import NamedTuple
@@ -35,7 +35,7 @@ import pyarrow as pa
 FOLDER = ".writing"
 SYNC_SECONDS = 0.4
 """How long a row may wait before it is written."""
-_BATCH_BYTES = 4 << 20
+_BATCH_BYTES = 2 << 20
 """More than this is written by whoever appends it: memory stays bounded where the disk is slower than the episode."""
 _SCHEMA = pa.schema([("kind", pa.string()), ("number", pa.int32()), ("value", pa.binary())])
 
@@ -46,7 +46,7 @@ class Entry(NamedTuple):
     value: bytes
 
 
-_Item = Entry | Future[list[Entry]]
+Item = Entry | Future[list[Entry]]
 
 
 class Journal:
@@ -58,8 +58,8 @@ class Journal:
         self._descriptor = _create(path)
         self._closer = weakref.finalize(self, os.close, self._descriptor)
         self._size = 0
-        self._pending: list[_Item] = []  # the owner's alone
-        self._waiting: list[_Item] = []
+        self._pending: list[Item] = []  # the owner's alone
+        self._waiting: list[Item] = []
         self._waiting_bytes = 0
         self._lock = threading.Lock()  # of what waits; never held while the disk works
         self._writing = threading.Lock()
@@ -81,9 +81,9 @@ class Journal:
     def add(self, kind: str, number: int, value: bytes) -> None:
         self._pending.append(Entry(kind, number, value))
 
-    def add_later(self, entries: Future[list[Entry]]) -> None:
-        """`add` what somebody is still working at; it keeps this place. Whoever writes waits for it, not the owner."""
-        self._pending.append(entries)
+    def take(self, item: Item) -> None:
+        """`add` it; entries that somebody is still working at keep this place, and whoever writes waits for them, not the owner."""
+        self._pending.append(item)
 
     def commit(self) -> None:
         """What was added belongs together from here on, and will be on the disk soon.
@@ -157,28 +157,32 @@ class Journal:
 
     def sync(self) -> None:
         """Write what was committed and make it last, also through a power cut. An error is raised by the next `commit`."""
+        self._written(os.fsync)
+
+    def finish(self) -> None:
+        """Write everything and stop writing; the file stays locked until `close`.
+
+        A process that dies loses nothing of it. For a power cut `sync` it, where it is not to be replaced by something better at once.
+        What could not be written before is tried again. Raises OSError where something still cannot.
+        """
+        _keeper.forget(self)
+        self._error = None
+        self._written(lambda _: None)
+        if self._error is not None:
+            raise self._error
+
+    def _written(self, last: Callable[[int], None]) -> None:
         self.write()
         with self._writing:
             if self._error is not None or not self._closer.alive:
                 return
             try:
-                os.fsync(self._descriptor)
+                last(self._descriptor)
                 if os.fstat(self._descriptor).st_nlink == 0:
                     gone = "the folder, or the file in it, was removed during the recording"
                     raise FileNotFoundError(errno.ENOENT, gone)
             except OSError as error:
                 self._error = error
-
-    def finish(self) -> None:
-        """Write everything and stop writing; the file stays locked until `close`.
-
-        What could not be written before is tried again. Raises OSError where something still cannot.
-        """
-        _keeper.forget(self)
-        self._error = None
-        self.sync()
-        if self._error is not None:
-            raise self._error
 
     def close(self) -> None:
         """Let go of the file."""
@@ -205,7 +209,7 @@ class Journal:
         self._size += written
 
 
-def _made(items: Sequence[_Item]) -> tuple[list[Entry], int, OSError | None]:
+def _made(items: Sequence[Item]) -> tuple[list[Entry], int, OSError | None]:
     """Their entries, and how many of them these are. Where one cannot be made, those of the states before it."""
     entries: list[Entry] = []
     whole, done = 0, 0
@@ -243,6 +247,7 @@ class _Keeper:
     def __init__(self) -> None:
         self._journals: set[Journal] = set()
         self._changed = threading.Condition()
+        self._before: set[weakref.WeakMethod] = set()
         self._thread: threading.Thread | None = None
 
     def watch(self, journal: Journal) -> None:
@@ -257,6 +262,11 @@ class _Keeper:
             self._journals.discard(journal)
             self._changed.notify()
 
+    def before_writing(self, flush: Callable[[], None]) -> None:
+        with self._changed:
+            self._before = {held for held in self._before if held() is not None}
+            self._before.add(weakref.WeakMethod(flush))
+
     def _run(self) -> None:
         while True:
             with self._changed:
@@ -266,6 +276,11 @@ class _Keeper:
                 if not self._journals:
                     self._thread = None
                     return
+                before = [flush for held in self._before if (flush := held()) is not None]
+            for flush in before:
+                flush()
+            del before
+            with self._changed:
                 journals = list(self._journals)
             for journal in journals:
                 journal.write()  # all of them before the first fsync, which may take its time
@@ -274,6 +289,14 @@ class _Keeper:
 
 
 _keeper = _Keeper()
+
+
+def before_writing(flush: Callable[[], None]) -> None:
+    """Have the bound method `flush` called before journals are written, while its object lives: for who holds rows back.
+
+    On the thread of the journals, so it must not raise.
+    """
+    _keeper.before_writing(flush)
 
 
 def read_journal(path: Path) -> Iterator[list[Entry]]:

@@ -11,6 +11,8 @@ Two timelines index all of it: ``step``, the state's number, and ``sim_time``. R
 `StepResult` k said: the state after k control steps, with the action that led there and the reward
 that it earned, so the action of row k is ``episode.action[k - 1]`` and row 0 has neither.
 
+A row of numbers or of a pose that is between two equal ones is left out (`rerun_log.telling`): the state before it says what it is.
+
 Everything goes in as columns (one call an entity and piece), which research measured at forty times the speed
 of one call a row; pieces are long, since each is a chunk of the file that readers and the viewer handle as one. Rerun writes quaternions as xyzw and cameras in the OpenCV frame (x right, y down,
 z forward); ManiSkill has wxyz and x forward, y left, z up.

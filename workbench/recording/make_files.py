@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from workbench.recording.episode import EpisodeInfo
-from workbench.recording.landing import RecordingError, publish, reason
+from workbench.recording.landing import RecordingError, make_last, publish, reason
 from workbench.recording.maniskill_h5 import h5_writer, write_json
 from workbench.recording.rrd import rrd_writer
 from workbench.recording.survey import Header, JournalReader, Survey
@@ -51,6 +51,7 @@ def make_files(journal: Path, header: Header, folder: Path, states: int | None =
         for path in temporaries:
             path.unlink(missing_ok=True)
         _write(reader, survey, temporaries, folder)
+        make_last(temporaries)
         return EpisodeFiles(*publish(temporaries, folder, episode_stem(header.info)))
     except OSError as error:
         why = error if isinstance(error, RecordingError) else reason(error, folder)

@@ -31,7 +31,7 @@ from workbench.recording.read_maniskill import UnreadableRecording as Unreadable
 from workbench.recording.read_maniskill import leaves
 from workbench.recording.read_maniskill import read_maniskill as read_maniskill
 from workbench.recording.read_maniskill import trajectories as trajectories
-from workbench.recording.rerun_table import RerunTable, wxyz_from_optical
+from workbench.recording.rerun_table import RerunTable, rows_at, wxyz_from_optical
 from workbench.recording.survey import camera_from
 
 
@@ -136,10 +136,13 @@ def _column(table: RerunTable | None, entity: str, column: Column, first: int, s
     if table is None or out.size == 0:
         return out
     steps, values = table.scalars(entity)
+    if len(steps) == 0:
+        return out
     flat = out.reshape(len(out), -1)
     if column.dtype.kind == "b":
         values = values != 0
-    flat[steps - first] = values.astype(column.dtype)
+    at = rows_at(steps, first, states)
+    flat[at >= 0] = values[at[at >= 0]].astype(column.dtype)
     return out
 
 

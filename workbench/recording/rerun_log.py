@@ -19,6 +19,7 @@ from rerun.chunk import Chunk
 
 STEP = "step"
 SIM_TIME = "sim_time"
+_MOST_TIMES = 64
 SERIES_COLORS = (
     (86, 180, 233),
     (230, 159, 0),
@@ -41,6 +42,23 @@ class Account:
     """Entity to number of rows in time."""
     statics: set[str] = field(default_factory=set)
     """Entities that hold something static."""
+
+
+def telling(values: NDArray) -> NDArray[np.int64] | None:
+    """Which rows of `values` (R, D) say something; None for all of them.
+
+    A row between two equal ones says nothing: whoever looks there finds the one before, and a curve is the same line.
+    A row of one number takes 20 bytes in the file besides that number, and most flags of a task change once in an episode. The
+    first and the last row always stay, so that an entity is there for as long as it was recorded.
+    """
+    if len(values) < 3:
+        return None
+    bits = np.ascontiguousarray(values).view(np.uint8).reshape(len(values), -1)  # NaN equals NaN
+    again = (bits[1:] == bits[:-1]).all(axis=1)
+    silent = again[:-1] & again[1:]
+    if not silent.any():
+        return None
+    return np.concatenate([[0], 1 + np.flatnonzero(~silent), [len(values) - 1]])
 
 
 def static_chunk(entity: str, *values: Any) -> Chunk:
@@ -66,8 +84,9 @@ class Log:
     def __init__(self, recording: rr.RecordingStream, control_dt: float) -> None:
         self._recording = recording
         self._control_dt = control_dt
-        self._steps: NDArray[np.int64] | None = None
-        self._times: list[rr.TimeColumn] = []  # of `_steps`, which most entities of a piece share
+        self._times: dict[
+            bytes, list[rr.TimeColumn]
+        ] = {}  # by their steps, which most entities of a piece share
         self.account = Account()
 
     def static(self, entity: str, *values: Any) -> None:
@@ -81,17 +100,22 @@ class Log:
     def columns(self, entity: str, steps: NDArray[np.int64], columns: Iterable[Any]) -> None:
         if len(steps) == 0:
             return
-        if steps is not self._steps:
-            self._steps = steps
-            self._times = [
+        self._recording.send_columns(entity, self._times_of(steps), columns)
+        self.account.rows[entity] += len(steps)
+
+    def _times_of(self, steps: NDArray[np.int64]) -> list[rr.TimeColumn]:
+        key = steps.tobytes()
+        if key not in self._times:
+            if len(self._times) >= _MOST_TIMES:
+                self._times.clear()
+            self._times[key] = [
                 rr.TimeColumn(STEP, sequence=steps),
                 # Whole nanoseconds by rounding: rerun itself cuts off, and 3 * 0.05 s would be 149999999 ns.
                 rr.TimeColumn(
                     SIM_TIME, duration=np.rint(steps * self._control_dt * 1e9).astype("timedelta64[ns]")
                 ),
             ]
-        self._recording.send_columns(entity, self._times, columns)
-        self.account.rows[entity] += len(steps)
+        return self._times[key]
 
     def pose(
         self,
@@ -100,7 +124,10 @@ class Log:
         translation: NDArray[np.float32],
         xyzw: NDArray[np.float32],
     ) -> None:
-        """`translation` (len(steps), 3) and `xyzw` (len(steps), 4)."""
+        """`translation` (len(steps), 3) and `xyzw` (len(steps), 4); rows that `telling` leaves out are."""
+        rows = telling(np.concatenate([translation, xyzw], axis=1))
+        if rows is not None:
+            steps, translation, xyzw = steps[rows], translation[rows], xyzw[rows]
         self.columns(entity, steps, rr.Transform3D.columns(translation=translation, quaternion=xyzw))
 
     def still(self, entity: str, translation: NDArray[np.float32], xyzw: NDArray[np.float32]) -> None:
@@ -115,8 +142,11 @@ class Log:
             self.chunk(_series_chunk(entity, tuple(names), first_color))
 
     def scalars(self, entity: str, steps: NDArray[np.int64], values: NDArray) -> None:
-        """`values` (len(steps), ...), all of a step as one batch."""
+        """`values` (len(steps), ...), all of a step as one batch; rows that `telling` leaves out are."""
         if np.size(values):
             flat = np.asarray(values, dtype=np.float64).reshape(len(steps), -1)
+            rows = telling(flat)
+            if rows is not None:
+                steps, flat = steps[rows], flat[rows]
             columns = rr.Scalars.columns(scalars=flat.reshape(-1))
             self.columns(entity, steps, columns.partition([flat.shape[1]] * len(flat)))

@@ -103,7 +103,7 @@ class RerunTable:
         return None
 
     def scalars(self, entity: str) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Steps (R,) and numbers (R, K) of a batched ``Scalars``."""
+        """Steps (R,) and numbers (R, K) of a batched ``Scalars``; see `rows_at`."""
         return self._rows(entity, "Scalars:scalars")
 
     def pose_rows(self, entity: str, frames: NDArray[np.int64], states: int) -> NDArray[np.float32]:
@@ -128,7 +128,8 @@ class RerunTable:
             else:
                 steps, rows = self._rows(entity, f"Transform3D:{key}")
                 if len(steps):
-                    poses[steps, place] = rows
+                    at = rows_at(steps, 0, states)
+                    poses[at >= 0, place] = rows[at[at >= 0]]
         return poses
 
     def _rows(self, entity: str, component: str) -> tuple[NDArray[np.int64], NDArray]:
@@ -218,6 +219,14 @@ class RerunTable:
     def _one(self, entity: str, component: str, otherwise: Any) -> Any:
         values = self._static.get((entity, component))
         return otherwise if values is None else values[0].as_py()
+
+
+def rows_at(steps: NDArray[np.int64], first: int, states: int) -> NDArray[np.int64]:
+    """(states - first,) which row says what was at each state: the one before where it has none; -1 where there is none yet.
+
+    Rows that say nothing new are left out (`rerun_log.telling`).
+    """
+    return np.searchsorted(steps, np.arange(first, states), side="right") - 1
 
 
 def _mark(place: IndexedChunk) -> tuple[bytes, int, int]:

@@ -171,6 +171,8 @@ class _Raw:
     def __init__(self, first: int) -> None:
         self.first = first
         self.rows: list[tuple[int, bytes]] = []
+        """Layout and bytes of a row, or of several."""
+        self.states = 0
         self.pictures: dict[tuple[int, Modality], tuple[list[int], list[bytes]]] = {}
         self.poses: list[tuple[int, int, bytes]] = []
         self.bytes = 0
@@ -235,9 +237,9 @@ class JournalReader:
                 for part in held:
                     self._take(raw, part)
                 held.clear()
-                if len(raw.rows) >= _PIECE_STATES or raw.bytes >= _PIECE_BYTES:
+                if raw.states >= _PIECE_STATES or raw.bytes >= _PIECE_BYTES:
                     yield raw
-                    raw = _Raw(raw.first + len(raw.rows))
+                    raw = _Raw(raw.first + raw.states)
         if raw.rows:
             yield raw
 
@@ -245,6 +247,7 @@ class JournalReader:
         raw.bytes += len(entry.value)
         if entry.kind == "row":
             raw.rows.append((entry.number, entry.value))
+            raw.states += len(entry.value) // self.layouts[entry.number].itemsize
         elif entry.kind == "layout":
             self.layouts.append(layout_type(entry.value.decode()))
         elif entry.kind.startswith("camera/"):

@@ -27,6 +27,7 @@ from workbench.core.step import StepResult
 from workbench.recording.batch_rows import BatchPacker
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.episode_writer import EpisodeWriter
+from workbench.recording.journal import Item as JournalItem
 from workbench.recording.row import EpisodeRow
 from workbench.recording.side_files import side_files
 from workbench.session.messages import Stepped, TaskDescription
@@ -108,6 +109,42 @@ class EpisodeGatherer:
             if env in self._episodes and step.elapsed_steps[env] == 0:
                 self._begin(env, stepped)
 
+    def take_steps(
+        self,
+        elapsed: NDArray[np.integer],
+        columns: Mapping[str, NDArray],
+        pictures: Sequence[Mapping[int, Sequence[JournalItem]]],
+    ) -> None:
+        """Several control steps of the batch in which no env was reset, in one; raises as `take`. For ``ends="reset"``.
+
+        Args:
+            elapsed: (K, N) the number of each step in its episode.
+            columns: what `batch_columns` names, (K, N, ...) each, with the states of all envs.
+            pictures: (K) env to what `EpisodeWriter.encode` gave for that step.
+        """
+        assert self._ends == "reset"
+        successes = columns.get("evaluate/success")
+        lost: ValueError | None = None
+        for names in {episode.state_names for episode in self.under_way}:
+            chosen = [(n, v) for n, v in columns.items() if n[:6] != STATE or n[6:] in names]
+            layout, rows = self._packer.pack_steps(chosen)
+            for episode in [e for e in self.under_way if e.state_names == names]:
+                env = episode.env
+                expected = episode.steps + 1 + np.arange(len(elapsed))
+                wrong = np.flatnonzero(elapsed[:, env] != expected)
+                good = int(wrong[0]) if len(wrong) else len(elapsed)
+                if good:
+                    items = [item for held in pictures[:good] for item in held.get(env, ())]
+                    episode.writer.append_steps(layout, rows[env, :good].tobytes(), good, items)
+                    episode.steps += good
+                    episode.total_reward += float(columns["reward"][:good, env].sum(dtype=np.float64))
+                    if successes is not None:
+                        episode.success = bool(np.any(successes[good - 1, env]))
+                if len(wrong):
+                    lost = lost or _lost(env, episode.steps + 1, int(elapsed[good, env]))
+        if lost is not None:
+            raise lost
+
     def finish(self) -> None:
         """End the episodes under way where they are."""
         for env in list(self._episodes):
@@ -167,10 +204,7 @@ class EpisodeGatherer:
         for episode in episodes:
             env = episode.env
             if elapsed[env] != episode.steps + 1:
-                raise ValueError(
-                    f"env {env}: step {episode.steps + 1} was expected and step {elapsed[env]} came; a step was lost or "
-                    "the env was reset unseen"
-                )
+                raise _lost(env, episode.steps + 1, elapsed[env])
             pictures = [p for p in captured if p.env == env] if captured else ()
             episode.writer.append_packed(layout, rows[env], pictures)
             episode.steps += 1
@@ -178,6 +212,12 @@ class EpisodeGatherer:
             episode.success = None if success is None else success[env]
             if over[env] and self._ends == "over":
                 self.end(env)
+
+
+def _lost(env: int, expected: int, came: int) -> ValueError:
+    return ValueError(
+        f"env {env}: step {expected} was expected and step {came} came; a step was lost or the env was reset unseen"
+    )
 
 
 def batch_columns(
