@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from tests.session.recordings import made, write
 from workbench.share_command import export_in_terminal, share_in_terminal
 
 
@@ -36,6 +37,15 @@ def test_what_cannot_be_shared_is_said(tmp_path: Path, said: list[str]) -> None:
     assert share([tmp_path / "broken.rrd"], said, tmp_path, sheet=True) == 2
     assert "nothing at" in said[0] and "--mp4" in said[1] and "broken" in said[2]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["broken.json", "broken.rrd"]
+
+
+def test_one_that_is_broken_takes_no_other_along(tmp_path: Path, said: list[str]) -> None:
+    whole = write(tmp_path, made(5))
+    (tmp_path / "broken.json").write_text('{"workbench": {}}')
+    (tmp_path / "broken.rrd").write_bytes(b"no recording")
+    assert share([tmp_path], said, tmp_path / "out", sheet=True) == 2
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [f"{whole.stem}.sheet.png"]
+    assert len(said) == 1 and said[0].startswith("broken")
 
 
 def test_what_cannot_be_exported_is_said(

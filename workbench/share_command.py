@@ -69,6 +69,7 @@ def export_in_terminal(
 
 def _make_all(wanted: Sequence[Wanted], err: Console, refuse: Callable[[str], int]) -> int:
     made: list[Made] = []
+    not_made: list[str] = []
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
     try:
         with Progress(*columns, console=err) as bar:
@@ -78,8 +79,12 @@ def _make_all(wanted: Sequence[Wanted], err: Console, refuse: Callable[[str], in
                 def told(done: float, doing: str, number: int = number) -> None:
                     bar.update(row, completed=number + done, description=doing)
 
-                made.append(make(one, told))
-    except (ValueError, OSError, RuntimeError) as error:
+                try:
+                    made.append(make(one, told))
+                    not_made += made[-1].not_made
+                except ValueError as error:
+                    not_made.append(str(error))
+    except (OSError, RuntimeError) as error:
         return refuse(str(error))
     except KeyboardInterrupt:
         return refuse("interrupted; what was finished is kept")
@@ -87,4 +92,4 @@ def _make_all(wanted: Sequence[Wanted], err: Console, refuse: Callable[[str], in
         for one in made:
             for path in one.paths:
                 print(path if path.is_file() else f"{path}: {one.words}")
-    return 0
+    return refuse("\n".join(not_made)) if not_made else 0

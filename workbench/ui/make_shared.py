@@ -48,34 +48,45 @@ class Made:
     paths: tuple[Path, ...]
     words: str
     """What it is, in a sentence or two."""
+    not_made: tuple[str, ...] = ()
+    """Of which recordings it could not be made, each a sentence that names it and says why."""
 
 
 OnProgress = Callable[[float, str], None]
 
 
 def make(wanted: Wanted, on_progress: OnProgress = lambda done, doing: None) -> Made:
-    """Make it.
+    """Make it, of every recording that has what is wanted.
 
     Args:
         on_progress: called with the part that is done, 0..1, and what is done now.
 
     Raises:
-        ValueError: a recording cannot be read, or lacks what is wanted; the message says which and what.
+        ValueError: none of the recordings can be read and has what is wanted; the message says which lacks what.
         OSError: it cannot be written; the message says why. What was finished before stays.
         RuntimeError: this machine has nothing to render with.
     """
     if wanted.what == "lerobot":
         return _dataset(wanted, on_progress)
     paths: list[Path] = []
+    not_made: list[str] = []
     for number, source in enumerate(wanted.sources):
 
         def part_done(done: float, doing: str, number: int = number) -> None:
             on_progress((number + done) / len(wanted.sources), doing)
 
         part_done(0.0, source.name)
-        paths += _of_one(wanted, source, source.read(), part_done)
+        try:
+            paths += _of_one(wanted, source, source.read(), part_done)
+        except ValueError as error:
+            not_made.append(str(error) if source.name in str(error) else f"{source.name}: {error}")
+    if not paths:
+        raise ValueError("\n".join(not_made))
     on_progress(1.0, "done")
-    return Made(tuple(paths), f"{len(paths)} file{'' if len(paths) == 1 else 's'}")
+    words = f"{len(paths)} file{'' if len(paths) == 1 else 's'}"
+    if not_made:
+        words += f"; {len(not_made)} could not be made. {' '.join(not_made)}"
+    return Made(tuple(paths), words, tuple(not_made))
 
 
 def file_name(what: What, source: str, camera: str = "") -> str:
