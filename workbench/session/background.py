@@ -114,10 +114,10 @@ class BackgroundProcess:
             self.end()  # of what it was asked for last; the next job starts another
 
     def end(self) -> None:
-        """End it, if there is one."""
-        process, self._process, self._owed = self._process, None, ()
-        if process is not None:
-            process.stop(grace=0.0)
+        """End it, if there is one. `pid` is its own until it has ended."""
+        if self._process is not None:
+            self._process.stop(grace=0.0)
+        self._process, self._owed = None, ()
 
     def _receive(self) -> Event | None:
         """What is owed; None if it has not come yet."""
