@@ -3,14 +3,14 @@
 The same env, the same seed, the same actions: inside RecordEpisode, inside `workbench.Recorder`, in turn, several rounds. Both
 recorders keep actions, rewards, flags, state observations and env states. With a camera, both keep the base camera's colour, depth and
 segmentation, which the env observes. Ours keeps more: every pose, what ``evaluate`` returned, the meshes, all in a second file, the
-.rrd, which RecordEpisode does not have, and which holds our pictures. So there are two verdicts: of the same content, which is all but the .rrd
-without a camera and everything with one, and of everything.
+.rrd, which RecordEpisode does not have, and which holds our pictures. So there are two verdicts on bytes and on the processor: of the same
+content, which is all but the .rrd without a camera and everything with one, and of everything.
 
 What a recorder takes is what a step takes beyond the env's own, which is measured within the same step: on a machine that others use
-too, two runs differ by more than a recorder takes. Stepping is that; the total is everything until the files are there, divided by the
-steps. (RecordEpisode compresses its pictures when the files are made, ours while the next step is made, on other threads: what these take
-of the processor is a row of its own, as the env may have wanted it.) Times are medians of the rounds. Bytes a step are a difference of two
-lengths, so that neither side's fixed parts (the scene's meshes, the sources' texts) count.
+too, two runs differ by more than a recorder takes. Stepping is that. The whole run is some episodes, one after the other, until the files
+of the last are there, without what the env took of it. RecordEpisode makes the files of an episode when the next one begins, ours while it
+happens, on another thread; what that takes of the processor is a row of its own, as the env may have wanted it. Times are medians of
+the rounds. Bytes a step are a difference of two lengths, so that neither side's fixed parts (the scene's meshes, the sources' texts) count.
 """
 
 from __future__ import annotations
@@ -45,6 +45,8 @@ class Options:
     num_envs: tuple[int, ...] = (1, 16)
     steps: int = 200
     """Of an episode."""
+    episodes: int = 3
+    """Of a run."""
     rounds: int = 5
     """Without a camera; 0 leaves it out."""
     camera_steps: tuple[int, ...] = (50, 16)
@@ -57,46 +59,66 @@ class Options:
 class Timed(gym.Wrapper):
     """Sums up what its env takes."""
 
-    clock = processor = 0.0
+    steps = resets = processor = 0.0
 
     def step(self, action: Any) -> Any:
         clock, processor = time.perf_counter(), time.thread_time()
         given = self.env.step(action)
-        self.clock += time.perf_counter() - clock
+        self.steps += time.perf_counter() - clock
         self.processor += time.thread_time() - processor
         return given
+
+    def reset(self, **asked: Any) -> Any:
+        clock, processor = time.perf_counter(), time.thread_time()
+        given = self.env.reset(**asked)
+        self.resets += time.perf_counter() - clock
+        self.processor += time.thread_time() - processor
+        return given
+
+
+class RecordersThread(threading.Thread):
+    """Every thread of this process: those of the recorder leave what they had of the processor."""
+
+    ended = 0.0
+
+    def run(self) -> None:
+        try:
+            super().run()
+        finally:
+            if self.name.startswith("episode-"):
+                RecordersThread.ended += time.thread_time()
+
+
+threading.Thread = RecordersThread  # type: ignore[misc]
 
 
 def on_threads() -> float:
     """Seconds of the processor that the recorder's own threads have had; those of the env would hide them in its step."""
     ours = [t for t in threading.enumerate() if t.name.startswith("episode-") and t.ident is not None]
-    return sum(time.clock_gettime(time.pthread_getcpuclockid(t.ident)) for t in ours if t.ident)
+    alive = sum(time.clock_gettime(time.pthread_getcpuclockid(t.ident)) for t in ours if t.ident)
+    return alive + RecordersThread.ended
 
 
 @dataclass(frozen=True)
 class Run:
-    """Seconds of an episode."""
+    """Seconds of all its episodes."""
 
     bare: float
     """Of the env's own steps."""
     stepping: float
     """That the recorder took while stepping."""
-    files: float
-    """For making the files."""
-    rrd: float
-    """Of `files`, what the .rrd took."""
+    whole: float
+    """That it took until the files were there."""
     processor: float
     """The whole, of the processor, all threads of the recorder."""
+    rrd: float
+    """Of `processor`, what the .rrd took."""
     size: dict[str, int]
     """Bytes by suffix."""
 
     @property
-    def total(self) -> float:
-        return self.stepping + self.files
-
-    @property
-    def total_without_rrd(self) -> float:
-        return self.total - self.rrd
+    def without_rrd(self) -> float:
+        return self.processor - self.rrd
 
 
 class _Rrd:
@@ -107,11 +129,11 @@ class _Rrd:
     def __init__(self) -> None:
         def timed(call: Any) -> Any:
             def run(*args: Any) -> Any:
-                began = time.perf_counter()
+                began = time.thread_time()
                 try:
                     return call(*args)
                 finally:
-                    self.taken += time.perf_counter() - began
+                    self.taken += time.thread_time() - began
 
             return run
 
@@ -142,33 +164,36 @@ class _Timed:
 rrd = _Rrd()
 
 
-def run(side: str, env: Any, actions: list[torch.Tensor], camera: bool) -> Run:
+def run(side: str, env: Any, actions: list[torch.Tensor], camera: bool, episodes: int = 1) -> Run:
     folder = Path(tempfile.mkdtemp(prefix="recording-"))
     timed = Timed(env)
     if side == "RecordEpisode":
         recorder: Any = RecordEpisode(timed, str(folder), save_video=False, trajectory_name="run")  # type: ignore[arg-type]
     else:
         recorder = workbench.Recorder(timed, folder, pictures=("base_camera",) if camera else False)
-    recorder.reset(seed=0)
-    clock, processor = time.perf_counter(), time.thread_time() + on_threads()
-    for action in actions:
-        recorder.step(action)
-    clock, processor = time.perf_counter() - clock, time.thread_time() + on_threads() - processor
     rrd.taken = 0.0
-    began = time.perf_counter(), time.process_time()
+    began, at_first = time.perf_counter(), time.thread_time() + on_threads()
+    stepping = 0.0
+    for episode in range(episodes):
+        recorder.reset(seed=episode)
+        clock = time.perf_counter()
+        for action in actions:
+            recorder.step(action)
+        stepping += time.perf_counter() - clock
     finish(side, recorder)
-    files_clock, files_processor = time.perf_counter() - began[0], time.process_time() - began[1]
+    whole = time.perf_counter() - began
+    processor = time.thread_time() + on_threads() - at_first
     size = {
         suffix: sum(p.stat().st_size for p in folder.glob(f"*{suffix}"))
         for suffix in (".h5", ".json", ".rrd")
     }
     shutil.rmtree(folder)
     return Run(
-        timed.clock,
-        clock - timed.clock,
-        files_clock,
+        timed.steps,
+        stepping - timed.steps,
+        whole - timed.steps - timed.resets,
+        processor - timed.processor,
         rrd.taken,
-        processor - timed.processor + files_processor,
         size,
     )
 
@@ -195,29 +220,30 @@ def measure(options: Options, num_envs: int, camera: bool, steps: int, rounds: i
         run(side, env, actions[:3], camera)  # first imports, first shaders
     for number in range(rounds):
         for side in SIDES if number % 2 else SIDES[::-1]:
-            runs[side].append(run(side, env, actions, camera))
+            runs[side].append(run(side, env, actions, camera, options.episodes))
     sizes = {}
     for side in SIDES:
-        half = run(side, env, actions[: steps // 2], camera).size
-        whole = runs[side][-1].size
+        half, whole = (run(side, env, some, camera).size for some in (actions[: steps // 2], actions))
         rest = (steps - steps // 2) * num_envs
         sizes[side] = {suffix: (whole[suffix] - half[suffix]) / rest for suffix in whole}
     env.close()
 
     def took(side: str, what: str) -> float:
-        return 1000 * statistics.median(getattr(r, what) for r in runs[side]) / steps
+        return 1000 * statistics.median(getattr(r, what) for r in runs[side]) / steps / options.episodes
 
     def weighs(side: str, *suffixes: str) -> float:
         return sum(sizes[side][suffix] for suffix in suffixes)
 
     about = f"{num_envs} env{'s' if num_envs > 1 else ''}, {'with a camera' if camera else 'states'}"
-    print(f"{options.task}, {about}; {steps} steps of {took('Recorder', 'bare'):.2f} ms without recording")
+    print(
+        f"{options.task}, {about}; {options.episodes} episodes of {steps} steps of {took('Recorder', 'bare'):.2f} ms without recording"
+    )
     whole = (".h5", ".json", ".rrd")
-    same, total = (whole, "total") if camera else (whole[:2], "total_without_rrd")
+    same, processor = (whole, "processor") if camera else (whole[:2], "without_rrd")
     rows = [
         ("ms a step: stepping", lambda side: took(side, "stepping")),
-        ("ms a step: total, same content", lambda side: took(side, total)),
-        ("ms a step: total, everything", lambda side: took(side, "total")),
+        ("ms a step: the whole run", lambda side: took(side, "whole")),
+        ("ms a step: processor, same content", lambda side: took(side, processor)),
         ("ms a step: processor, everything", lambda side: took(side, "processor")),
         ("bytes a step and env: same content", lambda side: weighs(side, *same)),
         ("bytes a step and env: everything", lambda side: weighs(side, *whole)),
