@@ -6,6 +6,7 @@ import shlex
 import signal
 import time
 from collections.abc import Callable
+from pathlib import Path
 from types import FrameType
 
 from rich.console import Console
@@ -61,6 +62,7 @@ def record_in_terminal(
         TextColumn("left"),
         TimeRemainingColumn(),
     )
+    before = set(what.out.glob("*.json"))
     try:
         asked, _ = with_given_actions(what)
         mended = recover(what.out) if what.out.is_dir() else []
@@ -78,8 +80,10 @@ def record_in_terminal(
             bar.update(row, completed=len(recorded.written), description="recorded")
     except TaskError as error:
         say_problem(error.problem)
+        _say_what_is_kept(what, before)
         return 1
     except (OSError, ValueError) as error:
+        _say_what_is_kept(what, before)
         return refuse(str(error))
     except KeyboardInterrupt:
         return refuse("interrupted; episodes that had ended are kept")
@@ -100,6 +104,15 @@ class _Rate:
         if not self._interrupt.asked:
             words = f"recording, {now.steps / seconds:.0f} steps a second"
             self._bar.update(self._row, description=words)
+
+
+def _say_what_is_kept(asked: RecordOptions, before: set[Path]) -> None:
+    kept = len(set(asked.out.glob("*.json")) - before)
+    if kept:
+        folder = shlex.quote(str(asked.out))
+        print(
+            f"{_episodes(kept)} that had ended before {'is' if kept == 1 else 'are'} kept: workbench review {folder}"
+        )
 
 
 def _say(asked: RecordOptions, recorded: Recorded, refuse: Callable[[str], int]) -> int:

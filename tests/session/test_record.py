@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import subprocess
@@ -14,8 +15,10 @@ import gymnasium as gym
 import mani_skill.envs  # noqa: F401  registers the ids
 import numpy as np
 import pytest
+from rich.console import Console
 
-from workbench.authoring.problem import TaskError
+from workbench.authoring.problem import Problem, TaskError
+from workbench.record_command import record_in_terminal
 from workbench.recording.episode import Episode
 from workbench.recording.read_episode import read_episode
 from workbench.recording.verify import verify_rrd
@@ -230,6 +233,22 @@ def test_a_task_that_fails_while_recording_says_where(tmp_path: Path) -> None:
         with pytest.raises(TaskError, match="not today"):
             record(what)
     assert not (tmp_path / "out").exists()
+
+
+def test_what_was_kept_before_a_failure_is_said(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    (tmp_path / "tires.py").write_text(
+        "asked = 0\n\n\ndef act(obs):\n    global asked\n    asked += 1\n"
+        "    if asked > 4:\n        raise RuntimeError('tired')\n    return obs.new_zeros(len(obs), 8)\n"
+    )
+    policy = f"{tmp_path}/tires.py:act"
+    options = TaskOptions(num_envs=1)
+    what = RecordOptions(
+        "PushCube-v1", tmp_path / "out", 2, actions=policy, pictures=False, max_steps=3, options=options
+    )
+    said: list[Problem] = []
+    assert record_in_terminal(what, Console(file=io.StringIO()), said.append, lambda why: 2) == 1
+    assert "tired" in said[0].message
+    assert "1 episode that had ended before is kept: workbench review" in capsys.readouterr().out
 
 
 def test_a_keyword_that_the_task_does_not_take_is_named(tmp_path: Path) -> None:
