@@ -22,7 +22,13 @@ def page(task_file: Path, chromium_path: str) -> Iterator[Page]:
     text = task_file.read_text()
     assert text.count(good) == 1
     task_file.write_text(text.replace(good, f"{good}.masked_fill({lost}, torch.nan)"))
-    with page_on(task_file, "--num-envs", str(ENVS), chromium=chromium_path) as (page, errors, _):
+    arguments = (
+        "--num-envs",
+        str(ENVS),
+        "--env",
+        "render_backend=none",
+    )  # no pictures: no shaders to wait for
+    with page_on(task_file, *arguments, chromium=chromium_path) as (page, errors, _):
         yield page
         assert not errors
 

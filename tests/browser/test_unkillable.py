@@ -14,12 +14,19 @@ from tests.session.hazards import calm, provoke, write_task
 
 pytestmark = pytest.mark.browser
 expect.set_options(timeout=60_000)
+ARGUMENTS = (
+    "--num-envs",
+    "2",
+    "--no-spare",
+    "--env",
+    "render_backend=none",
+)  # no pictures: no shaders to wait for
 
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Iterator[Desk]:
     file = write_task(tmp_path_factory.mktemp("author"))
-    with page_on(file, "--num-envs", "2", "--no-spare", chromium=chromium_path) as (page, errors, opened):
+    with page_on(file, *ARGUMENTS, chromium=chromium_path) as (page, errors, opened):
         yield Desk(page, errors, file, opened, file.parent)
 
 
