@@ -22,12 +22,8 @@ def page(task_file: Path, chromium_path: str) -> Iterator[Page]:
     text = task_file.read_text()
     assert text.count(good) == 1
     task_file.write_text(text.replace(good, f"{good}.masked_fill({lost}, torch.nan)"))
-    arguments = (
-        "--num-envs",
-        str(ENVS),
-        "--env",
-        "render_backend=none",
-    )  # no pictures: no shaders to wait for
+    # Without pictures there are no shaders to wait for.
+    arguments = ("--num-envs", str(ENVS), "--env", "render_backend=none")
     with page_on(task_file, *arguments, chromium=chromium_path) as (page, errors, _):
         yield page
         assert not errors

@@ -40,7 +40,8 @@ class Desk:
 @pytest.fixture(scope="module")
 def desk(task_file: Path, chromium_path: str) -> Iterator[Desk]:
     """Three envs that have made some sixty steps, paused, on the Reward tab."""
-    arguments = ("--num-envs", "3", "--env", "render_backend=none")  # no pictures: no shaders to wait for
+    # Without pictures there are no shaders to wait for.
+    arguments = ("--num-envs", "3", "--env", "render_backend=none")
     with page_on(task_file, *arguments, chromium=chromium_path, height=1000) as (page, errors, _):
         page.get_by_role("button", name="Play", exact=True).click()
         strip = page.locator(".wb-timeline")

@@ -14,13 +14,8 @@ from tests.session.hazards import calm, provoke, write_task
 
 pytestmark = pytest.mark.browser
 expect.set_options(timeout=60_000)
-ARGUMENTS = (
-    "--num-envs",
-    "2",
-    "--no-spare",
-    "--env",
-    "render_backend=none",
-)  # no pictures: no shaders to wait for
+ARGUMENTS = "--num-envs 2 --no-spare --env render_backend=none".split()
+"""Without pictures there are no shaders to wait for."""
 
 
 @pytest.fixture(scope="module")
