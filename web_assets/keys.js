@@ -4,7 +4,7 @@
 // dropdown are too; and a tab or a button that was clicked takes the arrows and the space for itself. So once the
 // pointer is up, the focus stays only where somebody types: in a text or number field, or in a dropdown that is open.
 // Whoever walks through the controls with the Tab key presses no pointer, and keeps the focus, also when they press
-// Enter.
+// Enter; and there Space and Enter are that control's, as everywhere else: else Space would play instead of pressing it.
 "use strict";
 {
   const NOT_TYPED_INTO = ["checkbox", "radio", "range", "button", "submit", "reset", "color", "file"];
@@ -22,6 +22,18 @@
     // The view keeps the browser from moving the focus when it is clicked, also out of a field.
     if (!isTypedInto(focused) || event.target instanceof HTMLCanvasElement) focused.blur();
   }
+
+  const PRESSED_BY_KEY = "button, summary, a[href], input[type=checkbox], input[type=radio]";
+
+  window.addEventListener(
+    "keydown",
+    (event) => {
+      if ((event.key !== " " && event.key !== "Enter") || !(event.target instanceof Element)) return;
+      // The browser presses it all the same; our own HTML has no such control and hears its keys itself.
+      if (event.target.matches(PRESSED_BY_KEY) && !event.target.matches("[data-press]")) event.stopImmediatePropagation();
+    },
+    true,
+  );
 
   // On the window and first: what is pressed may keep the event from going further.
   for (const kind of ["pointerup", "click"]) {

@@ -188,5 +188,12 @@ def test_a_moment_that_one_stands_still_at_is_drawn(desk: Desk) -> None:
     desk.page.get_by_role("tab", name="Reward").click()
 
 
+def test_space_is_for_the_button_that_was_walked_to(desk: Desk) -> None:
+    desk.page.get_by_role("button", name="‹ step", exact=True).focus()
+    desk.page.keyboard.press("Space")
+    desk.comes_to(STEPS - 1)
+    expect(desk.page.get_by_text("paused", exact=True)).to_be_visible()
+
+
 def test_nothing_went_wrong_in_the_console(opened: Desk) -> None:
     assert opened.errors == []

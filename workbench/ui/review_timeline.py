@@ -155,6 +155,7 @@ def strip_values(view: ReviewView) -> dict[str, object]:
     return {
         "rows": rows,
         "lines": reward_lines(_reward_over(view, chosen)),
+        "line_colour": COLOURS[view.selected % len(COLOURS)] if len(view.opened) > 1 else "",
         "zero": None if view.align == "start" or view.first == 0 else place(view, 0),
         "align": view.align,
         "kinds": [(style, name) for style, name in NAMES.items() if style in styles],
