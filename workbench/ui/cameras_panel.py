@@ -20,22 +20,12 @@ from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.session.messages import CameraRequest, TaskDescription
 from workbench.session.view import SessionView
 from workbench.ui.changed import fill
-from workbench.ui.false_colour import (
-    DepthRange,
-    colour_depth,
-    colour_normal,
-    colour_position,
-    colour_segmentation,
-    depth_range,
-    segments_seen,
-)
+from workbench.ui.false_colour import DepthRange
 from workbench.ui.fragments import render
+from workbench.ui.in_colours import COLOUR, MODALITIES, depth_span, image_format, in_colours
 
 FASTEST = 1 / 15
 """Seconds between two pictures of one camera."""
-MODALITIES = ("rgb", "depth", "segmentation", "position", "normal", "albedo")
-POSITION_CAPTION = "red, green, blue: right, up, towards the camera; each over its own range in this picture"
-NORMAL_CAPTION = "red, green, blue: right, up, towards the camera"
 KIND_NAMES: dict[CameraKind, str] = {"sensor": "sensor", "human": "for people"}
 
 
@@ -219,34 +209,20 @@ class CamerasPanel:
     def _draw_camera(
         self, camera: _Camera, picture: Picture, task: TaskDescription, milliseconds: float
     ) -> None:
-        wanted = camera.wanted()
-        if "rgb" in wanted and picture.rgb is not None:
-            self._draw_image(camera, "rgb", picture.rgb)
-            # A recorded picture was rendered when it was recorded.
-            took = f"{milliseconds:.0f}" if np.isfinite(milliseconds) else ""
-            camera.captions["rgb"].content = render("rgb_caption", milliseconds=took)
-        if "depth" in wanted and picture.depth is not None:
-            span = depth_range(picture.depth)
-            if span is not None:
-                # Only ever widened: a scale that follows each picture would recolour what stands still.
-                camera.depth_span = span if camera.depth_span is None else camera.depth_span.widened(span)
-            shown = camera.depth_span or DepthRange(0.0, 1.0)
-            self._draw_image(camera, "depth", colour_depth(picture.depth, shown))
-            camera.captions["depth"].content = render(
-                "depth_caption", near=f"{shown.near:.2f}", far=f"{shown.far:.2f}"
-            )
-        if "segmentation" in wanted and picture.segmentation is not None:
-            self._draw_image(camera, "segmentation", colour_segmentation(picture.segmentation))
-            legend, more = segments_seen(picture.segmentation, task.segmentation)
-            camera.captions["segmentation"].content = render("segmentation_caption", legend=legend, more=more)
-        if "position" in wanted and picture.position is not None:
-            self._draw_image(camera, "position", colour_position(picture.position))
-            camera.captions["position"].content = render("note", text=POSITION_CAPTION)
-        if "normal" in wanted and picture.normal is not None:
-            self._draw_image(camera, "normal", colour_normal(picture.normal))
-            camera.captions["normal"].content = render("note", text=NORMAL_CAPTION)
-        if "albedo" in wanted and picture.albedo is not None:
-            self._draw_image(camera, "albedo", picture.albedo)
+        if picture.depth is not None:
+            camera.depth_span = depth_span(camera.depth_span, picture)
+        for modality in camera.wanted():
+            coloured = in_colours(picture, modality, task.segmentation, camera.depth_span)
+            if coloured is None:
+                continue
+            pixels, caption = coloured
+            if modality == COLOUR:
+                # A recorded picture was rendered when it was recorded.
+                took = f"{milliseconds:.0f}" if np.isfinite(milliseconds) else ""
+                caption = render("rgb_caption", milliseconds=took)
+            self._draw_image(camera, modality, pixels)
+            if modality in camera.captions:
+                camera.captions[modality].content = caption
 
     def _draw_image(self, camera: _Camera, modality: str, pixels: np.ndarray) -> None:
         handle = camera.images.get(modality)
@@ -254,8 +230,7 @@ class CamerasPanel:
             with camera.folder:
                 camera.images[modality] = self._server.gui.add_image(
                     pixels,
-                    # Flat colours of a segmentation would get halos from JPEG.
-                    format="png" if modality == "segmentation" else "jpeg",
+                    format=image_format(modality),
                     jpeg_quality=75,
                     order=camera.ticks[modality].order + 1,
                 )

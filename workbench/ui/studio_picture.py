@@ -19,18 +19,9 @@ from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.cameras_panel import FASTEST, modalities_of
 from workbench.ui.changed import fill, show
-from workbench.ui.false_colour import (
-    DepthRange,
-    colour_depth,
-    colour_normal,
-    colour_position,
-    colour_segmentation,
-    depth_range,
-    segments_seen,
-)
+from workbench.ui.false_colour import DepthRange
 from workbench.ui.fragments import render
-
-COLOUR = "rgb"
+from workbench.ui.in_colours import COLOUR, depth_span, image_format, in_colours
 
 
 class StudioPicture:
@@ -41,6 +32,7 @@ class StudioPicture:
         self._picture: viser.GuiImageHandle | None = None
         self._drawn: tuple[CameraKey, Picture, str] | None = None
         self._drawn_at = 0.0
+        self._span: DepthRange | None = None
         self._wanted = COLOUR
         self.kinds: tuple[str, ...] = (COLOUR,)
         """That the chosen camera gives; `rgb` first."""
@@ -82,15 +74,15 @@ class StudioPicture:
         if self._drawn is not None and (self._drawn[0], self._drawn[2]) == (key, kind):
             if self._drawn[1] is picture or time.monotonic() - self._drawn_at < FASTEST:
                 return
-        coloured = in_colours(picture, kind, view.task.segmentation)
+        self._span = depth_span(self._span if self._drawn and self._drawn[0] == key else None, picture)
+        coloured = in_colours(picture, kind, view.task.segmentation, self._span)
         if coloured is None:
             return  # it is not there yet
         self._drawn, self._drawn_at = (key, picture, kind), time.monotonic()
         self._put(kind, *coloured)
 
     def _put(self, kind: str, pixels: NDArray[np.uint8], caption: str) -> None:
-        # Flat colours of a segmentation would get halos from JPEG.
-        form = "png" if kind == "segmentation" else "jpeg"
+        form = image_format(kind)
         if self._picture is None:
             with self.folder:
                 self._picture = self._server.gui.add_image(pixels, format=form, jpeg_quality=80)
@@ -100,23 +92,3 @@ class StudioPicture:
             self._picture.image = pixels
             show(self._picture, True)
         fill(self._caption, caption)
-
-
-def in_colours(picture: Picture, kind: str, names: dict[int, str]) -> tuple[NDArray[np.uint8], str] | None:
-    """One kind of a picture as colours, with what they mean; None if the picture has it not."""
-    if kind == "depth" and picture.depth is not None:
-        span = depth_range(picture.depth) or DepthRange(0.0, 1.0)
-        caption = render("depth_caption", near=f"{span.near:.2f}", far=f"{span.far:.2f}")
-        return colour_depth(picture.depth, span), caption
-    if kind == "segmentation" and picture.segmentation is not None:
-        legend, more = segments_seen(picture.segmentation, names)
-        return colour_segmentation(picture.segmentation), render(
-            "segmentation_caption", legend=legend, more=more
-        )
-    if kind == "position" and picture.position is not None:
-        return colour_position(picture.position), ""
-    if kind == "normal" and picture.normal is not None:
-        return colour_normal(picture.normal), ""
-    if kind == "albedo" and picture.albedo is not None:
-        return picture.albedo, ""
-    return None if kind != COLOUR or picture.rgb is None else (picture.rgb, "")
