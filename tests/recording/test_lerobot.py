@@ -17,7 +17,7 @@ from workbench.recording.lerobot_frames import Choice, frames_of
 from workbench.recording.lerobot_read import is_lerobot, lerobot_rows, read_lerobot
 from workbench.recording.library import Library, LibraryError
 from workbench.recording.read_episode import UnreadableRecording, read_episode
-from workbench.session.review import read_row
+from workbench.session.review_rows import read_row
 
 
 @pytest.fixture(scope="module")

@@ -40,7 +40,7 @@ def studio_session(task_file: Path, tmp_path_factory: pytest.TempPathFactory) ->
 def session(studio_session: Session) -> Session:
     """At rest, and every camera as the file has it."""
     studio_session.pause()
-    studio_session.seek(None)
+    studio_session.past.seek(None)
     for camera in studio_session.view().studio.cameras:
         studio_session.studio.back_to_file(camera.key)
     wait_until(studio_session, lambda v: not v.playing and not moved(v), "rest")
@@ -138,12 +138,12 @@ def test_a_moment_of_the_past_is_drawn_again_when_the_camera_moves(session: Sess
     start = camera(session, BASE).now
     session.step()
     wait_until(session, lambda v: v.step.elapsed_steps.any() and BASE in v.pictures, "a step")
-    session.seek_by(-1)
+    session.past.seek_by(-1)
     wait_until(session, lambda v: v.timeline.shown is not None, "the past")
     there = replace(start, position=(0.4, 0.1, 0.7))
     session.studio.place(BASE, there)
     wait_until(session, lambda v: v.timeline.wants_pictures, "the old picture being outdated")
-    session.draw_past()
+    session.past.draw()
     wait_until(session, seen_from(BASE, there), "the past seen from there")
 
 
@@ -226,7 +226,7 @@ def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session:
     assert {moment.env for moment in studio.report_moments} == {0} == set(studio.report.envs)
     (cube,) = studio.report.wanted_objects(("cube",))
     assert cube.summary().seen == 1.0
-    session.seek(studio.report_moments[2].serial)
+    session.past.seek(studio.report_moments[2].serial)
     assert session.view().step.elapsed_steps[0] == 2
     session.studio.judge_steps(BASE, 2)
     moments = settled(session, lambda s: len(s.report_moments) == 2, "its ends").report_moments
@@ -235,7 +235,7 @@ def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session:
     )
     session.reset()
     wait_until(session, lambda v: not v.step.elapsed_steps.any() or v.timeline.shown is not None, "another")
-    session.seek(None)
+    session.past.seek(None)
     session.studio.judge_steps(BASE)
     settled(session, lambda s: len(s.report_moments) == 1, "the episode that has just begun")
 

@@ -133,7 +133,7 @@ def test_the_reason_says_what_and_when(one_of_each: Session) -> None:
     assert (outliers[6][0].reason, outliers[6][0].step) == ("the reward is not a number", 1)
     assert (outliers[7][0].reason, outliers[7][0].step) == ("the observation is not a number", 2)
     one_of_each.select_env(6)
-    [odd] = [what for what in one_of_each.strip(0, 10**6).events if what[1] & NOT_A_NUMBER]
+    [odd] = [what for what in one_of_each.past.strip(0, 10**6).events if what[1] & NOT_A_NUMBER]
     assert odd[0] == one_of_each.view().timeline.first + 1
 
 

@@ -122,7 +122,7 @@ def test_a_moment_whose_beginning_is_gone_is_refused_in_a_sentence(session: Sess
     session.reset()
     wait_until(session, lambda view: view.step is not None and not view.step.elapsed_steps.any(), "a reset")
     first = session.view().timeline.first
-    session.seek(session.view().timeline.last)
+    session.past.seek(session.view().timeline.last)
     assert first == 0  # the history is whole, so what is refused is an episode without a step
     session._state.timeline.history.limit = 1  # type: ignore[union-attr]
     steps_made(session, 2)

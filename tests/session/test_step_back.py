@@ -92,7 +92,7 @@ def test_it_is_a_jump_that_undo_takes_back(live: Session, run: RecordedRun) -> N
     view = into(live, run.until(10))
     assert view.timeline.undo == "going live of env 1"
     last = view.timeline.last
-    live.undo()
+    live.past.undo()
     view = wait_until(live, lambda v: v.timeline.last > last, "the way back")
     assert np.allclose(view.step.poses[ENV], stood, atol=1e-6, equal_nan=True)
     assert view.timeline.arrived == ""

@@ -79,16 +79,16 @@ def test_scrubbing_shows_what_was_and_sends_nothing_to_the_worker(session: Sessi
     run(session, 5)
     sent.clear()
     for serial in (*range(start, start + 6), *range(start + 5, start - 1, -1)):
-        session.seek(serial)
+        session.past.seek(serial)
         view = session.view()
         assert np.array_equal(view.step.poses, poses(session, serial), equal_nan=True)
         assert view.step.elapsed_steps[0] == serial - start
         assert view.timeline.shown == (serial if serial < start + 5 else None)
-    session.seek_by(2)
+    session.past.seek_by(2)
     assert session.view().step.elapsed_steps[0] == 2
-    session.seek_event(-1)
+    session.past.seek_event(-1)
     assert session.view().timeline.shown == start
-    session.seek(None)
+    session.past.seek(None)
     assert session.view().timeline.shown is None
     assert sent == []
 
@@ -96,7 +96,7 @@ def test_scrubbing_shows_what_was_and_sends_nothing_to_the_worker(session: Sessi
 def test_a_step_or_play_shows_what_is_live_again(session: Session) -> None:
     start = fresh(session)
     run(session, 2)
-    session.seek(start)
+    session.past.seek(start)
     view = run(session, 1)
     assert view.timeline.shown is None and view.step.elapsed_steps[0] == 3
 
@@ -106,8 +106,8 @@ def test_two_branches_from_one_moment_are_equal_to_the_last_bit(session: Session
     run(session, 8)
     branches = []
     for _ in range(2):
-        session.seek(start + 3)
-        view = after(session, lambda: session.go_on("all"))
+        session.past.seek(start + 3)
+        view = after(session, lambda: session.past.go_on("all"))
         assert view.step.elapsed_steps.tolist() == [3] * N
         assert is_close(view.step.poses, poses(session, start + 3))
         run(session, 5)
@@ -124,12 +124,12 @@ def test_one_env_goes_back_alone(session: Session) -> None:
     run(session, 4)
     before = session.view().step
     session.select_env(1)
-    session.seek(start + 1)
-    view = after(session, lambda: session.go_on("this"))
+    session.past.seek(start + 1)
+    view = after(session, lambda: session.past.go_on("this"))
     assert view.step.elapsed_steps.tolist() == [4, 1, 4]
     assert is_close(view.step.poses[1], poses(session, start + 1)[1])
     assert is_close(view.step.poses[[0, 2]], before.poses[[0, 2]])
-    assert session.strip(0, 10**6).branches[-1] == (view.timeline.last, start + 1)
+    assert session.past.strip(0, 10**6).branches[-1] == (view.timeline.last, start + 1)
     session.select_env(0)
 
 
@@ -137,8 +137,8 @@ def test_one_envs_moment_is_put_into_all(session: Session) -> None:
     start = fresh(session)
     run(session, 3)
     session.select_env(2)
-    session.seek(start + 2)
-    view = after(session, lambda: session.go_on("into all"))
+    session.past.seek(start + 2)
+    view = after(session, lambda: session.past.go_on("into all"))
     assert view.step.elapsed_steps.tolist() == [2] * N
     was = poses(session, start + 2)[2]
     for env in range(N):
@@ -150,11 +150,11 @@ def test_the_future_that_was_left_can_be_returned_to(session: Session) -> None:
     start = fresh(session)
     run(session, 6)
     left = session.view().step
-    session.seek(start + 2)
-    after(session, lambda: session.go_on("all"))
+    session.past.seek(start + 2)
+    after(session, lambda: session.past.go_on("all"))
     run(session, 2)
     assert session.view().timeline.undo == "going back of all"
-    view = after(session, session.undo)
+    view = after(session, session.past.undo)
     assert is_close(view.step.poses, left.poses)
     assert view.step.elapsed_steps.tolist() == [6] * N
 
@@ -167,9 +167,9 @@ def test_a_reset_can_be_taken_back_and_the_one_before_it_too(session: Session) -
     run(session, 2)
     second = session.view().step
     after(session, lambda: session.reset(None))
-    view = after(session, session.undo)
+    view = after(session, session.past.undo)
     assert is_close(view.step.poses, second.poses)
-    view = after(session, session.undo)
+    view = after(session, session.past.undo)
     assert is_close(view.step.poses[:2], first.poses[:2])
     assert view.step.elapsed_steps.tolist() == [3, 3, 5]
 
@@ -183,15 +183,15 @@ def test_undo_leaves_alone_what_has_jumped_on_since(session: Session) -> None:
     view = run(session, 1)
     assert view.step.elapsed_steps.tolist() == [3, 1, 6]
     assert view.timeline.undo == "reset of env 0"
-    view = after(session, session.undo)
+    view = after(session, session.past.undo)
     assert view.step.elapsed_steps.tolist() == [3, 1, 6] and view.timeline.undo == "reset of 2 envs"
     session.select_env(1)
     assert session.view().timeline.undo == "reset of env 1"
-    assert after(session, session.undo).step.elapsed_steps.tolist() == [3, 2, 6]
+    assert after(session, session.past.undo).step.elapsed_steps.tolist() == [3, 2, 6]
     assert session.view().timeline.undo == "reset of env 1", (
         "of the two that were moved by it the other is back"
     )
-    view = after(session, session.undo)
+    view = after(session, session.past.undo)
     assert view.step.elapsed_steps.tolist() == [3, 3, 6] and view.timeline.undo == "reset of all"
     session.select_env(0)
 
@@ -202,15 +202,15 @@ def test_a_moment_without_an_action_has_the_reward_of_its_record_or_none(session
     rewards = [run(session, 1).step.reward for _ in range(4)]
     view = after(session, lambda: session.reset((1,)))
     assert np.isnan(view.step.reward[1]) and np.array_equal(view.step.reward[[0, 2]], rewards[3][[0, 2]])
-    session.seek(start + 2)
-    view = after(session, lambda: session.go_on("all"))
+    session.past.seek(start + 2)
+    view = after(session, lambda: session.past.go_on("all"))
     assert np.array_equal(view.step.reward, rewards[1])
     assert not view.timeline.not_carried
-    strip = session.strip(start, view.timeline.last)
+    strip = session.past.strip(start, view.timeline.last)
     kept = [np.nan, *(reward[0] for reward in rewards), rewards[3][0], rewards[1][0]]
     assert np.array_equal(strip.reward, kept, equal_nan=True)
-    session.seek(start + 2)
-    assert not after(session, lambda: session.go_on("into all")).timeline.not_carried
+    session.past.seek(start + 2)
+    assert not after(session, lambda: session.past.go_on("into all")).timeline.not_carried
 
 
 def test_a_recording_ends_where_one_goes_back(session: Session) -> None:
@@ -221,8 +221,8 @@ def test_a_recording_ends_where_one_goes_back(session: Session) -> None:
     session.start_recording((0,))
     wait_until(session, lambda v: v.timeline.last > last, "the fresh episode")
     run(session, 3)
-    session.seek(start + 1)
-    after(session, lambda: session.go_on("this"))
+    session.past.seek(start + 1)
+    after(session, lambda: session.past.go_on("this"))
     view = wait_until(session, lambda v: v.recording.episodes_written == written + 1, "the file")
     assert view.recording.active and view.recording.problem is None
     run(session, 1)
@@ -233,7 +233,7 @@ def test_a_recording_ends_where_one_goes_back(session: Session) -> None:
 def test_the_newest_snapshot_is_a_plain_pickle(session: Session) -> None:
     fresh(session)
     run(session, 2)
-    snapshot = pickle.loads(session.snapshot())
+    snapshot = pickle.loads(session._state.newest_moment())
     assert snapshot.num_envs == N and snapshot.memory.elapsed_steps.tolist() == [2] * N
 
 
@@ -246,9 +246,9 @@ def test_a_moment_without_a_picture_is_drawn_as_it_was(session: Session) -> None
     session.set_clients(1)
     key = ("human", human.name)
     now = wait_until(session, lambda v: key in v.pictures, "the live picture").pictures[key]
-    session.seek(start)
+    session.past.seek(start)
     assert session.view().pictures == {} and session.view().timeline.wants_pictures
-    session.draw_past()
+    session.past.draw()
     then = wait_until(session, lambda v: key in v.pictures, "the picture of the past").pictures[key]
     assert not session.view().timeline.wants_pictures
     live = session.view().timeline.last
@@ -256,7 +256,7 @@ def test_a_moment_without_a_picture_is_drawn_as_it_was(session: Session) -> None
     assert np.abs(then.rgb.astype(int) - now.rgb).mean() > 0.5, "the arm stood elsewhere"
     # The same moment, gone back to, looks the same.
     last = session.view().timeline.last
-    session.go_on("all")
+    session.past.go_on("all")
     wait_until(session, lambda v: v.timeline.last > last and v.timeline.shown is None, "the jump")
     serial = session.view().pictures_serial
     again = wait_until(session, lambda v: v.pictures_serial > serial and key in v.pictures, "its picture")

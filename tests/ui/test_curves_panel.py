@@ -5,7 +5,8 @@ import viser
 
 from tests.ui.scenes import running
 from workbench.session.view import Curves
-from workbench.ui.curves_panel import LONGEST, CurvesPanel, curve_data
+from workbench.ui.curves_panel import CurvesPanel, curve_data
+from workbench.ui.line_chart import LONGEST
 
 
 def curves(length: int, num_envs: int, success: float | None = 0.0, serial: int = 1) -> Curves:
@@ -41,7 +42,8 @@ def test_other_env_shows_its_own_past(server: viser.ViserServer) -> None:
     panel.draw(running(4, curves=past, selected_env=0))
     panel._drawn_at = 0.0
     panel.draw(running(4, curves=past, selected_env=3))
-    chart = panel._charts["reward"]
+    chart = panel._reward.handle
+    assert chart is not None
     assert len(chart.data[0]) == 50
     np.testing.assert_array_equal(chart.data[2], past.reward[:, 3])
     assert chart.series[2].get("label") == "env 3"
@@ -50,7 +52,7 @@ def test_other_env_shows_its_own_past(server: viser.ViserServer) -> None:
 def test_task_without_success_has_no_curve_of_it(server: viser.ViserServer) -> None:
     panel = CurvesPanel(server)
     panel.draw(running(4, curves=curves(50, 4, success=None)))
-    assert set(panel._charts) == {"reward"}
+    assert panel._reward.handle is not None and panel._success.handle is None
     assert not panel._empty.visible
 
 
@@ -58,5 +60,5 @@ def test_without_a_past_nothing_is_drawn(server: viser.ViserServer) -> None:
     panel = CurvesPanel(server)
     panel.draw(running(4, curves=None))
     panel.draw(running(4, curves=curves(1, 4)))
-    assert panel._charts == {}
+    assert panel._reward.handle is None and panel._success.handle is None
     assert panel._empty.visible

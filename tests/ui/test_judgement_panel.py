@@ -15,8 +15,8 @@ from workbench.session.judge import JudgementView
 from workbench.session.judgement import EpisodeDifference, JudgedCurve, Summary
 from workbench.session.timeline import TimelineView
 from workbench.ui import judged_in_words as words
-from workbench.ui.curves_panel import LONGEST
 from workbench.ui.judgement_panel import MOST_ROWS, JudgementPanel, chart_data, status_html
+from workbench.ui.line_chart import LONGEST
 
 
 def episode(env: int = 0, **changes: Any) -> EpisodeDifference:

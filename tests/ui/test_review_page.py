@@ -78,7 +78,8 @@ def test_an_opened_recording_fills_every_part(page: ReviewPage) -> None:
     assert page._timeline._slider.handle.max == 10 and page._timeline._slider.handle.value == 7
     assert "step 7 / 10" in page._timeline._strip.content and "success" in page._timeline._strip.content
     assert "success" in page._curves._numbers.content
-    assert page._curves._charts["reward"].title == "reward"
+    chart = page._curves._charts["reward"].handle
+    assert chart is not None and chart.title == "reward"
     image = next(iter(page._cameras._cameras.values())).images["rgb"]
     assert abs(int(np.asarray(image.image).mean()) - 140) <= 3
     assert page._panel._live.visible and not page._panel._arrange.visible
@@ -94,7 +95,8 @@ def test_two_recordings_are_compared_and_aligned(page: ReviewPage) -> None:
     assert sorted(float(h.batched_positions[0, 0]) for h in ghost if h.visible) == pytest.approx([0.05, 0.15])
     assert "They part at step 1" in page._compare._html.content
     assert "reward = 2" in page._compare._html.content
-    assert len(page._curves._charts["reward"].series) == 4, "step, two lines and the dot"
+    chart = page._curves._charts["reward"].handle
+    assert chart is not None and len(chart.series) == 4, "step, two lines and the dot"
     page._panel.toggle_arrangement()
     draw(page)
     (cubes,) = (h for h in page._in_3d.bodies.handles if "cube" in h.name)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from workbench.core.step import StepResult
 from workbench.session.env_table import EnvTable
 from workbench.session.messages import Stepped, TaskDescription
-from workbench.session.past import Past
+from workbench.session.recent_curves import RecentCurves
 from workbench.session.reward_terms import TermHistory
 from workbench.session.timeline import Timeline
 from workbench.session.view import Curves
@@ -28,19 +28,19 @@ class Chronicle:
         self.timeline = Timeline(task.num_envs, limit, first_serial)
         self.table = EnvTable(task, first)
         self.terms = TermHistory(task.num_envs)
-        self._past = Past(task.num_envs)
+        self._recent = RecentCurves(task.num_envs)
         self._curves: Curves | None = None
 
     def add(self, event: Stepped) -> StepResult:
         """Take an event; returns its result as it is kept (see `History.add`)."""
-        self._past.add(event)
-        moment = self.timeline.add(event, max(0, self._past.count - 1))
+        self._recent.add(event)
+        moment = self.timeline.add(event, max(0, self._recent.count - 1))
         self.table.add(event, self.timeline.history)
         self.terms.add(event)
         return moment.step
 
     def curves(self) -> Curves:
         """Copied once for every control step, however often they are asked for."""
-        if self._curves is None or self._curves.serial != self._past.count:
-            self._curves = self._past.curves()
+        if self._curves is None or self._curves.serial != self._recent.count:
+            self._curves = self._recent.curves()
         return self._curves

@@ -329,11 +329,10 @@ class LiveState:
         )
 
     def stretch(self) -> tuple[int, int] | None:
-        """See `Session.stretch`."""
+        """See `TimeTravel.stretch`."""
         if self.timeline is None or not len(self.timeline.history):
             return None
-        shown, history = self.timeline.shown, self.timeline.history
-        return history.stretch_at(self.selected_env, history.last if shown is None else shown.serial)
+        return self.timeline.history.stretch_at(self.selected_env, self.timeline.at)
 
     def what_to_keep(
         self,

@@ -23,10 +23,19 @@ from typing import Protocol
 
 from workbench.core.shared_shapes import SharedShapes
 from workbench.recording.episode import Episode
-from workbench.recording.lerobot_read import read_lerobot
-from workbench.recording.read_episode import UnreadableRecording, read_episode, read_maniskill
+from workbench.recording.read_episode import UnreadableRecording
 from workbench.session.recorded_scene import SceneError
 from workbench.session.review_events import happenings
+from workbench.session.review_rows import (
+    Row,
+    Rows,
+    Stamp,
+    not_as_read,
+    opening_words,
+    read_row,
+    shared,
+    stamps_of,
+)
 from workbench.session.review_view import START, Opened, ReviewView
 
 log = logging.getLogger(__name__)
@@ -40,46 +49,6 @@ FIRST_SHOWN = 0.4
 each time a scene is built."""
 _LOOK_EVERY = 2.0
 """Seconds between two looks at whether the files are still what was read."""
-
-
-Stamp = tuple[str, tuple[int, int] | None]
-"""Of a file that was read: whose it is, and its size and time of change then."""
-
-
-class Row(Protocol):
-    """What is asked of a row of the library."""
-
-    @property
-    def id(self) -> str: ...
-    @property
-    def name(self) -> str: ...
-    @property
-    def paths(self) -> tuple[Path, ...]: ...
-    @property
-    def kind(self) -> str: ...
-    @property
-    def trajectory(self) -> str | None: ...
-
-
-class Shelf(Protocol):
-    """What is asked of the library."""
-
-    def rows(self) -> Sequence[Row]: ...
-
-
-def read_row(row: Row, shapes: SharedShapes | None = None) -> Episode:
-    """The recording of a row, with those shapes where it looks the same. Raises as `read_episode`."""
-    if row.kind == "lerobot" and row.trajectory is not None:
-        return read_lerobot(row.paths[0].parents[1], int(row.trajectory))
-    if row.trajectory is not None:
-        # The library opens it by its .json, which is where the words are.
-        return read_maniskill(row.paths[0].with_suffix(".h5"), row.trajectory)
-    return read_episode(row.paths[0], shapes)
-
-
-def shared(episode: Episode, shapes: SharedShapes) -> Episode:
-    """The same recording, with shapes of others where they look the same."""
-    return episode if episode.geometry is None else replace(episode, geometry=shapes.share(episode.geometry))
 
 
 class SceneMaker(Protocol):
@@ -107,7 +76,7 @@ class Review:
 
     def __init__(
         self,
-        library: Shelf,
+        library: Rows,
         read: Callable[[Row, SharedShapes], Episode] = read_row,
         make_scene: SceneMaker | None = None,
         clock: Callable[[], float] = time.monotonic,
@@ -131,7 +100,7 @@ class Review:
         """What was closed again since then: the opening may still bring more."""
         self._thread: threading.Thread | None = None
         self._files: dict[Path, Stamp] = {}
-        """Of the opened ones: whose it is, and its size and time of change when it was read."""
+        """Those of the opened ones."""
         self._unread: tuple[str, ...] = ()
         self._looked = -math.inf
 
@@ -184,7 +153,7 @@ class Review:
             if not wanted:
                 self._change(problems=tuple(said), loading="")
                 return
-            self._change(loading=_opening_words(wanted, 0), problems=tuple(said))
+            self._change(loading=opening_words(wanted, 0), problems=tuple(said))
             self._thread = threading.Thread(
                 target=self._open, args=(number, wanted, said, state), name="review-open", daemon=True
             )
@@ -234,8 +203,8 @@ class Review:
                 if opened and time.monotonic() - shown_at > wait:
                     self._show(opened, files, state)
                     shown_at, wait = time.monotonic(), 2 * wait
-                self._change(loading=_opening_words(rows, done))
-            stamps = {path: (row.name, _stamp(path)) for path in row.paths}
+                self._change(loading=opening_words(rows, done))
+            stamps = stamps_of(row)
             try:
                 episode = shared(self._read(row, shapes), shapes)
                 opened.append(Opened(row.id, row.name, episode, happenings(episode)))
@@ -446,20 +415,11 @@ class Review:
             if self._clock() - self._looked < _LOOK_EVERY:
                 return
             self._looked = self._clock()
-            files, said = dict(self._files), dict.fromkeys(self._unread)
-        for path, (name, stamp) in files.items():
-            now = _stamp(path)
-            if now is None and stamp is not None:
-                said[f"{path.name} was deleted since it was opened; what was read of it is still shown."] = (
-                    None
-                )
-            elif now != stamp:
-                said[
-                    f"{path.name} has changed since it was opened; open {name} again to see what is in it now."
-                ] = None
+            files, unread = dict(self._files), self._unread
+        said = tuple(dict.fromkeys((*unread, *not_as_read(files))))
         with self._changed:
-            if tuple(said) != self._view.problems and files == self._files and not self._view.loading:
-                self._change(problems=tuple(said))
+            if said != self._view.problems and files == self._files and not self._view.loading:
+                self._change(problems=said)
 
     # --- under the lock ------------------------------------------------------------------------------
 
@@ -520,20 +480,3 @@ class Review:
             return 3600.0
         steps = (self._clock() - self._walk.at) * self._rate()
         return max((int(steps + 1e-6) + 1 - steps) / self._rate(), 1e-3)
-
-
-def _opening_words(rows: Sequence[Row], done: int) -> str:
-    return (
-        f"opening {rows[done].name}"
-        if len(rows) == 1
-        else f"opening {done + 1} of {len(rows)}: {rows[done].name}"
-    )
-
-
-def _stamp(path: Path) -> tuple[int, int] | None:
-    """Size and time of change; None if it is not there."""
-    try:
-        found = path.stat()
-    except OSError:
-        return None
-    return found.st_size, found.st_mtime_ns

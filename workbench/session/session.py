@@ -6,7 +6,7 @@ the env. The worker's events come one by one on one thread and change the `LiveS
 the last version that ran, and the page never goes away.
 
 What is done here is to bring those together: who is asked, and who is told of what. What an event means is in
-`live_state`, which version is loaded, and when, in `versions`.
+`live_state`, which version is loaded, and when, in `versions`, how the past is gone through in `time_travel`.
 """
 
 from __future__ import annotations
@@ -18,11 +18,9 @@ from typing import get_args
 
 from workbench.core.inspection import Section
 from workbench.core.recorded_run import RecordedRun
-from workbench.session.camera_judging import ShownMoment
 from workbench.session.camera_messages import CameraAnswer
 from workbench.session.camera_studio import CameraStudio
 from workbench.session.env_table import EnvRows
-from workbench.session.episode_moments import EpisodeMoment, moments_of_episode
 from workbench.session.judge import FILE_SAVED, Judge, what_a_load_means
 from workbench.session.judgement import JudgedCurve, Judgement
 from workbench.session.keep_past import PastKeeper
@@ -42,7 +40,6 @@ from workbench.session.messages import (
     Play,
     Request,
     Reset,
-    Restore,
     SetCapture,
     SetEpisodeEnd,
     SetSliders,
@@ -57,7 +54,7 @@ from workbench.session.printed import PrintedLine, PrintedLog
 from workbench.session.record_live import LiveRecorder
 from workbench.session.reward_terms import TermCurves
 from workbench.session.shared_state import SharedState
-from workbench.session.timeline import Scope, Strip, Timeline
+from workbench.session.time_travel import TimeTravel
 from workbench.session.versions import Versions
 from workbench.session.view import SessionView
 
@@ -115,12 +112,14 @@ class Session:
         )
         self._keeper = PastKeeper(recordings, self._recorder.finisher, self._note)
         self._judge = Judge(self._note)
+        self.past = TimeTravel(self._shared, self._send, self.pause)
+        """What the batch lived through."""
         self.studio = CameraStudio(
             self._send,
             self._note,
-            self._shown_moment,
+            self.past.shown_moment,
             self._versions.same_again,
-            self._episode_moments,
+            self.past.episode_moments,
             self.open_file,
         )
         """Cameras placed by hand."""
@@ -189,7 +188,7 @@ class Session:
         self._note()
 
     def play(self) -> None:
-        self.seek(None)
+        self.past.seek(None)
         self._shared.set(playing=True, wants_play=True)
         self._send(Play(True))
 
@@ -199,13 +198,13 @@ class Session:
 
     def step(self) -> None:
         """One control step; pauses first."""
-        self.seek(None)
+        self.past.seek(None)
         self.pause()
         self._send(SingleStep())
 
     def reset(self, env_idx: tuple[int, ...] | None = None) -> None:
         """All envs with the session's seed, or some with fresh seeds."""
-        self.seek(None)
+        self.past.seek(None)
         self._send(Reset(env_idx, self._state.seed if env_idx is None else None))
 
     def set_seed(self, seed: int) -> None:
@@ -307,38 +306,10 @@ class Session:
         """Give up what `keep_past` began; nothing of it is kept."""
         self._keeper.stop()
 
-    # --- the past ------------------------------------------------------------------------------------
-
-    def seek(self, serial: int | None) -> None:
-        """Show a moment of the past, by its number (see `TimelineView`); None shows what is live."""
-        self._seek(lambda timeline: timeline.seek(serial))
-
-    def seek_by(self, steps: int) -> None:
-        """Show a moment before (negative) or after the one that is shown."""
-        self._seek(lambda timeline: timeline.seek_by(steps))
-
-    def seek_step(self, env: int, step: int) -> None:
-        """Show the moment at which this env was at that step of its present episode."""
-        self._seek(lambda timeline: timeline.seek_step(env, step))
-
-    def seek_event(self, direction: int) -> None:
-        """Show the next (1) or last (-1) event of the selected env: reset, success, fail, truncation, branch."""
-        env = self._state.selected_env
-        self._seek(lambda timeline: timeline.seek_event(env, direction))
-
-    def go_on(self, scope: Scope) -> None:
-        """Put envs back to the shown moment; the simulation goes on from there (see `timeline.Scope`)."""
-        self._travel(lambda timeline, env: timeline.go_on(env, scope))
-
-    def undo(self) -> None:
-        """Take back the selected env's last reset or going back, and pause there."""
-        self.pause()
-        self._travel(lambda timeline, env: timeline.undo(env))
-
     def step_back(self, run: RecordedRun, everywhere: bool = False) -> None:
         """Put the selected env, or all, into the last state of a recorded run; pauses there. Before a task is loaded
         it is done when one is."""
-        self.seek(None)
+        self.past.seek(None)
         self.pause()
         with self._lock:
             task, env = self._state.task, self._state.selected_env
@@ -347,30 +318,6 @@ class Session:
                 return
         self._send(StepBack(run, tuple(range(task.num_envs)) if everywhere else (env,)))
         self._note()
-
-    def draw_past(self) -> None:
-        """Ask for pictures of the moment that is shown, if it has none of the cameras looked through."""
-        with self._lock:
-            s = self._state
-            request = None if s.timeline is None else s.timeline.draw(s.selected_env, s.cameras)
-        if request is not None:
-            self._send(request)
-
-    def strip(self, low: int, high: int) -> Strip | None:
-        """The selected env's past between two moments; None before a task is loaded."""
-        with self._lock:
-            s = self._state
-            return None if s.timeline is None else s.timeline.strip(s.selected_env, low, high)
-
-    def stretch(self) -> tuple[int, int] | None:
-        """First and last moment of what the selected env lived through round the shown moment, without a jump."""
-        with self._lock:
-            return self._state.stretch()
-
-    def snapshot(self) -> bytes | None:
-        """The newest moment, pickled for `Load.snapshot`; None before a task is loaded."""
-        with self._lock:
-            return self._state.newest_moment()
 
     # --- the past judged again -----------------------------------------------------------------------
 
@@ -385,20 +332,7 @@ class Session:
     def show(self, env: int, serial: int) -> None:
         """Select an env and show a moment of its past."""
         self.select_env(env)
-        self.seek(serial)
-
-    def _seek(self, seek: Callable[[Timeline], None]) -> None:
-        with self._lock:
-            moved = self._state.seek(seek)
-        if moved:
-            self._note()
-
-    def _travel(self, ask: Callable[[Timeline, int], Restore | None]) -> None:
-        with self._lock:
-            request = self._state.travel(ask)
-        if request is not None:
-            self._send(request)
-        self._note()
+        self.past.seek(serial)
 
     def close(self) -> None:
         """End the worker and the watcher, and wait for episodes that are being written."""
@@ -495,22 +429,6 @@ class Session:
         with self._lock:
             self._state.stepped(event)
         self._recorder.take(event)
-
-    def _shown_moment(self) -> ShownMoment:
-        with self._lock:
-            s = self._state
-            past = None if s.timeline is None else s.timeline.shown
-            count = 0 if s.task is None else s.task.num_envs
-            return ShownMoment(s.selected_env, count, None if past is None else past.step.poses)
-
-    def _episode_moments(self, most: int) -> tuple[EpisodeMoment, ...]:
-        with self._lock:
-            s = self._state
-            if s.timeline is None or not len(s.timeline.history):
-                return ()
-            history, shown = s.timeline.history, s.timeline.shown
-            at = history.last if shown is None else shown.serial
-            return moments_of_episode(history, s.selected_env, at, most)
 
     def _on_save(self) -> None:
         self._judge.stop(FILE_SAVED)

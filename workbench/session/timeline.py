@@ -41,7 +41,7 @@ class TimelineView:
     can_go_on: bool = False
     """Whether the shown moment can be gone back to."""
     undo: str | None = None
-    """What `Session.undo` would take back, in words."""
+    """What `TimeTravel.undo` would take back, in words."""
     not_carried: tuple[str, ...] = ()
     """What the last going back could not put back, each with its reason."""
     arrived: str = ""
@@ -100,6 +100,11 @@ class Timeline:
         """The pinned moment; None while live."""
         return None if self._shown is None else self.history.at(self._shown)
 
+    @property
+    def at(self) -> int:
+        """Serial of the moment that is shown, the newest while live."""
+        return self.history.last if self._shown is None else self._shown
+
     def seek(self, serial: int | None) -> None:
         """Pin a moment, the nearest that is kept; the newest, or None, is live."""
         if serial is None or serial >= self.history.last:
@@ -109,7 +114,7 @@ class Timeline:
 
     def seek_by(self, steps: int) -> None:
         """Some moments on (or back, if negative) from what is shown."""
-        self.seek((self.history.last if self._shown is None else self._shown) + steps)
+        self.seek(self.at + steps)
 
     def seek_step(self, env: int, step: int) -> None:
         """To that control step of the present episode of this env, through its goings back; or the nearest kept."""
@@ -120,7 +125,7 @@ class Timeline:
 
     def seek_event(self, env: int, direction: int) -> None:
         """To the next (1) or last (-1) event of this env; forward from the last one is live."""
-        here = self.history.last if self._shown is None else self._shown
+        here = self.at
         if direction > 0:
             after = self.history.events(env, here + 1, self.history.last)
             self.seek(after[0][0] if after else None)

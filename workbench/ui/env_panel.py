@@ -148,7 +148,7 @@ class EnvPanel:
         self._session.select_env(env)
         step = moment_of(rows, env)
         if step is not None:
-            self._session.seek_step(env, step)
+            self._session.past.seek_step(env, step)
 
     def _choose_column(self, column: str) -> None:
         self._descending = not self._descending if column == self._column else False

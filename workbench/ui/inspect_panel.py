@@ -81,7 +81,7 @@ class InspectPanel:
         while it steps: until then its list is empty, or that of the state before."""
         if self._now is not None and self._now.env == view.selected_env and self._now.elapsed_steps == 0:
             return True
-        lived = self._session.stretch() if view.timeline.shown is None else None
+        lived = self._session.past.stretch() if view.timeline.shown is None else None
         return lived is not None and lived[0] == lived[1]
 
     def _ask(self, view: SessionView, choice: str) -> None:

@@ -21,8 +21,8 @@ from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui import judged_in_words as words
 from workbench.ui.changed import fill, show
-from workbench.ui.curves_panel import LONGEST
 from workbench.ui.fragments import render
+from workbench.ui.line_chart import LONGEST
 from workbench.ui.presses import Presses
 from workbench.ui.then_and_now import ThenAndNow
 

@@ -283,7 +283,7 @@ class Page:
             Command("Single step", session.step, "S"),
             Command("Reset all envs", session.reset, "R"),
             Command("Reset the selected env", run.reset_this, "R", "shift"),
-            Command("Take back the last reset or going back", session.undo, "U"),
+            Command("Take back the last reset or going back", session.past.undo, "U"),
             Command("A step back in time", lambda: timeline.step_by(-1), "arrowleft"),
             Command("A step on in time", lambda: timeline.step_by(1), "arrowright"),
             Command("To the event before", lambda: timeline.to_event(-1), "arrowleft", "shift"),

@@ -20,9 +20,9 @@ from workbench.session.rescorer import Rescorer, RescoreView
 from workbench.session.review import Review
 from workbench.session.review_view import ReviewView
 from workbench.ui.changed import fill, show
-from workbench.ui.curves_panel import LONGEST
 from workbench.ui.fragments import render
 from workbench.ui.judged_with import RECORDED, TODAYS, codes_for
+from workbench.ui.line_chart import LONGEST
 from workbench.ui.presses import Presses
 from workbench.ui.then_and_now import ThenAndNow
 

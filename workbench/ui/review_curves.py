@@ -12,7 +12,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import viser
-import viser.uplot as uplot
 from numpy.typing import NDArray
 
 from workbench.session.review import MOST_COMPARED
@@ -20,8 +19,8 @@ from workbench.session.review_events import ACTION, REWARD, TERMS, curves
 from workbench.session.review_view import ReviewView, column_at
 from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_choice
-from workbench.ui.curves_panel import CURSOR, LONGEST, value_span
 from workbench.ui.fragments import render
+from workbench.ui.line_chart import CURSOR, LONGEST, STEP, LineChart, Span, line, value_span
 from workbench.ui.numbers_table import number_rows
 from workbench.ui.review_as_session import step_of
 from workbench.ui.review_scene import COLOURS, letter
@@ -29,20 +28,24 @@ from workbench.ui.terms_panel import COLOURS as LINE_COLOURS
 
 REDRAW_EVERY = 0.15
 _NUMBERS_EVERY = 0.09
+CHARTS = {"reward": 150, "also": 150, "terms": 150, "action": 190}
+"""Their heights, from the top."""
 Lines = dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
 
 
 class ReviewCurves:
     def __init__(self, server: viser.ViserServer) -> None:
-        self._server = server
         self._numbers = server.gui.add_html("")
         self._numbers_drawn: object = None
-        self._charts_folder = server.gui.add_folder(None)
+        folder = server.gui.add_folder(None)
         self._entry: viser.GuiDropdownHandle = server.gui.add_dropdown(
             "Also", ("-",), initial_value="-", visible=False
         )
         self._entry.on_update(lambda _: self._choose())
-        self._charts: dict[str, viser.GuiUplotHandle] = {}
+        self._charts = {
+            name: LineChart(server, folder, height, order)
+            for order, (name, height) in enumerate(CHARTS.items(), start=1)
+        }
         self._drawn: object = None
         self._lines_drawn: object = None
         self._drawn_at = self._numbers_at = 0.0
@@ -169,57 +172,23 @@ class ReviewCurves:
         position: int | None,
         cursor: int,
     ) -> None:
-        handle = self._charts.get(chart)
         known = [d for d in drawn if np.isfinite(d[2]).any()]
         if not known or len(axis) < 2:
-            if handle is not None:
-                show(handle, False)
+            self._charts[chart].hide()
             return
         stride = max(1, -(-len(axis) // LONGEST))
         x = axis[::stride].astype(np.float64)
         data: tuple[NDArray[np.float64], ...] = (x, *(d[2][::stride] for d in drawn))
-        series = [uplot.Series(label="step")]
-        series += [
-            uplot.Series(label=name, stroke=colour, width=1.7, points={"show": False})
-            for name, colour, _ in drawn
-        ]
+        series = [STEP, *(line(name, colour, 1.7) for name, colour, _ in drawn)]
         if position is not None:
             dot = np.full(len(x), np.nan)
             at = min(int(round((position - axis[0]) / stride)), len(x) - 1)
             dot[at] = drawn[cursor][2][position - int(axis[0])]
             data, series = (*data, dot), [*series, CURSOR]
-        # uPlot finds no range for data with NaN in it.
-        scales = {"x": uplot.Scale(time=False), "y": uplot.Scale(range=span_of(data[1:]))}
-        if handle is None:
-            with self._charts_folder:
-                self._charts[chart] = self._server.gui.add_uplot(
-                    data,
-                    tuple(series),
-                    title=title,
-                    scales=scales,
-                    axes=(uplot.Axis(size=30), uplot.Axis(size=46)),
-                    legend=uplot.Legend(show=True),
-                    height=150 if chart != "action" else 190,
-                    padding=(6, 12, 0, 0),
-                    order=ORDER[chart],
-                )
-            return
-        if handle.title != title:
-            handle.title = title
-        if handle.series != tuple(series) or handle.scales != scales:
-            # The data must fit the series in every state that the browser may see.
-            with self._server.atomic():
-                handle.series, handle.scales = tuple(series), scales
-                handle.data = data
-        else:
-            handle.data = data
-        show(handle, True)
+        self._charts[chart].draw(title, data, series, span_of(data[1:]))
 
 
-ORDER = {"reward": 1.0, "also": 2.0, "terms": 3.0, "action": 4.0}
-
-
-def span_of(lines: tuple[NDArray[np.float64], ...]) -> tuple[float, float]:
+def span_of(lines: tuple[NDArray[np.float64], ...]) -> Span:
     """The range of a chart; of a yes or no always the same one, whether it changes or not."""
     values = np.concatenate(lines)
     if np.isin(values[np.isfinite(values)], (0.0, 1.0)).all():

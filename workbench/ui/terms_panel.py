@@ -9,14 +9,14 @@ import time
 
 import numpy as np
 import viser
-import viser.uplot as uplot
 from numpy.typing import NDArray
 
 from workbench.session.reward_terms import TermCurves
 from workbench.session.session import Session
 from workbench.session.view import SessionView
-from workbench.ui.curves_panel import LONGEST
+from workbench.ui.changed import show
 from workbench.ui.fragments import render
+from workbench.ui.line_chart import LONGEST, STEP, LineChart, line
 
 REDRAW_EVERY = 0.25
 COLOURS = (
@@ -31,11 +31,9 @@ HOW_TO = (
 
 class TermsPanel:
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
-        self._server, self._session = server, session
-        self._folder = server.gui.add_folder(None)
+        self._session = session
+        self._chart = LineChart(server, server.gui.add_folder(None), height=170)
         self._how_to = server.gui.add_html(render("note", text=HOW_TO), visible=False)
-        self._chart: viser.GuiUplotHandle | None = None
-        self._names: tuple[str, ...] = ()
         self._drawn: tuple[int, int, int] | None = None
         self._drawn_at = 0.0
 
@@ -48,46 +46,13 @@ class TermsPanel:
         if curves is not None and len(curves.tick) < 2:
             curves = None
         dense = view.task is not None and "dense" in view.task.reward_mode
-        self._how_to.visible = curves is not None and not curves.terms and dense
+        show(self._how_to, curves is not None and not curves.terms and dense)
         if curves is None or not curves.terms:
-            if self._chart is not None and self._chart.visible:
-                self._chart.visible = False
+            self._chart.hide()
             return
-        self._draw_chart(curves, view.selected_env)
-
-    def _draw_chart(self, curves: TermCurves, env: int) -> None:
-        names, data = tuple(curves.terms), term_data(curves, env)
-        series = (
-            uplot.Series(label="step"),
-            *(
-                uplot.Series(label=name, stroke=colour, width=1.6, points={"show": False})
-                for name, colour in zip(names, COLOURS, strict=False)
-            ),
-        )
-        if self._chart is None:
-            with self._folder:
-                self._chart = self._server.gui.add_uplot(
-                    data,
-                    series,
-                    title=f"reward terms, env {env}",
-                    scales={"x": uplot.Scale(time=False)},
-                    axes=(uplot.Axis(size=30), uplot.Axis(size=46)),
-                    legend=uplot.Legend(show=True),
-                    height=170,
-                    padding=(6, 12, 0, 0),
-                )
-        elif names != self._names:
-            # The data must fit the series in every state that the browser may see.
-            with self._server.atomic():
-                self._chart.series = series
-                self._chart.data = data
-        else:
-            self._chart.data = data
-        self._names = names
-        if self._chart.title != f"reward terms, env {env}":
-            self._chart.title = f"reward terms, env {env}"
-        if not self._chart.visible:
-            self._chart.visible = True
+        env = view.selected_env
+        lines = (line(name, colour, 1.6) for name, colour in zip(curves.terms, COLOURS, strict=False))
+        self._chart.draw(f"reward terms, env {env}", term_data(curves, env), (STEP, *lines))
 
 
 def term_data(curves: TermCurves, env: int) -> tuple[NDArray[np.float64], ...]:

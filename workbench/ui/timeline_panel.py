@@ -81,45 +81,45 @@ class TimelinePanel:
     def step_by(self, steps: int) -> None:
         """An arrow key."""
         if not Control.took_the_key():
-            self._session.seek_by(steps)
+            self._session.past.seek_by(steps)
 
     def to_event(self, direction: int) -> None:
         """An arrow key with shift; what a slider that has the focus made of it is taken back."""
         if Control.took_the_key():
-            self._session.seek(self._before_slider)
-        self._session.seek_event(direction)
+            self._session.past.seek(self._before_slider)
+        self._session.past.seek_event(direction)
 
     def go_live(self) -> None:
-        self._session.seek(None)
+        self._session.past.seek(None)
 
     def go_to_the_first(self) -> None:
         """To the left end of the slider, which may have the focus and go there as well."""
-        self._session.seek(self._range[0] if self._episode_only else 0)
+        self._session.past.seek(self._range[0] if self._episode_only else 0)
 
     def go_on(self) -> None:
-        self._session.go_on("this")
+        self._session.past.go_on("this")
 
     def _seek(self, value: int) -> None:
         self._before_slider = self._shown
-        self._session.seek(None if value == 0 else self._newest + value)
+        self._session.past.seek(None if value == 0 else self._newest + value)
 
     def _on_walk(self, name: object) -> None:
         if name in (LAST_STEP, NEXT_STEP):
-            self._session.seek_by(1 if name == NEXT_STEP else -1)
+            self._session.past.seek_by(1 if name == NEXT_STEP else -1)
         elif name in (LAST_EVENT, NEXT_EVENT):
-            self._session.seek_event(1 if name == NEXT_EVENT else -1)
+            self._session.past.seek_event(1 if name == NEXT_EVENT else -1)
         elif name == NOW:
             self.go_live()
         elif name in (EPISODE, EVERYTHING):
             self._episode_only = name == EPISODE
             self._range_at = 0.0
         elif isinstance(name, str) and name.startswith(UNDO):
-            self._session.undo()
+            self._session.past.undo()
 
     def _on_travel(self, name: object) -> None:
         for scope, label in zip(SCOPES, self._travel.options, strict=False):
             if label == name:
-                self._session.go_on(scope)
+                self._session.past.go_on(scope)
 
     # --- drawing -----------------------------------------------------------------------------------
 
@@ -141,7 +141,7 @@ class TimelinePanel:
         moved = past.shown is not None and not self._range[0] <= past.shown <= self._range[1]
         if now - self._range_at >= RANGE_EVERY or moved:
             self._range_at = now
-            stretch = self._session.stretch() if self._episode_only else None
+            stretch = self._session.past.stretch() if self._episode_only else None
             self._range = (past.first, past.last) if stretch is None else stretch
             self._newest = past.last
             low, high = (serial - self._newest for serial in self._range)
@@ -177,7 +177,7 @@ class TimelinePanel:
             return
         self._strip_at, self._drawn = now, wanted
         low, high = self._range
-        strip = self._session.strip(low, high)
+        strip = self._session.past.strip(low, high)
         if strip is not None:
             self._strip.content = render("timeline", **strip_values(strip, view))
 
@@ -186,7 +186,7 @@ class TimelinePanel:
         if at != self._stood[0]:
             self._stood = (at, time.monotonic())
         elif view.timeline.wants_pictures and time.monotonic() - self._stood[1] > STANDS_STILL:
-            self._session.draw_past()
+            self._session.past.draw()
 
 
 def go_on_labels(view: SessionView) -> tuple[str, ...]:

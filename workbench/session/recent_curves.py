@@ -14,7 +14,7 @@ from workbench.session.view import Curves
 _LENGTH = 1000
 
 
-class Past:
+class RecentCurves:
     """A ring of rows, one a control step; `curves` gives them oldest first."""
 
     def __init__(self, num_envs: int, length: int = _LENGTH) -> None:
