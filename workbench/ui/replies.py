@@ -32,7 +32,14 @@ Handler = Callable[[str], "tuple[int, str, bytes] | FileReply"]
 status, the content type and the body, or a file to be sent without reading it whole. Runs in a thread
 of its own, so it may read files."""
 
-SCRIPTS = ("keys.js", "pressed_by_key.js", "timeline_width.js", "typed_first.js", "steady_resolution.js")
+SCRIPTS = (
+    "keys.js",
+    "pressed_by_key.js",
+    "view_stays.js",
+    "timeline_width.js",
+    "typed_first.js",
+    "steady_resolution.js",
+)
 """Of ``web_assets/``, run by the page; each says what it is for."""
 
 _log = logging.getLogger("workbench.door")

@@ -1,0 +1,49 @@
+"""A key that is a command does not move the 3-D view as well."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+from playwright.sync_api import sync_playwright
+
+from tests.browser.opened import launch, until
+from workbench.ui.commands import Command, register
+from workbench.ui.door import DoorOptions, open_door
+
+pytestmark = pytest.mark.browser
+
+
+def test_keys_do_what_they_say_and_the_view_stays(chromium_path: str) -> None:
+    door = open_door(DoorOptions(port=0))
+    stepped, walked = threading.Event(), threading.Event()
+    register(
+        door.server, [Command("step", stepped.set, "S"), Command("a step back", walked.set, "arrowleft")]
+    )
+    try:
+        with sync_playwright() as playwright:
+            browser = launch(playwright, chromium_path)
+            page = browser.new_page(viewport={"width": 1000, "height": 600})
+            page.goto(door.url)
+            until(lambda: len(door.server.get_clients()) == 1, "the page")
+            (client,) = door.server.get_clients().values()
+            until(lambda: client.camera.image_width > 300, "the view")
+            before = client.camera.position.copy()
+            for key in ("s", "ArrowLeft", "w", "e", "ArrowUp"):
+                page.keyboard.down(key)
+                page.wait_for_timeout(300)  # some frames: viser moves its view as long as the key is down
+                page.keyboard.up(key)
+            until(lambda: stepped.is_set() and walked.is_set(), "the commands")
+            # What the view tells of itself comes in order: behind a drag, it has told of all before.
+            np.testing.assert_allclose(client.camera.position, before, atol=1e-6)
+            page.mouse.move(200, 400)
+            page.mouse.down()
+            page.mouse.move(260, 400, steps=6)
+            page.mouse.up()
+            until(lambda: not np.allclose(client.camera.position, before), "the view that is dragged")
+            height = client.camera.position[2]
+            assert height == pytest.approx(before[2], abs=1e-3), "it was moved up or down by a key"
+            browser.close()
+    finally:
+        door.close()
