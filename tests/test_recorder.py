@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import random
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +19,7 @@ from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 import workbench
 from workbench.recording.episode import NO_SEED, Episode
 from workbench.recording.read_episode import read_episode, read_maniskill, trajectories
+from workbench.recording.recover import recover
 
 TASKS = Path(__file__).parents[1] / "tasks"
 OPTIONS: Any = {"backend": "cpu", "render_backend": "none"}
@@ -36,6 +42,7 @@ def test_auto_resets_end_an_episode_and_begin_the_next(tmp_path: Path) -> None:
     read = episodes_in(tmp_path)
     assert [(e.info.env_index, e.length) for e in read] == [(0, 3), (0, 1), (1, 3), (1, 1)]
     assert [e.info.seed for e in read] == [7, NO_SEED, 8, NO_SEED]  # an auto-reset has no seed
+    assert read[0].info.acted_by == ((0, "a program"),)
     assert read[0].info.max_episode_steps == 3 and bool(read[0].truncated[-1])
 
 
@@ -101,6 +108,38 @@ def test_what_came_before_an_unseen_reset_is_kept(tmp_path: Path) -> None:
         env.close()
     assert env.problem is not None
     assert sorted(episode.length for episode in episodes_in(tmp_path)) == [3, 3]
+
+
+CHILD = """
+import sys, time
+import workbench
+
+env = workbench.make("PushCube-v1", 3, backend="cpu", render_backend="none")
+env = workbench.Recorder(env, sys.argv[1])
+env.reset(seed=0)
+print("begun", flush=True)
+for step in range(1, 10**6):
+    env.step(env.action_space.sample())
+    print(step, time.time(), flush=True)
+"""
+
+
+def test_a_killed_program_loses_a_second(tmp_path: Path) -> None:
+    """Its steps wait in memory to be taken apart together, and a second is for all that waits anywhere."""
+    child = subprocess.Popen([sys.executable, "-c", CHILD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    assert child.stdout is not None and child.stdout.readline() == "begun\n"
+    time.sleep(random.uniform(1.2, 3.0))
+    child.send_signal(signal.SIGKILL)
+    killed = time.time()
+    made = [line.split() for line in child.stdout.read().splitlines(keepends=True) if line.endswith("\n")]
+    child.wait()
+    old = max(int(step) for step, at in made if float(at) < killed - 1.0)
+    assert len(recover(tmp_path)) == 3
+    for episode in episodes_in(tmp_path):
+        assert episode.info.recovered and old <= episode.length <= len(made) + 1
+        assert (
+            np.isfinite(episode.reward).all() and len(episode.env_states["actors/cube"]) == episode.length + 1
+        )
 
 
 def test_a_vector_env_is_refused(tmp_path: Path) -> None:

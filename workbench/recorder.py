@@ -62,6 +62,7 @@ class Recorder(gym.Wrapper):
         *,
         env_idx: Sequence[int] | None = None,
         pictures: bool | Sequence[str] = False,
+        acted_by: str = "a program",
     ) -> None:
         """
         Args:
@@ -70,6 +71,7 @@ class Recorder(gym.Wrapper):
             env_idx: which envs; None for all.
             pictures: record what every camera sees at every step, or those of these names. Sensors that the env
                 observes are there already; any other picture takes 25 to 50 ms without a GPU.
+            acted_by: what chooses the actions, in words, for who reads the recordings: the name of a policy, say.
 
         Raises:
             TypeError: `env` is no ManiSkill env, or wrapped for vectors already.
@@ -86,6 +88,7 @@ class Recorder(gym.Wrapper):
         if any(not 0 <= i < base.num_envs for i in chosen):
             raise IndexError(f"env_idx {chosen} is out of range for {base.num_envs} envs")
         self._folder, self._envs, self._pictures = Path(folder), chosen, pictures
+        self._acted_by = acted_by
         if self._folder.is_dir():
             recover(self._folder)
         self._task = TaskEnv(base)
@@ -177,6 +180,7 @@ class Recorder(gym.Wrapper):
             self._gatherer = EpisodeGatherer(
                 self._description, self._envs, self._folder, self._over, ends="reset"
             )
+            self._gatherer.acted_by = self._acted_by
             try:
                 self._later = LaterSteps(self._task, self._gatherer, self._wanted())
             except ValueError:

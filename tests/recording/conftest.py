@@ -77,6 +77,7 @@ def _make_episode(steps: int = 3, **fields: Any) -> Made:
             control_dt=0.05,
             control_mode=None,
             backend="cpu",
+            acted_by=((0, "random"),),
         ),
         "geometry": SceneGeometry(
             num_envs=1,

@@ -110,7 +110,9 @@ def test_a_killed_writer_was_given_time_to_lose_nothing(make_episode: Maker, tmp
     """Rows that were appended long ago are there though none came after them."""
     episode = make_episode(5)
     writer = episode.writer(tmp_path)
-    for row in episode.rows():
+    for k, row in enumerate(episode.rows()):
+        if k == 4:
+            writer.acted_by("somebody else")
         writer.append(row)
     journal = next((tmp_path / FOLDER).glob("*.arrow"))
     deadline = time.monotonic() + 20 * SYNC_SECONDS + 20
@@ -121,7 +123,8 @@ def test_a_killed_writer_was_given_time_to_lose_nothing(make_episode: Maker, tmp
     writer.close()
     (files,) = recover(tmp_path)
     found = read_episode(files.h5)
-    assert found.info == dataclasses.replace(episode.info, recovered=True)
+    acted_by = (*episode.info.acted_by, (3, "somebody else"))
+    assert found.info == dataclasses.replace(episode.info, recovered=True, acted_by=acted_by)
     assert found.length == 5
 
 

@@ -65,6 +65,7 @@ def test_every_episode_is_three_files_that_stand_alone(recorded: Recorded) -> No
         files = sorted(episode.path.parent.glob(f"{episode.path.stem}.*"))
         assert [file.suffix for file in files] == [".h5", ".json", ".rrd"]
     read = read_all(recorded)
+    assert read[0].info.acted_by == ((0, "random"),)
     assert {"articulations/panda", "actors/cube"} <= read[0].env_states.keys()
     assert read[0].obs["agent/qpos"].shape == (6, 9)
     assert read[0].info.env_kwargs == {
@@ -115,6 +116,7 @@ def test_successes_are_kept_and_nothing_else(tmp_path: Path) -> None:
     assert [episode.index for episode in done.written] == [0, 1, 2, 4]
     assert done.tried == 5
     assert all(bool(episode.evaluate["success"][-1]) for episode in read_all(done))
+    assert read_all(done)[0].info.acted_by == ((0, f"policy {lazy}:lazy"),)
     assert len(list((tmp_path / "out").iterdir())) == 12
 
 
@@ -144,8 +146,9 @@ def test_actions_come_from_a_file_and_are_done_to_its_end(recorded: Recorded, tm
         pictures=False,
         options=TaskOptions(num_envs=2, seed=10),
     )
-    for one, other in zip(read_all(recorded), read_all(record(what)), strict=True):
+    for index, (one, other) in enumerate(zip(read_all(recorded), read_all(record(what)), strict=True)):
         assert_same(one, other)
+        assert other.info.acted_by == ((0, f"file actions.npz, its array {index}"),)
 
 
 @pytest.mark.parametrize("use_env_states", [False, True])
@@ -165,6 +168,7 @@ def test_demonstrations_are_replayed_from_their_own_seeds(
     (replayed,) = read_all(done)
     assert done.put_right == 0
     assert_same(replayed, read_all(recorded)[1])
+    assert replayed.info.acted_by == ((0, f"file {demonstration.name}, traj_0"),)
 
 
 @pytest.mark.parametrize(

@@ -53,6 +53,7 @@ def written(session: Session, count: int) -> list[Episode]:
 def assert_same(one: Episode, other: Episode) -> None:
     """All of it, to the last bit, but for who and when."""
     assert (one.info.seed, one.info.env_index) == (other.info.seed, other.info.env_index)
+    assert one.info.acted_by == other.info.acted_by
     assert one.poses is not None and other.poses is not None
     for name in ("poses", "action", "reward", "terminated", "truncated"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), err_msg=name)
@@ -88,6 +89,7 @@ def test_what_was_kept_after_the_fact_is_what_recording_it_gave(session: Session
     assert kept.keys() == {0, 1}
     for episode in live:
         assert episode.length == STEPS
+        assert episode.info.acted_by == ((0, "random"),)
         assert_same(episode, kept[episode.info.env_index])
 
 
@@ -95,12 +97,15 @@ def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> N
     count = session.view().recording.episodes_written
     for steps in (3, 1):
         session.reset()
-        for _ in range(steps):
+        for made in range(steps):
+            session.set_action_source("random" if made == 0 else "hold")
             session.step()
         wait_until(session, lambda view, n=steps: elapsed(view) == n, "the steps")
     session.keep_past((0,), before=True)
     kept = written(session, count + 1)[-1]
     assert kept.length == 3 and kept.info.env_index == 0
+    assert kept.info.acted_by == ((0, "random"), (1, "hold still"))
+    session.set_action_source("random")
 
 
 def test_the_next_episode_waits_for_its_reset_and_ends_with_it(session: Session) -> None:
@@ -111,11 +116,15 @@ def test_the_next_episode_waits_for_its_reset_and_ends_with_it(session: Session)
     assert view.recording.active and view.recording.steps == 0
     session.reset((1,))
     wait_until(session, lambda view: view.recording.waiting == 0, "the reset")
-    steps_made(session, 2)
+    steps_made(session, 1)
+    session.set_action_source("zero")
+    steps_made(session, 1)
     session.reset((1,))
     wait_until(session, lambda view: not view.recording.active, "its end")
+    session.set_action_source("random")
     steps_made(session, 1)
-    assert written(session, before + 1)[-1].length == 2
+    (*_, episode) = written(session, before + 1)
+    assert episode.length == 2 and episode.info.acted_by == ((0, "random"), (1, "zero"))
 
 
 def test_a_moment_whose_beginning_is_gone_is_refused_in_a_sentence(session: Session) -> None:

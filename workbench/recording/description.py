@@ -9,6 +9,7 @@ neither of the two formats keeps: the types of the entries of ``evaluate()``, th
     source_file     the name of the task's file; null
     source_path     where it lies as seen from the recording's folder; null; not in the .rrd, which is handed on
     source          path as seen from the task's file, to text
+    acted_by        what chose the actions: pairs of the number of an action, and what it was from that one on; may lack
     side_files      what else the task reads and is not held here: path as seen from the task's file, to hash; may lack
     length, return, success, success_once, fail, fail_once       the last four null where the task has no such entry
     action_names, cameras, segmentation, scene, evaluate, obs    what the columns are
@@ -29,7 +30,7 @@ from PIL import Image
 
 from workbench.core.geometry import SceneGeometry
 from workbench.recording.columns import Column
-from workbench.recording.episode import EpisodeInfo
+from workbench.recording.episode import EpisodeInfo, acted_by_from
 from workbench.recording.survey import Survey, camera_words
 
 FORMAT = 1
@@ -60,6 +61,7 @@ def describe(survey: Survey) -> dict[str, Any]:
         "source_file": os.path.basename(info.source_file) if info.source_file else None,
         "source": {_relative(path, folder): text for path, text in info.source.items()},
         "side_files": info.side_files,
+        "acted_by": [list(pair) for pair in info.acted_by],
         "length": survey.length,
         "return": float(np.sum(survey.reward, dtype=np.float64)),
         "success": _last(survey, "success"),
@@ -120,6 +122,7 @@ def info_from(said: dict[str, Any], folder: Path) -> EpisodeInfo:
         written_at=said["written_at"],
         id=said["id"],
         recovered=said["recovered"],
+        acted_by=acted_by_from(said.get("acted_by")),
         side_files={str(name): str(hashed) for name, hashed in dict(said.get("side_files") or {}).items()},
     )
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import datetime
 import uuid
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -62,6 +63,9 @@ class EpisodeInfo:
     """Its writer ended in the middle; the episode is cut where that was."""
     side_files: dict[str, str] = field(default_factory=dict)
     """What else the task reads, and the recording does not hold: path as seen from `source_file`'s folder, to hash."""
+    acted_by: tuple[tuple[int, str], ...] = ()
+    """What chose the actions: number of an action, and what it was from that one on (``random``, ``policy act.py:act``).
+    Empty where it is not known."""
 
 
 @dataclass
@@ -110,3 +114,16 @@ class Episode:
     def length(self) -> int:
         """T, the number of control steps."""
         return len(self.reward)
+
+
+ActedBy = tuple[tuple[int, str], ...]
+
+
+def acted_by_from(said: Iterable[Iterable[Any]] | None) -> ActedBy:
+    """`EpisodeInfo.acted_by` of what JSON keeps of it. Raises TypeError or ValueError."""
+    return tuple((int(begin), str(what)) for begin, what in said or ())
+
+
+def acted_by_in_words(acted_by: ActedBy) -> str:
+    """``random; from step 41 on: sliders``; empty where it is not known. Action k leads to step k + 1."""
+    return "; ".join(what if begin == 0 else f"from step {begin + 1} on: {what}" for begin, what in acted_by)

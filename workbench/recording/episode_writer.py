@@ -118,6 +118,17 @@ class EpisodeWriter:
             )
         self._append(*self._packer.pack(row), row.pictures)
 
+    def acted_by(self, what: str) -> None:
+        """What chooses the actions from the next one on, where it is not what `info` says.
+
+        Raises:
+            RecordingError: as `append`.
+        """
+        try:
+            self._journal.put("acted", len(self), what.encode())
+        except OSError as error:
+            raise self._failed(error) from error
+
     def append_steps(
         self, layout: Layout, packed: bytes, steps: int, pictures: Sequence[JournalItem] = ()
     ) -> None:

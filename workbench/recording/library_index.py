@@ -29,7 +29,7 @@ from workbench.recording.library_scan import found_of
 
 log = logging.getLogger(__name__)
 
-VERSION = 1
+VERSION = 2
 """Raised whenever rows are read or kept in another way: what another version left is read again."""
 LOCKED_SECONDS = 3.0
 _TABLES = (

@@ -22,6 +22,7 @@ import numpy as np
 from PIL import Image
 
 from workbench.recording.annotations import read_json, read_notes
+from workbench.recording.episode import acted_by_from, acted_by_in_words
 from workbench.recording.lerobot_read import lerobot_rows
 from workbench.recording.library_row import (
     Facts,
@@ -122,11 +123,22 @@ def _episode(kind: Kind, said: dict[str, Any], if_undated: float) -> Facts:
         success_once=truth(said.get("success_once")),
         fail=truth(said.get("fail")),
         control_mode=text(said.get("control_mode")),
+        acted_by=_acted_by(said.get("acted_by")),
         source_hash=text(said.get("source_hash"), 64),
         tags=clean_tags(said.get("tags")),
         note=clean_note(said.get("note")),
         recovered=said.get("recovered") is True,
     )
+
+
+def _acted_by(said: object) -> str:
+    """A list in a ``.json``, words already in a ``.rrd``."""
+    if not isinstance(said, list):
+        return text(said)
+    try:
+        return text(acted_by_in_words(acted_by_from(said)))
+    except (TypeError, ValueError):
+        return ""
 
 
 def _thumbnail(encoded: object) -> bytes | None:
@@ -185,6 +197,7 @@ def _maniskills(folder: Path, found: Found, described: dict[str, Any]) -> list[E
                     success=success,
                     fail=truth(episode.get("fail")),
                     control_mode=text(episode.get("control_mode")),
+                    acted_by=text(described.get("source_type")),
                     problem=problem or lost,
                 ),
                 None,

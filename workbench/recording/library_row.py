@@ -43,6 +43,8 @@ class Facts:
     success_once: bool | None = None
     fail: bool | None = None
     control_mode: str = ""
+    acted_by: str = ""
+    """What chose the actions, in words; empty where it is not known."""
     source_hash: str = ""
     """Empty where the task's source is not known."""
     tags: tuple[str, ...] = ()
@@ -149,6 +151,7 @@ def facts_from_dict(values: object) -> Facts:
         success_once=truth(values["success_once"]),
         fail=truth(values["fail"]),
         control_mode=text(values["control_mode"]),
+        acted_by=text(values["acted_by"]),
         source_hash=text(values["source_hash"]),
         tags=clean_tags(values["tags"]),
         note=clean_note(values["note"]),

@@ -130,6 +130,7 @@ def _episode(
         max_episode_steps=env_info.get("max_episode_steps"),
         written_at=_written(path),
         id=f"{path.stem}/{trajectory}",
+        acted_by=_acted_by(document),
     )
     obs = group.get("obs")
     return Episode(
@@ -147,6 +148,12 @@ def _episode(
         env_states=dict(leaves(group.get("env_states"))),
         obs=dict(leaves(obs, skip=_PICTURES)),
     )
+
+
+def _acted_by(document: dict[str, Any]) -> tuple[tuple[int, str], ...]:
+    """``RecordEpisode`` may be told (``source_type="RL"``), and ManiSkill's demonstrations say it."""
+    said = " ".join(text.split()) if isinstance(text := document.get("source_type"), str) else ""
+    return ((0, said[:80]),) if said else ()
 
 
 def _written(path: Path) -> str:

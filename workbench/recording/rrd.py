@@ -20,7 +20,7 @@ from rerun.error_utils import catch_and_log_exceptions
 
 from workbench.recording.blueprint import episode_blueprint
 from workbench.recording.description import describe
-from workbench.recording.episode import EpisodeInfo
+from workbench.recording.episode import EpisodeInfo, acted_by_in_words
 from workbench.recording.landing import RecordingError as RecordingError
 from workbench.recording.landing import SafeFile
 from workbench.recording.layout import EpisodeLog
@@ -103,6 +103,7 @@ def properties(survey: Survey) -> dict[str, dict[str, Any]]:
     episode = {name: said[name] for name in words}
     for name in ("success", "success_once", "fail", "fail_once"):
         episode[name] = bool(said[name])
+    episode["acted_by"] = acted_by_in_words(survey.info.acted_by)
     for name in ("env_kwargs", "reset_options"):
         episode[name] = json.dumps(said[name])
     values: dict[str, dict[str, Any]] = {"episode": episode}

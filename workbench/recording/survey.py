@@ -21,7 +21,7 @@ from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import CameraInfo
 from workbench.recording.columns import EVALUATE, Column, assemble, layout_type, merge
 from workbench.recording.encoded_pictures import MODALITIES, Modality
-from workbench.recording.episode import EpisodeInfo
+from workbench.recording.episode import EpisodeInfo, acted_by_from
 from workbench.recording.journal import Entry, read_journal
 
 _PIECE_STATES = 1024
@@ -65,12 +65,16 @@ def header_from(text: str, geometry: SceneGeometry | None) -> Header:
         num_envs, names, kinds, hidden = said["bodies"]
         geometry = SceneGeometry(num_envs, tuple(names), tuple(kinds), tuple(hidden), ())
     return Header(
-        info=EpisodeInfo(**said["info"]),
+        info=_info_from(said["info"]),
         geometry=geometry,
         segmentation={int(key): name for key, name in said["segmentation"].items()},
         action_names=tuple(said["action_names"]),
         cameras=tuple(camera_from(words) for words in said["cameras"]),
     )
+
+
+def _info_from(said: Mapping[str, Any]) -> EpisodeInfo:
+    return EpisodeInfo(**{**said, "acted_by": acted_by_from(said.get("acted_by"))})
 
 
 def camera_words(camera: CameraInfo) -> dict[str, Any]:
@@ -175,6 +179,7 @@ class _Raw:
         self.states = 0
         self.pictures: dict[tuple[int, Modality], tuple[list[int], list[bytes]]] = {}
         self.poses: list[tuple[int, int, bytes]] = []
+        self.acted: list[tuple[int, str]] = []
         self.bytes = 0
 
     def runs(self, layouts: Sequence[np.dtype]) -> list[NDArray]:
@@ -250,6 +255,8 @@ class JournalReader:
             raw.states += len(entry.value) // self.layouts[entry.number].itemsize
         elif entry.kind == "layout":
             self.layouts.append(layout_type(entry.value.decode()))
+        elif entry.kind == "acted":
+            raw.acted.append((entry.number, entry.value.decode()))
         elif entry.kind.startswith("camera/"):
             raw.poses.append((int(entry.kind[7:]), entry.number, entry.value))
         elif entry.kind.startswith("picture/"):
@@ -268,6 +275,7 @@ class JournalReader:
         smalls: dict[str, list[NDArray]] = {"reward": [], "terminated": [], "truncated": []}
         flags: dict[str, list[NDArray[np.bool_]]] = {"success": [], "fail": []}
         samples: dict[str, bytes] = {}
+        acted = list(header.info.acted_by)
         for raw in self.raw():
             for run in raw.runs(self.layouts):
                 counts[run.dtype] = counts.get(run.dtype, 0) + len(run)
@@ -283,6 +291,7 @@ class JournalReader:
                     parts.append(run[name].copy())
                 for name, parts in flags.items():
                     parts.append(_flag(run, EVALUATE + name))
+            acted += raw.acted
             for index, state, value in raw.poses:
                 cameras[index].frames.append(state)
                 cameras[index].poses.append(value)
@@ -292,6 +301,7 @@ class JournalReader:
                     cameras[index].wide |= any(blob[25] == _PNG_RGBA for blob in blobs)
                 if modality == "rgb":
                     samples[header.cameras[index].kind] = blobs[-1]
+        survey.header = replace(header, info=replace(header.info, acted_by=tuple(acted)))
         survey.columns = merge(counts)
         survey.cameras = [
             seen.survey(info) for info, seen in zip(header.cameras, cameras, strict=True) if seen.frames

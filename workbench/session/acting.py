@@ -32,6 +32,11 @@ class Acting:
         self.sliders: tuple[float, ...] = ()
         """(A,) what every env is given while the source is ``sliders``; another length is no action."""
 
+    @property
+    def name(self) -> str:
+        """What chooses, as a recording says it."""
+        return {"hold": "hold still", "policy": f"policy {self._policy_name}"}.get(self._source, self._source)
+
     def seed(self, seed: int) -> None:
         """Begin the random numbers anew."""
         self._rng = np.random.default_rng(seed)

@@ -49,6 +49,14 @@ class GatheredEpisode:
     """At its last state; None for a task that says nothing of it."""
     state_names: frozenset[str] = frozenset()
     """Of the env states that its first row has."""
+    acted_by: str = ""
+    """What chose its last action."""
+
+    def acts(self, what: str) -> None:
+        """What chooses the next action; empty for no news. Raises RecordingError."""
+        if what and what != self.acted_by:
+            self.writer.acted_by(what)
+            self.acted_by = what
 
 
 class EpisodeGatherer:
@@ -76,6 +84,8 @@ class EpisodeGatherer:
         self._ends, self._one_each = ends, one_each
         self.reset_options: Mapping[str, Any] = reset_options or {}
         """Of the resets that come next."""
+        self.acted_by = ""
+        """What chooses the actions of the episodes that begin next, where the steps do not say it."""
         self._episodes: dict[int, GatheredEpisode | None] = {int(env): None for env in env_idx}
         self._packer = BatchPacker()
 
@@ -175,7 +185,7 @@ class EpisodeGatherer:
         seed = int(stepped.seeds[env]) if stepped.seeds is not None else -1
         writer = EpisodeWriter(
             self._folder,
-            episode_info(task, env, seed, self.reset_options),
+            episode_info(task, env, seed, self.reset_options, self.acted_by),
             task.geometry,
             task.segmentation,
             [dimension.name for dimension in task.actions],
@@ -187,7 +197,9 @@ class EpisodeGatherer:
         except BaseException:
             writer.discard()
             raise
-        self._episodes[env] = GatheredEpisode(writer, env, seed, state_names=frozenset(row.env_states))
+        self._episodes[env] = GatheredEpisode(
+            writer, env, seed, state_names=frozenset(row.env_states), acted_by=self.acted_by
+        )
 
     def _append(self, episodes: list[GatheredEpisode], state_names: frozenset[str], stepped: Stepped) -> None:
         """The rows of envs that have the same states."""
@@ -206,6 +218,7 @@ class EpisodeGatherer:
             if elapsed[env] != episode.steps + 1:
                 raise _lost(env, episode.steps + 1, elapsed[env])
             pictures = [p for p in captured if p.env == env] if captured else ()
+            episode.acts(stepped.acted_by)
             episode.writer.append_packed(layout, rows[env], pictures)
             episode.steps += 1
             episode.total_reward += reward[env]
@@ -275,7 +288,11 @@ def next_row(
 
 
 def episode_info(
-    task: TaskDescription, env: int, seed: int, reset_options: Mapping[str, Any] | None = None
+    task: TaskDescription,
+    env: int,
+    seed: int,
+    reset_options: Mapping[str, Any] | None = None,
+    acted_by: str = "",
 ) -> EpisodeInfo:
     """What is needed to make an episode of this task again."""
     return EpisodeInfo(
@@ -293,6 +310,7 @@ def episode_info(
         reset_options=dict(reset_options or {}),
         max_episode_steps=task.max_episode_steps,
         side_files=side_files(task.file, task.source),
+        acted_by=((0, acted_by),) if acted_by else (),
     )
 
 

@@ -25,6 +25,8 @@ SUFFIXES = (".npy", ".npz", ".h5")
 class GivenEpisode:
     """What one episode is to do."""
 
+    name: str
+    """``file pushes.npy``, ``file demos.h5, traj_3``"""
     actions: NDArray[np.float32]
     """(T, A)"""
     seed: int | None = None
@@ -78,7 +80,12 @@ def read_given(path: Path) -> GivenEpisodes:
             )
     if not arrays:
         raise ValueError(f"{path} holds no array")
-    return GivenEpisodes(path.name, [GivenEpisode(_finite(path, array)) for array in arrays])
+    names = [
+        f"file {path.name}" + (f", its array {i}" if len(arrays) > 1 else "") for i in range(len(arrays))
+    ]
+    return GivenEpisodes(
+        path.name, [GivenEpisode(name, _finite(path, array)) for name, array in zip(names, arrays)]
+    )
 
 
 def _demonstrations(path: Path) -> GivenEpisodes:
@@ -88,7 +95,8 @@ def _demonstrations(path: Path) -> GivenEpisodes:
         if episode.length == 0:
             continue
         seed = episode.info.seed if episode.info.seed >= 0 else None
-        episodes.append(GivenEpisode(_finite(path, episode.action), seed, dict(episode.env_states)))
+        actions = _finite(path, episode.action)
+        episodes.append(GivenEpisode(f"file {path.name}, {name}", actions, seed, dict(episode.env_states)))
         given: Mapping[str, Any] = episode.info.env_kwargs
         kwargs = {key: given[key] for key in ("robot_uids", "control_mode") if given.get(key) is not None}
         if episode.info.control_mode is not None:

@@ -15,6 +15,7 @@ than half of it. Snapshots are kept as the bytes that came, cut into parts that 
 from __future__ import annotations
 
 import pickle
+import sys
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
@@ -68,6 +69,8 @@ class Moment:
     """Which of the pictures are of a camera that was moved since."""
     standing: Standing | None = None
     """What the table of envs said then."""
+    acted_by: str = ""
+    """As `Stepped.acted_by`."""
     first_said: StepResult | None = None
     """`step` as it was when this happened, if a newer version has said otherwise since."""
 
@@ -134,6 +137,7 @@ class History:
             snapshot=stepped.snapshot if parts.complete else b"",
             parts=parts,
             size=size,
+            acted_by=sys.intern(stepped.acted_by),
         )
         self._rows.write(moment.serial, self.first, moment.happened, moment.step.reward)
         self._next_serial += 1

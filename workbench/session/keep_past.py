@@ -134,6 +134,7 @@ class PastKeeper:
                         writer.append(row)
                         continue
                     gathered = writers[episode.env]
+                    gathered.acts(moment.acted_by)
                     gathered.writer.append(next_row(step, env, columns, pictures, gathered.state_names))
                     gathered.steps += 1
 

@@ -378,6 +378,8 @@ class Stepped:
     columns: dict[str, NDArray] = field(default_factory=dict)
     """(N, ...) each, as `core.state_columns` names them: ``state/actors/cube``, ``obs/agent/qpos``. Only while
     capturing."""
+    acted_by: str = ""
+    """What chose the action of this step, as a recording is to say it; empty where it is known beforehand."""
 
 
 @dataclass(frozen=True)

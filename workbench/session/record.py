@@ -326,7 +326,7 @@ class _Share:
         if given is not None and given.states:
             step = self._put_right(env, given, step)
         self._running[env], self._steps[env] = index, 0
-        self._acting.begin(env, seed, given)
+        self._gatherer.acted_by = self._acting.begin(env, seed, given)
         mask = np.zeros(task.num_envs, bool)
         mask[env] = True
         self._gatherer.take(self._stepped(step, mask, [env]))

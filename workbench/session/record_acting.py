@@ -30,12 +30,14 @@ class RecordActing:
         self._rng: dict[int, np.random.Generator] = {}
         self._given: dict[int, GivenEpisode] = {}
 
-    def begin(self, env: int, seed: int, given: GivenEpisode | None) -> None:
-        """An episode begins in this env."""
+    def begin(self, env: int, seed: int, given: GivenEpisode | None) -> str:
+        """An episode begins in this env; returns what will choose its actions, as its recording says it."""
         self._rng[env] = np.random.default_rng(seed)
         self._given.pop(env, None)
         if given is not None:
             self._given[env] = given
+            return given.name
+        return "random" if self._acting is None else self._acting.name
 
     def end(self, env: int) -> None:
         """Nothing is to be done in this env any more."""

@@ -60,6 +60,7 @@ class StepEvents:
         reset_mask: NDArray[np.bool_],
         seeds: NDArray[np.int64] | None,
         restored: Restored | None,
+        acted_by: str,
     ) -> Stepped:
         """See `Stepped` for what the arguments become."""
         self.number += 1
@@ -82,6 +83,7 @@ class StepEvents:
             self.number,
             restored,
             columns,
+            acted_by,
         )
 
     def _state_columns(self, opened: OpenedTask) -> dict[str, NDArray]:

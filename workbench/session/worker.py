@@ -346,7 +346,8 @@ class Worker:
         self._last = step
         if self._steps.pictures_due(step, reset_mask):
             self._cameras.settle()  # the same scene is about to be drawn
-        event = self._steps.event(self._held.opened, step, reset_mask, seeds, restored)
+        acted_by = "" if restored else self._acting.name
+        event = self._steps.event(self._held.opened, step, reset_mask, seeds, restored, acted_by)
         self._cameras.scene_changed()
         self._line.send(event)
 

@@ -88,9 +88,11 @@ def has_outcome(row: LibraryRow, outcome: Outcome) -> bool:
 
 
 def has_words(row: LibraryRow, words: Sequence[str]) -> bool:
-    """Whether each of these lower-case words is somewhere in its task, tags, note, name or source hash; ``seed:3``
-    means that seed."""
-    said = "\n".join((row.task, *row.tags, row.note, row.name, row.source_hash, row.problem or "")).lower()
+    """Whether each of these lower-case words is somewhere in its task, tags, note, name, source hash or what chose its
+    actions; ``seed:3`` means that seed."""
+    said = "\n".join(
+        (row.task, *row.tags, row.note, row.name, row.source_hash, row.facts.acted_by, row.problem or "")
+    ).lower()
     return all(
         row.seed is not None and word == f"seed:{row.seed}" if word.startswith("seed:") else word in said
         for word in words
@@ -164,6 +166,8 @@ def cells(row: LibraryRow, newest: dict[str, str], now: datetime.datetime) -> Ce
     total = row.total_reward
     task = row.task or ("?" if row.problem else "")
     about = [row.name, f"{_bytes(row.size)}", row.facts.control_mode]
+    if row.facts.acted_by:
+        about.append(f"actions: {row.facts.acted_by}")
     if row.facts.env_index is not None:
         about.insert(1, f"env {row.facts.env_index}")
     return Cells(

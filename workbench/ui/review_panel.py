@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 import viser
 
+from workbench.recording.episode import acted_by_in_words
 from workbench.session.review import MOST_COMPARED, SPEEDS, Review
 from workbench.session.review_events import success_words
 from workbench.session.review_view import Opened, ReviewView
@@ -189,6 +190,10 @@ def facts(one: Opened) -> list[tuple[str, str, str]]:
             ("not held", short_text(names), f"What else the task reads, as it was named by its text: {names}")
         )
     rows.append(("ran on", info.backend, ", ".join(f"{k} {v}" for k, v in info.versions.items())))
+    if info.acted_by:
+        rows.append(
+            ("actions", short_text(acted_by_in_words(info.acted_by)), acted_by_in_words(info.acted_by))
+        )
     if info.control_mode:
         rows.append(("control mode", info.control_mode, ""))
     kwargs = {k: v for k, v in info.env_kwargs.items() if k != "control_mode"}
