@@ -89,6 +89,9 @@ class ReviewPanel:
     def toggle_arrangement(self) -> None:
         self._arrange.value = GRID if self._arrange.value == GHOSTS else GHOSTS
 
+    def lay_side_by_side(self) -> None:
+        self._arrange.value = GRID
+
     def step_back(self) -> None:
         view = self._review.view()
         if self._on_step_back is not None and view.chosen is not None:
@@ -109,7 +112,8 @@ class ReviewPanel:
         for handle in (self._play, self._speed.handle, self._loop.handle):
             show(handle, there)
         show(self._live, there and self._on_step_back is not None)
-        live = STAY if going else GO_LIVE
+        live = GO_LIVE if len(view.opened) < 2 else f"{GO_LIVE} ({letter(view.selected)})"
+        live = STAY if going else live
         if self._live.label != live:
             self._live.label = live
         label = "Pause" if view.playing else "Play"

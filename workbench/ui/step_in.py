@@ -237,6 +237,12 @@ class Judging:
         """Judge recordings that are selected in the library."""
         if self._panel is None or self._server is None:
             return
+        if not ids:
+            for client in self._server.get_clients().values():
+                client.add_notification(
+                    "Nothing to judge", "No recording is selected or open.", color="orange"
+                )
+            return
         self._panel.judge(ids)
         for client in self._server.get_clients().values():
             client.add_notification(
