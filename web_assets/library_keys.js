@@ -4,6 +4,8 @@
 // it out of the page. Delete, T or the arrows would then be about a selection that nobody sees. Which keys those are says
 // the status line of the review (review_status.html); while that is folded as well, what it said last counts.
 //
+// A question with a text field has the focus in it, where Escape would not be heard.
+//
 // In the search Escape shows all recordings again, and Enter goes back to the table, whose keys are not heard while
 // somebody types.
 "use strict";
@@ -26,9 +28,18 @@
     field.blur();
   }
 
+  function leaveDialog(field) {
+    field.blur();
+    document.body.dispatchEvent(new KeyboardEvent("keydown", { key: "Escape", code: "Escape", bubbles: true }));
+  }
+
   window.addEventListener(
     "keydown",
     (event) => {
+      if (event.key === "Escape" && event.target instanceof HTMLInputElement && event.target.closest("[role=dialog]")) {
+        leaveDialog(event.target);
+        return;
+      }
       if ((event.key === "Escape" || event.key === "Enter") && event.target instanceof Element && event.target.matches(SEARCH)) {
         leaveSearch(event, event.target);
         return;
