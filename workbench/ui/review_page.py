@@ -44,6 +44,8 @@ TOLD_EVERY = 0.1
 """Seconds, while it plays. Faster, numbers cannot be read."""
 PANEL_WIDTH = 340
 LIBRARY_WIDTH = 520
+LEAST_VIEW = 240
+"""Pixels of the view between the library and another panel."""
 NARROW = 700
 """Pixels of the view beside the library, from which on there is room for both."""
 BACK = "Back to the live env"
@@ -64,9 +66,10 @@ class Places:
     """For a tab of its own."""
     library: LibraryPanel | None
     """Says which recordings are selected, and takes further buttons for them (`LibraryPanel.add_action`)."""
-    make_way: Callable[[], int] = lambda: 0
+    make_way: Callable[[Callable[[bool], None]], int] = lambda fold: 0
     """Folds the table of recordings, for a part that opens a panel of its own; says how many pixels of the smallest
-    page are between the panels then."""
+    page are between the panels then. It gets what folds and unfolds that panel in turn, where there is no room for it
+    beside the table."""
 
 
 Part = Callable[[viser.ViserServer, Places], "Drawn | None"]
@@ -120,6 +123,9 @@ class ReviewPage:
         self._had_opened = tuple(one.id for one in review.view().opened)
         self._folded_keys = ""
         """Keys that are of use only where the library is seen."""
+        self._fold_other: Callable[[bool], None] = lambda folded: None
+        """Of a part's own panel."""
+        self._other_folded = False
         self._told: ReviewView | None = None
         self._told_at = 0.0
         stage = stage or Stage(server)
@@ -271,7 +277,8 @@ class ReviewPage:
             if not ids or self._smallest_view() < NARROW:
                 self._show_library(not ids)
 
-    def _make_way(self) -> int:
+    def _make_way(self, fold: Callable[[bool], None]) -> int:
+        self._fold_other = fold
         width = self._smallest_view() + (LIBRARY_WIDTH if self._library_open else 0)
         self._show_library(False)
         return width
@@ -286,9 +293,16 @@ class ReviewPage:
         if self._library_window is None:
             return
         if shown:
+            # While it is folded, the other panel and the view share the width.
+            self._other_folded = 0 < self._smallest_view() < LIBRARY_WIDTH + LEAST_VIEW
+            if self._other_folded:
+                self._fold_other(True)
             self._library_window.expand()
         else:
             self._library_window.minimize()
+            if self._other_folded:
+                self._other_folded = False
+                self._fold_other(False)
 
     # --- cameras -----------------------------------------------------------------------------------
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 import viser
 
+from workbench.session.changed_since import ChangesOnDisk
 from workbench.session.review import MOST_COMPARED, SPEEDS, Review
 from workbench.session.review_events import success_words
 from workbench.session.review_view import Opened, ReviewView
@@ -77,6 +78,7 @@ class ReviewPanel:
         )
         self._never = gui.add_html("")
         self._facts = gui.add_html("")
+        self._changes = ChangesOnDisk()
         self._presses = Presses(server)
         self._listed: object = None
         """What the list was made of."""
@@ -135,7 +137,12 @@ class ReviewPanel:
         self._align.show(view.align)
         fill(self._never, render("note", text=never_words(view)) if never_words(view) else "")
         chosen = view.chosen
-        fill(self._facts, "" if chosen is None else render("review_facts", rows=facts(chosen)))
+        fill(
+            self._facts,
+            ""
+            if chosen is None
+            else render("review_facts", rows=facts(chosen, self._changes.of(chosen.episode.info))),
+        )
 
     def _list_html(self, view: ReviewView) -> str:
         if not view.opened and view.loading:
@@ -177,8 +184,12 @@ def never_words(view: ReviewView) -> str:
     return f"{', '.join(without)} {verb} no {name}, and {'is' if len(without) == 1 else 'are'} aligned at the start."
 
 
-def facts(one: Opened) -> list[tuple[str, str, str]]:
-    """Name, value, and what to show when the pointer rests there."""
+def facts(one: Opened, changed: str = "") -> list[tuple[str, str, str]]:
+    """Name, value, and what to show when the pointer rests there.
+
+    Args:
+        changed: what of its task is another now.
+    """
     info = one.episode.info
     rows = [("file", one.name, one.name), ("recorded", local_time(info.written_at), info.written_at)]
     if info.seed >= 0:
@@ -187,6 +198,8 @@ def facts(one: Opened) -> list[tuple[str, str, str]]:
         rows.append(("reset options", short(info.reset_options), short(info.reset_options, 2000)))
     if info.source_hash:
         rows.append(("source", info.source_hash, info.source_file or ""))
+    if changed:
+        rows.append(("changed since", changed, f"In {info.source_file}, as it is now"))
     if info.side_files:
         names = ", ".join(info.side_files)
         rows.append(

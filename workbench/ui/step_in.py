@@ -91,7 +91,7 @@ class StepIn:
             self._say(str(error))
             return
         self._place.go_live_with(session)
-        self._going = begin_to_go(session, run, self.everywhere, info.task, state)
+        self._going = begin_to_go(session, run, self.everywhere, info, state)
 
     def going(self) -> str:
         """What is waited for on the way to the live env; empty while nobody is on it."""
