@@ -178,7 +178,7 @@ def rescore(
     csv: Path | None = None,
     json: Path | None = None,
 ) -> int:
-    """Judge recorded episodes again with today's reward and evaluate, and say what is otherwise.
+    """Judge recorded episodes again with today's reward and evaluate, and say what is otherwise (on the page: Judge again).
 
     Args:
         places: recordings (.json, .h5 or .rrd of the workbench, .h5 of ManiSkill's RecordEpisode) and folders of them.

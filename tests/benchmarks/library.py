@@ -105,12 +105,10 @@ def open_once(folder: Path, count: int, browser: bool) -> dict[str, float]:
     import viser
 
     from workbench.recording.library import Library
-    from workbench.ui.fragments import style_sheet
     from workbench.ui.library_list import MOST_ROWS
     from workbench.ui.library_panel import LibraryPanel
 
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    server.gui.add_html(style_sheet())
     began = time.perf_counter()
     library = Library(folder)
     library.watch()

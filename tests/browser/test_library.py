@@ -14,7 +14,6 @@ from tests.browser.opened import launch, new_page, until
 from tests.recording.library_files import describe
 from workbench.recording.library import Library
 from workbench.ui.commands import register
-from workbench.ui.fragments import style_sheet
 from workbench.ui.library_panel import LibraryPanel
 from workbench.web_assets import web_assets_folder
 
@@ -49,7 +48,6 @@ def shown(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Itera
         when = f"2026-11-21T10:{k:02}:00"
         describe(folder, f"r{k:02}", id=f"id{k:02}", seed=k, written_at=when, tags=["even"] * (k % 2 == 0))
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    server.gui.add_html(style_sheet())
     library, opened = Library(folder), []
     library.watch()
     window = server.gui.add_panel()
@@ -71,6 +69,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Itera
         page, errors = new_page(browser)
         page.set_default_timeout(15_000)
         page.goto(f"http://127.0.0.1:{server.get_port()}")
+        page.add_style_tag(path=web_assets_folder() / "panels" / "page.css")
         page.wait_for_selector(".wb-library tbody")
         yield Shown(page, panel, library, opened)
         assert not errors

@@ -101,7 +101,10 @@ def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
         live.click()
         expect(page.get_by_text("loading WorkbenchPushCube-v1 at step 2")).to_be_visible()
         expect(page.get_by_role("button", name="Stay here")).to_be_visible()
-        told = page.get_by_text("WorkbenchPushCube-v1, seed 5, step 2: its actions were made again")
+        changed = "changed since: compute_normalized_dense_reward"
+        told = page.get_by_text(
+            f"WorkbenchPushCube-v1, seed 5, step 2 ({changed}): its actions were made again"
+        )
         expect(told).to_be_visible(timeout=PATIENT)
         assert page.evaluate("window.fewest") > 5, "the view was empty for a while"
         until(lambda: timeline_width(page) > 700, "the wide timeline")

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +32,7 @@ class Row:
     paths: tuple[Path, ...] = ()
     kind: str = "workbench"
     trajectory: str | None = None
+    date: datetime | None = None
 
     @property
     def name(self) -> str:
@@ -46,7 +48,7 @@ class Shelf:
     extra: dict[str, tuple[Path, ...]] = field(default_factory=dict)
 
     def rows(self) -> list[Row]:
-        return [Row(id, self.extra.get(id, ())) for id in self.episodes]
+        return [Row(id, self.extra.get(id, ()), date=_date(e)) for id, e in self.episodes.items()]
 
     def read(self, row: Row, shapes: SharedShapes) -> Episode:
         found = self.episodes[row.id]
@@ -56,6 +58,11 @@ class Shelf:
 
     def clock(self) -> float:
         return self.now
+
+
+def _date(episode: Episode | Exception) -> datetime | None:
+    written = "" if isinstance(episode, Exception) else episode.info.written_at
+    return datetime.fromisoformat(written) if written else None
 
 
 def review_of(**episodes: Episode | Exception) -> tuple[Review, Shelf]:
@@ -139,14 +146,15 @@ def test_aligned_at_an_event_each_shows_its_own_state_of_it() -> None:
     review.seek_event(1)
 
 
-def test_the_older_one_comes_first_and_they_can_change_places() -> None:
+def test_the_older_one_comes_first_and_they_can_change_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("workbench.session.review.FIRST_SHOWN", 0.0)  # it is seen before the other is read
     review, _ = review_of(
         new=made(4, written_at="2026-11-22T10:00:00+00:00"),
         old=made(6, written_at="2026-11-21T10:00:00+00:00"),
     )
     review.open(["new", "old"])
     view = until(review, lambda view: len(view.opened) == 2 and not view.loading, "opening")
-    assert [one.id for one in view.opened] == ["old", "new"]
+    assert [one.id for one in view.opened] == ["old", "new"] and view.selected == 0
     review.select(1)
     review.seek(3)
     review.exchange(0, 1)

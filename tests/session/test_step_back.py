@@ -125,6 +125,21 @@ def test_code_that_raises_on_the_way_leaves_the_envs_where_they_were(live: Sessi
     assert np.nanmax(np.abs(moved - stood)[..., :3]) < 0.02
 
 
+def test_what_changed_since_it_was_recorded_is_told_on_arrival(live: Session, run: RecordedRun) -> None:
+    text = (TASKS / "push_cube.py").read_text()
+    then = text.replace("GOAL_RADIUS = 0.1", "GOAL_RADIUS = 0.2").replace(
+        "tanh(5 * distance)", "tanh(distance)"
+    )
+    assert then != text
+    last = live.view().timeline.last
+    live.step_back(run.until(3), source_file="push_cube.py", source={"push_cube.py": then})
+    view = wait_until(live, lambda v: v.timeline.last > last and bool(v.timeline.arrived), "the state")
+    told = (
+        "an episode, step 3 (changed since: GOAL_RADIUS, compute_dense_reward): its actions were made again"
+    )
+    assert view.timeline.arrived.startswith(told)
+
+
 def test_a_renamed_actor_is_told_and_the_robot_is_where_it_was(live: Session, run: RecordedRun) -> None:
     view = live.view()
     file = Path(view.task.file or "")

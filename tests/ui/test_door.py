@@ -21,7 +21,7 @@ from workbench.ui import door as door_module
 from workbench.ui import viser_seam
 from workbench.ui.door import DEFAULT_PORT, Door, DoorError, DoorOptions, open_door
 from workbench.ui.gate import cookie_name
-from workbench.ui.replies import SCRIPTS, folder_handler
+from workbench.ui.replies import SCRIPTS, STYLES, folder_handler
 from workbench.web_assets import web_assets_folder
 
 
@@ -271,10 +271,12 @@ def test_our_files_are_served_small_where_the_browser_can(door):
 
 
 @pytest.mark.parametrize("encoding", ["identity", "gzip"])
-def test_the_page_runs_our_scripts_and_they_are_served(door, encoding):
+def test_the_page_has_our_styles_and_scripts_and_they_are_served(door, encoding):
     status, headers, body = get(door, "/", Accept_Encoding=encoding)
     page = gzip.decompress(body) if headers["Content-Encoding"] == "gzip" else body
     assert status == 200 and int(headers["Content-Length"]) == len(body)
+    assert f'<link rel="stylesheet" href="/workbench/{STYLES}">'.encode() in page
+    assert get(door, f"/workbench/{STYLES}")[1]["Content-Type"].startswith("text/css")
     for name in SCRIPTS:
         assert f'<script src="/workbench/{name}"></script>'.encode() in page
         status, headers, _ = get(door, f"/workbench/{name}")

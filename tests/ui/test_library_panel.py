@@ -13,6 +13,7 @@ import viser
 from tests.recording.library_files import describe
 from workbench.recording.library import Library
 from workbench.ui.commands import register
+from workbench.ui.library_commands import Action
 from workbench.ui.library_list import MOST_ROWS, RANGE, TOGGLE
 from workbench.ui.library_panel import OPEN, LibraryPanel
 
@@ -166,7 +167,7 @@ def test_buttons_are_there_for_as_many_as_they_take(
     panel: LibraryPanel, server: viser.ViserServer, told: Told
 ) -> None:
     judged: list[tuple[str, ...]] = []
-    panel.add_action("Judge again", "With today's code", judged.append)
+    panel.add_action(Action("Judge again", "With today's code", judged.append))
     panel.draw()
     assert panel._tools.content.count("wb-off") >= 5
     ids = newest(0, 5)

@@ -16,7 +16,6 @@ from playwright.sync_api import Request, sync_playwright
 from tests.browser.opened import until
 from workbench.recording.web_viewer import VIEWER_FILES, web_viewer_folder
 from workbench.ui.door import Door, DoorOptions, open_door
-from workbench.ui.fragments import style_sheet
 from workbench.ui.gate import cookie_name
 from workbench.ui.offers import Offers
 from workbench.ui.rerun_view import RerunPages, RerunView
@@ -121,7 +120,6 @@ def test_a_recordings_name_is_text_and_no_script(door: Door, pages: RerunPages, 
 def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
     door: Door, pages: RerunPages, recording: Path, chromium_path: str
 ) -> None:
-    door.server.gui.add_html(style_sheet())
     library = door.server.gui.add_panel()
     with library.add_tab("Library"):
         door.server.gui.add_html("...")

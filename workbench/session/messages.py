@@ -7,6 +7,7 @@ whatever crosses is numpy and plain data, so that a dying worker can take nothin
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -226,6 +227,9 @@ class StepBack:
     """Up to the state."""
     env_idx: tuple[int, ...]
     """The envs to be set, all to the same state."""
+    source_file: str | None = None
+    source: Mapping[str, str] = field(default_factory=dict)
+    """What the task was when it was recorded, where what has changed since is to be told."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ earlier one still brings worthless, which is how opening something else stops it
 
 from __future__ import annotations
 
+import datetime
 import logging
 import math
 import threading
@@ -47,6 +48,7 @@ SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 FIRST_SHOWN = 0.4
 """Seconds after which the recordings that are read are shown while others are read; then after twice that, and so on:
 each time a scene is built."""
+_NEVER = datetime.datetime.min.replace(tzinfo=datetime.timezone.utc)
 _LOOK_EVERY = 2.0
 """Seconds between two looks at whether the files are still what was read."""
 
@@ -153,6 +155,9 @@ class Review:
             if not wanted:
                 self._change(problems=tuple(said), loading="")
                 return
+            # A table is most often sorted by date, the newest at its top; but one asks what became of the older one. It is
+            # read first too: who sees one before the others are there looks at the first of them from then on.
+            wanted.sort(key=lambda row: (row.date is None, row.date or _NEVER))
             self._change(loading=opening_words(wanted, 0), problems=tuple(said))
             self._thread = threading.Thread(
                 target=self._open, args=(number, wanted, said, state), name="review-open", daemon=True
@@ -215,7 +220,6 @@ class Review:
                 # A page that stays on "opening" says nothing; and the file is whatever somebody put there.
                 log.exception("%s could not be opened.", row.name)
                 said.append(f"{row.name} could not be opened ({type(error).__name__}: {error}).")
-        # A table is most often sorted by date, the newest at its top; but one asks what became of the older one.
         opened.sort(key=lambda one: one.episode.info.written_at)
         with self._changed:
             if number != self._opening:

@@ -7,6 +7,7 @@ written anew later takes nothing away. It only has to be said.
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -31,6 +32,8 @@ class Row(Protocol):
     def kind(self) -> str: ...
     @property
     def trajectory(self) -> str | None: ...
+    @property
+    def date(self) -> datetime.datetime | None: ...
 
 
 class Rows(Protocol):

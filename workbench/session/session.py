@@ -11,9 +11,10 @@ What is done here is to bring those together: who is asked, and who is told of w
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import get_args
 
 from workbench.core.inspection import Section
@@ -91,7 +92,7 @@ class Session:
         self._state = LiveState(task, options, history_bytes)
         self._shared = SharedState(self._state)
         self._lock, self._note = self._shared.lock, self._shared.note
-        self._step_in: tuple[RecordedRun, bool] | None = None
+        self._step_in: tuple[RecordedRun, bool, str | None, Mapping[str, str]] | None = None
         """What is to be gone into as soon as a task is there."""
         self._printed = PrintedLog(self._on_lines)
         self._versions = Versions(
@@ -306,17 +307,28 @@ class Session:
         """Give up what `keep_past` began; nothing of it is kept."""
         self._keeper.stop()
 
-    def step_back(self, run: RecordedRun, everywhere: bool = False) -> None:
+    def step_back(
+        self,
+        run: RecordedRun,
+        everywhere: bool = False,
+        source_file: str | None = None,
+        source: Mapping[str, str] = MappingProxyType({}),
+    ) -> None:
         """Put the selected env, or all, into the last state of a recorded run; pauses there. Before a task is loaded
-        it is done when one is."""
+        it is done when one is.
+
+        Args:
+            source_file, source: what the task was then; what has changed since is told on arrival.
+        """
         self.past.seek(None)
         self.pause()
         with self._lock:
             task, env = self._state.task, self._state.selected_env
             if task is None:
-                self._step_in = run, everywhere
+                self._step_in = run, everywhere, source_file, source
                 return
-        self._send(StepBack(run, tuple(range(task.num_envs)) if everywhere else (env,)))
+        env_idx = tuple(range(task.num_envs)) if everywhere else (env,)
+        self._send(StepBack(run, env_idx, source_file, dict(source)))
         self._note()
 
     # --- the past judged again -----------------------------------------------------------------------

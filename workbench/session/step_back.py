@@ -12,10 +12,10 @@ from __future__ import annotations
 import ast
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
-from pathlib import Path, PurePath
+from pathlib import Path
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from workbench.core.recorded_run import RecordedRun
 from workbench.recording.episode import Episode, EpisodeInfo
 from workbench.recording.side_files import folder_of, place_of
 from workbench.session.messages import TaskDescription, TaskOptions
+from workbench.session.recorded_text import NoText, below_one_folder
 
 
 class CannotStepIn(ValueError):
@@ -127,7 +128,10 @@ def write_source(info: EpisodeInfo) -> tuple[Path, str]:
     """
     if not info.source or info.source_file is None:
         raise CannotStepIn("this recording does not hold the text of its task")
-    main, texts = _below_one_folder(info.source_file, info.source)
+    try:
+        main, texts = below_one_folder(info.source_file, info.source)
+    except NoText as error:
+        raise CannotStepIn(str(error)) from error
     folder = Path(tempfile.mkdtemp(prefix="workbench-recorded-"))
     try:
         for name, text in texts.items():
@@ -148,25 +152,6 @@ def _link_side_files(info: EpisodeInfo, folder: Path) -> None:
         if there is not None and here is not None and there.is_file() and not here.exists():
             here.parent.mkdir(parents=True, exist_ok=True)
             here.symlink_to(there)
-
-
-def _below_one_folder(main: str, source: Mapping[str, str]) -> tuple[str, dict[str, str]]:
-    """Names relative to the task's folder, none of which leads out of it: a recording is somebody else's file."""
-    names = {path: PurePath(path) for path in source}
-    # As it was recorded every path is absolute; as it is read, as seen from the main file's folder.
-    folder = PurePath(main).parent
-    found: dict[str, str] = {}
-    chosen = ""
-    for path, pure in names.items():
-        relative = pure.relative_to(folder) if pure.is_absolute() and pure.is_relative_to(folder) else pure
-        if relative.is_absolute() or ".." in relative.parts or not relative.parts:
-            relative = PurePath(pure.name)
-        found[str(relative)] = source[path]
-        if path == main or (pure.name == PurePath(main).name and not chosen):
-            chosen = str(relative)
-    if not chosen:
-        raise CannotStepIn("this recording does not hold the text of its task's own file")
-    return chosen, found
 
 
 def _with_class(file: str, text: str, env_id: str) -> str:

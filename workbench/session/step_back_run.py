@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from workbench.core.step import StepResult
+from workbench.session.changed_since import changed_since
 from workbench.session.lengths import length
 from workbench.session.messages import NO_MOMENT, Restored, StepBack
 from workbench.session.open_task import OpenedTask
@@ -23,9 +24,11 @@ def step_back(
     step, arrival = arrive(opened, run, run.length, request.env_idx, on_step)
     source = request.env_idx
     where = f"{run.name}, step {run.length}"
-    return step, Restored(
-        request.env_idx, source, NO_MOMENT, None, arrival.missed, where, f"{where}: {how(arrival)}"
-    )
+    loaded = opened.loaded
+    file = None if loaded.file is None else str(loaded.file)
+    changed = changed_since(request.source_file, request.source, file, loaded.source)
+    said = f"{where} (changed since: {changed}): {how(arrival)}" if changed else f"{where}: {how(arrival)}"
+    return step, Restored(request.env_idx, source, NO_MOMENT, None, arrival.missed, where, said)
 
 
 def going_there(request: StepBack, done: int) -> str:

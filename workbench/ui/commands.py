@@ -45,6 +45,11 @@ class Command:
         held = [word.removeprefix("cmd/").capitalize() for word in (self.modifier or "").split("+") if word]
         return " ".join([*held, name])
 
+    @property
+    def combination(self) -> str:
+        """For the page's scripts: ``arrowdown``, ``cmd/ctrl+a``."""
+        return "+".join(part for part in (self.modifier, (self.key or "").lower()) if part)
+
 
 def register(server: viser.ViserServer, commands: list[Command]) -> None:
     """Put the commands into the palette of every page."""

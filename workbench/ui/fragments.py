@@ -20,12 +20,6 @@ def render(template: str, **values: Any) -> str:
     return _environment().get_template(f"{template}.html").render(**values)
 
 
-def style_sheet() -> str:
-    """The page's own CSS as one ``<style>`` element."""
-    css = (web_assets_folder() / "panels" / "page.css").read_text(encoding="utf-8")
-    return f"<style>{css}</style>"
-
-
 @cache
 def _environment() -> jinja2.Environment:
     environment = jinja2.Environment(

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from workbench.core.recorded_run import RecordedRun
+from workbench.recording.episode import EpisodeInfo
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.busy_banner import is_shown as is_busy_for_long
@@ -42,10 +43,12 @@ class GoingLive:
         return f"{doing}: {view.activity}" if view.activity else f"{doing} …"
 
 
-def begin_to_go(session: Session, run: RecordedRun, everywhere: bool, task: str, state: int) -> GoingLive:
+def begin_to_go(
+    session: Session, run: RecordedRun, everywhere: bool, info: EpisodeInfo, state: int
+) -> GoingLive:
     """Ask the session for a recorded moment."""
     view = session.view()
     last = view.timeline.last if view.task is not None else -1
-    going = GoingLive(session, f"{run.name}, step {run.length}", task, state, last, view.problem_serial)
-    session.step_back(run, everywhere)
+    going = GoingLive(session, f"{run.name}, step {run.length}", info.task, state, last, view.problem_serial)
+    session.step_back(run, everywhere, info.source_file, info.source)
     return going

@@ -17,7 +17,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import viser
 
@@ -26,6 +26,7 @@ from workbench.recording.library_row import LibraryRow
 from workbench.ui.changed import fill, show
 from workbench.ui.commands import Command
 from workbench.ui.fragments import render
+from workbench.ui.library_commands import Action, acting, walking
 from workbench.ui.library_edits import LibraryEdits
 from workbench.ui.library_list import MOST_ROWS, RANGE, TOGGLE, LibraryList
 from workbench.ui.library_rows import (
@@ -53,17 +54,6 @@ OPEN = 4
 """In what ``choosable.html`` says of a press, beside `TOGGLE` and `RANGE`: it was the second of two."""
 
 
-@dataclass(frozen=True)
-class Action:
-    """Something to be done with the selected recordings."""
-
-    label: str
-    hint: str
-    run: Callable[[tuple[str, ...]], None]
-    most: int | None = None
-    """Recordings that it can take at once."""
-
-
 class LibraryPanel:
     """The table in the present container.
 
@@ -87,10 +77,36 @@ class LibraryPanel:
         self._edits = LibraryEdits(server, library, self._on_asking)
         self._lock = threading.RLock()
         self._actions = [
-            Action("Open", "Show it in the review (Enter, or press it twice)", on_open, MOST_OPEN),
-            Action("Tag", "Add tags or take them away (T)", self._edits.ask_tags),
-            Action("Note", "Write a note to it", self._edits.ask_note),
-            Action("Delete", "Move its files to the trash (Delete)", self._edits.ask_delete),
+            Action(
+                "Open",
+                "Show it in the review (Enter, or press it twice)",
+                on_open,
+                MOST_OPEN,
+                "Open the selected recordings",
+                "enter",
+            ),
+            Action(
+                "Tag",
+                "Add tags or take them away (T)",
+                self._edits.ask_tags,
+                named="Tag the selected recordings",
+                key="T",
+            ),
+            Action(
+                "Note",
+                "Write a note to it (Shift T)",
+                self._edits.ask_note,
+                named="Write a note to the selected recordings",
+                key="T",
+                modifier="shift",
+            ),
+            Action(
+                "Delete",
+                "Move its files to the trash (Delete)",
+                self._edits.ask_delete,
+                named="Delete the selected recordings",
+                key="delete",
+            ),
         ]
         self._filters = server.gui.add_html("")
         self._find = server.gui.add_text(
@@ -115,6 +131,8 @@ class LibraryPanel:
 
         self._keys: list[viser.CommandHandle] = []
         self._escapes: list[viser.CommandHandle] = []
+        self._key_names: tuple[str, ...] = ()
+        self._asking = False
         self._find.on_update(lambda _: self._on_typed())
         self._tasks.on_update(lambda _: self._on_task())
 
@@ -129,53 +147,48 @@ class LibraryPanel:
         self._list.select(ids)
         self._tell()
 
-    def add_action(
-        self, label: str, hint: str, run: Callable[[tuple[str, ...]], None], most: int | None = None
-    ) -> None:
-        """One more button for the selected recordings.
-
-        Args:
-            run: gets their ids; called on any thread, must not block.
-            most: recordings that it can take at once.
-        """
+    def add_action(self, action: Action) -> None:
+        """One more button for the selected recordings; it is run on any thread and must not block."""
         with self._lock:
-            self._actions.append(Action(label, hint, run, most))
+            self._actions.append(action)
 
     def close(self) -> None:
         """Close the window with a question, if there is one. For when the page goes."""
         self._edits.close()
 
     def commands(self) -> list[Command]:
-        """Keys of the table, for the page to register."""
-        commands = [replace(command, registered=self._keys.append) for command in self._commands()]
-        return [*commands, Command("Cancel", self.close, "escape", registered=self._add_escape)]
-
-    def _add_escape(self, handle: viser.CommandHandle) -> None:
-        handle.disabled = True  # of no use but while something is asked
-        self._escapes.append(handle)
-
-    def _commands(self) -> list[Command]:
-        listed, actions = self._list, {action.label: action for action in self._actions}
-
-        def move(by: int, held: int = 0) -> Callable[[], None]:
-            return self._then_tell(lambda: listed.move(by, held))
-
-        return [
-            Command("The next recording of the table", move(1), "arrowdown"),
-            Command("The recording before it", move(-1), "arrowup"),
-            Command("Select the next recording too", move(1, RANGE), "arrowdown", "shift"),
-            Command("Select the one before it too", move(-1, RANGE), "arrowup", "shift"),
-            Command("The next page of recordings", lambda: listed.turn(1), "pagedown"),
-            Command("The page of recordings before it", lambda: listed.turn(-1), "pageup"),
-            Command("Select this recording, or no longer", self._then_tell(listed.toggle_cursor), "X"),
-            Command(
-                "Select all recordings that are listed", self._then_tell(listed.select_all), "A", "cmd/ctrl"
-            ),
-            Command("Open the selected recordings", lambda: self._run(actions["Open"]), "enter"),
-            Command("Tag the selected recordings", lambda: self._run(actions["Tag"]), "T"),
-            Command("Delete the selected recordings", lambda: self._run(actions["Delete"]), "delete"),
+        """Keys of the table, for the page to register after the last action was added."""
+        commands = [
+            *walking(self._list, self._then_tell),
+            *acting(self._actions, self._run),
             Command("Take back the last deletion", self._edits.undo_delete, "Z"),
         ]
+        self._key_names = tuple(command.combination for command in commands)
+        commands = [replace(command, registered=self._keys.append) for command in commands]
+        escape = Command("Cancel, or show all recordings again", self._escape, "escape")
+        return [*commands, replace(escape, registered=self._add_escape)]
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Of `commands`, those that are of use only where the table is seen, as `Command.combination` has them."""
+        return self._key_names
+
+    def _add_escape(self, handle: viser.CommandHandle) -> None:
+        handle.disabled = True  # of no use but while something is asked, or looked for
+        self._escapes.append(handle)
+
+    def _escape(self) -> None:
+        if self._asking:
+            self._edits.close()
+        else:
+            self._clear_filter()
+
+    def _can_escape(self) -> None:
+        listed = self._list
+        of_use = self._asking or bool(listed.words or listed.task) or listed.outcome != "all"
+        for handle in self._escapes:
+            if handle.disabled == of_use:
+                handle.disabled = not of_use
 
     # --- drawing ---------------------------------------------------------------------------------------
 
@@ -192,6 +205,7 @@ class LibraryPanel:
                 self._list.look_for(self._find.value, self._list.task)
             if not self._is_new("all", (view.serial, self._list.state(), len(self._actions))):
                 return
+            self._can_escape()
             page = self._list.page(view)
             self._draw_filters(view)
             self._draw_table(view, page)
@@ -236,7 +250,9 @@ class LibraryPanel:
                     {
                         "name": outcome,
                         "hint": MEANS[outcome],
-                        "count": counts[outcome],
+                        "count": f"{len(others)} of {len(view.rows)}"
+                        if outcome == "all" and len(others) < len(view.rows)
+                        else counts[outcome],
                         "on": outcome == listed.outcome,
                         "press": self._press(outcome, lambda outcome=outcome: listed.choose(outcome)),
                     }
@@ -433,7 +449,9 @@ class LibraryPanel:
     def _run(self, action: Action) -> None:
         ids = self.selected()
         if not ids:
-            self._edits.notify("Nothing is selected", f"Select a recording to {action.label.lower()} it.")
+            self._edits.notify(
+                "Nothing is selected", f"{action.label} is for recordings that are selected in the library."
+            )
         elif action.most is not None and len(ids) > action.most:
             self._edits.notify(
                 f"{len(ids)} are selected", f"{action.label} takes at most {action.most} at once."
@@ -443,10 +461,10 @@ class LibraryPanel:
 
     def _on_asking(self, asking: bool) -> None:
         # viser's keys come before a focused button's: Enter on Cancel would open a recording.
+        self._asking = asking
         for key in self._keys:
             key.disabled = asking
-        for key in self._escapes:
-            key.disabled = not asking
+        self._can_escape()
 
 
 def data_address_of_jpeg(jpeg: bytes | None) -> str:

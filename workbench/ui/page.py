@@ -26,7 +26,7 @@ from workbench.ui.curves_panel import CurvesPanel
 from workbench.ui.env_layout import EnvLayout, acting_box, env_under_ray, lay_out
 from workbench.ui.env_panel import EnvPanel
 from workbench.ui.force_arrows import ForceArrows
-from workbench.ui.fragments import render, style_sheet
+from workbench.ui.fragments import render
 from workbench.ui.inspect_panel import InspectPanel
 from workbench.ui.judgement_panel import JudgementPanel
 from workbench.ui.log_panel import LogPanel
@@ -84,7 +84,6 @@ class Page:
         server.gui.main_panel.set_width(PANEL_WIDTH)
         server.gui.set_panel_label("Workbench")
 
-        server.gui.add_html(style_sheet())
         self._status = StatusLine(server)
         run_tab = self._add_tabs(dark)
         self._timeline = TimelinePanel(server, session)

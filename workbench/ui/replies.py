@@ -36,11 +36,14 @@ SCRIPTS = (
     "keys.js",
     "pressed_by_key.js",
     "view_stays.js",
+    "library_keys.js",
     "timeline_width.js",
     "typed_first.js",
     "steady_resolution.js",
 )
 """Of ``web_assets/``, run by the page; each says what it is for."""
+STYLES = "panels/page.css"
+"""Of ``web_assets/``. In the page's head, since an HTML element of viser's is gone while the panel that it is in is folded."""
 
 _log = logging.getLogger("workbench.door")
 
@@ -146,7 +149,7 @@ async def admitted_reply(
         if response.headers.get("Content-Type", "").startswith("text/html"):
             zipped = response.headers.get("Content-Encoding") == "gzip"
             # In a thread: packing viser's page anew takes a while, at the first time.
-            response.body = await asyncio.to_thread(with_our_scripts, bytes(response.body), zipped)
+            response.body = await asyncio.to_thread(with_our_head, bytes(response.body), zipped)
             del response.headers["Content-Length"]
             response.headers["Content-Length"] = str(len(response.body))
         for name, value in {**_EVERY_REPLY, **page}.items():
@@ -182,8 +185,8 @@ def _no_such_file(headers: Mapping[str, str]) -> Response:
 
 
 @functools.lru_cache(maxsize=4)
-def with_our_scripts(page: bytes, zipped: bool) -> bytes:
-    """viser's page with `SCRIPTS` in its head; viser itself offers no way to add one.
+def with_our_head(page: bytes, zipped: bool) -> bytes:
+    """viser's page with `STYLES` and `SCRIPTS` in its head; viser itself offers no way to add one.
 
     Raises:
         ValueError: it has no head; viser is not the one that this was written for.
@@ -192,7 +195,8 @@ def with_our_scripts(page: bytes, zipped: bool) -> bytes:
     before, head_end, after = plain.partition(b"</head>")
     if not head_end:
         raise ValueError(f"viser {viser_seam.WRITTEN_FOR} serves a page with a </head>; this one has none.")
-    tags = "".join(f'<script src="/workbench/{name}"></script>' for name in SCRIPTS)
+    tags = f'<link rel="stylesheet" href="/workbench/{STYLES}">'
+    tags += "".join(f'<script src="/workbench/{name}"></script>' for name in SCRIPTS)
     plain = before + tags.encode() + head_end + after
     return gzip.compress(plain, 6) if zipped else plain
 

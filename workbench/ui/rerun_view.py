@@ -177,12 +177,15 @@ class RerunView:
     Args:
         server: The page.
         pages: Where rerun is served.
-        make_way: Called before the panel comes, to make room for it; says how many pixels there are between the
-            other panels then.
+        make_way: Called before the panel comes, to make room for it, with what folds and unfolds it; says how many
+            pixels there are between the other panels then.
     """
 
     def __init__(
-        self, server: viser.ViserServer, pages: RerunPages, make_way: Callable[[], int] = lambda: 0
+        self,
+        server: viser.ViserServer,
+        pages: RerunPages,
+        make_way: Callable[[Callable[[bool], None]], int] = lambda fold: 0,
     ) -> None:
         self._server, self._pages, self._make_way = server, pages, make_way
         self._paths: tuple[Path, ...] = ()
@@ -265,7 +268,7 @@ class RerunView:
             self._waiting = False
             self.draw(self._paths, self._chosen, self._moments)
         self.close()
-        room = self._make_way()
+        room = self._make_way(self._fold)
         with self._lock:
             self._panel = panel = self._server.gui.add_panel(order=6.0)
         with panel.add_tab("rerun", viser.Icon.APP_WINDOW):
@@ -278,6 +281,11 @@ class RerunView:
         # Beside the scene, with a border that can be dragged.
         panel.dock_left()
         self._width = max(LEAST, round(SHARE * room))
+
+    def _fold(self, folded: bool) -> None:
+        with self._lock:
+            if self._panel is not None:
+                (self._panel.minimize if folded else self._panel.expand)()
 
     def close(self) -> None:
         """Take the panel away, and the program that runs in it."""

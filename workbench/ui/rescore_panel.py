@@ -24,6 +24,7 @@ from workbench.ui.fragments import render
 from workbench.ui.judged_with import RECORDED, TODAYS, codes_for
 from workbench.ui.line_chart import LONGEST
 from workbench.ui.presses import Presses
+from workbench.ui.review_scene import COLOURS, letter
 from workbench.ui.then_and_now import ThenAndNow
 
 REDRAW_EVERY = 0.2
@@ -180,6 +181,7 @@ class RescorePanel:
         verdict = self._listed[place]
         at = verdict.first_difference
         return {
+            **self._letter_of(verdict),
             "episode": f"seed {verdict.seed}" if verdict.seed >= 0 else verdict.file.name[-24:],
             "changed": words.what_changed(verdict),
             "returns": "" if verdict.why_not else words.returns(verdict),
@@ -192,6 +194,14 @@ class RescorePanel:
                 ("row", place % MOST_ROWS), lambda _, k=place % MOST_ROWS: self._go(k)
             ),
         }
+
+    def _letter_of(self, verdict: Verdict) -> dict[str, str]:
+        """As it is drawn with, if it is one of several that are open."""
+        opened = [one.id for one in self._review.view().opened]
+        if len(opened) < 2 or verdict.file.id not in opened:
+            return {"letter": "", "colour": ""}
+        index = opened.index(verdict.file.id)
+        return {"letter": letter(index), "colour": COLOURS[index % len(COLOURS)]}
 
     def _go(self, row: int) -> None:
         place = self._first + row

@@ -26,7 +26,8 @@ from workbench.session.review_view import ReviewView
 from workbench.ui.cameras_panel import CamerasPanel
 from workbench.ui.changed import fill
 from workbench.ui.commands import Command, register
-from workbench.ui.fragments import render, style_sheet
+from workbench.ui.fragments import render
+from workbench.ui.library_commands import Action
 from workbench.ui.library_panel import LibraryPanel
 from workbench.ui.redraw_loop import RedrawLoop, draw_apart
 from workbench.ui.review_as_session import as_session_view
@@ -34,6 +35,7 @@ from workbench.ui.review_compare_panel import ReviewComparePanel
 from workbench.ui.review_curves import ReviewCurves
 from workbench.ui.review_in_3d import ReviewIn3D
 from workbench.ui.review_panel import ReviewPanel
+from workbench.ui.review_scene import COLOURS, letter
 from workbench.ui.review_timeline import ReviewTimeline
 from workbench.ui.stage import Stage
 from workbench.ui.view_panel import ViewPanel
@@ -42,6 +44,8 @@ TOLD_EVERY = 0.1
 """Seconds, while it plays. Faster, numbers cannot be read."""
 PANEL_WIDTH = 340
 LIBRARY_WIDTH = 520
+LEAST_VIEW = 240
+"""Pixels of the view between the library and another panel."""
 NARROW = 700
 """Pixels of the view beside the library, from which on there is room for both."""
 BACK = "Back to the live env"
@@ -62,9 +66,10 @@ class Places:
     """For a tab of its own."""
     library: LibraryPanel | None
     """Says which recordings are selected, and takes further buttons for them (`LibraryPanel.add_action`)."""
-    make_way: Callable[[], int] = lambda: 0
+    make_way: Callable[[Callable[[bool], None]], int] = lambda fold: 0
     """Folds the table of recordings, for a part that opens a panel of its own; says how many pixels of the smallest
-    page are between the panels then."""
+    page are between the panels then. It gets what folds and unfolds that panel in turn, where there is no room for it
+    beside the table."""
 
 
 Part = Callable[[viser.ViserServer, Places], "Drawn | None"]
@@ -116,6 +121,11 @@ class ReviewPage:
         self._pictures: dict[CameraKey, Picture] = {}
         self._pictures_serial = 0
         self._had_opened = tuple(one.id for one in review.view().opened)
+        self._folded_keys = ""
+        """Keys that are of use only where the library is seen."""
+        self._fold_other: Callable[[bool], None] = lambda folded: None
+        """Of a part's own panel."""
+        self._other_folded = False
         self._told: ReviewView | None = None
         self._told_at = 0.0
         stage = stage or Stage(server)
@@ -124,7 +134,6 @@ class ReviewPage:
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(PANEL_WIDTH)
         server.gui.set_panel_label("Recordings")
-        server.gui.add_html(style_sheet())
         self._status = server.gui.add_html("")
         self._add_way_back()
         tabs = server.gui.add_tab_group()
@@ -141,6 +150,7 @@ class ReviewPage:
         commands = [*self._commands(), *self._offers.commands]
         if self._library is not None:
             commands += self._library.commands()
+            self._folded_keys = " ".join(self._library.keys)
         register(server, commands)
         with review_tab, server.gui.add_folder("Keys", expand_by_default=False):
             server.gui.add_html(render("keys", commands=commands))
@@ -176,11 +186,23 @@ class ReviewPage:
             with self._library_window.add_tab("Library", viser.Icon.LIST_DETAILS):
                 self._library = LibraryPanel(self._server, library, self._review.open)
             self._library.add_action(
-                "Side by side", "Watch them all at once, each at its own place", self._review.open, MOST_OPEN
+                Action(
+                    "Side by side",
+                    "Watch them all at once, each at its own place (Shift Enter)",
+                    self._open_side_by_side,
+                    MOST_OPEN,
+                    "Open the selected recordings side by side",
+                    "enter",
+                    "shift",
+                )
             )
             if self._offers.on_rescore is not None:
                 self._library.add_action(
-                    "Judge again", "Run today's reward and evaluate over them", self._offers.on_rescore
+                    Action(
+                        "Judge again",
+                        "Run today's reward and evaluate over them (J)",
+                        self._offers.on_rescore,
+                    )
                 )
             self._library_window.dock_left()
             self._library_window.set_width(LIBRARY_WIDTH)
@@ -230,7 +252,7 @@ class ReviewPage:
         self._told, self._told_at = view, now
         self._make_way_for_the_first(view)
         going = self._offers.going()
-        fill(self._status, status_html(view, going))
+        fill(self._status, status_html(view, going, self._folded_keys))
         self._panel.draw(view, bool(going))
         self._timeline.draw(view)
         self._draw_cameras(view)
@@ -255,7 +277,8 @@ class ReviewPage:
             if not ids or self._smallest_view() < NARROW:
                 self._show_library(not ids)
 
-    def _make_way(self) -> int:
+    def _make_way(self, fold: Callable[[bool], None]) -> int:
+        self._fold_other = fold
         width = self._smallest_view() + (LIBRARY_WIDTH if self._library_open else 0)
         self._show_library(False)
         return width
@@ -270,9 +293,16 @@ class ReviewPage:
         if self._library_window is None:
             return
         if shown:
+            # While it is folded, the other panel and the view share the width.
+            self._other_folded = 0 < self._smallest_view() < LIBRARY_WIDTH + LEAST_VIEW
+            if self._other_folded:
+                self._fold_other(True)
             self._library_window.expand()
         else:
             self._library_window.minimize()
+            if self._other_folded:
+                self._other_folded = False
+                self._fold_other(False)
 
     # --- cameras -----------------------------------------------------------------------------------
 
@@ -321,15 +351,32 @@ class ReviewPage:
             Command("Open or close the library", lambda: self._show_library(not self._library_open), "B"),
             Command("Dark or light", self._view_panel.toggle_dark, "D"),
         ]
+        if offers.on_rescore is not None:
+            commands.append(Command("Judge again what is selected, or else what is open", self._judge, "J"))
         if offers.on_step_back is not None:
             commands.append(Command("Go on live from here", self._panel.step_back, "G"))
         if offers.on_back is not None:
             commands.append(Command(BACK, offers.on_back, "V"))
         return commands
 
+    def _judge(self) -> None:
+        chosen = () if self._library is None else self._library.selected()
+        if self._offers.on_rescore is not None:
+            self._offers.on_rescore(chosen or tuple(one.id for one in self._review.view().opened))
 
-def status_html(view: ReviewView, going: str = "") -> str:
+    def _open_side_by_side(self, ids: tuple[str, ...]) -> None:
+        self._panel.lay_side_by_side()
+        self._review.open(ids)
+
+
+def status_html(view: ReviewView, going: str = "", library_keys: str = "") -> str:
+    """
+    Args:
+        going: what is waited for on the way to the live env.
+        library_keys: those that `library_keys.js` keeps from doing anything while the library is folded.
+    """
     chosen = view.chosen
+    several = len(view.opened) > 1
     ended, mood = ("", "") if chosen is None else success_words(chosen.episode)
     return render(
         "review_status",
@@ -339,6 +386,9 @@ def status_html(view: ReviewView, going: str = "") -> str:
         word="playing" if view.playing else "paused" if view.opened else "nothing open",
         speed=f"{view.speed:g}",
         task=None if chosen is None else chosen.episode.info.task,
+        letter=letter(view.selected) if several else "",
+        colour=COLOURS[view.selected % len(COLOURS)],
+        library_keys=library_keys,
         name="" if chosen is None else chosen.name,
         scene="" if chosen is None or not chosen.making else chosen.scene,
         ended=ended,

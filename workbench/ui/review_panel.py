@@ -13,6 +13,7 @@ from collections.abc import Callable
 import viser
 
 from workbench.recording.episode import acted_by_in_words
+from workbench.session.changed_since import ChangesOnDisk
 from workbench.session.review import MOST_COMPARED, SPEEDS, Review
 from workbench.session.review_events import success_words
 from workbench.session.review_view import Opened, ReviewView
@@ -78,6 +79,7 @@ class ReviewPanel:
         )
         self._never = gui.add_html("")
         self._facts = gui.add_html("")
+        self._changes = ChangesOnDisk()
         self._presses = Presses(server)
         self._listed: object = None
         """What the list was made of."""
@@ -89,6 +91,9 @@ class ReviewPanel:
 
     def toggle_arrangement(self) -> None:
         self._arrange.value = GRID if self._arrange.value == GHOSTS else GHOSTS
+
+    def lay_side_by_side(self) -> None:
+        self._arrange.value = GRID
 
     def step_back(self) -> None:
         view = self._review.view()
@@ -110,7 +115,8 @@ class ReviewPanel:
         for handle in (self._play, self._speed.handle, self._loop.handle):
             show(handle, there)
         show(self._live, there and self._on_step_back is not None)
-        live = STAY if going else GO_LIVE
+        live = GO_LIVE if len(view.opened) < 2 else f"{GO_LIVE} ({letter(view.selected)})"
+        live = STAY if going else live
         if self._live.label != live:
             self._live.label = live
         label = "Pause" if view.playing else "Play"
@@ -132,7 +138,12 @@ class ReviewPanel:
         self._align.show(view.align)
         fill(self._never, render("note", text=never_words(view)) if never_words(view) else "")
         chosen = view.chosen
-        fill(self._facts, "" if chosen is None else render("review_facts", rows=facts(chosen)))
+        fill(
+            self._facts,
+            ""
+            if chosen is None
+            else render("review_facts", rows=facts(chosen, self._changes.of(chosen.episode.info))),
+        )
 
     def _list_html(self, view: ReviewView) -> str:
         if not view.opened and view.loading:
@@ -174,8 +185,12 @@ def never_words(view: ReviewView) -> str:
     return f"{', '.join(without)} {verb} no {name}, and {'is' if len(without) == 1 else 'are'} aligned at the start."
 
 
-def facts(one: Opened) -> list[tuple[str, str, str]]:
-    """Name, value, and what to show when the pointer rests there."""
+def facts(one: Opened, changed: str = "") -> list[tuple[str, str, str]]:
+    """Name, value, and what to show when the pointer rests there.
+
+    Args:
+        changed: what of its task is another now.
+    """
     info = one.episode.info
     rows = [("file", one.name, one.name), ("recorded", local_time(info.written_at), info.written_at)]
     if info.seed >= 0:
@@ -184,6 +199,8 @@ def facts(one: Opened) -> list[tuple[str, str, str]]:
         rows.append(("reset options", short(info.reset_options), short(info.reset_options, 2000)))
     if info.source_hash:
         rows.append(("source", info.source_hash, info.source_file or ""))
+    if changed:
+        rows.append(("changed since", changed, f"In {info.source_file}, as it is now"))
     if info.side_files:
         names = ", ".join(info.side_files)
         rows.append(

@@ -91,7 +91,7 @@ class StepIn:
             self._say(str(error))
             return
         self._place.go_live_with(session)
-        self._going = begin_to_go(session, run, self.everywhere, info.task, state)
+        self._going = begin_to_go(session, run, self.everywhere, info, state)
 
     def going(self) -> str:
         """What is waited for on the way to the live env; empty while nobody is on it."""
@@ -236,6 +236,12 @@ class Judging:
     def judge(self, ids: tuple[str, ...]) -> None:
         """Judge recordings that are selected in the library."""
         if self._panel is None or self._server is None:
+            return
+        if not ids:
+            for client in self._server.get_clients().values():
+                client.add_notification(
+                    "Nothing to judge", "No recording is selected or open.", color="orange"
+                )
             return
         self._panel.judge(ids)
         for client in self._server.get_clients().values():
