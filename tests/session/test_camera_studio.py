@@ -127,6 +127,9 @@ def test_a_quick_look_in_another_size_leaves_the_camera_and_the_observation_alon
     view = wait_until(session, looked, "the look from there")
     size = (start.width, start.height)
     assert view.studio.quick.rgb.shape == (size[1] // 4, size[0] // 4, 3) and view.studio.quick.rgb.std() > 5
+    depth, bodies = view.studio.quick.depth, view.studio.quick.segmentation
+    assert depth is not None and bodies is not None
+    assert depth.shape == bodies.shape == (size[1] // 4, size[0] // 4) and np.ptp(depth) > 0.1 and np.ptp(bodies) > 0
     assert (camera(session, BASE).now.width, camera(session, BASE).info.width) == (size[0], size[0])
     session.studio.set_quick_scale(1.0)
     view = wait_until(session, seen_from(BASE, there), "the picture in its own size")

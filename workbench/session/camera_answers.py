@@ -69,7 +69,15 @@ def _looked_at(opened: OpenedTask, question: DrawCamera) -> tuple[Picture, ...]:
     for e in question.envs:
         moment = None if question.poses is None else question.poses[e]
         picture = picture_of(opened.env.env, e, placement, table, moment, size)
-        made.append(replace(picture, camera=question.key[1], depth=None, segmentation=None))
+        wanted = question.modalities
+        made.append(
+            replace(
+                picture,
+                camera=question.key[1],
+                depth=picture.depth if "depth" in wanted else None,
+                segmentation=picture.segmentation if "segmentation" in wanted else None,
+            )
+        )
     return tuple(made)
 
 

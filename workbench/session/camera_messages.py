@@ -33,8 +33,8 @@ class DrawCamera:
     poses: NDArray[np.float32] | None = None
     """(N, B, 7) of the bodies at a moment of the past; None for now."""
     scale: float = 1.0
-    """Other than 1: colours alone, in a picture whose sides are so much of `settings`' (which must be given), by a
-    camera beside the env's, with the minimal shader."""
+    """Other than 1: in a picture whose sides are so much of `settings`' (which must be given), by a camera beside the
+    env's, with the minimal shader: colours, depth and segmentation."""
 
 
 @dataclass(frozen=True)
