@@ -57,7 +57,7 @@ def answer(
 
 
 def _looked_at(opened: OpenedTask, question: DrawCamera) -> tuple[Picture, ...]:
-    """In another size than the env's camera has, which is left alone."""
+    """In another size than the env's camera has, which is left alone; or by a camera that the env has not."""
     settings, scale = question.settings, question.scale
     if settings is None or not 0 < scale <= LARGEST_SCALE:
         raise ValueError(f"a camera is looked through in up to {LARGEST_SCALE} times its size, not {scale}")
@@ -82,9 +82,9 @@ def _looked_at(opened: OpenedTask, question: DrawCamera) -> tuple[Picture, ...]:
 
 
 def _drawn(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> tuple[Picture, ...]:
-    if question.scale != 1.0:
-        return _looked_at(opened, question)
     env, key = opened.env.env, question.key
+    if question.scale != 1.0 or all(info.key != key for info in opened.description.cameras):
+        return _looked_at(opened, question)
     before = placed.settings(key)
     if question.settings is not None:
         placed.place(env, key, question.settings)

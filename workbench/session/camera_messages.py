@@ -26,7 +26,8 @@ class DrawCamera:
     number: int
     key: CameraKey
     settings: CameraSettings | None
-    """Drawn as if it were placed so, and left as it is; None for as it is placed."""
+    """Drawn as if it were placed so, and left as it is; None for as it is placed. Of a camera that the env has not
+    they must be given: it is one that stands still, and is drawn as with a `scale`."""
     envs: tuple[int, ...]
     modalities: tuple[str, ...] = ("rgb",)
     """Those that its shader does not give are left out."""

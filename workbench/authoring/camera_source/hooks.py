@@ -169,8 +169,8 @@ def new_hook(
     end = file.text.find("\n", end)
     at = len(file.text) if end < 0 else end + 1
     lead = "\n" if end >= 0 else "\n\n"
-    text = (
+    new = (
         f"{lead}{indent}@property\n{indent}def {hook}(self):\n{inner}return [\n"
         f"{inner}    {text(inner + '    ')},\n{inner}]\n"
     )
-    return [Replacement(at, at, text)]
+    return [Replacement(at, at, new)]

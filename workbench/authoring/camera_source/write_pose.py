@@ -142,8 +142,8 @@ def look_at_text(name: str, settings: CameraSettings, aim: Triple | None) -> str
     ahead = [float(x) for x in settings.position + forward]
     if abs(_cosine(forward.tolist(), (0.0, 0.0, 1.0))) > math.cos(1e-3):
         return None
-    for target in (aim, ahead):
-        for decimals in _METRES if target is not None else ():
+    for target in (ahead,) if aim is None else (aim, ahead):
+        for decimals in _METRES:
             eye, point = ([round(x, decimals) for x in numbers] for numbers in (settings.position, target))
             if rotations.angle_between(rotations.look_at(eye, point), settings.quaternion) <= ANGLE_STEP:
                 return f"{name}(eye={list_text(eye, decimals)}, target={list_text(point, decimals)})"
