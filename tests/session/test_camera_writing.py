@@ -100,8 +100,9 @@ def test_a_camera_is_added_moved_copied_renamed_and_removed_and_the_env_has_it_e
 
 
 def test_a_camera_to_be_added_is_seen_before_and_what_is_left_for_another_plan_is_said(session: Session) -> None:
-    studio, new = session.studio, replace(there(session, BASE), position=(0.5, 0.2, 0.6))
-    studio.plan_add("sensor", "side", new)
+    studio = session.studio
+    new = replace(there(session, ("human", "render_camera")), position=(0.5, 0.2, 0.6))
+    studio.plan_add("human", "side", new)
     assert planned(session).message.startswith("This adds side to")
     view = wait_until(session, said(lambda s: s.first_sight is not None), "its picture")
     picture = view.studio.first_sight
