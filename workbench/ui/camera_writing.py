@@ -46,7 +46,7 @@ NEW = CameraSettings(
     shader_pack="minimal",
 )
 """A camera that is added to a task that has none of its kind, but for its place: what ManiSkill's own tasks have."""
-NEW_NAMES = {"sensor": "camera", "human": "render_camera"}
+NEW_NAMES = {"sensor": "side_camera", "human": "render_camera"}
 PREVIEW = 256
 """Pixels of the longer side of the new camera's picture."""
 
