@@ -235,8 +235,12 @@ def test_put_where_one_looks_through_it_it_stays(page: Page) -> None:
 def test_a_copy_is_planned_and_left(page: Page, task_file: Path) -> None:
     text = task_file.read_text()
     page.get_by_text("Add, copy, rename, remove", exact=True).click()
-    page.get_by_role("button", name="Duplicate", exact=True).click()
+    page.get_by_role("button", name="Rename", exact=True).click()
     expect(page.get_by_text("Type a new name first: letters, digits, - and _.")).to_be_visible()
+    # Without a name it is given one.
+    page.get_by_role("button", name="Duplicate", exact=True).click()
+    expect(page.locator(".wb-diff-add").filter(has_text='"base_camera_2"')).to_be_visible()
+    expect(page.get_by_text("Type a new name first")).not_to_be_visible()
     # viser's text fields are not tied to their labels.
     page.locator("//label[text()='New name']/ancestor::*[.//input][1]//input").fill("second_camera")
     page.get_by_role("button", name="Duplicate", exact=True).click()

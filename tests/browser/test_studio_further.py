@@ -111,6 +111,9 @@ def test_a_camera_is_added_where_one_looks_renamed_and_removed(page: Page, task_
     page.locator(field(page, "New name")).fill("third")
     button(page, "Add a sensor")
     expect(page.get_by_text(re.compile("It looks from your side at cube, goal from 0"))).to_be_visible()
+    sight = page.get_by_alt_text("what it would see")
+    until(lambda: sight.evaluate("e => e.naturalWidth") == 128, "its picture, before it is written")
+    assert task_file.read_text() == before
     leave = page.get_by_role("button", name="Leave the file as it is")
     until(lambda: bottom_of(leave) < HEIGHT, "the last of it in sight")
     leave.click()

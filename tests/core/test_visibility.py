@@ -24,6 +24,7 @@ from workbench.core.visibility import (
     judge_camera,
     judge_placement,
     list_objects,
+    objects_to_see,
     settings_of,
     small_size,
 )
@@ -70,6 +71,12 @@ def test_objects_are_told_from_robot_and_room(env: Any) -> None:
     assert [name for name, thing in objects.items() if thing.robot] == ["panda"]
     assert {name for name, thing in objects.items() if thing.scenery} == {"table-workspace", "ground"}
     assert len(objects["panda"].bodies) > 10 and len(objects["cube"].bodies) == 1
+
+
+def test_of_a_robot_its_hand_comes_first_and_what_is_near_its_tool_before_the_rest(env: Any) -> None:
+    (robot,) = (thing for thing in objects_to_see(env) if thing.robot)
+    hand, *fingers, wrist = (name.removeprefix("panda/panda_") for name in robot.links[:4])
+    assert hand == "hand" and {*fingers} == {"leftfinger", "rightfinger"} and wrist == "link7"
 
 
 def test_pixels_are_those_of_maniskills_segmentation(env: Any) -> None:

@@ -127,6 +127,13 @@ def test_a_quick_look_in_another_size_leaves_the_camera_and_the_observation_alon
     view = wait_until(session, looked, "the look from there")
     size = (start.width, start.height)
     assert view.studio.quick.rgb.shape == (size[1] // 4, size[0] // 4, 3) and view.studio.quick.rgb.std() > 5
+    depth, bodies = view.studio.quick.depth, view.studio.quick.segmentation
+    assert depth is not None and bodies is not None
+    assert (
+        depth.shape == bodies.shape == (size[1] // 4, size[0] // 4)
+        and np.ptp(depth) > 0.1
+        and np.ptp(bodies) > 0
+    )
     assert (camera(session, BASE).now.width, camera(session, BASE).info.width) == (size[0], size[0])
     session.studio.set_quick_scale(1.0)
     view = wait_until(session, seen_from(BASE, there), "the picture in its own size")
@@ -339,7 +346,7 @@ def test_an_installed_task_is_copied_opened_and_the_placement_planned_in_the_cop
         assert view.task.file == str(file) == view.studio.writing.edit.file
         assert view.task.env_id == "MyPushCube2-v1" and view.reload.level == "rebuilt"
         assert view.reload.reason == "push_cube_2.py was opened in place of PushCubeEnv"
-        assert view.studio.writing.message.startswith(f"This is your copy of the task, {file}. This is what")
+        assert view.studio.writing.message.startswith(f"This is your copy of the task, {file}. This changes")
         assert moved(view) == {BASE}, "the placement is lost"
         session.studio.file.write()
         view = wait_until(session, said(lambda s: s.writing.stage in ("checked", "mismatch")), "the check")

@@ -76,7 +76,7 @@ def test_a_camera_is_added_moved_copied_renamed_and_removed_and_the_env_has_it_e
     new = replace(there(session, ("human", "render_camera")), position=(0.6, 0.0, 0.7), fov=0.9)
     studio.file.plan_add("human", "side", new)
     assert written(session).message == f"side is in {task_file.name}, and the env has it."
-    assert not differences(there(session, ("human", "side")), new)
+    assert not differences(there(session, ("human", "side")), new, close=3e-4), "but for what is rounded"
     assert session.view().studio.selected == ("human", "side"), "one wants to place what one has added"
     # What is not written yet is in the copy, and stays with the original.
     away = replace(new, position=(0.61, 0.1, 0.7))
@@ -97,6 +97,46 @@ def test_a_camera_is_added_moved_copied_renamed_and_removed_and_the_env_has_it_e
         "CameraConfig("
     ) == before.count("CameraConfig(")
     studio.file.drop_plan()
+
+
+def test_a_camera_to_be_added_is_seen_before_and_what_is_left_for_another_plan_is_said(session: Session) -> None:
+    studio = session.studio
+    new = replace(there(session, ("human", "render_camera")), position=(0.5, 0.2, 0.6))
+    studio.plan_add("human", "side", new)
+    assert planned(session).message.startswith("This adds side to")
+    view = wait_until(session, said(lambda s: s.first_sight is not None), "its picture")
+    picture = view.studio.first_sight
+    assert picture.rgb.shape == (new.height, new.width, 3) and picture.rgb.std() > 5
+    assert [c.key[1] for c in view.studio.cameras] == ["base_camera", "render_camera"], "it is there already"
+    studio.place(BASE, replace(there(session, BASE), fov=0.9))
+    studio.file.plan_write(BASE)
+    view = wait_until(session, said(lambda s: s.writing.what == "edit"), "the other plan")
+    assert view.studio.writing.message.startswith("side was not added. This changes base_camera in")
+    assert view.studio.first_sight is None
+    studio.back_to_file(BASE)
+    studio.file.drop_plan()
+
+
+def test_changes_are_taken_back_one_after_the_other_also_when_a_plan_came_between(
+    session: Session, task_file: Path
+) -> None:
+    studio, texts = session.studio, [task_file.read_text()]
+    for fov in (0.9, 0.95):
+        studio.place(BASE, replace(there(session, BASE), fov=fov))
+        studio.file.plan_write(BASE)
+        written(session)
+        texts.append(task_file.read_text())
+    studio.file.plan_remove(BASE)
+    planned(session)
+    studio.file.drop_plan()
+    for wanted in (texts[1], texts[0]):
+        wait_until(session, said(lambda s: s.writing.stage == "checked"), "the change that can be taken back")
+        studio.file.undo_write()
+        wait_until(session, said(lambda s: "as it was before." in s.writing.message), "the file of before")
+        assert task_file.read_text() == wanted
+        studio.file.drop_plan()
+    wait_until(session, said(lambda s: s.writing.stage == "none"), "nothing left")
+    studio.back_to_file(BASE)
 
 
 def test_a_camera_that_comes_out_otherwise_is_an_error_and_is_taken_back(

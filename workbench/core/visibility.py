@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import sapien.physx
 import sapien.render
 from mani_skill.utils.scene_builder import SceneBuilder
 from numpy.typing import NDArray
@@ -112,9 +113,11 @@ def objects_to_see(env: Any, table: BodyTable | None = None) -> tuple[ObjectToSe
 
 
 def _links_from_the_hand(env: Any, robot: SceneObject, table: BodyTable) -> tuple[str, ...]:
-    """Names of a robot's links that have something to be seen, from its tool centre point on; else the last one first.
+    """Names of a robot's links that have something to be seen: its hand, then what is near its tool centre point.
 
-    That point is a link that ManiSkill's agents have under the name ``tcp``, where they have a hand.
+    That point is a link that ManiSkill's agents have under the name ``tcp``, where they have a hand. The hand is the
+    link that carries it: the fingers may be nearer to it, but a hand is what people ask to see. Without a tool the last
+    link comes first.
     """
     drawn = [body for body in reversed(robot.bodies) if _is_drawn(table.entities[0, body])]
     agents = getattr(env.agent, "agents", [env.agent])
@@ -122,9 +125,20 @@ def _links_from_the_hand(env: Any, robot: SceneObject, table: BodyTable) -> tupl
     name = f"{robot.name}/{getattr(tools[0], 'name', '')}" if tools else ""
     if name in table.names:
         places = read_poses(env, table)[0, :, :3]
-        point = places[table.names.index(name)]
-        drawn.sort(key=lambda body: float(np.linalg.norm(places[body] - point)))
+        tool = table.names.index(name)
+        hand = _carrier(table.entities[0, tool])
+        drawn.sort(key=lambda body: float(np.linalg.norm(places[body] - places[tool])))
+        drawn.sort(key=lambda body: table.entities[0, body] is not hand)
     return tuple(table.names[body] for body in drawn)
+
+
+def _carrier(entity: Any) -> Any:
+    """The nearest link that has something to be seen, from this one towards the root; None if there is none."""
+    while entity is not None and not _is_drawn(entity):
+        link = entity.find_component_by_type(sapien.physx.PhysxArticulationLinkComponent)
+        parent = None if link is None else link.parent
+        entity = None if parent is None else parent.entity
+    return entity
 
 
 def _is_drawn(entity: Any) -> bool:

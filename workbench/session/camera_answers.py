@@ -57,7 +57,7 @@ def answer(
 
 
 def _looked_at(opened: OpenedTask, question: DrawCamera) -> tuple[Picture, ...]:
-    """In another size than the env's camera has, which is left alone."""
+    """In another size than the env's camera has, which is left alone; or by a camera that the env has not."""
     settings, scale = question.settings, question.scale
     if settings is None or not 0 < scale <= LARGEST_SCALE:
         raise ValueError(f"a camera is looked through in up to {LARGEST_SCALE} times its size, not {scale}")
@@ -69,14 +69,22 @@ def _looked_at(opened: OpenedTask, question: DrawCamera) -> tuple[Picture, ...]:
     for e in question.envs:
         moment = None if question.poses is None else question.poses[e]
         picture = picture_of(opened.env.env, e, placement, table, moment, size)
-        made.append(replace(picture, camera=question.key[1], depth=None, segmentation=None))
+        wanted = question.modalities
+        made.append(
+            replace(
+                picture,
+                camera=question.key[1],
+                depth=picture.depth if "depth" in wanted else None,
+                segmentation=picture.segmentation if "segmentation" in wanted else None,
+            )
+        )
     return tuple(made)
 
 
 def _drawn(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> tuple[Picture, ...]:
-    if question.scale != 1.0:
-        return _looked_at(opened, question)
     env, key = opened.env.env, question.key
+    if question.scale != 1.0 or all(info.key != key for info in opened.description.cameras):
+        return _looked_at(opened, question)
     before = placed.settings(key)
     if question.settings is not None:
         placed.place(env, key, question.settings)

@@ -26,15 +26,16 @@ class DrawCamera:
     number: int
     key: CameraKey
     settings: CameraSettings | None
-    """Drawn as if it were placed so, and left as it is; None for as it is placed."""
+    """Drawn as if it were placed so, and left as it is; None for as it is placed. Of a camera that the env has not
+    they must be given: it is one that stands still, and is drawn as with a `scale`."""
     envs: tuple[int, ...]
     modalities: tuple[str, ...] = ("rgb",)
     """Those that its shader does not give are left out."""
     poses: NDArray[np.float32] | None = None
     """(N, B, 7) of the bodies at a moment of the past; None for now."""
     scale: float = 1.0
-    """Other than 1: colours alone, in a picture whose sides are so much of `settings`' (which must be given), by a
-    camera beside the env's, with the minimal shader."""
+    """Other than 1: in a picture whose sides are so much of `settings`' (which must be given), by a camera beside the
+    env's, with the minimal shader: colours, depth and segmentation."""
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from typing import Literal
 from workbench.core.camera_frames import Convention, Direction, with_pose
 from workbench.core.camera_settings import (
     CameraKey,
+    CameraKind,
     CameraSettings,
     differences,
     why_no_camera,
@@ -29,6 +30,7 @@ from workbench.session import camera_in_words
 from workbench.session.camera_judging import CameraJudging, ShownMoment
 from workbench.session.camera_messages import CameraAnswer
 from workbench.session.episode_moments import EpisodeMoment
+from workbench.session.first_sight import FirstSight
 from workbench.session.messages import Load, PlaceCamera, Placed, ReloadLevel, Request, TaskDescription
 from workbench.session.quick_look import QuickLook, Sight
 from workbench.session.studio_cameras import StudioCameras
@@ -70,6 +72,7 @@ class CameraStudio:
         self._serial = 0
         self._judging = CameraJudging(send, self._note)
         self._quick = QuickLook(send, self._note)
+        self._first = FirstSight(send, self._note)
 
     # --- placing -------------------------------------------------------------------------------------
 
@@ -113,6 +116,17 @@ class CameraStudio:
                 key, file, words=f"put {key[1]} back to the file"
             )
         self.ask_for([key] if moved else [])
+
+    def plan_add(
+        self,
+        kind: CameraKind,
+        name: str,
+        settings: CameraSettings,
+        target: tuple[float, float, float] | None = None,
+    ) -> None:
+        """Find the edit that adds a camera which looks at `target`, and see what it would see: `first_sight`."""
+        self.file.plan_add(kind, name, settings, target)
+        self._first.look((kind, name), settings, self._shown())
 
     # --- judged ----------------------------------------------------------------------------------------
 
@@ -300,8 +314,9 @@ class CameraStudio:
                 selected=self._cameras.selected,
                 undo=self._cameras.placements.undo_words,
                 redo=self._cameras.placements.redo_words,
-                writing=self.file.view,
-                problem=self._cameras.problem or looked.problem or self._quick.problem,
+                writing=(writing := self.file.view),
+                first_sight=self._first.picture(writing.key if writing.stage == "planned" else None),
+                problem=self._cameras.problem or looked.problem or self._quick.problem or self._first.problem,
                 serial=self._serial,
             )
 
@@ -342,11 +357,13 @@ class CameraStudio:
         """The worker that plays answered a question about a camera."""
         self._judging.take(answer)
         self._quick.take(answer)
+        self._first.take(answer)
 
     def interrupted(self) -> None:
         """The file was saved, or the worker is gone: what is under way is about what there was before."""
         self._judging.stop()
         self._quick.stop()
+        self._first.stop()
 
     def failed_to_load(self) -> None:
         """A version does not load; the one before goes on."""
@@ -377,6 +394,7 @@ class CameraStudio:
         """Wait for what is being written."""
         self._judging.close()
         self._quick.close()
+        self._first.close()
         self.file.close()
 
     # --- small things ----------------------------------------------------------------------------------

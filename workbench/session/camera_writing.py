@@ -20,26 +20,30 @@ from workbench.authoring.modules import decode
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.core.pictures import CameraInfo
 from workbench.session.messages import TaskDescription
-from workbench.session.studio_view import Writing
+from workbench.session.studio_view import Change, Writing
 
 if TYPE_CHECKING:
     from workbench.authoring.camera_source import Refusal, SourceEdit
 
     Plan = SourceEdit | Refusal
 
+MADE = ("written", "checked", "mismatch")
+"""Stages in which the change is in the file."""
+
 
 @dataclass(frozen=True)
 class Wish:
     """What is to be written."""
 
-    what: str
-    """``edit``, ``add``, ``duplicate``, ``rename`` or ``remove``."""
+    what: Change
     key: CameraKey
     """The camera that is changed, copied, renamed or removed, or the one that is added."""
     settings: CameraSettings | None
     """What it is to have."""
     name: str = ""
     """The new name."""
+    target: tuple[float, float, float] | None = None
+    """The point that one looks at which is added."""
 
     @property
     def result(self) -> CameraKey:
@@ -79,9 +83,32 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish) -> Writing:
     if isinstance(made, camera_source.Refusal):
         can_copy = _could_be_copied(task)
         ways = " You can copy the text below into the file yourself." if made.snippet and not can_copy else ""
-        return Writing("refused", wish.result, None, made, f"Not written: {made.reason}.{ways}", can_copy)
-    message = f"This is what changes in {made.names}. Nothing is written yet."
-    return Writing("planned", wish.result, made, None, message)
+        message = f"Not written: {made.reason}.{ways}"
+        return Writing("refused", wish.result, wish.what, None, made, message, can_copy)
+    message = f"{_intended(wish, made.names)} Nothing is written yet."
+    return Writing("planned", wish.result, wish.what, made, None, message)
+
+
+def _intended(wish: Wish, file: str) -> str:
+    old, new = wish.key[1], wish.result[1]
+    return {
+        "edit": f"This changes {old} in {file}.",
+        "add": f"This adds {new} to {file}.",
+        "duplicate": f"This adds {new}, a copy of {old}, to {file}.",
+        "rename": f"This makes {old} {new} in {file}.",
+        "remove": f"This takes {old} out of {file}.",
+    }[wish.what]
+
+
+def _left(wish: Wish) -> str:
+    """What becomes of a plan in whose place another comes; empty where nothing is lost by it."""
+    return {
+        "edit": "",
+        "add": f"{wish.result[1]} was not added.",
+        "duplicate": f"{wish.result[1]} was not added.",
+        "rename": f"{wish.key[1]} was not renamed.",
+        "remove": f"{wish.key[1]} was not removed.",
+    }[wish.what]
 
 
 def _could_be_copied(task: TaskDescription) -> bool:
@@ -113,7 +140,7 @@ def _made(task: TaskDescription, texts: dict[str, str], info: CameraInfo | None,
     if wish.what == "add":
         assert wish.settings is not None
         file = task.file or task.source_files[0]
-        return camera_source.plan_add(texts, file, task.class_name, kind, uid, wish.settings)
+        return camera_source.plan_add(texts, file, task.class_name, kind, uid, wish.settings, wish.target)
     if info is None or info.settings is None:
         return camera_source.Refusal(f"there is no {kind} camera {uid!r} whose settings are known")
     if wish.what == "remove":
@@ -156,19 +183,31 @@ class CameraWriting:
         """Of the task, which is being opened."""
         self._just_copied = ""
         """What is said first of the plan in it."""
+        self._made: list[tuple[Wish, Writing]] = []
+        """What is in the file and can be taken back, the last one last."""
 
     def planned(self, wish: Wish, view: Writing) -> None:
-        if self._just_copied:
-            view, self._just_copied = replace(view, message=f"{self._just_copied} {view.message}"), ""
+        before = self.wish if self.view.stage == "planned" else None
+        first = self._just_copied
+        if before is not None and (before.what, before.key) != (wish.what, wish.key):
+            first = _left(before)
+        self._just_copied = ""
+        if first:
+            view = replace(view, message=f"{first} {view.message}")
         self.wish, self.view = wish, view
 
     def drop(self) -> None:
-        self.wish, self.view, self.copy, self._just_copied = None, Writing(), None, ""
+        if self.view.stage in MADE:
+            self._made.clear()
+        self.wish, self.view = self._made[-1] if self._made else (None, Writing())
+        self.copy, self._just_copied = None, ""
 
     def copied(self, copy: Path | None, view: Writing) -> None:
         """The task was copied, or not: the wish waits until its copy is there."""
         self.copy = copy
-        self.view = view if copy is not None else replace(view, key=self.view.key)
+        if copy is not None:
+            self._made.clear()  # of another file
+        self.view = replace(view, key=self.view.key, what=self.view.what)
         self._just_copied = "" if copy is None else f"This is your copy of the task, {copy}."
 
     def wish_for(self, task: TaskDescription) -> Wish | None:
@@ -190,7 +229,7 @@ class CameraWriting:
         from workbench.authoring import camera_source
 
         view = self.view
-        ready = view.stage == needs if needs else view.stage in ("written", "checked", "mismatch")
+        ready = view.stage == needs if needs else view.stage in MADE
         if view.edit is None or not ready:
             return False
         do: Callable[[SourceEdit], Refusal | None] = getattr(camera_source, how)
@@ -203,6 +242,10 @@ class CameraWriting:
         self.view = replace(
             view, stage=stage, refusal=None, message=message.format(file=file, was=_was(view.edit))
         )  # type: ignore[arg-type]
+        if stage == "undone":
+            del self._made[-1:]
+        elif self.wish is not None:
+            self._made.append((self.wish, self.view))
         return True
 
     @property
@@ -239,6 +282,7 @@ class CameraWriting:
                 stage="mismatch",
                 message=f"{wrong} Take the change back, or look at what else in the task places this camera.",
             )
+            self._made[-1:] = [(wish, self.view)]
             return
         done = {
             "add": f"{wish.key[1]} is in {file}, and the env has it.",
@@ -247,11 +291,14 @@ class CameraWriting:
             "duplicate": f"{wish.name} is in {file}, a copy of {wish.key[1]}.",
         }.get(wish.what, f"{wish.key[1]} is written to {file}, and the new env has it.")
         self.view = replace(view, stage="checked", message=done)
+        self._made[-1:] = [(wish, self.view)]
 
     def failed_to_load(self) -> None:
         if self.copy is not None:
             self.view = Writing(
-                "refused", message=f"{self.copy} was made, but does not load: mend or delete it."
+                "refused",
+                what=self.view.what,
+                message=f"{self.copy} was made, but does not load: mend or delete it.",
             )
         if self.awaited and self.view.edit is not None:
             file = self.view.edit.names

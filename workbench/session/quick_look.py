@@ -22,6 +22,8 @@ from workbench.session.camera_messages import CameraAnswer, CameraPictures, Draw
 from workbench.session.lane import Job, Lane
 from workbench.session.messages import Request
 
+MODALITIES = ("rgb", "depth", "segmentation")
+"""That a quick look has, whatever the camera's own shader gives."""
 _FIRST_NUMBER = 1_000_000_000
 """Of the questions asked here: another asker counts from 1, and both hear all answers."""
 
@@ -95,7 +97,7 @@ class QuickLook:
 
         def work(job: Job) -> None:
             question = DrawCamera(
-                0, sight.key, sight.settings, (sight.env,), ("rgb",), moment.poses, sight.scale
+                0, sight.key, sight.settings, (sight.env,), MODALITIES, moment.poses, sight.scale
             )
             try:
                 picture = self._asker.ask(question, job, CameraPictures).pictures[0]

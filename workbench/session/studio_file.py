@@ -46,9 +46,15 @@ class StudioFile:
             wish = Wish("edit", key, self._cameras.placements.now(key))
         self._plan(wish)
 
-    def plan_add(self, kind: CameraKind, name: str, settings: CameraSettings) -> None:
-        """Find the edit that adds a camera."""
-        self._plan(Wish("add", (kind, name), settings))
+    def plan_add(
+        self,
+        kind: CameraKind,
+        name: str,
+        settings: CameraSettings,
+        target: tuple[float, float, float] | None = None,
+    ) -> None:
+        """Find the edit that adds a camera; `target` is the point that it looks at, in the env's frame."""
+        self._plan(Wish("add", (kind, name), settings, target=target))
 
     def plan_duplicate(self, key: CameraKey, name: str) -> None:
         """Find the edit that adds a copy of a camera, placed as that one is now."""
@@ -112,9 +118,11 @@ class StudioFile:
         self._note()
 
     def drop_plan(self) -> None:
-        """Forget the plan (or the message about the last one)."""
+        """Forget the plan: the change before, which can be taken back, is spoken of again. Or forget that one."""
         with self._cameras.lock:
             self._writing.drop()
+            if self._cameras.task is not None:
+                self.loaded(self._cameras.task)  # what is spoken of again may have come in meanwhile
         self._note()
 
     # --- what the studio tells -------------------------------------------------------------------------

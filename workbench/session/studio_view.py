@@ -25,6 +25,10 @@ WritingStage = Literal["none", "planned", "refused", "written", "checked", "mism
 was written. ``mismatch``: it has something else. ``undone``: taken back out of the file."""
 
 
+Change = Literal["edit", "add", "duplicate", "rename", "remove"]
+"""Of a camera in the file."""
+
+
 @dataclass(frozen=True)
 class StudioCamera:
     """One camera, as the file has it and as it is placed."""
@@ -50,6 +54,7 @@ class Writing:
     stage: WritingStage = "none"
     key: CameraKey | None = None
     """Whose: of a camera that is added, the new one's."""
+    what: Change = "edit"
     edit: SourceEdit | None = None
     refusal: Refusal | None = None
     message: str = ""
@@ -105,6 +110,8 @@ class StudioView:
     """What `CameraStudio.undo` takes back, in words (``moved base_camera``); None if there is nothing."""
     redo: str | None = None
     writing: Writing = Writing()
+    first_sight: Picture | None = None
+    """What the camera would see whose addition is planned."""
     report: CameraReport | None = None
     """Of the last judgement."""
     report_of: CameraKey | None = None

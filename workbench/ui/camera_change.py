@@ -46,18 +46,19 @@ class CameraChange:
         self._copy.on_click(lambda _: session.studio.file.copy_task())
         self._drop.on_click(lambda _: session.studio.file.drop_plan())
 
-    def draw(self, writing: Writing, stale: bool, about: str = "") -> None:
+    def draw(self, writing: Writing, stale: bool, about: str = "", picture: str = "") -> None:
         """Show how far it is; a `Writing` of no stage and no message empties the box.
 
         Args:
             stale: the camera was moved since the plan was made.
             about: what else is to be said of the plan.
+            picture: address of what the camera would see that is to be added.
         """
         stage = writing.stage
         show(self._text, stage != "none" or bool(writing.message))
         show(self._copy, writing.can_copy)
         show(self._write, stage == "planned" and not stale)
-        show(self._drop, stage in ("planned", "refused", "undone"))
+        show(self._drop, stage not in ("none", "written"))
         show(self._undo, stage in DONE)
         name = "" if writing.edit is None else writing.edit.names
         _label(self._drop, LEAVE if stage == "planned" else CLOSE)
@@ -66,7 +67,11 @@ class CameraChange:
         fill(
             self._text,
             writing_html(
-                writing, stale, about if stage == "planned" else "", element_id(self._drop) if new else ""
+                writing,
+                stale,
+                about if stage == "planned" else "",
+                element_id(self._drop) if new else "",
+                picture if stage == "planned" else "",
             ),
         )
 
@@ -76,11 +81,14 @@ def _label(button: viser.GuiButtonHandle, label: str) -> None:
         button.label = label
 
 
-def writing_html(writing: Writing, stale: bool, about: str = "", scroll_to: str = "") -> str:
+def writing_html(
+    writing: Writing, stale: bool, about: str = "", scroll_to: str = "", picture: str = ""
+) -> str:
     """How far the change is; every value escaped.
 
     Args:
         scroll_to: id of the element that is to come into sight.
+        picture: address of one.
     """
     edit, refusal = writing.edit, writing.refusal
     files = [] if edit is None or writing.stage == "undone" else edit.changes
@@ -89,6 +97,7 @@ def writing_html(writing: Writing, stale: bool, about: str = "", scroll_to: str 
         message="The camera was moved since: show the change again." if stale else writing.message,
         mood="warn" if stale else MOODS.get(writing.stage, "plain"),
         about=about,
+        picture=picture,
         files=[(change.file, PurePath(change.file).name, diff_lines(change.diff)) for change in files],
         folded=writing.stage in DONE,
         notes=() if edit is None or writing.stage == "undone" else edit.notes,

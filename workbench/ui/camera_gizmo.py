@@ -10,6 +10,7 @@ While somebody holds it, it belongs to them: a pose that the server writes then 
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,8 +25,10 @@ from workbench.ui.placing import Placing
 
 LEFT_ALONE = 60.0
 """Seconds without a movement after which a gizmo that was never let go (a page that went away) is free again."""
-PIXELS = 75.0
-TARGET_PIXELS = 45.0
+PIXELS = 76.0
+TARGET_PIXELS = 44.0
+SIZES = (0.5, 32.0, PIXELS), (0.35, 24.0, TARGET_PIXELS)
+"""Of the eye's handle and the target's: its share of the distance between them on the screen, its least, its most."""
 SIGHT_COLOUR = (34, 139, 230)
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -112,8 +115,25 @@ class CameraGizmo:
             return
         pose = self._placing.frame(camera).to_view(camera.now)
         _move(self._camera, pose[:3], pose[3:] if self._own_axes() else UNTURNED)
+        target = self._placing.target_in_view(camera, camera.now)
         _move(self._eye, pose[:3], UNTURNED)
-        _move(self._target, self._placing.target_in_view(camera, camera.now), UNTURNED)
+        _move(self._target, target, UNTURNED)
+        if two:
+            self._keep_apart(pose[:3], target)
+
+    def _keep_apart(self, eye: Floats, target: Floats) -> None:
+        """As large as they can be without lying over each other, in the page that looks from farthest away."""
+        apart = [
+            pixels_apart(page.camera.position, page.camera.fov, page.camera.image_height, eye, target)
+            for page in self._server.get_clients().values()
+        ]
+        for handle, pixels in zip((self._eye, self._target), sizes(min(apart, default=np.inf)), strict=True):
+            if handle.scale != pixels:
+                handle.scale = pixels
+            few = pixels < PIXELS / 2
+            # Its planes are what hides most, and can be done without.
+            if handle.disable_sliders != few:
+                handle.disable_sliders = few
 
     def _draw_line(self, camera: StudioCamera | None) -> None:
         """From the eye to the target, which otherwise would be any three arrows in the air."""
@@ -206,6 +226,19 @@ class CameraGizmo:
         self._start = None
         if event.client is not None:
             event.client.add_notification("Not possible", str(error), color="orange", auto_close_seconds=6.0)
+
+
+def pixels_apart(viewer: Floats, fov: float, height: float, a: Floats, b: Floats) -> float:
+    """How far apart two points (3,) are on a screen of so many pixels, seen at an angle `fov` (radians) in all."""
+    to_a, to_b = a - viewer, b - viewer
+    angle = math.atan2(float(np.linalg.norm(np.cross(to_a, to_b))), float(to_a @ to_b))
+    return angle * height / fov
+
+
+def sizes(apart: float) -> tuple[float, float]:
+    """Pixels of the eye's handle and of the target's, for a distance of their middles on the screen."""
+    eye, target = (round(float(np.clip(share * apart, least, most)) / 4) * 4 for share, least, most in SIZES)
+    return eye, target
 
 
 def _move(handle: viser.TransformControlsHandle, position: Floats, wxyz: Floats) -> None:

@@ -267,7 +267,8 @@ def report_html(
         before=standing.before,
         new=standing.new,
         over=over,
-        how=f"{report.pictures} pictures of {width} × {height} in {report.milliseconds / 1000:.1f} s",
+        how=f"{report.pictures} pictures of {width} × {height} in {report.milliseconds / 1000:.1f} s: each as it is, "
+        "without the robot if that is in it, and of each object alone",
         unit=unit,
         moments=moments,
         headline=words.headline(report, unit),

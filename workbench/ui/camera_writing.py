@@ -8,25 +8,31 @@ plan says where the camera stood when it was made; if the camera was moved since
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Callable
 from dataclasses import replace
 
 import viser
 
-from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.core.camera_settings import CameraKey, CameraKind, CameraSettings
+from workbench.core.pictures import Picture
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioView, Writing
 from workbench.ui.camera_change import CameraChange
-from workbench.ui.changed import show
+from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_text
-from workbench.ui.first_place import first_place, objects_in
+from workbench.ui.first_place import FirstPlace, aimed_at, first_place, objects_in
 from workbench.ui.fragments import render
+from workbench.ui.inline_pictures import data_address
 from workbench.ui.placing import Placing
 
 DUPLICATE, RENAME, REMOVE = "Duplicate", "Rename", "Remove"
 ADD_SENSOR, ADD_HUMAN = "Add a sensor", "Add one for people"
-WHERE = "A new sensor looks at the task's objects from the side that you look from; one for people stands where you look from."
+WHERE = (
+    "A new sensor looks at the task's objects from the side that you look from; one for people stands where you look "
+    "from. Its picture comes with the change, before anything is written."
+)
 LONGEST_NAME = 64
 NEW = CameraSettings(
     position=(0.0, 0.0, 0.0),
@@ -39,7 +45,10 @@ NEW = CameraSettings(
     far=100.0,
     shader_pack="minimal",
 )
-"""A camera that is added, but for its place: what ManiSkill's own tasks have."""
+"""A camera that is added to a task that has none of its kind, but for its place: what ManiSkill's own tasks have."""
+NEW_NAMES = {"sensor": "side_camera", "human": "render_camera"}
+PREVIEW = 256
+"""Pixels of the longer side of the new camera's picture."""
 
 FromViewer = Callable[[viser.ClientHandle, CameraSettings], CameraSettings]
 
@@ -67,18 +76,26 @@ class CameraWriting:
         self._name: viser.GuiTextHandle | None = None
         self._with_chosen: viser.GuiButtonGroupHandle | None = None
         self._member_change: CameraChange | None = None
-        self._of_members = False
-        """The change was asked for in the folder that adds and removes."""
+        self._why_not: viser.GuiHtmlHandle | None = None
         self._before: Writing | None = None
-        """What there was when it was asked for, which is not to be shown as its answer."""
+        """What there was when something was asked for, which is not to be shown as its answer."""
+        self._named: Writing | None = None
+        """The last change after which the field for a name was emptied."""
+        self._sight: tuple[Picture, str] | None = None
+        """The last picture of a camera to be added, and its address."""
 
     def add_members(self) -> None:
         """The folder that adds, copies, renames and removes: last in the tab, since it is wanted least."""
         gui = self._server.gui
         with gui.add_folder("Add, copy, rename, remove", expand_by_default=False):
-            self._name = gui.add_text("New name", "", hint="Letters, digits, - and _.")
+            self._name = gui.add_text(
+                "New name",
+                "",
+                hint="Letters, digits, - and _. A camera that is added without one is given one.",
+            )
             self._with_chosen = gui.add_button_group("", (DUPLICATE, RENAME, REMOVE), visible=False)
             add = gui.add_button_group("", (ADD_SENSOR, ADD_HUMAN))
+            self._why_not = gui.add_html("", visible=False)
             gui.add_html(render("aside", text=WHERE))
             self._member_change = CameraChange(self._server, self._session)
         self._with_chosen.on_click(self._on_member)
@@ -101,7 +118,8 @@ class CameraWriting:
     ) -> None:
         """Note what is asked for and where, and then ask: the answer may come at once."""
         self._planned, self._about = (key, placed), about
-        self._of_members, self._before = of_members, self._session.view().studio.writing
+        self._before = self._session.view().studio.writing
+        self._say("")
         change = self._member_change if of_members else self._change
         if change is not None:
             change.arrival.asked(self._before)
@@ -111,34 +129,44 @@ class CameraWriting:
         try:
             self._plan_member(event.target.value, event.client)
         except ValueError as error:
-            if event.client is not None:
-                event.client.add_notification(
-                    "Not possible", str(error), color="orange", auto_close_seconds=6.0
-                )
+            self._say(str(error))
+
+    def _say(self, why_not: str) -> None:
+        """Beside the buttons that were pressed, where one looks."""
+        if self._why_not is not None:
+            show(self._why_not, bool(why_not))
+            fill(self._why_not, render("warning", text=why_not) if why_not else "")
 
     def _plan_member(self, what: object, client: viser.ClientHandle | None) -> None:
         file, view = self._session.studio.file, self._session.view()
         chosen = view.studio.chosen
         if what in (ADD_SENSOR, ADD_HUMAN) and client is not None:
             kind = "sensor" if what == ADD_SENSOR else "human"
-            key = (kind, self._checked_name(view.studio, kind))
+            key = (kind, self._checked_name(view.studio, kind, NEW_NAMES[kind]))
+            seen_from, (names, places) = (
+                self._from_viewer(client, lens_of_siblings(view.studio, kind)),
+                objects_in(view),
+            )
             if kind == "sensor":
-                place = first_place(self._from_viewer(client, NEW), *objects_in(view))
-                settings, about = place.settings, place.words
+                place = first_place(seen_from, names, places)
             else:
-                settings, about = self._from_viewer(client, replace(NEW, width=512, height=512)), ""
-            self._ask(key, None, lambda: file.plan_add(kind, key[1], settings), True, about)
+                place = FirstPlace(seen_from, "", aimed_at(seen_from, places))
+            add = self._session.studio.plan_add
+            self._ask(key, None, lambda: add(kind, key[1], place.settings, place.target), True, place.words)
         elif chosen is None:
             raise ValueError("Choose the camera first.")
         elif what == REMOVE:
             self._ask(chosen.key, chosen.now, lambda: file.plan_remove(chosen.key), True)
         elif what in (DUPLICATE, RENAME):
-            name = self._checked_name(view.studio, chosen.key[0])
+            name = self._checked_name(view.studio, chosen.key[0], chosen.key[1] if what == DUPLICATE else "")
             plan = file.plan_duplicate if what == DUPLICATE else file.plan_rename
             self._ask(chosen.key, chosen.now, lambda: plan(chosen.key, name), True)
 
-    def _checked_name(self, view: StudioView, kind: str) -> str:
+    def _checked_name(self, view: StudioView, kind: CameraKind, like: str) -> str:
+        """The name that was typed, or a free one like another; `ValueError` where neither is there."""
         name = checked_text("" if self._name is None else self._name.value, LONGEST_NAME, "name").strip()
+        if not name and like:
+            return free_name(view, kind, like)
         if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_-]*", name):
             raise ValueError(
                 "Type a new name first: letters, digits, - and _."
@@ -155,23 +183,36 @@ class CameraWriting:
         chosen, writing = studio.chosen, studio.writing
         stale = self._is_stale(studio)
         can_place = chosen is not None and not chosen.refused
-        wants_plan = (
-            chosen is not None
-            and can_place
-            and chosen.moved
-            and writing.stage != "written"
-            and (writing.stage != "planned" or stale or self._of_members)
-        )
+        if writing is not self._before:
+            self._before = None
+        of_members = writing.what != "edit"
         # Not at the place of the button that writes: a second press must not write what was not read.
-        show(self._plan, can_place and (writing.stage != "planned" or stale or self._of_members))
+        can_plan = can_place and (writing.stage != "planned" or stale or of_members)
+        wants_plan = can_plan and chosen is not None and chosen.moved and writing.stage != "written"
+        show(self._plan, can_plan)
         if self._plan.disabled == wants_plan:
             self._plan.disabled = not wants_plan
-        for change, here in ((self._change, not self._of_members), (self._member_change, self._of_members)):
+        for change, here in ((self._change, not of_members), (self._member_change, of_members)):
             if change is not None:
-                shown = here and writing is not self._before
-                change.draw(writing if shown else Writing(), stale and shown, self._about)
+                shown = here and self._before is None
+                change.draw(
+                    writing if shown else Writing(), stale and shown, self._about, self._address(studio)
+                )
+        if writing.stage == "checked" and of_members and writing is not self._named:
+            self._named = writing
+            if self._name is not None and self._name.value:
+                self._name.value = ""  # it is taken now
         if self._with_chosen is not None:
             show(self._with_chosen, chosen is not None)
+
+    def _address(self, studio: StudioView) -> str:
+        """Of the picture of the camera that is to be added; empty while there is none."""
+        picture = studio.first_sight
+        if picture is None or picture.rgb is None:
+            return ""
+        if self._sight is None or self._sight[0] is not picture:
+            self._sight = picture, data_address(picture.rgb, PREVIEW)
+        return self._sight[1]
 
     def _is_stale(self, studio: StudioView) -> bool:
         """The camera was moved since the plan for it was made."""
@@ -180,3 +221,18 @@ class CameraWriting:
         key, placed = self._planned
         camera = studio.camera(key)
         return placed is not None and camera is not None and camera.now != placed
+
+
+def lens_of_siblings(studio: StudioView, kind: CameraKind) -> CameraSettings:
+    """A camera like the first of its kind that stands still, as the file has it; else as ManiSkill's tasks have them."""
+    for camera in studio.cameras:
+        if camera.key[0] == kind and camera.info.mount is None and camera.info.settings is not None:
+            return camera.info.settings
+    return NEW if kind == "sensor" else replace(NEW, width=512, height=512)
+
+
+def free_name(studio: StudioView, kind: CameraKind, like: str) -> str:
+    """`like`, or with a number at its end, that no camera of the kind has."""
+    taken = {camera.key for camera in studio.cameras}
+    names = itertools.chain([like], (f"{like}_{number}" for number in itertools.count(2)))
+    return next(name for name in names if (kind, name) not in taken)

@@ -27,6 +27,8 @@ NEAREST = 0.6
 """Metres from which a hand that reaches for one small thing is in the picture too."""
 NEAR_ENOUGH = 1.5
 """Times the distance that is wanted, up to which an eye stays where it is."""
+NEAREST_TARGET = 0.1
+"""Metres."""
 MOST_NAMES = 3
 
 
@@ -35,6 +37,8 @@ class FirstPlace:
     settings: CameraSettings
     words: str
     """Where that is, a sentence."""
+    target: tuple[float, float, float] | None = None
+    """The point on its line of sight that is nearest to the objects; None if they are not before it."""
 
 
 def first_place(seen_from: CameraSettings, names: tuple[str, ...], places: NDArray[np.float64]) -> FirstPlace:
@@ -55,13 +59,28 @@ def first_place(seen_from: CameraSettings, names: tuple[str, ...], places: NDArr
     wanted = max(NEAREST, ROOM * reach / math.sin(fov / 2))
     away = float(np.linalg.norm(middle - pose[:3]))
     if away <= NEAR_ENOUGH * wanted:
-        return FirstPlace(seen_from, stays)
+        return FirstPlace(seen_from, stays, aimed_at(seen_from, places))
     x, y, z = rounded(middle - wanted * axes_of(pose[3:])[0], 4)
     told = ", ".join(names[:MOST_NAMES]) + (" and others" if len(names) > MOST_NAMES else "")
+    settings = replace(seen_from, position=(x, y, z))
     return FirstPlace(
-        replace(seen_from, position=(x, y, z)),
+        settings,
         f"It looks from your side at {told} from {wanted:.2f} m; you look from {away:.1f} m away.",
+        aimed_at(settings, places),
     )
+
+
+def aimed_at(settings: CameraSettings, places: NDArray[np.float64]) -> tuple[float, float, float] | None:
+    """The point ahead of a camera that is nearest to the middle of some places (K, 3); None if that is behind it."""
+    if not len(places):
+        return None
+    pose = pose_of(settings)
+    forward = axes_of(pose[3:])[0]
+    distance = float((np.median(places, axis=0) - pose[:3]) @ forward)
+    if distance < NEAREST_TARGET:
+        return None
+    x, y, z = (pose[:3] + distance * forward).tolist()
+    return x, y, z
 
 
 def objects_in(view: SessionView) -> tuple[tuple[str, ...], NDArray[np.float64]]:

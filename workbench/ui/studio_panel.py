@@ -51,6 +51,13 @@ STEP = 0.01
 """Metres by which a key moves the camera."""
 TURN = 1.0
 """Degrees by which a key turns it."""
+PLACE = (
+    "move, turn: its pose. Move it, and what it looks at goes along; or turn it.\n"
+    "eye and target: move the eye, and it goes on looking at its target; or move the target."
+)
+ALONG = "Along which axes it is moved and turned. The camera's own: red is forward, green left, blue up."
+STEPS = "In which it is dragged."
+SIZE = "Of the picture above, for a quick look. The camera keeps its own."
 VARIES = "Its pose differs between envs, or the task moves it: what is placed here holds for all of them until then."
 IN_ITS_EYE = "You look from where it stands. Move the view, and its handles appear."
 
@@ -212,20 +219,9 @@ class StudioPanel:
         rows = [
             [
                 self._tool(
-                    "Back to my view" if looks else "Look through it",
-                    "The view goes back to where it was."
-                    if looks
-                    else "The view goes to where the camera is.",
-                    "look",
-                    self._look.toggle,
-                    on=looks,
+                    "Back to my view" if looks else "Look through it", "", "look", self._look.toggle, on=looks
                 ),
-                self._tool(
-                    "Put it where I look",
-                    "The camera goes to where the view is; its lens stays.",
-                    "put",
-                    self._put,
-                ),
+                self._tool("Put it where I look", "", "put", self._put),
             ],
             [
                 self._tool(
@@ -260,56 +256,30 @@ class StudioPanel:
         studio = self._session.studio
         rows = [
             [
-                {"label": "Place"},
-                self._tool(
-                    "move, turn",
-                    "Its pose: move it, and what it looks at goes along; or turn it.",
-                    "move",
-                    self._sets(look_at=False),
-                    not self._look_at,
-                ),
-                self._tool(
-                    "eye and target",
-                    "Move the eye and it goes on looking at its target; or move the target.",
-                    "look at",
-                    self._sets(look_at=True),
-                    self._look_at,
-                ),
+                {"label": "Place", "hint": PLACE},
+                self._tool("move, turn", "", "move", self._sets(look_at=False), not self._look_at),
+                self._tool("eye and target", "", "look at", self._sets(look_at=True), self._look_at),
             ],
             [
-                {"label": "Along"},
+                {"label": "Along", "hint": ALONG},
                 self._tool(
-                    "world",
-                    "The world's axes.",
-                    "world",
-                    self._sets(own_axes=False),
-                    not self._own_axes,
-                    self._look_at,
+                    "world", "", "world", self._sets(own_axes=False), not self._own_axes, self._look_at
                 ),
-                self._tool(
-                    "camera",
-                    "Its own: red is forward, green left, blue up.",
-                    "own",
-                    self._sets(own_axes=True),
-                    self._own_axes,
-                    self._look_at,
-                ),
+                self._tool("camera", "", "own", self._sets(own_axes=True), self._own_axes, self._look_at),
             ],
             [
-                {"label": "Steps"},
+                {"label": "Steps", "hint": STEPS},
                 *(
-                    self._tool(
-                        name, "Of what is dragged.", f"snap {name}", self._sets(snap=snap), self._snap == snap
-                    )
+                    self._tool(name, "", f"snap {name}", self._sets(snap=snap), self._snap == snap)
                     for name, snap in SNAPS.items()
                 ),
             ],
             [
-                {"label": "Shows"},
+                {"label": "Shows", "hint": "What the picture above is of."},
                 *(
                     self._tool(
                         KINDS.get(kind, kind),
-                        "Of the picture above.",
+                        "",
                         f"kind {kind}",
                         lambda _, kind=kind: self._picture.show_kind(kind),
                         self._picture.shows == kind,
@@ -318,13 +288,11 @@ class StudioPanel:
                 ),
             ],
             [
-                {"label": "Size"},
+                {"label": "Size", "hint": SIZE},
                 *(
                     self._tool(
                         name,
-                        "In the camera's own size."
-                        if of == 1
-                        else "The picture above in another size, for a quick look. The camera keeps its own.",
+                        "",
                         f"quick {name}",
                         lambda _, of=of: studio.set_quick_scale(of),
                         scale == of,

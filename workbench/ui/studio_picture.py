@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from workbench.core.camera_settings import CameraKey
 from workbench.core.pictures import Picture
+from workbench.session.quick_look import MODALITIES as IN_A_QUICK_LOOK
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.cameras_panel import FASTEST, modalities_of
@@ -57,8 +58,8 @@ class StudioPicture:
         studio, key = view.studio, view.studio.selected
         chosen = studio.chosen
         quick = studio.quick_scale != 1.0
-        # The quick look has colours only.
-        self.kinds = (COLOUR,) if chosen is None or quick else modalities_of(chosen.info)
+        gives = (COLOUR,) if chosen is None else modalities_of(chosen.info)
+        self.kinds = tuple(kind for kind in gives if not quick or kind in IN_A_QUICK_LOOK)
         picture = None if key is None else view.pictures.get(key)
         if quick:
             picture = studio.quick

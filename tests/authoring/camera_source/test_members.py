@@ -18,6 +18,7 @@ from workbench.authoring.camera_source import (
     plan_rename,
 )
 from workbench.authoring.camera_source.rotations import unit
+from workbench.core.camera_frames import LookAt, pose_from_look_at, with_pose
 from workbench.core.camera_settings import CameraSettings
 from workbench.core.pictures import CameraKind
 
@@ -142,6 +143,69 @@ def test_settings_are_those_that_are_written() -> None:
     assert isinstance(plan, SourceEdit) and plan.settings is not None
     assert plan.settings.position == (0.3333, 0.0, 0.6667) and plan.settings.fov == 1.2346
     assert close(plan.settings, cameras(plan.new_text)[SENSOR, "added"])
+
+
+def hook(body: str) -> str:
+    return f"{HEADER}class Task(Base):\n    @property\n    def {SENSOR}(self):\n{body}"
+
+
+BESIDE_LOOK_AT = """\
+        pose = sapien_utils.look_at(eye=[0.45, 0, 0.6], target=[0.08, 0, 0])
+        return [CameraConfig("cam", pose=pose, width=128, height=128, fov=1.0, near=0.01, far=10)]
+"""
+
+
+def test_a_new_camera_is_written_as_its_sibling_is_and_stands_in_a_line_as_that_does() -> None:
+    wanted = with_pose(NEW, pose_from_look_at(LookAt((0.51234, 0.3, 0.6), (0.08, 0.0, 0.02))))
+    plan = plan_add({FILE: hook(BESIDE_LOOK_AT)}, FILE, "Task", "sensor", "side", wanted, (0.08, 0.0, 0.02))
+    assert isinstance(plan, SourceEdit)
+    assert (
+        """\
+        return [
+            CameraConfig("cam", pose=pose, width=128, height=128, fov=1.0, near=0.01, far=10),
+            CameraConfig(
+                "side",
+                pose=sapien_utils.look_at(eye=[0.5123, 0.3, 0.6], target=[0.08, 0.0, 0.02]),
+                width=64,
+"""
+        in plan.new_text
+    )
+    assert plan.settings is not None and close(plan.settings, cameras(plan.new_text)[SENSOR, "side"])
+
+
+@pytest.mark.parametrize("forward", [(0, 0, -1), (0, 0, 1)])
+def test_straight_down_and_up_look_at_is_not_used(forward: tuple[float, float, float]) -> None:
+    x, y, z = forward
+    wanted = with_pose(NEW, pose_from_look_at(LookAt((0.1, 0.2, 0.9), (0.1 + x, 0.2 + y, 0.9 + z))))
+    plan = plan_add({FILE: hook(BESIDE_LOOK_AT)}, FILE, "Task", "sensor", "side", wanted)
+    assert isinstance(plan, SourceEdit) and "q=[" in plan.diff
+    assert close(wanted, cameras(plan.new_text)[SENSOR, "side"])
+
+
+@pytest.mark.parametrize(
+    "held",
+    [
+        "[CAM, CAM2]",
+        "[CAM, (CAM2),]",
+        "(CAM, CAM2)",
+        "CAM, CAM2",
+        "(CAM,)  # one",
+        "dict(cam=CAM, cam2=CAM2)",
+        '{"cam": CAM , "cam2" : CAM2 ,}',
+    ],
+)
+def test_what_stands_on_one_line_gets_a_line_each(held: str) -> None:
+    for name in ("cam2", "cam"):
+        camera = f'CameraConfig("{name}", sapien.Pose([0, 0, 1]), 8, 8, 1.0)'
+        held = held.replace(name.upper(), camera)
+    source = hook(f"        return {held}\n")
+    plan = plan_add({FILE: source}, FILE, "Task", "sensor", "added", NEW)
+    assert isinstance(plan, SourceEdit), plan
+    assert same_cameras(cameras(plan.new_text), cameras(source) | {(SENSOR, "added"): NEW}), plan.diff
+    indents = [
+        len(line) - len(line.lstrip()) for line in plan.new_text.splitlines() if "CameraConfig(" in line
+    ]
+    assert set(indents) == {12}, plan.diff
 
 
 def test_tidy_text_comes_of_it() -> None:

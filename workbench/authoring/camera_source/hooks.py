@@ -10,7 +10,7 @@ import libcst as cst
 from workbench.authoring.camera_source.bindings import Binding
 from workbench.authoring.camera_source.definitions import Project
 from workbench.authoring.camera_source.result import Refused
-from workbench.authoring.camera_source.snippet import repr_text, snippet
+from workbench.authoring.camera_source.snippet import repr_text
 from workbench.authoring.camera_source.source_file import Replacement, SourceFile, walk
 from workbench.authoring.camera_source.write_pose import import_place
 from workbench.core.camera_settings import CameraSettings
@@ -27,9 +27,11 @@ _CONFIG = "from mani_skill.sensors.camera import CameraConfig\n"
 
 
 def needed_imports(
-    project: Project, file: SourceFile, settings: CameraSettings
+    project: Project, file: SourceFile, settings: CameraSettings, with_sapien: bool = True
 ) -> tuple[list[Replacement], list[str]]:
-    wanted = [("CameraConfig", _CONFIG), ("sapien", "import sapien\n")]
+    wanted = [("CameraConfig", _CONFIG)]
+    if with_sapien:
+        wanted.append(("sapien", "import sapien\n"))
     if settings.intrinsic is not None:
         wanted.append(("np", "import numpy as np\n"))
     bindings = project.bindings(file, file.module)
@@ -80,6 +82,13 @@ def appended(
     """`text(indent)` as one more of what `value` holds."""
     line = file.line_text(file.line(value))
     indent = line[: len(line) - len(line.lstrip())]
+    if isinstance(value, cst.Tuple) and not value.lpar:
+        # It has no brackets to put one more into.
+        start, end = file.span(value)
+        own = indent + "    "
+        held = [file.code(element.value).replace("\n", "\n    ") for element in value.elements]
+        lines = "".join(f"{own}{line},\n" for line in (*held, text(own)))
+        return [Replacement(start, end, f"[\n{lines}{indent}]")]
     if isinstance(value, (cst.List, cst.Tuple)):
         start, end = file.span(value)
         return _into_brackets(file, value.elements, start, end, indent, text)
@@ -120,12 +129,25 @@ def _into_brackets(file: SourceFile, elements, start: int, end: int, indent: str
     own = indent + "    "
     if comma:
         last_end = file.text.index(",", last_end) + 1
-    return [Replacement(last_end, close, f"{'' if comma else ','}\n{own}{text(own)},\n{indent}")]
+    found = []
+    if closing == file.line_at(start):
+        # What stood on one line gets a line each, or the first would share one with the bracket.
+        gaps = [start + 1, *(file.text.index(",", file.span(e.value)[1]) + 1 for e in elements[:-1])]
+        found = [
+            Replacement(gap, _start_of(file, element), f"\n{own}")
+            for gap, element in zip(gaps, elements, strict=True)
+        ]
+    return [*found, Replacement(last_end, close, f"{'' if comma else ','}\n{own}{text(own)},\n{indent}")]
+
+
+def _start_of(file: SourceFile, element: cst.CSTNode) -> int:
+    return (file.span(element.value) if isinstance(element, cst.Element) else file.inner_span(element))[0]
 
 
 def new_hook(
-    project: Project, file: SourceFile, cls: cst.ClassDef, hook: Hook, uid: str, settings: CameraSettings
+    project: Project, file: SourceFile, cls: cst.ClassDef, hook: Hook, text: Callable[[str], str]
 ) -> list[Replacement]:
+    """The hook, which returns the one camera that `text(indent)` is."""
     if not isinstance(cls.body, cst.IndentedBlock) or not cls.body.body:
         raise Refused(f"the class {cls.name.value} has no body to add {hook} to")
     for where, parent in project.above(file, cls, []):
@@ -147,8 +169,8 @@ def new_hook(
     end = file.text.find("\n", end)
     at = len(file.text) if end < 0 else end + 1
     lead = "\n" if end >= 0 else "\n\n"
-    text = (
+    new = (
         f"{lead}{indent}@property\n{indent}def {hook}(self):\n{inner}return [\n"
-        f"{inner}    {snippet(uid, settings, inner + '    ')},\n{inner}]\n"
+        f"{inner}    {text(inner + '    ')},\n{inner}]\n"
     )
-    return [Replacement(at, at, text)]
+    return [Replacement(at, at, new)]

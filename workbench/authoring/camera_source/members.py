@@ -25,7 +25,9 @@ from workbench.authoring.camera_source.read_camera import FIELDS, ReadCamera, mi
 from workbench.authoring.camera_source.result import Refusal, Refused, SourceEdit
 from workbench.authoring.camera_source.snippet import repr_text, snippet
 from workbench.authoring.camera_source.source_file import Replacement, SourceFile
+from workbench.authoring.camera_source.values import PoseValue
 from workbench.authoring.camera_source.wanted import check_wanted
+from workbench.authoring.camera_source.write_pose import look_at_text
 from workbench.core.camera_settings import CallSite, CameraSettings
 from workbench.core.pictures import CameraKind
 
@@ -37,8 +39,12 @@ def plan_add(
     kind: CameraKind,
     uid: str,
     settings: CameraSettings,
+    target: tuple[float, float, float] | None = None,
 ) -> SourceEdit | Refusal:
-    """A new camera that stands still, in the hook of `class_name`, which is made if the class has none."""
+    """A new camera that stands still, in the hook of `class_name`, which is made if the class has none.
+
+    Its pose is written as its siblings' is, where that can say it; `target` is the point that it looks at then.
+    """
     try:
         check_wanted(settings)
     except Refused as refused:
@@ -46,7 +52,7 @@ def plan_add(
     try:
         project = Project(sources)
         _check_uid(project, uid, kind, file, class_name)
-        return _add(project, file, class_name, kind, uid, settings)
+        return _add(project, file, class_name, kind, uid, settings, target)
     except Refused as refused:
         return Refusal(refused.reason, snippet(uid, settings))
 
@@ -163,6 +169,7 @@ def _add(
     kind: CameraKind,
     uid: str,
     settings: CameraSettings,
+    target: tuple[float, float, float] | None,
 ) -> SourceEdit:
     file = project.file(path)
     check_own(path)
@@ -171,17 +178,35 @@ def _add(
     )
     if cls is None:
         raise Refused(f"there is no class {class_name} in {file.name}")
-    imports, notes = needed_imports(project, file, settings)
     hook = HOOK_OF[kind]
+    name = _siblings_look_at(project, file, hook)
+    pose = name and look_at_text(name, settings, target) or ""
+    imports, notes = needed_imports(project, file, settings, with_sapien=not pose)
+
+    def text(indent: str) -> str:
+        return snippet(uid, settings, indent, pose=pose)
+
     functions = [n for n in cls.body.body if isinstance(n, cst.FunctionDef) and n.name.value == hook]
     if functions:
         value = returned(file, functions[-1])
-        replacement = appended(file, value, uid, lambda indent: snippet(uid, settings, indent))
+        replacement = appended(file, value, uid, text)
     else:
-        replacement = new_hook(project, file, cls, hook, uid, settings)
+        replacement = new_hook(project, file, cls, hook, text)
     new_text = file.replaced([*imports, *replacement])
     found = _check(project, file, None, new_text, uid)
     return SourceEdit(file.path, file.text, new_text, tuple(notes), _as_written(found, settings))
+
+
+def _siblings_look_at(project: Project, file: SourceFile, hook: str) -> str:
+    """How a camera of this file calls look_at, one of that hook before others; empty if none does."""
+    calls = sorted(camera_calls(project, file), key=lambda call: call.hook != hook)
+    for pose in (read.values.get("pose") for call in calls for read in readings(project, call)):
+        if isinstance(pose, PoseValue) and pose.form == "look_at" and pose.at.file is file:
+            assert isinstance(pose.at.node, cst.Call)
+            name = file.code(pose.at.node.func)
+            if name.partition(".")[0] in project.bindings(file, file.module):
+                return name
+    return ""
 
 
 def _insert_beside(

@@ -14,15 +14,18 @@ from workbench.authoring.camera_source.number_text import (
 from workbench.core.camera_settings import CameraSettings
 
 
-def snippet(uid: str, settings: CameraSettings, indent: str = "", more: Sequence[str] = ()) -> str:
+def snippet(
+    uid: str, settings: CameraSettings, indent: str = "", more: Sequence[str] = (), pose: str = ""
+) -> str:
     """``CameraConfig(...)``, an argument a line, with `more` of them as they are.
 
-    It needs ``import sapien``, and numpy as np for an intrinsic.
+    It needs ``import sapien`` unless the `pose` is given as a text of its own, and numpy as np for an intrinsic.
     """
     quaternion = ", ".join(quaternion_texts(settings.quaternion))
+    pose = pose or f"sapien.Pose(p={list_text(settings.position, 4)}, q=[{quaternion}])"
     lines = [
         repr_text(uid),
-        f"pose=sapien.Pose(p={list_text(settings.position, 4)}, q=[{quaternion}])",
+        f"pose={pose}",
         f"width={settings.width}",
         f"height={settings.height}",
     ]

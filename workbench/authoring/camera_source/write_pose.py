@@ -132,6 +132,24 @@ def _look_at(changes: Changes, pose: PoseValue, after: CameraSettings, aim: Trip
     return False
 
 
+def look_at_text(name: str, settings: CameraSettings, aim: Triple | None) -> str | None:
+    """A new camera's pose as a call of `name`, which is a look_at; None if that cannot say it.
+
+    Args:
+        aim: the point that it looks at; else it is one a metre ahead.
+    """
+    forward = rotations.matrix(settings.quaternion)[:, 0]
+    ahead = [float(x) for x in settings.position + forward]
+    if abs(_cosine(forward.tolist(), (0.0, 0.0, 1.0))) > math.cos(1e-3):
+        return None
+    for target in (ahead,) if aim is None else (aim, ahead):
+        for decimals in _METRES:
+            eye, point = ([round(x, decimals) for x in numbers] for numbers in (settings.position, target))
+            if rotations.angle_between(rotations.look_at(eye, point), settings.quaternion) <= ANGLE_STEP:
+                return f"{name}(eye={list_text(eye, decimals)}, target={list_text(point, decimals)})"
+    return None
+
+
 def _as_quaternion(changes: Changes, project: Project, pose: PoseValue, after: CameraSettings) -> None:
     """A pose in place of a look_at, with the author's own expression for where the camera stands."""
     file, node = pose.at.file, pose.at.node
