@@ -46,6 +46,8 @@ def test_a_group_of_many_is_one_name_that_the_command_takes() -> None:
 
 
 def test_what_is_there_is_not_asked_for(tmp_path: Path) -> None:
+    with pytest.raises(MissingAssets):
+        require_assets("PickSingleYCB", ["ycb"], "panda")
     (tmp_path / "assets" / "mani_skill2_ycb").mkdir(parents=True)
     require_assets("PickSingleYCB", ["ycb"], "panda")
     require_assets("Nothing", [])

@@ -30,5 +30,11 @@ def test_a_batch_that_does_not_fit_is_refused_with_the_number_that_does() -> Non
         make_env(task, EnvOptions(1024, "cpu", render=False))
 
 
-def test_what_fits_is_not_refused() -> None:
+def test_what_fits_is_not_refused_and_one_more_is() -> None:
     require_scenes(500)
+    with pytest.raises(ValueError, match=r"\d+ are left here") as caught:
+        require_scenes(1024)
+    room = int(str(caught.value).split(" are left here")[0].split()[-1])
+    require_scenes(room)
+    with pytest.raises(ValueError, match=f"{room} are left here"):
+        require_scenes(room + 1)

@@ -66,6 +66,13 @@ def run(task: type, strict: Any = True, **kwargs: Any) -> BaseEnv:
 ACTION = np.full((N, 8), 0.3, np.float32)
 
 
+def keeps(task: type) -> None:
+    """Nothing is told, and every step and reset was made."""
+    env = run(task)
+    assert env.elapsed_steps.tolist() == [4, 1, 4]
+    env.close()
+
+
 def breaks(task: type, words: str, **kwargs: Any) -> pytest.ExceptionInfo[Exception]:
     with pytest.raises(BrokenRule, match=words) as caught:
         run(task, **kwargs).close()
@@ -167,7 +174,7 @@ def test_a_write_in_evaluate_is_told_at_its_line_by_the_next_step(write: Hook) -
 
 
 def test_drive_targets_set_in_evaluate_are_applied_with_the_next_action() -> None:
-    run(pick_cube(evaluate=lambda self: set_targets(self))).close()
+    keeps(pick_cube(evaluate=lambda self: set_targets(self)))
 
 
 def test_a_write_that_a_reset_of_other_envs_would_apply_is_told() -> None:
@@ -193,7 +200,7 @@ def test_the_same_writes_applied_are_no_fault() -> None:
             self.scene.px.gpu_update_articulation_kinematics()
             self.scene._gpu_fetch_all()
 
-    run(pick_cube(_before_control_step=apply)).close()
+    keeps(pick_cube(_before_control_step=apply))
 
 
 def test_without_strict_mode_the_write_is_lost_as_on_the_gpu() -> None:
@@ -438,7 +445,7 @@ def test_a_tensor_of_the_task_that_loses_its_rows_is_told() -> None:
         self.target[env_idx] = torch.rand((len(env_idx), 3))
 
     breaks(pick_cube(_initialize_episode=replace), r"left self.target with a row for each of the 1 envs")
-    run(pick_cube(_initialize_episode=write)).close()
+    keeps(pick_cube(_initialize_episode=write))
 
 
 # --- behind the tensors ------------------------------------------------------------------------------
@@ -639,6 +646,7 @@ def test_built_in_tasks_that_keep_the_rules_hear_nothing(env_id: str) -> None:
         env.step(env.action_space.sample())
     env.reset(options={"env_idx": torch.tensor([0, 2])})
     env.step(env.action_space.sample())
+    assert env.elapsed_steps.tolist() == [1, 6, 1]
     env.close()
 
 

@@ -23,7 +23,7 @@ def test_the_first_body_that_moves_elsewhere_and_when() -> None:
     b.reward[3:] *= 2
     found = difference(a, b, (0, 0))
     assert found.bodies is not None and found.bodies.position == 6 and found.body == "arm/hand"
-    assert "20 mm" in found.bodies.first and "500 mm (cube)" in found.bodies.most
+    assert "2 cm" in found.bodies.first and "50 cm (cube)" in found.bodies.most
     differing = [(p.name, p.position) for p in found.numbers if p.position is not None]
     assert differing == [("reward", 4), ("success", 9)]
     reward = found.numbers[0]

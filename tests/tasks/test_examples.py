@@ -102,4 +102,6 @@ def test_unsupported_rewards_are_refused_and_not_made_up(make: Make) -> None:
 def test_it_builds_and_steps_with_rendering(name: str, make: Make, render_system: object) -> None:
     env = make(name, render_backend="cpu")
     env.reset(seed=0)
-    env.step(env.action_space.sample())
+    _, reward, terminated, _, info = env.step(env.action_space.sample())
+    assert torch.isfinite(reward).all() and reward.shape == terminated.shape
+    assert info["elapsed_steps"].unique().tolist() == [1]

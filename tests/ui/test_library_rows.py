@@ -150,8 +150,8 @@ def test_dates_are_as_long_as_they_must_be(written: datetime.datetime, said: str
 def test_files_of_several_trajectories_are_counted_once() -> None:
     both = (Path("x.json"), Path("x.h5"))
     rows = [row("a", paths=both, trajectory="traj_0"), row("b", paths=both, trajectory="traj_1"), row("c")]
-    assert in_words(rows) == "3 recordings (4 files, 2 KB)"
-    assert in_words(rows[:1]) == "1 recording (2 files, 1 KB)"
+    assert in_words(rows) == "3 recordings (4 files, 2 kB)"
+    assert in_words(rows[:1]) == "1 recording (2 files, 1 kB)"
 
 
 def test_an_empty_list_says_which_filter_emptied_it() -> None:

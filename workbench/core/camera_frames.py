@@ -274,7 +274,7 @@ def look_at_of(pose: ArrayLike, distance: float = 1.0) -> LookAt:
     # The direction that the way back will see: next to the vertical its last digits decide what upright means.
     forward = _direction(target - p[:3], "forward")
     turned = upright(forward).T @ r
-    return LookAt(_triple(p[:3]), _triple(target), math.atan2(turned[2, 1], turned[1, 1]))
+    return LookAt(triple(p[:3]), triple(target), math.atan2(turned[2, 1], turned[1, 1]))
 
 
 def upright(forward: ArrayLike) -> Floats:
@@ -401,10 +401,16 @@ def scaled_intrinsic(intrinsic: ArrayLike, size: Sequence[int], new_size: Sequen
     return scale @ checked_intrinsic(intrinsic)
 
 
+def triple(vector: ArrayLike) -> tuple[float, float, float]:
+    """Three numbers, as settings and messages hold them."""
+    x, y, z = np.asarray(vector, np.float64).tolist()
+    return x, y, z
+
+
 def matrix3(matrix: ArrayLike) -> Matrix3:
     """A (3, 3) array as `CameraSettings.intrinsic` has it."""
     rows = np.asarray(matrix, np.float64).reshape(3, 3)
-    return _triple(rows[0]), _triple(rows[1]), _triple(rows[2])
+    return triple(rows[0]), triple(rows[1]), triple(rows[2])
 
 
 def project(points: ArrayLike, pose: ArrayLike, intrinsic: ArrayLike) -> tuple[Floats, Floats]:
@@ -449,10 +455,6 @@ def _product(a: Floats, b: Floats) -> Floats:
 def _about_x(angle: float) -> Floats:
     c, s = math.cos(angle), math.sin(angle)
     return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
-
-
-def _triple(v: Floats) -> tuple[float, float, float]:
-    return float(v[0]), float(v[1]), float(v[2])
 
 
 def _check_size(width: int, height: int) -> None:

@@ -93,13 +93,13 @@ class ObjectSeen:
             share = 1 - self.unhindered / self.alone
         return np.where(self.alone > 0, np.clip(share, 0, 1), np.nan).astype(np.float32)
 
-    def marks(self, enough_pixels: float = ENOUGH_PIXELS) -> NDArray[np.float32]:
+    def marks(self) -> NDArray[np.float32]:
         """(E,) 0 where it is not seen, 1 where it is whole, in the open and large enough; NaN where it is absent.
 
         The product of what is left to see: the share that nothing covers, half where the border cuts it, and
         for small objects the square root of their pixels (a length: twice as far away is half as good).
         """
-        size = np.sqrt(np.clip(self.alone / enough_pixels, 0, 1))
+        size = np.sqrt(np.clip(self.alone / ENOUGH_PIXELS, 0, 1))
         open_share = np.clip(self.pixels / np.maximum(self.alone, 1e-6), 0, 1)
         marks = np.where(self.pixels > 0, size * open_share * np.where(self.cut, 0.5, 1.0), 0.0)
         return np.where(self.present, marks, np.nan).astype(np.float32)

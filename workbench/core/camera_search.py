@@ -137,7 +137,6 @@ def suggest_cameras(
     space: SearchSpace,
     envs: Sequence[int],
     *,
-    poses: NDArray[np.float32] | None = None,
     table: BodyTable | None = None,
     progress: Callable[[SearchProgress], None] = lambda progress: None,
     cancelled: Callable[[], bool] = lambda: False,
@@ -148,7 +147,6 @@ def suggest_cameras(
     then where the search is cancelled.
 
     Args:
-        poses: (N, B, 7) where to draw the bodies, as `read_poses` gives them; None for where they are.
         progress: called after each look, so it should do little.
         cancelled: asked before each look.
 
@@ -157,7 +155,7 @@ def suggest_cameras(
         IndexError: there is no such env.
         RuntimeError: the renderer failed.
     """
-    search = _Search(env, space, list(envs), poses, table or build_body_table(env), progress, cancelled)
+    search = _Search(env, space, list(envs), table or build_body_table(env), progress, cancelled)
     return tuple(search.run())
 
 
@@ -186,7 +184,6 @@ class _Search:
         env: Any,
         space: SearchSpace,
         envs: list[int],
-        poses: NDArray[np.float32] | None,
         table: BodyTable,
         progress: Callable[[SearchProgress], None],
         cancelled: Callable[[], bool],
@@ -195,7 +192,7 @@ class _Search:
             raise ValueError("no env is named to search in")
         if any(not 0 <= e < env.num_envs for e in envs):
             raise IndexError(f"envs {envs} are out of range for {env.num_envs} envs")
-        self.env, self.space, self.envs, self.poses, self.table = env, space, envs, poses, table
+        self.env, self.space, self.envs, self.table = env, space, envs, table
         self.progress, self.cancelled = progress, cancelled
         every = list_objects(env, table)
         self.wanted = [_wanted(every, name, space.kind, self.table) for name in space.objects]
@@ -288,11 +285,10 @@ class _Search:
         placement = Placement(self.space.lens, self.space.kind)
         local = [self._pose(candidate) for candidate in candidates]
         for position, e in enumerate(self.envs):
-            moment = None if self.poses is None else self.poses[e]
             robots = [x for thing in self.objects if thing.robot for x in entities_of(thing, e, self.table)]
             poses = local if self.mounts is None else [compose(self.mounts[e], pose) for pose in local]
             with (
-                placed_camera(self.env, e, placement, self.size, moment) as view,
+                placed_camera(self.env, e, placement, self.size, None) as view,
                 undrawn(robots if bare is None else []),
             ):
                 for i, pose in enumerate(poses):
@@ -353,7 +349,7 @@ class _Search:
 
     def _places(self, things: Sequence[SceneObject]) -> NDArray[np.float64]:
         """(K, 3) where the bodies of some objects are, in all envs that have them; seen from the mount if there is one."""
-        bodies = self._bodies()
+        bodies = read_poses(self.env, self.table)
         columns = [body for thing in things for body in thing.bodies]
         places = bodies[self.envs][:, columns, :3].astype(np.float64)
         if self.mounts is not None:
@@ -363,9 +359,6 @@ class _Search:
         places = places.reshape(-1, 3)
         return places[np.isfinite(places).all(axis=1)]
 
-    def _bodies(self) -> NDArray[np.float32]:
-        return read_poses(self.env, self.table) if self.poses is None else self.poses
-
     def _mounts(self) -> NDArray[np.float32] | None:
         """(N, 7) where the mount is in each env; None for a camera that stands still."""
         name = self.space.mount
@@ -373,7 +366,7 @@ class _Search:
             return None
         if name not in self.table.names:
             raise ValueError(f"there is no body {name!r} to mount a camera on")
-        mounts = self._bodies()[:, self.table.names.index(name)]
+        mounts = read_poses(self.env, self.table)[:, self.table.names.index(name)]
         if not np.isfinite(mounts[self.envs]).all():
             raise ValueError(f"not every env has a body {name!r} to mount a camera on")
         return mounts
@@ -394,14 +387,13 @@ class _Search:
         worst = report.worst_first(self.space.objects)[0]
         e = report.envs[worst]
         placement = Placement(settings, self.space.kind, self.space.mount)
-        moment = None if self.poses is None else self.poses[e]
         target = candidate[1]
         return Suggestion(
             settings=settings,
             target=(float(target[0]), float(target[1]), float(target[2])),
             score=score,
             report=report,
-            picture=picture_of(self.env, e, placement, self.table, moment),
+            picture=picture_of(self.env, e, placement, self.table),
         )
 
 

@@ -57,7 +57,7 @@ def frames(episode: Episode, camera: CameraTrack) -> Iterator[NDArray[np.uint8]]
         yield picture
 
 
-def enlarged(picture: NDArray[np.uint8], side: int = SMALLEST_SIDE) -> NDArray[np.uint8]:
-    """`picture` with every pixel repeated until its smaller side has `side` pixels or more."""
-    times = -(-side // min(picture.shape[:2]))
+def enlarged(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """`picture` with every pixel repeated until its smaller side has `SMALLEST_SIDE` pixels or more."""
+    times = -(-SMALLEST_SIDE // min(picture.shape[:2]))
     return picture if times <= 1 else picture.repeat(times, axis=0).repeat(times, axis=1)

@@ -347,8 +347,8 @@ class Library:
                 )
         return keys
 
-    def undo_delete(self, batch: str | None = None) -> None:
-        """Bring back what one deletion took, or the last one.
+    def undo_delete(self) -> None:
+        """Bring back what the last deletion took.
 
         Raises:
             LibraryError: there is none, or something could not be brought back.
@@ -358,7 +358,7 @@ class Library:
             if not batches:
                 raise LibraryError("The trash is empty.")
             try:
-                back = take_out_of_trash(self.folder, batches[-1] if batch is None else batch)
+                back = take_out_of_trash(self.folder, batches[-1])
             except TrashError as error:
                 raise LibraryError(f"Not everything could be brought back. {error}") from error
             self._read_again({key_of(path) for path in back})

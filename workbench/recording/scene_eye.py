@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.core.camera_frames import triple
 from workbench.recording.episode import Episode
 
 FOVY = 0.75
@@ -43,7 +44,7 @@ def usual_eye(episode: Episode) -> Eye:
         if camera.info.kind == "human" and len(camera.pose):
             position, forward = camera.pose[0, :3], _forward(camera.pose[0, 3:])
             look_at = position + forward
-            return Eye(_triple(position), _triple(look_at), fovy=float(camera.info.fovy))
+            return Eye(triple(position), triple(look_at), fovy=float(camera.info.fovy))
     assert episode.poses is not None and episode.geometry is not None
     moving = np.isin(np.array(episode.geometry.body_kinds), ("link", "dynamic"))
     points = episode.poses[:, moving, :3].reshape(-1, 3)
@@ -55,12 +56,7 @@ def usual_eye(episode: Episode) -> Eye:
     # Origins of bodies, not their outlines: half as far again holds a hand or a cube around its origin.
     radius = max(float(np.linalg.norm(high - low)) / 2, 0.25) * 1.1
     direction = FROM_THE_FRONT / np.linalg.norm(FROM_THE_FRONT)
-    return Eye(_triple(middle + direction * radius / np.sin(FOVY / 2)), _triple(middle))
-
-
-def _triple(values: NDArray) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
+    return Eye(triple(middle + direction * radius / np.sin(FOVY / 2)), triple(middle))
 
 
 def _forward(wxyz: NDArray) -> NDArray:

@@ -18,9 +18,7 @@ SIZE = (960, 720)
 """Width and height in pixels."""
 
 
-def scene_frames(
-    episode: Episode, eye: Eye | None = None, size: tuple[int, int] = SIZE
-) -> Iterator[NDArray[np.uint8]]:
+def scene_frames(episode: Episode, eye: Eye | None = None) -> Iterator[NDArray[np.uint8]]:
     """One picture (H, W, 3) a state.
 
     Raises:
@@ -34,6 +32,6 @@ def scene_frames(
     eye = eye or usual_eye(episode)
     # A recording that was read holds its env alone, as env 0 of 1; one in memory may still hold the batch.
     env = 0 if episode.geometry.num_envs == 1 else episode.info.env_index
-    scene = RecordedScene(episode.geometry, env, *size, eye.fovy)
+    scene = RecordedScene(episode.geometry, env, *SIZE, eye.fovy)
     for poses in episode.poses:
         yield scene.picture(poses, eye.pose)

@@ -48,7 +48,6 @@ def open_task(
     reference: str,
     options: TaskOptions,
     *,
-    source: Mapping[str, str] | None = None,
     on_activity: Callable[[str], None] = lambda activity: None,
 ) -> OpenedTask:
     """Import, build, rehearse and reset a task.
@@ -58,7 +57,7 @@ def open_task(
     """
     clock = Clock()
     on_activity(f"importing {reference.rsplit('/', 1)[-1]}")
-    loaded = load_task(reference, source=source)
+    loaded = load_task(reference)
     clock.lap("import")
 
     try:

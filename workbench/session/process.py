@@ -23,7 +23,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 
 from workbench.session.interrupts import INTERRUPT_SIGNAL, STACK_SIGNAL
@@ -63,11 +63,10 @@ class WorkerProcess:
     thread that started it, so that none is left behind when the server is killed.
     """
 
-    def __init__(self, output: Output, env: Mapping[str, str] | None = None) -> None:
+    def __init__(self, output: Output) -> None:
         """
         Args:
             output: called with what it prints, on threads of this object; see `hear`.
-            env: environment variables to set on top of this process's own.
         """
         ours, theirs = socket.socketpair()
         pulse = make_pulse()
@@ -84,7 +83,7 @@ class WorkerProcess:
                 bufsize=0,
                 pass_fds=fds,
                 start_new_session=True,
-                env={**os.environ, "PYTHONUNBUFFERED": "1", **(env or {})},
+                env={**os.environ, "PYTHONUNBUFFERED": "1"},
             )
             self._pulse = PulseReader(pulse)
         except BaseException:

@@ -17,12 +17,11 @@ _LENGTH = 1000
 class RecentCurves:
     """A ring of rows, one a control step; `curves` gives them oldest first."""
 
-    def __init__(self, num_envs: int, length: int = _LENGTH) -> None:
-        self._length = length
-        self._tick = np.zeros(length, np.int64)
-        self._reward = np.zeros((length, num_envs), np.float32)
-        self._success = np.full((length, num_envs), np.nan, np.float32)
-        self._started = np.zeros((length, num_envs), bool)
+    def __init__(self, num_envs: int) -> None:
+        self._tick = np.zeros(_LENGTH, np.int64)
+        self._reward = np.zeros((_LENGTH, num_envs), np.float32)
+        self._success = np.full((_LENGTH, num_envs), np.nan, np.float32)
+        self._started = np.zeros((_LENGTH, num_envs), bool)
         self._count = 0
         self._new_episode = np.ones(num_envs, bool)
 
@@ -31,7 +30,7 @@ class RecentCurves:
         self._new_episode |= stepped.reset_mask
         if stepped.reset_mask.any():
             return
-        row = self._count % self._length
+        row = self._count % _LENGTH
         self._tick[row] = self._count
         self._reward[row] = stepped.step.reward
         success = stepped.step.evaluate.get("success")
@@ -48,7 +47,7 @@ class RecentCurves:
         return self._count
 
     def curves(self) -> Curves:
-        rows = np.arange(max(0, self._count - self._length), self._count) % self._length
+        rows = np.arange(max(0, self._count - _LENGTH), self._count) % _LENGTH
         return Curves(
             self._count, self._tick[rows], self._reward[rows], self._success[rows], self._started[rows]
         )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import shutil
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -18,7 +18,7 @@ from typing import Literal
 from workbench.authoring.problem import Problem
 from workbench.session.background import BackgroundProcess
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
-from workbench.session.messages import Failed, Load, Loaded, TaskOptions
+from workbench.session.messages import Failed, Load, Loaded
 from workbench.session.rescore import Group, group_episodes, not_judged, with_renderer
 from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored, Verdict
 from workbench.session.step_back import CannotStepIn, file_of, write_source
@@ -62,7 +62,6 @@ class RescoreView:
 @dataclass(frozen=True)
 class _Asked:
     files: tuple[EpisodeFile, ...]
-    base: TaskOptions | None
     file: Path | None
     recorded_source: bool
     use_env_states: bool
@@ -71,18 +70,13 @@ class _Asked:
 class Rescorer:
     """One judgement at a time; a new one takes the place of the one before. All methods return at once."""
 
-    def __init__(self, on_change: Callable[[], None] = lambda: None) -> None:
-        """
-        Args:
-            on_change: called on this object's thread when `view` has something new.
-        """
-        self._on_change = on_change
+    def __init__(self) -> None:
         self._lock = threading.Lock()
         """Of `view`: what a job that was stopped still has to say is not heard."""
         self._view = RescoreView()
         self._process = BackgroundProcess("that judges", "to judge with")
         # `_run` tells of failures itself, with what the code raised.
-        self._lane = Lane("rescore", on_change, lambda why: None, IDLE_SECONDS, self._process.end)
+        self._lane = Lane("rescore", lambda: None, lambda why: None, IDLE_SECONDS, self._process.end)
 
     @property
     def view(self) -> RescoreView:
@@ -92,7 +86,6 @@ class Rescorer:
         self,
         files: Sequence[EpisodeFile],
         *,
-        base: TaskOptions | None = None,
         file: Path | None = None,
         recorded_source: bool = False,
         use_env_states: bool = False,
@@ -100,7 +93,7 @@ class Rescorer:
         """Judge these; see `group_episodes` for the arguments."""
         if not files:
             return
-        asked = _Asked(tuple(files), base, file, recorded_source, use_env_states)
+        asked = _Asked(tuple(files), file, recorded_source, use_env_states)
         with self._lock:
             # Under the lock, or the job might tell how far it is before it is said that it begins.
             self._lane.start("judging", lambda job: self._run(job, asked))
@@ -111,7 +104,6 @@ class Rescorer:
                 recorded_source=recorded_source,
                 use_env_states=use_env_states,
             )
-        self._on_change()
 
     def stop(self) -> None:
         """Go no further; what is known by now stays to be seen."""
@@ -119,7 +111,6 @@ class Rescorer:
             self._lane.stop()
             if self._view.state in ("loading", "judging"):
                 self._view = replace(self._view, state="stopped", serial=self._view.serial + 1)
-        self._on_change()
 
     def close(self) -> None:
         """End it all; returns when the thread has ended."""
@@ -132,7 +123,6 @@ class Rescorer:
             groups, unread = group_episodes(
                 asked.files,
                 MOST_AT_ONCE,
-                asked.base,
                 file=asked.file,
                 recorded_source=asked.recorded_source,
             )
@@ -205,7 +195,6 @@ class Rescorer:
             if job.stopped:
                 return
             self._view = replace(self._view, serial=self._view.serial + 1, **values)  # type: ignore[arg-type]
-        self._on_change()
 
 
 def _judged_with(group: Group, asked: _Asked) -> str:

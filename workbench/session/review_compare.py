@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.recording.episode import Episode
+from workbench.session.lengths import length
 
 ARM = 0.1
 """Metres; a body of this size is thought at each pose, so that an angle is a way."""
@@ -147,15 +148,15 @@ def _bodies(
     apart = away.max(axis=1, initial=0.0)
     off = np.flatnonzero(apart > tolerance)
     if not len(off):
-        return Parting("bodies", None, "", metres(float(apart.max(initial=0.0)))), "", apart
+        return Parting("bodies", None, "", _apart(float(apart.max(initial=0.0)))), "", apart
     first = int(off[0])
     body = names[int(away[first].argmax())]
     worst = int(apart.argmax())
     parting = Parting(
         "bodies",
         begin + first,
-        f"{body}, {metres(float(apart[first]))}",
-        f"{metres(float(apart[worst]))} ({names[int(away[worst].argmax())]})",
+        f"{body}, {_apart(float(apart[first]))}",
+        f"{_apart(float(apart[worst]))} ({names[int(away[worst].argmax())]})",
     )
     return parting, body, apart
 
@@ -221,9 +222,5 @@ def _not_in_both(a: Episode, b: Episode) -> tuple[str, ...]:
     )
 
 
-def metres(way: float) -> str:
-    if not np.isfinite(way):
-        return "missing in one"
-    if way == 0:
-        return "0"
-    return f"{way * 1000:.3g} mm" if way >= 1e-4 else f"{way * 1e6:.2g} µm"
+def _apart(metres: float) -> str:
+    return length(metres) if np.isfinite(metres) else "missing in one"

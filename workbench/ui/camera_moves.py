@@ -28,6 +28,7 @@ from workbench.core.camera_frames import (
     quaternion_of,
     relative_to,
     rotation_matrix,
+    triple,
     with_pose,
 )
 from workbench.core.camera_settings import CameraSettings
@@ -115,7 +116,7 @@ def looking_at(pose: ArrayLike, eye: ArrayLike, target: ArrayLike) -> Floats:
     Raises:
         ValueError: eye and target are one point.
     """
-    return pose_from_look_at(LookAt(_triple(eye), _triple(target), look_at_of(pose).roll))
+    return pose_from_look_at(LookAt(triple(eye), triple(target), look_at_of(pose).roll))
 
 
 def turned_in_world(start: ArrayLike, position: ArrayLike, turn: ArrayLike) -> Floats:
@@ -217,8 +218,3 @@ def _in_steps(rotation: Floats, step: float) -> Floats:
     axis = axis / np.linalg.norm(axis)
     k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.eye(3) + math.sin(whole) * k + (1 - math.cos(whole)) * k @ k
-
-
-def _triple(v: ArrayLike) -> tuple[float, float, float]:
-    x, y, z = map(float, np.asarray(v, np.float64))
-    return x, y, z

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 
-def data_address(pixels: NDArray[np.uint8], longest: int, quality: int = 78) -> str:
+def data_address(pixels: NDArray[np.uint8], longest: int) -> str:
     """``data:image/jpeg;base64,...`` of a picture.
 
     Args:
@@ -27,5 +27,5 @@ def data_address(pixels: NDArray[np.uint8], longest: int, quality: int = 78) -> 
         size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
         image = image.resize(size, Image.Resampling.BOX)
     written = io.BytesIO()
-    image.save(written, "JPEG", quality=quality)
+    image.save(written, "JPEG", quality=78)
     return "data:image/jpeg;base64," + base64.b64encode(written.getvalue()).decode("ascii")

@@ -9,8 +9,9 @@ import viser
 
 from workbench.recording.library import Library, LibraryError
 from workbench.recording.library_row import LONGEST_NOTE, LibraryRow, clean_tags
+from workbench.ui.file_size import size_in_words
 from workbench.ui.library_forms import Question, ask_text, ask_whether
-from workbench.ui.library_rows import in_words, size_in_words
+from workbench.ui.library_rows import in_words
 
 MOST_KNOWN = 12
 """Tags in use that are named."""

@@ -25,6 +25,7 @@ from workbench.recording.library import Library, LibraryView
 from workbench.recording.library_row import LibraryRow
 from workbench.ui.changed import fill, show
 from workbench.ui.commands import Command
+from workbench.ui.file_size import size_in_words
 from workbench.ui.fragments import render
 from workbench.ui.library_commands import Action, acting, walking
 from workbench.ui.library_edits import LibraryEdits
@@ -41,7 +42,6 @@ from workbench.ui.library_rows import (
     has_outcome,
     newest_sources,
     none_like_that,
-    size_in_words,
 )
 from workbench.ui.presses import Presses
 

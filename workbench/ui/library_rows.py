@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from workbench.recording.library_row import LibraryRow
+from workbench.ui.file_size import size_in_words
 
 Column = Literal["task", "date", "seed", "steps", "return", "success", "version", "tags", "note", "name"]
 COLUMNS: tuple[Column, ...] = ("task", "date", "seed", "steps", "return", "success")
@@ -165,7 +166,7 @@ def cells(row: LibraryRow, newest: dict[str, str], now: datetime.datetime) -> Ce
     when = None if row.date is None else row.date.astimezone(now.tzinfo)
     total = row.total_reward
     task = row.task or ("?" if row.problem else "")
-    about = [row.name, f"{_bytes(row.size)}", row.facts.control_mode]
+    about = [row.name, size_in_words(row.size), row.facts.control_mode]
     if row.facts.acted_by:
         about.append(f"actions: {row.facts.acted_by}")
     if row.facts.env_index is not None:
@@ -215,21 +216,11 @@ def _short_date(when: datetime.datetime, now: datetime.datetime) -> str:
     return f"{when.day} {when:%b %Y}"
 
 
-def _bytes(size: float) -> str:
-    for unit in ("B", "KB", "MB"):
-        if size < 1000:
-            return f"{size:.3g} {unit}"
-        size /= 1000
-    return f"{size:.3g} GB"
-
-
 def in_words(rows: Sequence[LibraryRow]) -> str:
     """``3 recordings (9 files, 1.2 MB)``."""
     files = {path for row in rows for path in row.paths}
     by_files = {row.paths: row.size for row in rows}
     what = "1 recording" if len(rows) == 1 else f"{len(rows)} recordings"
-    return f"{what} ({len(files)} file{'' if len(files) == 1 else 's'}, {_bytes(sum(by_files.values()))})"
-
-
-def size_in_words(size: int) -> str:
-    return _bytes(size)
+    return (
+        f"{what} ({len(files)} file{'' if len(files) == 1 else 's'}, {size_in_words(sum(by_files.values()))})"
+    )

@@ -16,6 +16,7 @@ from workbench.session.keep_status import KeepStatus
 from workbench.session.session import Session
 from workbench.session.view import RecordingStatus, SessionView
 from workbench.ui.changed import fill, show
+from workbench.ui.file_size import size_in_words
 from workbench.ui.fragments import render
 
 THIS_ENV, ALL_ENVS = "the selected env", "all envs"
@@ -159,13 +160,6 @@ def recording_html(recording: RecordingStatus) -> str:
         keeping=recording.keeping,
         percent=_percent(recording.keeping),
     )
-
-
-def size_in_words(count: int) -> str:
-    """``0.4 MB``, ``23 MB``, ``1.2 GB``"""
-    if count < 1e9:
-        return f"{count / 1e6:.1f} MB" if count < 1e7 else f"{count / 1e6:.0f} MB"
-    return f"{count / 1e9:.1f} GB"
 
 
 def _envs_in_words(env_idx: tuple[int, ...]) -> str:

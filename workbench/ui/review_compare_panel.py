@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import viser
 
+from workbench.session.lengths import length
 from workbench.session.review import Review
 from workbench.session.review_compare import (
     TOLERANCES,
@@ -14,7 +15,6 @@ from workbench.session.review_compare import (
     Difference,
     Parting,
     difference,
-    metres,
 )
 from workbench.session.review_view import Opened, ReviewView
 from workbench.session.reward_terms import PREFIX
@@ -24,7 +24,7 @@ from workbench.ui.fragments import render
 from workbench.ui.presses import Presses
 from workbench.ui.review_scene import COLOURS, letter
 
-TOLERANCE_NAMES = {metres(way): way for way in TOLERANCES}
+TOLERANCE_NAMES = {length(way): way for way in TOLERANCES}
 MOST_ROWS = 30
 
 
@@ -46,7 +46,7 @@ class ReviewComparePanel:
         self._tolerance = gui.add_dropdown(
             "Moved from",
             tuple(TOLERANCE_NAMES),
-            initial_value=metres(USUAL_TOLERANCE),
+            initial_value=length(USUAL_TOLERANCE),
             visible=False,
             hint="How far a body must be away to count as elsewhere.",
         )

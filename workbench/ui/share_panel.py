@@ -7,14 +7,14 @@ import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import viser
-from numpy.typing import NDArray
 
+from workbench.core.camera_frames import triple
 from workbench.recording.lerobot_export import ExportOptions
 from workbench.recording.scene_eye import Eye
 from workbench.recording.sources import Source
 from workbench.ui.changed import fill, show
+from workbench.ui.file_size import size_in_words
 from workbench.ui.fragments import render
 from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted, What, file_name
 from workbench.ui.making import Making, MakingView
@@ -146,7 +146,11 @@ class SharePanel:
 
     def _said(self, made: Made) -> dict[str, object]:
         links = [
-            {"address": self._offers.address(path, download=True), "name": path.name, "size": _size(path)}
+            {
+                "address": self._offers.address(path, download=True),
+                "name": path.name,
+                "size": size_in_words(path.stat().st_size),
+            }
             for path in made.paths
             if path.is_file()
         ]
@@ -187,21 +191,11 @@ def _names(cameras: tuple[str, ...]) -> tuple[str, ...]:
     return (ALL_CAMERAS, *cameras)
 
 
-def _size(path: Path) -> str:
-    size = path.stat().st_size
-    return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{max(size / 1e3, 1):.0f} kB"
-
-
 def _eye_of(client: viser.ClientHandle | None) -> Eye | None:
     """From where this page looks."""
     if client is None or client.camera.image_width == 0:
         return None
     camera = client.camera
     return Eye(
-        _triple(camera.position), _triple(camera.look_at), _triple(camera.up_direction), float(camera.fov)
+        triple(camera.position), triple(camera.look_at), triple(camera.up_direction), float(camera.fov)
     )
-
-
-def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
-    x, y, z = (float(value) for value in values)
-    return x, y, z
