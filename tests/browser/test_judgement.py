@@ -72,6 +72,13 @@ def test_an_edited_reward_is_drawn_over_the_recorded_one_and_what_differs_is_lis
     expect(desk.page.get_by_text("judged again", exact=True)).to_be_visible()
     until(lambda: desk.rows.count() >= 6, "the list")
     expect(desk.page.get_by_role("button", name="Stop judging")).to_have_count(0)
+    above = desk.page.get_by_role("link", name=re.compile(r"judged again: (\d+) of \1 episodes differ"))
+    desk.page.set_viewport_size({"width": 1280, "height": 600})
+    expect(above).to_be_in_viewport()
+    expect(desk.rows.last).not_to_be_in_viewport()
+    above.click()
+    expect(desk.page.locator(".wb-again")).to_be_in_viewport(ratio=0.9)
+    desk.page.set_viewport_size({"width": 1280, "height": 1000})
 
 
 def test_a_row_shows_its_env_at_its_moment_and_a_key_goes_to_the_next(desk: Desk) -> None:

@@ -73,6 +73,20 @@ def draw(panel: JudgementPanel, judged: JudgementView, **changes: Any) -> None:
     panel.draw(running(40, judgement=judged, **{"timeline": timeline, **changes}))
 
 
+@pytest.mark.parametrize(
+    ("judged", "says"),
+    [
+        (JudgementView("none"), ""),
+        (JudgementView("loading"), "loading the new code"),
+        (JudgementView("judging", 1, 26, 50, summary=summary()), "50 %"),
+        (done(summary(episode())), "1 of 12 episodes differ."),
+        (JudgementView("stopped", 1, 26, 50, why="the file was saved again"), "the file was saved again"),
+    ],
+)
+def test_one_line_says_how_far_it_is_and_what_came_of_it(judged: JudgementView, says: str) -> None:
+    assert words.in_a_line(judged).endswith(says) and bool(words.in_a_line(judged)) == bool(says)
+
+
 def test_outcomes_are_said_before_rewards() -> None:
     moved = episode(success=(None, 41), fail=(7, None))
     assert words.difference(moved) == ["success now at step 41, was never", "fail never now, was at step 7"]

@@ -41,7 +41,7 @@ def test_a_flood_is_shown_by_its_end_and_its_number() -> None:
     lines = tuple(PrintedLine("stdout", f"line {i}.") for i in range(1000))
     html = log_html(Printed(1, lines, 1234567), "")
     assert html.count('title="stdout"') == LINES_SHOWN and "line 999." in html and "line 0." not in html
-    assert "1 234 567 more" in html
+    assert "1 234 567 more" in html and "lines. <" in html
 
 
 def test_what_was_printed_is_text() -> None:

@@ -201,6 +201,8 @@ class KeptWorker:
             self._take_the_last_events(worker)
         self._on_busy(None)
         if self._closing:
+            if self._spare is not None:
+                self._spare.kill()  # now: a gigabyte takes a while to be given back, and it need not be in a row
             worker.stop(grace=0.3)  # it has nothing to lose: what is kept is kept by the server
             return False
         code = worker.exit_code()

@@ -67,6 +67,11 @@ class SpareWorker:
         process = self._process
         return 0 if process is None else process.memory()
 
+    def kill(self) -> None:
+        """Have it end, without waiting for it; `stop` does that."""
+        if self._process is not None:
+            self._process.kill()
+
     def stop(self) -> None:
         """End it; it has nothing to lose."""
         process, self._process, self._ready, self._due = self._process, None, False, None

@@ -79,9 +79,10 @@ class Framing:
 
     def _point(self, client: viser.ClientHandle, frame: Frame) -> None:
         viewpoint = frame(aspect_of(client), client.camera.image_height or USUAL_HEIGHT)
-        self._pointed[client.client_id] = (viewpoint.position, aspect_of(client))
         client.camera.position = viewpoint.position
         client.camera.look_at = viewpoint.look_at
+        # After it is: who waits for it may close the page, and viser warns of what is written to a page that has gone.
+        self._pointed[client.client_id] = (viewpoint.position, aspect_of(client))
 
 
 def aspect_of(client: viser.ClientHandle) -> float:

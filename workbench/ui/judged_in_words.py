@@ -27,6 +27,17 @@ def headline(view: JudgementView) -> str:
     return sentence + (f" Other entries differ: {', '.join(others)}." if others else "")
 
 
+def in_a_line(view: JudgementView) -> str:
+    """For who does not see the rest; empty while there is nothing to say."""
+    if view.state == "loading":
+        return "The past is judged again: loading the new code"
+    if view.state == "judging":
+        # In tenths, or a page that is played on would be written to at every look.
+        return f"The past is judged again: {10 * int(10 * view.done / max(1, view.total))} %"
+    says = {"none": "", "done": headline(view)}.get(view.state, view.why)
+    return f"The past, judged again: {says}" if says else ""
+
+
 def numbers(view: JudgementView) -> list[str]:
     """Success and return over all episodes, before and now, where they differ."""
     summary = view.summary

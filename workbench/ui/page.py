@@ -28,6 +28,7 @@ from workbench.ui.env_panel import EnvPanel
 from workbench.ui.force_arrows import ForceArrows
 from workbench.ui.fragments import render
 from workbench.ui.inspect_panel import InspectPanel
+from workbench.ui.judged_above import JudgedAbove
 from workbench.ui.judgement_panel import JudgementPanel
 from workbench.ui.log_panel import LogPanel
 from workbench.ui.numbers_panel import NumbersPanel
@@ -115,6 +116,7 @@ class Page:
             self._studio = StudioPanel(server, session)
         with tabs.add_tab("Reward", viser.Icon.CHART_LINE):
             self._numbers = NumbersPanel(server)
+            self._judged_above = JudgedAbove(server)
             self._curves = CurvesPanel(server)
             self._terms = TermsPanel(server, session)
             self._judgement = JudgementPanel(server, session)
@@ -175,6 +177,7 @@ class Page:
         self._terms.draw(view)
         self._inspect.draw(view)
         self._envs.draw(view)
+        self._judged_above.draw(view)
         self._judgement.draw(view)
         self._record.draw(view)
         self._timeline.draw(view)
