@@ -77,7 +77,7 @@ def make(wanted: Wanted, on_progress: OnProgress = lambda done, doing: None) -> 
 
         part_done(0.0, source.name)
         try:
-            paths += _of_one(wanted, source, source.read(), part_done)
+            paths += _of_readable(wanted, source, part_done)
         except ValueError as error:
             not_made.append(str(error) if source.name in str(error) else f"{source.name}: {error}")
     if not paths:
@@ -93,6 +93,18 @@ def file_name(what: What, source: str, camera: str = "") -> str:
     """Of what is made from the recording that is called `source`, and of its `camera` where it is a film of one."""
     suffix = {"film": f".{camera.replace('/', '_')}.mp4", "scene": ".scene.mp4", "page": ".html"}
     return source + suffix.get(what, ".sheet.png")
+
+
+def _of_readable(wanted: Wanted, source: Source, on_progress: OnProgress) -> list[Path]:
+    episode = source.read()
+    try:
+        return _of_one(wanted, source, episode, on_progress)
+    except ValueError as error:
+        if not episode.unread:
+            raise
+        raise ValueError(
+            " ".join(episode.unread)
+        ) from error  # it does not lack pictures, they cannot be read
 
 
 def _of_one(wanted: Wanted, source: Source, episode: Episode, on_progress: OnProgress) -> list[Path]:
