@@ -26,6 +26,8 @@ from workbench.recording.sources import Source
 from workbench.ui.scene_html import write_scene_html
 
 What = Literal["film", "scene", "page", "sheet", "lerobot"]
+MOST_SAID = 5
+"""Sentences on recordings that were left out."""
 EVERY_CAMERA = ""
 
 
@@ -149,7 +151,9 @@ def _dataset(wanted: Wanted, on_progress: OnProgress) -> Made:
     words = f"{made.episodes} episode{'' if made.episodes == 1 else 's'}, {made.frames} frames"
     if made.left_out:
         words += f"; {made.left_out} without success left out"
-    return Made((made.folder,), " ".join([words + ".", *made.notes]))
+    if made.not_fitting:
+        words += f"; {len(made.not_fitting)} left out that cannot be read or do not fit"
+    return Made((made.folder,), " ".join([words + ".", *made.not_fitting[:MOST_SAID], *made.notes]))
 
 
 def _rate(episode: Episode) -> float:

@@ -67,6 +67,11 @@ class SharePanel:
         self._successes = server.gui.add_checkbox(
             "Only successes", True, hint="Leave out recordings that reach success at no step"
         )
+        self._fitting = server.gui.add_checkbox(
+            "Only what fits",
+            True,
+            hint="Leave out recordings that cannot be read, or lack what the first one has; which is said",
+        )
         self._task = server.gui.add_text(
             "Task", "", hint="In words, for policies that read; empty: the task's id"
         )
@@ -102,6 +107,7 @@ class SharePanel:
             self._camera.options = options
         show(self._camera, what == "film" and len(options) > 2)
         show(self._successes, what == "lerobot")
+        show(self._fitting, what == "lerobot" and len(names) > 1)
         show(self._task, what == "lerobot")
         show(self._make, not view.running)
         show(self._stop, view.running)
@@ -123,7 +129,11 @@ class SharePanel:
         if what == "lerobot":
             now = datetime.datetime.now()
             words = self._task.value.strip()[:400]
-            export = ExportOptions(only_successes=self._successes.value, instruction=words or None)
+            export = ExportOptions(
+                only_successes=self._successes.value,
+                only_fitting=self._fitting.value,
+                instruction=words or None,
+            )
             folder = self._folder / "datasets" / f"lerobot_{now:%Y-%m-%dT%H-%M-%S}"
             self._making.start(replace(wanted, folder=folder, export=export))
             return
