@@ -58,7 +58,9 @@ def test_what_cannot_be_exported_is_said(
     err = Console(file=io.StringIO())
     (tmp_path / "broken.json").write_text('{"workbench": {}}')
     for fps in (0, None):
-        code = export_in_terminal([tmp_path], tmp_path / "set", False, None, fps, None, (), (), err, refuse)
+        code = export_in_terminal(
+            [tmp_path], tmp_path / "set", False, False, None, fps, None, (), (), err, refuse
+        )
         assert code == 2
     assert "--fps" in said[0] and said[1]
     assert not (tmp_path / "set").exists() and capsys.readouterr().out == ""

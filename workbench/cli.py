@@ -247,6 +247,7 @@ def export(
     /,
     lerobot: Path,
     only_successes: bool = False,
+    only_fitting: bool = False,
     task: str | None = None,
     fps: int | None = None,
     cameras: tuple[str, ...] | None = None,
@@ -259,6 +260,8 @@ def export(
         files: recordings, or folders of them.
         lerobot: folder that becomes a LeRobot dataset (version 3); must not exist yet.
         only_successes: leave out recordings that reach success at no step.
+        only_fitting: leave out recordings that cannot be read, or lack what the first one has (cameras, dimensions), and
+            say which; else such a one ends it.
         task: the task in words, for policies that read; else its id.
         fps: frames a second, of which the control rate is a whole multiple; else the control rate.
         cameras: names of cameras; else all. Give none (--cameras) for a dataset without films.
@@ -268,7 +271,17 @@ def export(
     from workbench.share_command import export_in_terminal
 
     return export_in_terminal(
-        files, lerobot, only_successes, task, fps, cameras, state, environment_state, err, refuse
+        files,
+        lerobot,
+        only_successes,
+        only_fitting,
+        task,
+        fps,
+        cameras,
+        state,
+        environment_state,
+        err,
+        refuse,
     )
 
 

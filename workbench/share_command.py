@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from workbench.recording.lerobot_export import ExportOptions
+from workbench.recording.lerobot_export import DoesNotFit, ExportOptions
 from workbench.recording.lerobot_frames import Choice
 from workbench.recording.sources import Source, sources_among
 from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted, make
@@ -47,6 +47,7 @@ def export_in_terminal(
     files: Sequence[Path],
     folder: Path,
     only_successes: bool,
+    only_fitting: bool,
     task: str | None,
     fps: int | None,
     cameras: tuple[str, ...] | None,
@@ -63,7 +64,7 @@ def export_in_terminal(
     except (OSError, ValueError) as error:
         return refuse(str(error))
     choice = Choice(state=state, environment=environment_state, cameras=cameras)
-    options = ExportOptions(choice, only_successes, task, fps)
+    options = ExportOptions(choice, only_successes, only_fitting, task, fps)
     return _make_all([Wanted("lerobot", sources, folder, export=options)], err, refuse)
 
 
@@ -82,6 +83,8 @@ def _make_all(wanted: Sequence[Wanted], err: Console, refuse: Callable[[str], in
                 try:
                     made.append(make(one, told))
                     not_made += made[-1].not_made
+                except DoesNotFit as error:
+                    not_made.append(f"{error} With --only-fitting such recordings are left out.")
                 except ValueError as error:
                     not_made.append(str(error))
     except (OSError, RuntimeError) as error:

@@ -286,7 +286,6 @@ def test_finishing_again_helps_once_there_is_room(make_episode: Maker, tmp_path:
     assert len(left(tmp_path)) == 3
 
 
-@pytest.mark.filterwarnings("ignore:RRD file has no footer")
 @pytest.mark.parametrize("suffix", [".rrd", ".h5"])
 @pytest.mark.parametrize("kept", [0.05, 0.5, 0.99])
 def test_files_that_were_cut_short_are_not_given_their_names(

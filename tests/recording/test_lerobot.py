@@ -158,6 +158,13 @@ def test_episodes_that_do_not_fit_together_are_said_and_nothing_is_left(
     ):
         export(tmp_path / "set", episode, narrow)
     assert list(tmp_path.iterdir()) == []
+    cut = replace(episode, unread=("c.rrd was cut short.",))
+    made = export(tmp_path / "rest", episode, narrow, cut, episode, options=ExportOptions(only_fitting=True))
+    assert made.episodes == 2 and made.frames == 2 * episode.length
+    assert made.not_fitting[0].startswith("episode 1 does not go") and made.not_fitting[1:] == [
+        "c.rrd was cut short."
+    ]
+    assert len(read_lerobot(tmp_path / "rest", 1).reward) == episode.length
 
 
 def test_a_folder_with_something_in_it_is_not_written_to(episode: Episode, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import h5py
 import mani_skill.envs  # noqa: F401  (registers the tasks)
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ import rerun as rr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mani_skill.utils.wrappers.record import RecordEpisode
+from PIL import Image
 
 from tests.recording.library_files import describe, jpeg
 from tests.recording.made import Made
@@ -124,7 +127,28 @@ def test_each_trajectory_of_maniskills_recorder_is_a_row(maniskill: Path) -> Non
     )
     assert (first.seed, first.length, second.seed, second.length) == (5, 3, 6, 2)
     assert first.success is False and first.total_reward is not None and first.total_reward > 0
+    assert first.facts.acted_by == "test"
     assert first.facts.control_mode == "pd_joint_delta_pos" and first.id != second.id
+
+
+def test_a_trajectory_with_pictures_has_a_thumbnail(
+    maniskill: Path, tmp_path: Path, library: Library
+) -> None:
+    for suffix in (".json", ".h5"):
+        shutil.copy(maniskill / f"demo{suffix}", tmp_path)
+    seen = np.zeros((4, 200, 300, 3), np.uint8)
+    seen[3] = (255, 0, 0)
+    with h5py.File(tmp_path / "demo.h5", "r+") as file:
+        file.create_dataset("traj_0/obs/sensor_data/eye/depth", data=np.zeros((4, 2, 2, 1), np.int16))
+        file.create_dataset("traj_0/obs/sensor_data/hand/rgb", data=seen, compression="gzip")
+    library.refresh()
+    first, second = library.rows()
+    picture = library.thumbnail(first.id)
+    assert picture is not None and library.thumbnail(second.id) is None
+    with Image.open(io.BytesIO(picture)) as image:
+        assert image.size == (96, 64)
+        red, green, _ = np.asarray(image.convert("RGB")).mean((0, 1))
+    assert red > 250 and green < 5
 
 
 def test_a_lone_rrd_is_a_row_with_its_properties(tmp_path: Path) -> None:

@@ -200,6 +200,23 @@ def test_their_cameras_are_read_too(recorded: Any, tmp_path: Path) -> None:
             assert np.abs(track.depth[state] - made.depth[state]).max() < 2e-3
 
 
+@pytest.mark.parametrize(("suffix", "lost"), [(".rrd", "poses"), (".h5", "env_states"), (".json", "")])
+def test_a_file_that_was_cut_takes_only_its_own_with_it(
+    make_episode: Callable[..., Made], tmp_path: Path, suffix: str, lost: str
+) -> None:
+    states = {"actors/cube": np.zeros((7, 13), np.float32)}
+    made = make_episode(6, reward=np.arange(6, dtype=np.float32), env_states=states)
+    path = made.write(tmp_path).rrd
+    file = path.with_suffix(suffix)
+    file.write_bytes(file.read_bytes()[:-100])
+    read = read_episode(path)
+    (said,) = read.unread
+    assert said.startswith(f"{file.name} was cut short or changed (")
+    np.testing.assert_array_equal(read.reward, made.reward)
+    assert read.info == made.info
+    assert (read.poses is None, not read.env_states) == (lost == "poses", lost == "env_states")
+
+
 def test_what_is_no_recording_is_said(tmp_path: Path) -> None:
     theirs, ours = record_both("MS-CartpoleBalance-v1", tmp_path, obs_mode="state")
     for reading, why in (
@@ -211,12 +228,15 @@ def test_what_is_no_recording_is_said(tmp_path: Path) -> None:
         with pytest.raises(UnreadableRecording, match=why):
             reading()
     ours.with_suffix(".rrd").write_bytes(b"RRF2 and then nothing")
-    with pytest.raises(UnreadableRecording, match="no .rrd that can be read"):
-        read_episode(ours)
+    (said,) = read_episode(ours).unread
+    assert said.startswith(f"{ours.stem}.rrd was cut short or changed")
     ours.with_suffix(".rrd").unlink()
     assert read_episode(ours).length == STEPS
     ours.with_suffix(".json").write_text('{"workbench": {"length": 3}}')
     with pytest.raises(UnreadableRecording, match="a broken one"):
+        read_episode(ours)
+    ours.with_suffix(".json").write_text('{"workbench": {"leng')
+    with pytest.raises(UnreadableRecording, match=r"no JSON that can be read"):
         read_episode(ours)
     ours.with_suffix(".json").unlink()
     with pytest.raises(UnreadableRecording, match=r"json is missing"):

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from tests.recording.made import Made
 from tests.session.recordings import made, write
 from workbench.recording.read_episode import read_episode
 from workbench.recording.side_files import side_files, side_files_in_words
@@ -66,3 +70,21 @@ def test_a_recording_says_them(tmp_path: Path) -> None:
     json = write(tmp_path, made(3, side_files={"meshes/part.obj": "0123456789ab"}), pictures=False)
     assert read_episode(json).info.side_files == {"meshes/part.obj": "0123456789ab"}
     assert read_episode(json.with_suffix(".rrd")).info.side_files == {"meshes/part.obj": "0123456789ab"}
+
+
+def test_a_recording_that_was_copied_elsewhere_finds_its_task_where_one_looks_from(
+    make_episode: Callable[..., Made], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    task, copy = tmp_path / "project" / "tasks" / "push.py", tmp_path / "copy"
+    task.parent.mkdir(parents=True)
+    task.write_text('@register_env("Made-v1")\n')
+    episode = make_episode()
+    episode.info = dataclasses.replace(episode.info, source_file=str(task))
+    file = episode.write(tmp_path / "project" / "recordings").json
+    assert read_episode(file).info.source_file == str(task)
+    copied = shutil.copytree(file.parent, copy / "a" / "b") / file.name
+    assert read_episode(copied).info.source_file == "push.py"
+    monkeypatch.chdir(tmp_path / "project")
+    assert read_episode(copied).info.source_file == str(task)
+    task.write_text("something else of that name")
+    assert read_episode(copied).info.source_file == "push.py"

@@ -161,9 +161,11 @@ def test_what_is_no_recording_is_said(author: Path, tmp_path: Path) -> None:
 def test_a_broken_recording_is_a_row_and_the_others_are_judged(author: Path, tmp_path: Path) -> None:
     for file in (author / "recordings").iterdir():
         shutil.copy(file, tmp_path)
-    broken = min(tmp_path.glob("*.rrd"))
-    broken.write_bytes(broken.read_bytes()[:1000])
+    broken, cut, _ = sorted(tmp_path.glob("*.rrd"))
+    for file in (broken, broken.with_suffix(".h5"), cut):
+        file.write_bytes(file.read_bytes()[:1000])
     verdicts, _ = rescore_all(RescoreOptions((tmp_path,)))
+    # Of the second what there is to judge by is whole.
     assert [bool(verdict.why_not) for verdict in verdicts] == [True, False, False]
     assert broken.stem in verdicts[0].why_not
 

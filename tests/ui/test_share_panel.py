@@ -14,7 +14,16 @@ from workbench.ui.door import Door, DoorOptions, open_door
 from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted
 from workbench.ui.making import Making, MakingView
 from workbench.ui.offers import Offers
-from workbench.ui.share_panel import ALL_CAMERAS, MOST_NAMED, WHAT, Chosen, SharePanel, will_make
+from workbench.ui.share_panel import (
+    ALL_CAMERAS,
+    MOST_NAMED,
+    OPENED,
+    WHAT,
+    Chosen,
+    SharePanel,
+    short_names,
+    will_make,
+)
 
 
 class Noted(Making):
@@ -93,6 +102,19 @@ def test_a_film_is_of_the_camera_that_was_chosen_or_of_every_one(panel: SharePan
     assert making.wanted[0].folder != making.wanted[1].folder
     panel.draw(Chosen((RECORDING,), ("base_camera",)))
     assert not panel._camera.visible, "there is no choice"
+
+
+def test_names_are_shown_without_their_time_and_the_scope_stays_as_chosen(panel: SharePanel) -> None:
+    name = "Push_seed0001_env00_2026-11-22T04-40-41"
+    panel.draw(Chosen((Source(Path(f"/recordings/{name}.json")),), ("eye",), selected=True))
+    assert ">Push_seed0001_env00<" in panel._about.content and f'title="{name}"' in panel._about.content
+    assert ">Push_seed0001_env00.eye.mp4<" in panel._will.content
+    same = [name, name.replace("41", "42")]
+    assert short_names(same) == same
+    assert not panel.takes_opened(True) and panel._of.visible
+    panel._of.value = OPENED
+    assert panel.takes_opened(True) and not panel.takes_opened(False) and not panel._of.visible
+    assert panel.takes_opened(True)
 
 
 def test_a_value_that_no_page_of_ours_sends_makes_nothing(panel: SharePanel, making: Noted) -> None:

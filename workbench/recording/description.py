@@ -103,8 +103,10 @@ def thumbnail(picture: bytes | None) -> str | None:
 def info_from(said: dict[str, Any], folder: Path) -> EpisodeInfo:
     """The info that `said` describes, of a recording in `folder`. Raises KeyError or TypeError."""
     source_file = said["source_file"]
-    if said.get("source_path") and (path := (folder / said["source_path"])).is_file():
-        source_file = os.fspath(path.resolve())
+    if said.get("source_path") and (
+        found := _source_where(str(said["source_path"]), str(said["task"]), folder)
+    ):
+        source_file = os.fspath(found.resolve())
     return EpisodeInfo(
         task=said["task"],
         env_index=said["env_index"],
@@ -125,6 +127,26 @@ def info_from(said: dict[str, Any], folder: Path) -> EpisodeInfo:
         acted_by=acted_by_from(said.get("acted_by")),
         side_files={str(name): str(hashed) for name, hashed in dict(said.get("side_files") or {}).items()},
     )
+
+
+def _source_where(path: str, task: str, folder: Path) -> Path | None:
+    """The task's file, where `path` leads to from `folder`; None where it is not found.
+
+    A recording that was copied elsewhere has not taken its task along, and is mostly looked at from where that lies: so the end
+    of `path` is looked for below the present folder and those above the recording as well. There the file has to name the task.
+    """
+    if (there := folder / path).is_file():
+        return there
+    parts = [part for part in Path(path).parts if part not in ("..", os.sep)] if path.endswith(".py") else []
+    for place in (Path.cwd(), *folder.resolve().parents):
+        for begin in range(len(parts)):
+            candidate = place.joinpath(*parts[begin:])
+            try:
+                if candidate.is_file() and task in candidate.read_text(encoding="utf-8"):
+                    return candidate
+            except (OSError, UnicodeDecodeError):
+                continue
+    return None
 
 
 def columns_from(said: dict[str, Any]) -> dict[str, Column]:

@@ -109,6 +109,8 @@ class Episode:
     """``actors/cube``, ``articulations/panda``, each (T + 1, D) as ManiSkill's ``get_state_dict`` lays it out."""
     obs: dict[str, NDArray] = field(default_factory=dict)
     """State observations flattened by ``/``, each (T + 1, ...); no pictures. The key of one that was no dict is ``""``."""
+    unread: tuple[str, ...] = ()
+    """Of a recording that was read: a sentence on each of its files that is broken, and what it would have held."""
 
     @property
     def length(self) -> int:

@@ -37,10 +37,16 @@ class ExportOptions:
     choice: Choice = Choice()
     only_successes: bool = False
     """Leave out episodes that reach success at no step."""
+    only_fitting: bool = False
+    """Leave out episodes that cannot be read, or lack what the first one has, and say which; else such a one ends it."""
     instruction: str | None = None
     """The task in words, as policies that read are given it; None is the task's id."""
     fps: int | None = None
     """Frames a second; the control rate has to be a whole multiple of it. None is the control rate."""
+
+
+class DoesNotFit(ValueError):
+    """An episode that cannot be one of the dataset's, in a sentence; without it the others can."""
 
 
 @dataclass
@@ -50,6 +56,8 @@ class Exported:
     frames: int = 0
     left_out: int = 0
     """Episodes without success."""
+    not_fitting: list[str] = field(default_factory=list)
+    """A sentence on each episode that was left out for that."""
     notes: list[str] = field(default_factory=list)
 
 
@@ -68,7 +76,8 @@ def export_lerobot(
         on_progress: called with the number of episodes that are done, and what is done now.
 
     Raises:
-        ValueError: nothing is left to write, or the episodes do not fit together; the message says which.
+        DoesNotFit: an episode cannot be read, or lacks what was chosen or what the first one has; the message says which.
+        ValueError: nothing is left to write.
         OSError: it cannot be written there.
     """
     folder = Path(folder).absolute()
@@ -84,7 +93,15 @@ def export_lerobot(
             writer = _Writer(temporary, options, made, stack)
             for number, (name, read) in enumerate(sources):
                 on_progress(number, name)
-                writer.add(name, read())
+                try:
+                    fitting = writer.fitting(name, read)
+                except DoesNotFit as error:
+                    if not options.only_fitting:
+                        raise
+                    made.not_fitting.append(str(error))
+                    continue
+                if fitting is not None:
+                    writer.add(fitting)
             writer.finish()
         os.rename(temporary, folder)
     except OSError as error:
@@ -155,23 +172,39 @@ class _Writer:
         self._from: list[dict[str, Any]] = []
         self._fps, self._robot = 0, None
 
-    def add(self, name: str, episode: Episode) -> None:
+    def fitting(self, name: str, read: Callable[[], Episode]) -> Frames | None:
+        """What there is to `add` of an episode; None for one without success where those are left out.
+
+        Raises:
+            DoesNotFit: it cannot be added.
+        """
+        try:
+            episode = read()
+        except ValueError as error:
+            raise DoesNotFit(str(error) if name in str(error) else f"{name}: {error}") from error
+        if episode.unread:
+            raise DoesNotFit(" ".join(episode.unread))
         if self._options.only_successes and not _succeeds(episode):
             self._made.left_out += 1
-            return
+            return None
         fps, every = self._rate(name, episode)
         try:
             frames = frames_of(episode, replace(self._options.choice, every=every))
         except ValueError as error:
-            raise ValueError(f"{name} {error}.") from error
+            raise DoesNotFit(f"{name} {error}.") from error
         features = frames.features()
         if self._features is None:
             self._features, self._first, self._fps = features, name, fps
             self._robot = episode.info.env_kwargs.get(ROBOT)
         elif features != self._features or fps != self._fps:
-            raise ValueError(
+            raise DoesNotFit(
                 f"{name} does not go into one dataset with {self._first}: {_difference(self._features, features)}."
             )
+        return frames
+
+    def add(self, frames: Frames) -> None:
+        """The next episode. Raises OSError, or ValueError where its pictures cannot be decoded."""
+        episode = frames.episode
         entry: dict[str, Any] = {"episode_index": self._made.episodes}
         task = self._options.instruction or episode.info.task
         task_index = self._tasks.setdefault(task, len(self._tasks))
@@ -212,7 +245,7 @@ class _Writer:
             return fps, 1
         every = round(rate / self._options.fps)
         if every < 1 or abs(rate / self._options.fps - every) > 1e-3:
-            raise ValueError(
+            raise DoesNotFit(
                 f"{name} has {rate:g} steps a second, which is no whole multiple of {self._options.fps}; choose another "
                 "number of frames a second."
             )
@@ -254,7 +287,7 @@ class _Writer:
     def finish(self) -> None:
         if self._features is None or self._rows is None:
             why = "none of them reaches success" if self._made.left_out else "none was named"
-            raise ValueError(f"There is no episode to export: {why}.")
+            raise ValueError(" ".join(self._made.not_fitting[:5]) or f"There is no episode to export: {why}.")
         self._rows.close()
         for films in self._films.values():
             films.close()

@@ -1,6 +1,6 @@
 """From the files of one name to rows: what is read, and what is said of files that cannot be.
 
-The ``.json`` is enough for all but the sum of rewards of ManiSkill's trajectories, which is in its ``.h5``. A bare
+The ``.json`` is enough for all but the sum of rewards and the pictures of ManiSkill's trajectories, which are in the ``.h5``. A bare
 ``.rrd``, as they were written before there was a ``.json``, has to be read through, which takes a tenth of a second and
 more: one reason for an index.
 
@@ -43,6 +43,9 @@ DATASET_KEY = ["meta", "info"]
 THUMBNAIL_PIXELS = 96
 THUMBNAIL_BYTES = 8192
 """A thumbnail as it was recorded is taken as it is up to here, and made smaller beyond."""
+
+_LARGEST_PICTURE = 4096
+"""Pixels of a side of a picture that a thumbnail is made of."""
 
 Entry = tuple[Facts, bytes | None]
 """A recording and its thumbnail (jpeg)."""
@@ -151,10 +154,14 @@ def _thumbnail(encoded: object) -> bytes | None:
             if image.format == "JPEG" and max(image.size) <= 2 * THUMBNAIL_PIXELS:
                 if len(content) <= THUMBNAIL_BYTES:
                     return content
-            small = image.convert("RGB")
-        small.thumbnail((THUMBNAIL_PIXELS, THUMBNAIL_PIXELS))
+            return _small_jpeg(image.convert("RGB"))
     except (ValueError, OSError, SyntaxError, binascii.Error, Image.DecompressionBombError):
         return None
+
+
+def _small_jpeg(small: Image.Image) -> bytes:
+    """`small` itself is made small."""
+    small.thumbnail((THUMBNAIL_PIXELS, THUMBNAIL_PIXELS))
     written = io.BytesIO()
     small.save(written, "JPEG", quality=80)
     return written.getvalue()
@@ -173,7 +180,7 @@ def _maniskills(folder: Path, found: Found, described: dict[str, Any]) -> list[E
         lost = f"{name}.h5, which {name}.json describes, is missing."
         return [(Facts("maniskill", task=task, written=written, length=None, problem=lost), None)]
     numbers = [whole(episode.get("episode_id")) for episode in episodes]
-    totals, problem = _totals(found.path(folder, ".h5"), [f"traj_{n}" for n in numbers])
+    totals, pictures, problem = _look_into(found.path(folder, ".h5"), [f"traj_{n}" for n in numbers])
     if not task and problem is None:
         problem = f"{name}.json does not name the env."
     entries: list[Entry] = []
@@ -200,7 +207,7 @@ def _maniskills(folder: Path, found: Found, described: dict[str, Any]) -> list[E
                     acted_by=text(described.get("source_type")),
                     problem=problem or lost,
                 ),
-                None,
+                pictures.get(trajectory),
             )
         )
     return entries
@@ -231,10 +238,13 @@ def _lerobots(folder: Path, found: Found) -> list[Entry]:
     ]
 
 
-def _totals(path: Path, trajectories: list[str]) -> tuple[dict[str, float | None], str | None]:
-    """The sum of rewards of each trajectory that is in the ``.h5`` (None where rewards were not recorded), and what
-    is wrong with the file."""
+def _look_into(
+    path: Path, trajectories: list[str]
+) -> tuple[dict[str, float | None], dict[str, bytes], str | None]:
+    """Of each trajectory that is in the ``.h5`` the sum of rewards (None where they were not recorded) and a thumbnail, where
+    it holds what a camera saw; and what is wrong with the file."""
     totals: dict[str, float | None] = {}
+    pictures: dict[str, bytes] = {}
     try:
         # Without a lock: a recorder that has the file open would be a reason to show nothing.
         with h5py.File(path, "r", locking=False) as file:
@@ -247,9 +257,22 @@ def _totals(path: Path, trajectories: list[str]) -> tuple[dict[str, float | None
                 totals[name] = (
                     number(float(np.asarray(rewards, dtype=np.float64).sum())) if is_numbers else None
                 )
+                if (picture := _last_picture(group)) is not None:
+                    pictures[name] = picture
     except (OSError, RuntimeError, KeyError, ValueError):
-        return totals, f"{path.name} is damaged, or still being written."
-    return totals, None
+        return totals, pictures, f"{path.name} is damaged, or still being written."
+    return totals, pictures, None
+
+
+def _last_picture(group: h5py.Group) -> bytes | None:
+    """A small jpeg of what the first camera saw last, in colour; None where no picture was recorded."""
+    cameras = group.get("obs/sensor_data")
+    for camera in cameras.values() if isinstance(cameras, h5py.Group) else ():
+        rgb = camera.get("rgb") if isinstance(camera, h5py.Group) else None
+        if isinstance(rgb, h5py.Dataset) and rgb.dtype == np.uint8 and rgb.ndim == 4 and len(rgb):
+            if rgb.shape[3] == 3 and max(rgb.shape[1:3]) <= _LARGEST_PICTURE:
+                return _small_jpeg(Image.fromarray(rgb[len(rgb) - 1]))
+    return None
 
 
 def _rrd_only(folder: Path, found: Found) -> Entry:

@@ -1,8 +1,8 @@
 """A recording as an `Episode` again.
 
 The ``.json`` says what the episode is, the ``.rrd`` holds what there is to see (meshes, poses, pictures, curves), and the ``.h5``
-what there is to compute with (env states, observations, actions). Each is read for what it holds best, and a file that is missing takes only its
-own with it: a lone ``.rrd`` that somebody was sent can be looked at, though nobody can step into it.
+what there is to compute with (env states, observations, actions). Each is read for what it holds best, and a file that is missing or broken takes
+only its own with it: a lone ``.rrd`` that somebody was sent can be looked at, though nobody can step into it.
 
 Pictures stay in the file until one is asked for.
 """
@@ -41,42 +41,64 @@ def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
     With `shapes`, meshes are those of other recordings that were read with it, where they look the same.
 
     What a missing file would have held is empty: without the .rrd no geometry, poses and pictures, without the .h5 no env
-    states. The geometry is that of this env alone, as env 0 of 1.
+    states. The same for one that is broken, with a sentence in `Episode.unread`. The geometry is that of this env alone, as
+    env 0 of 1.
 
     Raises:
-        UnreadableRecording: what is there is no recording of ours, or broken; the message says which.
+        UnreadableRecording: what is there is no recording of ours, or all of it is broken; the message says which.
     """
     path = Path(path)
     files = {suffix: path.with_suffix(suffix) for suffix in (".rrd", ".h5", ".json")}
     there = {suffix: file for suffix, file in files.items() if file.is_file()}
     if not there:
         raise UnreadableRecording(f"{path.name} is not there any more.")
-    try:
-        table = RerunTable(there[".rrd"], shapes) if ".rrd" in there else None
-    except (OSError, ValueError, RuntimeError) as error:
-        raise UnreadableRecording(f"{files['.rrd'].name} is no .rrd that can be read: {error}") from error
-    said = _description(there.get(".json"), table, path)
+    unread: list[str] = []
+    table = states = None
+    if ".rrd" in there:
+        try:
+            table = RerunTable(there[".rrd"], shapes)
+        except (OSError, ValueError, RuntimeError) as error:
+            lost = "its 3-D scene, its pictures and what evaluate() said are missing"
+            unread.append(_unread(there[".rrd"], error, lost))
+    if ".h5" in there:
+        try:
+            states = _read_states(there[".h5"])
+        except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
+            unread.append(_unread(there[".h5"], error, "its env states are missing"))
+    if table is None and states is None and unread:
+        raise UnreadableRecording(" ".join(unread))
+    said = _description(there.get(".json"), table, path, unread)
     try:
         episode = _episode(said, table, path.parent)
-        if ".h5" in there:
-            _add_states(episode, there[".h5"])
+        if states is not None:
+            _add_states(episode, states)
         elif table is not None:
             episode.obs = dict(_observations(table, columns_from(said["obs"]), episode.length + 1))
-    except UnreadableRecording:
-        raise
     except (OSError, RuntimeError, KeyError, TypeError, ValueError, IndexError) as error:
         raise UnreadableRecording(
             f"{path.stem} is a recording, but a broken one ({type(error).__name__}: {error})"
         ) from error
+    episode.unread = tuple(unread)
     return episode
 
 
-def _description(file: Path | None, table: RerunTable | None, path: Path) -> dict[str, Any]:
+def _unread(file: Path, error: Exception, lost: str) -> str:
+    why = " ".join(str(error).split()).removeprefix(f"Failed to read RRD file at {file}: ")
+    why = why if len(why) <= 160 else why[:159] + "\u2026"
+    return f"{file.name} was cut short or changed ({why}): {lost}."
+
+
+def _description(
+    file: Path | None, table: RerunTable | None, path: Path, unread: list[str]
+) -> dict[str, Any]:
     if file is not None:
+        said = None
         try:
             said = json.loads(file.read_bytes())
         except (OSError, ValueError) as error:
-            raise UnreadableRecording(f"{file.name} is no JSON that can be read: {error}") from error
+            if table is None:
+                raise UnreadableRecording(f"{file.name} is no JSON that can be read: {error}") from error
+            unread.append(_unread(file, error, "its tags, its note and the place of its task are missing"))
         if isinstance(said, dict) and isinstance(said.get("workbench"), dict):
             return said["workbench"]
         if table is None:
@@ -176,19 +198,25 @@ def _observations(
         begin = end
 
 
-def _add_states(episode: Episode, path: Path) -> None:
+_FLAGS = ("success", "fail")
+
+
+def _read_states(path: Path) -> dict[str, Any]:
     """What the .h5 holds; where the .rrd holds it too, this is what ManiSkill reads."""
     with h5py.File(path, "r") as file:
         if TRAJECTORY not in file:
-            raise UnreadableRecording(f"{path.name} has no {TRAJECTORY}.")
+            raise KeyError(f"it has no {TRAJECTORY}")
         group: Any = file[TRAJECTORY]
-        episode.env_states = dict(leaves(group.get("env_states")))
-        episode.obs = dict(leaves(group.get("obs")))
-        episode.action = group["actions"][:]
-        episode.reward = group["rewards"][:]
-        episode.terminated = group["terminated"][:]
-        episode.truncated = group["truncated"][:]
-        if not episode.evaluate:
-            for name in ("success", "fail"):
-                if name in group:
-                    episode.evaluate[name] = np.concatenate([[False], group[name][:]])
+        held: dict[str, Any] = {name: dict(leaves(group.get(name))) for name in ("env_states", "obs")}
+        held |= {name: group[name][:] for name in ("actions", "rewards", "terminated", "truncated")}
+        return held | {name: group[name][:] for name in _FLAGS if name in group}
+
+
+def _add_states(episode: Episode, held: dict[str, Any]) -> None:
+    episode.env_states, episode.obs = held["env_states"], held["obs"]
+    episode.action, episode.reward = held["actions"], held["rewards"]
+    episode.terminated, episode.truncated = held["terminated"], held["truncated"]
+    if not episode.evaluate:
+        for name in _FLAGS:
+            if name in held:
+                episode.evaluate[name] = np.concatenate([[False], held[name]])

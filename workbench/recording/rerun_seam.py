@@ -18,6 +18,7 @@ import fcntl
 import os
 import threading
 import uuid
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -28,6 +29,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 import rerun_bindings
 from rerun.chunk import LazyStore, RrdReader
+from rerun.error_utils import RerunWarning
+
+# Whoever opens a file that was cut short is told so by an error; this says it once more, in rerun's words, on the terminal.
+warnings.filterwarnings("ignore", "RRD file has no footer", RerunWarning)
 
 
 @contextmanager

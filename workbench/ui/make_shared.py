@@ -26,6 +26,8 @@ from workbench.recording.sources import Source
 from workbench.ui.scene_html import write_scene_html
 
 What = Literal["film", "scene", "page", "sheet", "lerobot"]
+MOST_SAID = 5
+"""Sentences on recordings that were left out."""
 EVERY_CAMERA = ""
 
 
@@ -77,7 +79,7 @@ def make(wanted: Wanted, on_progress: OnProgress = lambda done, doing: None) -> 
 
         part_done(0.0, source.name)
         try:
-            paths += _of_one(wanted, source, source.read(), part_done)
+            paths += _of_readable(wanted, source, part_done)
         except ValueError as error:
             not_made.append(str(error) if source.name in str(error) else f"{source.name}: {error}")
     if not paths:
@@ -93,6 +95,18 @@ def file_name(what: What, source: str, camera: str = "") -> str:
     """Of what is made from the recording that is called `source`, and of its `camera` where it is a film of one."""
     suffix = {"film": f".{camera.replace('/', '_')}.mp4", "scene": ".scene.mp4", "page": ".html"}
     return source + suffix.get(what, ".sheet.png")
+
+
+def _of_readable(wanted: Wanted, source: Source, on_progress: OnProgress) -> list[Path]:
+    episode = source.read()
+    try:
+        return _of_one(wanted, source, episode, on_progress)
+    except ValueError as error:
+        if not episode.unread:
+            raise
+        raise ValueError(
+            " ".join(episode.unread)
+        ) from error  # it does not lack pictures, they cannot be read
 
 
 def _of_one(wanted: Wanted, source: Source, episode: Episode, on_progress: OnProgress) -> list[Path]:
@@ -137,7 +151,9 @@ def _dataset(wanted: Wanted, on_progress: OnProgress) -> Made:
     words = f"{made.episodes} episode{'' if made.episodes == 1 else 's'}, {made.frames} frames"
     if made.left_out:
         words += f"; {made.left_out} without success left out"
-    return Made((made.folder,), " ".join([words + ".", *made.notes]))
+    if made.not_fitting:
+        words += f"; {len(made.not_fitting)} left out that cannot be read or do not fit"
+    return Made((made.folder,), " ".join([words + ".", *made.not_fitting[:MOST_SAID], *made.notes]))
 
 
 def _rate(episode: Episode) -> float:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import datetime
+import re
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,6 +30,7 @@ WHAT: dict[str, What] = {
     "LeRobot dataset": "lerobot",
 }
 ALL_CAMERAS = "every camera"
+SELECTED, OPENED = "what is selected in the library", "what is open in the review"
 MOST_SHOWN = 6
 """Made things in the list; the newest ones."""
 MOST_NAMED = 5
@@ -61,11 +64,19 @@ class SharePanel:
         self._offers, self._making, self._folder = offers, making, folder
         self._chosen = Chosen()
         self._drawn: object = None
+        self._of = server.gui.add_dropdown(
+            "Of", (SELECTED, OPENED), initial_value=SELECTED, visible=False, hint="It stays as you choose it"
+        )
         self._about = server.gui.add_html("")
         self._what = server.gui.add_dropdown("Make", tuple(WHAT))
         self._camera = server.gui.add_dropdown("Camera", _names(()))
         self._successes = server.gui.add_checkbox(
             "Only successes", True, hint="Leave out recordings that reach success at no step"
+        )
+        self._fitting = server.gui.add_checkbox(
+            "Only what fits",
+            True,
+            hint="Leave out recordings that cannot be read, or lack what the first one has; which is said",
         )
         self._task = server.gui.add_text(
             "Task", "", hint="In words, for policies that read; empty: the task's id"
@@ -76,6 +87,11 @@ class SharePanel:
         self._made = server.gui.add_html("")
         self._make.on_click(lambda event: self._start(event.client))
         self._stop.on_click(lambda _: self._making.stop())
+
+    def takes_opened(self, choice: bool) -> bool:
+        """Whether it is to be about what is open although other recordings are selected; `choice`: there are both."""
+        show(self._of, choice)
+        return choice and self._of.value == OPENED
 
     def draw(self, chosen: Chosen) -> None:
         self._chosen = chosen
@@ -92,7 +108,7 @@ class SharePanel:
             render(
                 "share_about",
                 count=len(names),
-                names=names[:MOST_NAMED],
+                names=list(zip(short_names(names)[:MOST_NAMED], names)),
                 more=len(names[MOST_NAMED:]),
                 selected=chosen.selected,
             ),
@@ -102,6 +118,7 @@ class SharePanel:
             self._camera.options = options
         show(self._camera, what == "film" and len(options) > 2)
         show(self._successes, what == "lerobot")
+        show(self._fitting, what == "lerobot" and len(names) > 1)
         show(self._task, what == "lerobot")
         show(self._make, not view.running)
         show(self._stop, view.running)
@@ -123,7 +140,11 @@ class SharePanel:
         if what == "lerobot":
             now = datetime.datetime.now()
             words = self._task.value.strip()[:400]
-            export = ExportOptions(only_successes=self._successes.value, instruction=words or None)
+            export = ExportOptions(
+                only_successes=self._successes.value,
+                only_fitting=self._fitting.value,
+                instruction=words or None,
+            )
             folder = self._folder / "datasets" / f"lerobot_{now:%Y-%m-%dT%H-%M-%S}"
             self._making.start(replace(wanted, folder=folder, export=export))
             return
@@ -154,7 +175,11 @@ class SharePanel:
             for path in made.paths
             if path.is_file()
         ]
-        return {"links": links, "words": made.words, "folder": ", ".join(map(str, made.paths))}
+        short = short_names([str(link["name"]) for link in links])
+        for link, name in zip(links, short):
+            link["short"] = name
+        lost = made.words if made.not_made else ""
+        return {"links": links, "lost": lost, "words": made.words, "folder": ", ".join(map(str, made.paths))}
 
 
 @dataclass(frozen=True)
@@ -165,6 +190,8 @@ class WillMake:
     files: tuple[str, ...] = ()
     more: int = 0
     """Further files."""
+    short: tuple[str, ...] = ()
+    """`files` as they are shown."""
     where: str = ""
     """The folder that they go into; empty for files that the page offers to save."""
 
@@ -184,7 +211,17 @@ def will_make(what: What, chosen: Chosen, camera: str, folder: Path) -> WillMake
         known = f" ({', '.join(chosen.cameras)})" if chosen.cameras else ""
         return WillMake(f"one film for each camera{known} {of}")
     count = f"{len(files)} file{'' if len(files) == 1 else 's'}"
-    return WillMake(count, tuple(files[:MOST_NAMED]), len(files[MOST_NAMED:]))
+    short = tuple(short_names(files)[:MOST_NAMED])
+    return WillMake(count, tuple(files[:MOST_NAMED]), len(files[MOST_NAMED:]), short)
+
+
+_TIME = re.compile(r"_\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d")
+
+
+def short_names(names: Sequence[str]) -> list[str]:
+    """Without the time that a recording's name ends with, where they differ without it too: it is half of the name."""
+    short = [_TIME.sub("", name) for name in names]
+    return short if len(set(short)) == len(short) else list(names)
 
 
 def _names(cameras: tuple[str, ...]) -> tuple[str, ...]:

@@ -1,6 +1,7 @@
 """Sharing and rerun on the review page: which recordings they are about, and what outlives the page.
 
-They are about the recordings that are selected in the library, and where none is, about those that are open.
+They are about the recordings that are selected in the library, and where none is, about those that are open; where both are
+there and differ, a person chooses.
 """
 
 from __future__ import annotations
@@ -67,6 +68,8 @@ class SharePart:
     def draw(self, view: ReviewView) -> None:
         opened = {one.id: one.episode for one in view.opened}
         ids = self._table.selected() if self._table is not None else ()
+        if self._share.takes_opened(bool(ids) and bool(opened) and set(ids) != set(opened)):
+            ids = ()
         rows = [row for row in map(self._library.row, ids or tuple(opened)) if row is not None]
         rows = [row for row in rows if row.problem is None]
         cameras = {name: None for row in rows if row.id in opened for name in cameras_by_name(opened[row.id])}
