@@ -148,7 +148,7 @@ def test_a_recording_is_tagged_and_deleted_and_comes_back(shown: Shown) -> None:
     shown.row(1).click()
     shown.selects(1)
     page.keyboard.press("t")
-    save = page.get_by_role("button", name="Save")
+    save = page.get_by_role("button", name="Save", exact=True)
     expect(save).to_be_visible()
     # Letters and Enter as fast as they can be pressed: all of them count.
     page.evaluate((web_assets_folder() / "typed_first.js").read_text())
