@@ -122,6 +122,23 @@ def test_words_are_looked_for_as_they_are_typed(shown: Shown) -> None:
     shown.page.get_by_text("Clear the filter").click()
     until(lambda: len(shown.seeds()) == 50, "all of them")
     expect(field).to_have_value("")
+    shown.page.evaluate((web_assets_folder() / "library_keys.js").read_text())
+    pill = shown.page.locator(".wb-library-pills .wb-on")
+    field.click()
+    shown.page.keyboard.type("even")
+    expect(pill).to_have_text(f"all {COUNT // 2} of {COUNT}")
+    shown.panel.select(())
+    shown.page.keyboard.press("Enter")  # back to the table
+    shown.page.keyboard.press("ArrowDown")
+    until(lambda: len(shown.panel.selected()) == 1, "one selected")
+    shown.page.keyboard.press("Escape")
+    expect(pill).to_have_text(f"all {COUNT}")
+    field.click()
+    shown.page.keyboard.type("even")
+    expect(pill).to_have_text(f"all {COUNT // 2} of {COUNT}")
+    shown.page.keyboard.press("Escape")
+    expect(pill).to_have_text(f"all {COUNT}")
+    expect(field).to_have_value("")
 
 
 def test_a_recording_is_tagged_and_deleted_and_comes_back(shown: Shown) -> None:
@@ -131,7 +148,7 @@ def test_a_recording_is_tagged_and_deleted_and_comes_back(shown: Shown) -> None:
     shown.row(1).click()
     shown.selects(1)
     page.keyboard.press("t")
-    save = page.get_by_role("button", name="Save")
+    save = page.get_by_role("button", name="Save", exact=True)
     expect(save).to_be_visible()
     # Letters and Enter as fast as they can be pressed: all of them count.
     page.evaluate((web_assets_folder() / "typed_first.js").read_text())
@@ -140,6 +157,10 @@ def test_a_recording_is_tagged_and_deleted_and_comes_back(shown: Shown) -> None:
     page.keyboard.press("Enter")
     expect(shown.row(1).locator(".wb-library-tag")).to_have_text(["wobbly", "good"])
     expect(shown.row(1).locator(".wb-library-name")).to_have_text("r01")
+    expect(save).to_be_hidden()
+    page.keyboard.press("Shift+T")
+    expect(page.get_by_role("dialog").get_by_role("textbox")).to_be_focused()
+    page.keyboard.press("Escape")
     expect(save).to_be_hidden()
     page.keyboard.press("Delete")
     expect(page.get_by_text("Delete 1 recording (3 files")).to_be_visible()
