@@ -99,7 +99,9 @@ def test_a_camera_is_added_moved_copied_renamed_and_removed_and_the_env_has_it_e
     studio.file.drop_plan()
 
 
-def test_a_camera_to_be_added_is_seen_before_and_what_is_left_for_another_plan_is_said(session: Session) -> None:
+def test_a_camera_to_be_added_is_seen_before_and_what_is_left_for_another_plan_is_said(
+    session: Session,
+) -> None:
     studio = session.studio
     new = replace(there(session, ("human", "render_camera")), position=(0.5, 0.2, 0.6))
     studio.plan_add("human", "side", new)
@@ -137,6 +139,22 @@ def test_changes_are_taken_back_one_after_the_other_also_when_a_plan_came_betwee
         studio.file.drop_plan()
     wait_until(session, said(lambda s: s.writing.stage == "none"), "nothing left")
     studio.back_to_file(BASE)
+
+
+def test_a_change_is_not_taken_back_out_of_a_file_that_moved_on(session: Session, task_file: Path) -> None:
+    studio, before = session.studio, task_file.read_text()
+    studio.place(BASE, replace(there(session, BASE), fov=0.9))
+    studio.file.plan_write(BASE)
+    written(session)
+    edited = task_file.read_text() + "# more\n"
+    task_file.write_text(edited)
+    studio.file.undo_write()
+    view = wait_until(session, said(lambda s: s.writing.message.startswith("Not done:")), "why not")
+    assert "was edited since" in view.studio.writing.message and view.studio.writing.stage == "checked"
+    assert task_file.read_text() == edited
+    studio.file.drop_plan()
+    task_file.write_text(before)
+    wait_until(session, lambda v: v.studio.camera(BASE).info.settings.fov == 1.0, "the file of before")
 
 
 def test_a_camera_that_comes_out_otherwise_is_an_error_and_is_taken_back(
