@@ -125,7 +125,7 @@ def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
         door.server.gui.add_html("...")
     library.dock_left()
     library.minimize()
-    view = RerunView(door.server, pages, lambda: 850)
+    view = RerunView(door.server, pages, lambda fold: 850)
     stopping = threading.Event()
 
     def draw() -> None:
