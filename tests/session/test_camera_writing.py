@@ -12,7 +12,7 @@ import pytest
 
 from tests.session.conftest import wait_until
 from tests.session.test_camera_studio import BASE, camera, moved, said
-from workbench.core.camera_settings import CameraKey, CameraSettings, differences
+from workbench.core.camera_settings import CallSite, CameraKey, CameraSettings, differences
 from workbench.session.camera_writing import Wish, copy, plan
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
@@ -139,6 +139,16 @@ def test_changes_are_taken_back_one_after_the_other_also_when_a_plan_came_betwee
         studio.file.drop_plan()
     wait_until(session, said(lambda s: s.writing.stage == "none"), "nothing left")
     studio.back_to_file(BASE)
+
+
+def test_a_camera_that_the_robot_brings_is_in_no_copy_of_the_task(session: Session) -> None:
+    view = session.view()
+    elsewhere = CallSite("/site-packages/robots/wristcam.py", 20, "WristCam._sensor_configs")
+    info = replace(camera(session, BASE).info, site=elsewhere, mount="panda/camera_link")
+    for task in (view.task, replace(view.task, source_files=())):
+        found = plan(task, info, Wish("edit", BASE, replace(there(session, BASE), fov=0.9)))
+        assert found.stage == "refused" and not found.can_copy and "wristcam.py, line 20" in found.message
+        assert 'mount=self.robot.links_map["camera_link"],' in found.refusal.snippet
 
 
 def test_a_change_is_not_taken_back_out_of_a_file_that_moved_on(session: Session, task_file: Path) -> None:

@@ -61,7 +61,11 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish) -> Writing:
 
     made: Plan
     texts, unread = _texts(task)
-    if not task.source_files:
+    elsewhere = "" if wish.what == "add" or info is None else _made_elsewhere(task, info)
+    if elsewhere and info is not None:
+        text = "" if wish.settings is None else _with_mount(info, wish)
+        made = camera_source.Refusal(elsewhere, text)
+    elif not task.source_files:
         text = "" if wish.settings is None else camera_source.snippet(wish.result[1], wish.settings)
         where = "" if task.file is None else f" ({task.file})"
         made = camera_source.Refusal(
@@ -81,8 +85,9 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish) -> Writing:
             text = "" if wish.settings is None else camera_source.snippet(wish.result[1], wish.settings)
             made = camera_source.Refusal(blocked, text)
     if isinstance(made, camera_source.Refusal):
-        can_copy = _could_be_copied(task)
+        can_copy = not elsewhere and _could_be_copied(task)
         ways = " You can copy the text below into the file yourself." if made.snippet and not can_copy else ""
+        ways = " The text below is for a class of your own that inherits from it." if elsewhere else ways
         message = f"Not written: {made.reason}.{ways}"
         return Writing("refused", wish.result, wish.what, None, made, message, can_copy)
     message = f"{_intended(wish, made.names)} Nothing is written yet."
@@ -109,6 +114,28 @@ def _left(wish: Wish) -> str:
         "rename": f"{wish.key[1]} was not renamed.",
         "remove": f"{wish.key[1]} was not removed.",
     }[wish.what]
+
+
+def _made_elsewhere(task: TaskDescription, info: CameraInfo) -> str:
+    """Why neither the task's file nor a copy of it holds this camera; empty where one of them may."""
+    own = {Path(file).resolve() for file in (task.file, *task.source_files) if file is not None}
+    if info.site is None or Path(info.site.file).resolve() in own:
+        return ""
+    return (
+        f"{info.name} is not the task's own: the robot, or else what the task is made of, brings it "
+        f"({info.site.file}, line {info.site.line})"
+    )
+
+
+def _with_mount(info: CameraInfo, wish: Wish) -> str:
+    from workbench.authoring import camera_source
+
+    assert wish.settings is not None
+    link = (info.mount or "").partition("/")[2]
+    hook = "" if info.site is None else info.site.function.rpartition(".")[2]
+    robot = "self.robot" if hook == "_sensor_configs" else "self.agent.robot"  # an agent's hook, or a task's
+    more = [f'mount={robot}.links_map["{link}"]'] if link else []
+    return camera_source.snippet(wish.result[1], wish.settings, more=more)
 
 
 def _could_be_copied(task: TaskDescription) -> bool:
