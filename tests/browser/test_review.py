@@ -175,7 +175,7 @@ def test_what_is_shared_is_named_made_and_fetched(desk: tuple[Page, list[str]]) 
         address = link.evaluate("link => link.href")
         sheet = Image.open(io.BytesIO(page.request.get(address).body()))
         assert sheet.format == "PNG" and sheet.width > 100
-        assert address.endswith(f"{link.inner_text()}") and ".sheet.png" in address
+        assert address.endswith(str(link.get_attribute("title"))) and ".sheet.png" in address
     assert [e for e in errors if LATE not in e] == []
 
 
