@@ -146,8 +146,8 @@ def test_dragged_with_the_mouse_written_checked_and_taken_back(page: Page, task_
     for i in range(1, 5):
         page.mouse.move(x + 10 * i, y)
     # While the button is still down.
-    until(lambda: picture(page) not in ("", before), "another picture")
     until(lambda: numbers(page, "Position")[1] > 0.05, "the number")
+    until(lambda: picture(page) not in ("", before), "another picture")
     page.mouse.up()
     assert numbers(page, "Position")[::2] == [0.45, 0.6] and numbers(page, "Degrees")[:2] == [0, 58.34]
     # All of it is one step of undo, which brings back what it looked at too.

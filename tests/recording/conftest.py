@@ -153,6 +153,7 @@ def _play(env: gym.Env, task: str, steps: int) -> Recorded:
             seed=SEED,
             source_file="some/folder/task.py",
             source_hash="0123456789ab",
+            acted_by=((0, "random"), (5, "sliders")),
             source={"some/folder/task.py": "class Task: ...\n", "some/folder/parts.py": "SIZE = 2\n"},
             control_dt=base.control_timestep,
             control_mode=base.control_mode,

@@ -288,6 +288,7 @@ def test_properties_tell_the_episode(written: tuple[Made, Path, Entities]) -> No
         "backend": "cpu",
         "source_file": "task.py",
         "source_hash": "0123456789ab",
+        "acted_by": "random; from step 6 on: sliders",
         "max_episode_steps": 50,
         "recovered": False,
         "reset_options": "{}",
