@@ -40,3 +40,32 @@ def test_frustums_follow_their_pictures_and_leave_with_them(server: viser.ViserS
     assert (frustums._drawn["sensor", "base"].fov, frustums._drawn["sensor", "base"].aspect) == (1.5, 2.0)
     frustums.draw((), {("sensor", "base"): moved}, offset)
     assert frustums._drawn == {}
+
+
+def test_the_nearest_frustum_that_a_ray_meets_is_the_one_pressed(server: viser.ViserServer) -> None:
+    frustums = CameraFrustums(server)
+    behind = POSE + [0.3, 0, 0, 0, 0, 0, 0]
+    pictures: dict[tuple[CameraKind, str], Picture] = {
+        ("sensor", "base"): Picture("base", "sensor", 0, POSE, GREY),
+        ("sensor", "hand"): Picture("hand", "sensor", 0, behind.astype(np.float32), GREY),
+    }
+    frustums.draw((camera("base"), camera("hand")), pictures, np.zeros(3, np.float32), size=0.1)
+    along = np.array([1.0, 0.0, 0.0])
+    # They look along x, one behind the other.
+    assert frustums.under_ray(np.array([0.0, 2, 3]), along) == ("sensor", "base")
+    assert frustums.under_ray(np.array([9.0, 2, 3]), -along) == ("sensor", "hand")
+    assert frustums.under_ray(np.array([2.0, 2, 3]), along) is None, "both lie behind"
+    assert frustums.under_ray(np.array([0.0, 2.2, 3]), along) is None
+    # Just inside and just outside of the edges that viser draws.
+    frustums.draw(
+        (camera("base"),), {("sensor", "base"): pictures["sensor", "base"]}, np.zeros(3, np.float32), size=0.1
+    )
+    handle = frustums._drawn["sensor", "base"]
+    y = np.tan(handle.fov / 2)
+    corner = np.array([y * handle.aspect, y, 1.0]) * 0.1 / np.cbrt(y * y * handle.aspect / 3)
+    turn = viser.transforms.SO3(handle.wxyz)
+    for sign in ([1, 1], [-1, 1], [1, -1], [-1, -1]):
+        for share, met in ((0.99, ("sensor", "base")), (1.01, None)):
+            aside = turn.apply(np.array([*(corner[:2] * sign * share), 0.0]))
+            in_front = handle.position + aside + along * corner[2]
+            assert frustums.under_ray(in_front + along, -along) == met

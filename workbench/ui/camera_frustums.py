@@ -1,8 +1,12 @@
-"""The selected env's cameras in the 3-D view, each a frustum with its live picture on it."""
+"""The selected env's cameras in the 3-D view, each a frustum with its live picture on it.
+
+Which one is pressed is told from the ray of the press, not by viser's own clicks on a node: a node that can be clicked
+takes every press at its place for itself, also those on the handles of the chosen camera that are drawn over it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,16 +43,10 @@ class Placed:
 
 
 class CameraFrustums:
-    """One frustum for each camera whose picture is at hand; a camera's pose travels with its picture.
+    """One frustum for each camera whose picture is at hand; a camera's pose travels with its picture."""
 
-    Args:
-        pressed: called with the camera whose frustum was pressed.
-    """
-
-    def __init__(
-        self, server: viser.ViserServer, pressed: Callable[[CameraKey], None] = lambda key: None
-    ) -> None:
-        self._server, self._pressed = server, pressed
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
         self._drawn: dict[tuple[CameraKind, str], viser.CameraFrustumHandle] = {}
         self._worn: dict[tuple[CameraKind, str], Picture | None] = {}
 
@@ -84,6 +82,15 @@ class CameraFrustums:
 
     def clear(self) -> None:
         self.draw((), {}, np.zeros(3, np.float32))
+
+    def under_ray(self, origin: NDArray, direction: NDArray) -> CameraKey | None:
+        """The camera whose frustum a ray (3,) in the view meets first; None if it meets none."""
+        met = [
+            (distance, key)
+            for key, handle in list(self._drawn.items())  # another thread may be drawing
+            if (distance := _distance_to(handle, origin, direction)) is not None
+        ]
+        return min(met)[1] if met else None
 
     def _draw_one(
         self,
@@ -125,7 +132,6 @@ class CameraFrustums:
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            handle.on_click(lambda _: self._pressed(key))
             self._drawn[key], self._worn[key] = handle, picture
             return
         handle.wxyz, handle.position, handle.scale = wxyz, position, size
@@ -134,6 +140,25 @@ class CameraFrustums:
             # Assigning encodes and sends it, also when it is the picture that is there already.
             self._worn[key] = picture
             handle.image = small_image(picture)
+
+
+def _distance_to(handle: viser.CameraFrustumHandle, origin: NDArray, direction: NDArray) -> float | None:
+    """How far along a ray (3,) its frustum begins, in lengths of `direction`; None where the ray passes it by."""
+    turn = viser.transforms.SO3(handle.wxyz).inverse()
+    start, along = turn @ (np.asarray(origin, float) - handle.position), turn @ np.asarray(direction, float)
+    # viser keeps the volume of what it draws (CameraFrustumVariants.tsx): a pyramid with its tip in the origin.
+    y = np.tan(handle.fov / 2)
+    x = y * handle.aspect
+    depth = np.mean(handle.scale) / np.cbrt(x * y / 3)
+    sides = np.array([[0, 0, 1], [1, 0, -x], [-1, 0, -x], [0, 1, -y], [0, -1, -y]])
+    # The inside of each side: `sides @ point <= room`.
+    room = np.array([depth, 0, 0, 0, 0]) - sides @ start
+    speed = sides @ along
+    if (room[speed == 0] < 0).any():
+        return None
+    enters = (room[speed < 0] / speed[speed < 0]).max(initial=0)
+    leaves = (room[speed > 0] / speed[speed > 0]).min(initial=np.inf)
+    return float(enters) if enters <= leaves else None
 
 
 def small_image(picture: Picture) -> NDArray[np.uint8] | None:

@@ -14,7 +14,6 @@ from collections.abc import Callable
 import numpy as np
 import viser
 
-from workbench.core.camera_settings import CameraKey
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.banner import Banner
@@ -93,7 +92,7 @@ class Page:
         self._busy_banner = BusyBanner(server, session.interrupt, session.restart_worker)
 
         self._mark = SelectionMark(server)
-        self._frustums = CameraFrustums(server, self._on_frustum)
+        self._frustums = CameraFrustums(server)
         self._forces = ForceArrows(server)
         commands = self._commands()
         register(server, commands)
@@ -262,14 +261,17 @@ class Page:
             return frame_one(self._layout, human, aspect, TIMELINE_HEIGHT / height, fovy, acting)
         return frame_all(self._layout, aspect, TIMELINE_HEIGHT / height)
 
-    def _on_frustum(self, key: CameraKey) -> None:
-        self._studio.select(key)
-
     def _on_scene_click(self, event: viser.SceneClickEvent) -> None:
         layout, view = self._layout, self._session.view()
-        if layout is None or view.task is None or self._view_panel.only_selected:
+        if layout is None or view.task is None:
             return
-        env = env_under_ray(layout, np.array(event.ray_origin), np.array(event.ray_direction))
+        ray = np.array(event.ray_origin), np.array(event.ray_direction)
+        if (camera := self._frustums.under_ray(*ray)) is not None:
+            self._studio.select(camera)
+            return
+        if self._view_panel.only_selected:
+            return
+        env = env_under_ray(layout, *ray)
         if env is not None and env < view.task.num_envs:
             self._session.select_env(env)
 
