@@ -9,12 +9,8 @@ content, which is all but the .rrd without a camera and everything with one, and
 What a recorder takes is what a step takes beyond the env's own, which is measured within the same step: on a machine that others use
 too, two runs differ by more than a recorder takes. Stepping is that. The whole run is some episodes, one after the other, until the files
 of the last are there, without what the env took of it. RecordEpisode makes the files of an episode when the next one begins, ours while it
-happens, on another thread; what that takes of the processor is a row of its own, as the env may have wanted it, and so is the env's own step,
-which waits for that thread. Times are medians of the rounds.
-
-An episode has a cost of its own besides that of its steps: a file with the scene's meshes and the sources' texts in it is opened, made last
-and read back. So what a step costs, files included, and the bytes of a step, are differences of two lengths of episode; what is left of
-the shorter one is the row "an episode".
+happens, on another thread; what that takes of the processor is a row of its own, as the env may have wanted it. Times are medians of
+the rounds. Bytes a step are a difference of two lengths, so that neither side's fixed parts (the scene's meshes, the sources' texts) count.
 """
 
 from __future__ import annotations
@@ -220,13 +216,10 @@ def measure(options: Options, num_envs: int, camera: bool, steps: int, rounds: i
     shape = (steps, num_envs, env.action_space.shape[-1])  # type: ignore[index]
     actions = list(torch.from_numpy(rng.uniform(-1, 1, shape).astype(np.float32)))
     runs: dict[str, list[Run]] = {side: [] for side in SIDES}
-    shorter: dict[str, list[Run]] = {side: [] for side in SIDES}
-    few = steps // 4
     for side in SIDES:
         run(side, env, actions[:3], camera)  # first imports, first shaders
     for number in range(rounds):
         for side in SIDES if number % 2 else SIDES[::-1]:
-            shorter[side].append(run(side, env, actions[:few], camera, options.episodes))
             runs[side].append(run(side, env, actions, camera, options.episodes))
     sizes = {}
     for side in SIDES:
@@ -237,13 +230,6 @@ def measure(options: Options, num_envs: int, camera: bool, steps: int, rounds: i
 
     def took(side: str, what: str) -> float:
         return 1000 * statistics.median(getattr(r, what) for r in runs[side]) / steps / options.episodes
-
-    def episode(runs: list[Run]) -> float:
-        """Milliseconds of one, in all."""
-        return 1000 * statistics.median(r.whole for r in runs) / options.episodes
-
-    def a_step(side: str) -> float:
-        return (episode(runs[side]) - episode(shorter[side])) / (steps - few)
 
     def weighs(side: str, *suffixes: str) -> float:
         return sum(sizes[side][suffix] for suffix in suffixes)
@@ -256,10 +242,7 @@ def measure(options: Options, num_envs: int, camera: bool, steps: int, rounds: i
     same, processor = (whole, "processor") if camera else (whole[:2], "without_rrd")
     rows = [
         ("ms a step: stepping", lambda side: took(side, "stepping")),
-        ("ms a step: files included", a_step),
-        ("ms an episode: besides its steps", lambda side: episode(shorter[side]) - few * a_step(side)),
         ("ms a step: the whole run", lambda side: took(side, "whole")),
-        ("ms a step: the env's own meanwhile", lambda side: took(side, "bare")),
         ("ms a step: processor, same content", lambda side: took(side, processor)),
         ("ms a step: processor, everything", lambda side: took(side, "processor")),
         ("bytes a step and env: same content", lambda side: weighs(side, *same)),
