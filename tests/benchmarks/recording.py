@@ -80,6 +80,8 @@ class RecordersThread(threading.Thread):
     """Every thread of this process: those of the recorder leave what they had of the processor."""
 
     ended = 0.0
+    pumped = 0.0
+    """Of `ended`, those that take an .rrd from rerun."""
 
     def run(self) -> None:
         try:
@@ -87,6 +89,8 @@ class RecordersThread(threading.Thread):
         finally:
             if self.name.startswith("episode-"):
                 RecordersThread.ended += time.thread_time()
+            if self.name == "episode-rrd":
+                RecordersThread.pumped += time.thread_time()
 
 
 threading.Thread = RecordersThread  # type: ignore[misc]
@@ -171,7 +175,7 @@ def run(side: str, env: Any, actions: list[torch.Tensor], camera: bool, episodes
         recorder: Any = RecordEpisode(timed, str(folder), save_video=False, trajectory_name="run")  # type: ignore[arg-type]
     else:
         recorder = workbench.Recorder(timed, folder, pictures=("base_camera",) if camera else False)
-    rrd.taken = 0.0
+    rrd.taken = RecordersThread.pumped = 0.0
     began, at_first = time.perf_counter(), time.thread_time() + on_threads()
     stepping = 0.0
     for episode in range(episodes):
@@ -193,7 +197,7 @@ def run(side: str, env: Any, actions: list[torch.Tensor], camera: bool, episodes
         stepping - timed.steps,
         whole - timed.steps - timed.resets,
         processor - timed.processor,
-        rrd.taken,
+        rrd.taken + RecordersThread.pumped,
         size,
     )
 
