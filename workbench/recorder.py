@@ -42,8 +42,8 @@ from workbench.core.take_pictures import Request
 from workbench.core.task_env import TaskEnv
 from workbench.recording.episode import NO_SEED
 from workbench.recording.episode_writer import EpisodeFiles
+from workbench.recording.landing import RecordingError
 from workbench.recording.recover import recover
-from workbench.recording.rrd import RecordingError
 from workbench.session.episode_files import EpisodeFinisher
 from workbench.session.episodes import EpisodeGatherer, GatheredEpisode
 from workbench.session.gather_later import LaterSteps

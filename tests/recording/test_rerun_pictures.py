@@ -18,7 +18,7 @@ from workbench.core.shared_shapes import SharedShapes
 from workbench.recording import layout, rerun_pictures
 from workbench.recording.episode import CameraTrack, Episode
 from workbench.recording.read_episode import read_episode
-from workbench.recording.rerun_log import STEP
+from workbench.recording.rerun_chunks import STEP
 from workbench.recording.rerun_seam import IndexedChunk, decode_chunk, index_of
 from workbench.recording.rerun_table import RerunTable
 

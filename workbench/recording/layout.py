@@ -11,7 +11,7 @@ Two timelines index all of it: ``step``, the state's number, and ``sim_time``. R
 `StepResult` k said: the state after k control steps, with the action that led there and the reward
 that it earned, so the action of row k is ``episode.action[k - 1]`` and row 0 has neither.
 
-A row of numbers or of a pose that is between two equal ones is left out (`rerun_log.telling`): the state before it says what it is.
+A row of numbers or of a pose that is between two equal ones is left out (`rerun_chunks.telling`): the state before it says what it is.
 
 Everything goes in as columns (one call an entity and piece), which research measured at forty times the speed
 of one call a row; pieces are long, since each is a chunk of the file that readers and the viewer handle as one. Rerun writes quaternions as xyzw and cameras in the OpenCV frame (x right, y down,
@@ -23,7 +23,8 @@ from __future__ import annotations
 import math
 import weakref
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cache
 
 import numpy as np
 import rerun as rr
@@ -34,7 +35,7 @@ from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo
 from workbench.recording.columns import EVALUATE, OBS, Column
 from workbench.recording.encoded_pictures import MILLIMETRES_PER_METRE, decode
-from workbench.recording.rerun_log import Log, static_chunk
+from workbench.recording.rerun_chunks import TimedChunks, series_chunk, static_chunk, still_pose
 from workbench.recording.survey import CameraSurvey, Piece, Survey
 
 WORLD = "/world"
@@ -52,60 +53,69 @@ _OPTICAL_FROM_CAMERA = (0.5, -0.5, 0.5, -0.5)
 z up): the rotation matrix [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]."""
 
 
-class EpisodeLog:
-    """Hands one episode to `recording`: what it is as a whole at once, then its pieces as they are `take`n."""
+def static_chunks(survey: Survey) -> Iterator[Chunk]:
+    """What an episode is as a whole, and what happened in it in words.
 
-    def __init__(self, recording: rr.RecordingStream, survey: Survey) -> None:
-        self._survey = survey
-        self._log = log = Log(recording, survey.info.control_dt)
-        self.account = log.account
-        self._cameras = camera_entities([camera.info for camera in survey.cameras])
-        self._bodies = [
-            (body, entity)
-            for body, entity in enumerate(body_entities(survey.header.geometry))
-            if survey.present[body]
-        ]
-        _log_scene(log, survey, dict(self._bodies))
-        _log_lenses(log, survey, self._cameras)
-        _log_series(log, survey)
-        _log_events(log, survey)
+    Raises:
+        ValueError: rerun refuses something in it.
+    """
+    yield from _scene(survey)
+    yield from _lenses(survey)
+    yield from _series(survey)
+    yield _events(survey)
 
-    def take(self, piece: Piece) -> None:
-        """The next piece."""
-        log, survey, states = self._log, self._survey, piece.states
+
+def piece_chunks(survey: Survey, pieces: Iterable[Piece]) -> Iterator[Chunk]:
+    """What is in time, piece by piece in order; an entity has one chunk a piece, or none."""
+    timed = TimedChunks(survey.info.control_dt)
+    cameras = camera_entities([camera.info for camera in survey.cameras])
+    bodies = [pair for pair in _present(survey) if not survey.still[pair[0]]]
+    for piece in pieces:
         poses = piece.columns["poses"]
-        for body, entity in self._bodies:
-            if not survey.still[body]:
-                log.pose(entity, states, poses[:, body, :3], xyzw(poses[:, body, 3:]))
+        for body, entity in bodies:
+            yield timed.pose(entity, piece.states, poses[:, body, :3], xyzw(poses[:, body, 3:]))
         for (index, modality), (frames, blobs) in piece.pictures.items():
-            _log_pictures(log, survey.cameras[index], self._cameras[index], modality, frames, blobs)
-        self._take_camera_poses(states)
-        self._take_numbers(piece)
+            if len(frames):
+                yield _pictures(timed, survey.cameras[index], cameras[index], modality, frames, blobs)
+        yield from _camera_poses(timed, survey, cameras, piece.states)
+        yield from _numbers_in_time(timed, survey, piece)
 
-    def _take_camera_poses(self, states: NDArray[np.int64]) -> None:
-        for camera, entity in zip(self._survey.cameras, self._cameras):
-            begin, end = np.searchsorted(camera.frames, [states[0], states[-1] + 1])
-            if begin < end and not camera.still:
-                translation, quaternion = optical_pose(camera.poses[begin:end])
-                self._log.pose(entity, camera.frames[begin:end], translation, quaternion)
 
-    def _take_numbers(self, piece: Piece) -> None:
-        log, survey, states = self._log, self._survey, piece.states
-        skip = 1 if piece.first == 0 else 0
-        stepped = states[skip:]
-        for name, entity, _ in _numbers(survey):
-            if name in ("action", "reward", "terminated", "truncated"):
-                # State 0 is a reset: nothing led to it.
-                log.scalars(entity, stepped, piece.columns[name][skip:])
-            else:
-                log.scalars(entity, states, piece.columns[name])
-        for name, values in survey.flags.items():
-            log.scalars(f"/episode/{name}", states, values[states])
-        if observed := [piece.columns[OBS + name] for name in survey.named(OBS)]:
-            flat = [
-                np.asarray(v, dtype=np.float64).reshape(len(states), math.prod(v.shape[1:])) for v in observed
-            ]
-            log.scalars(OBSERVATION, states, np.concatenate(flat, axis=1))
+def _camera_poses(
+    timed: TimedChunks, survey: Survey, entities: Sequence[str], states: NDArray[np.int64]
+) -> Iterator[Chunk]:
+    for camera, entity in zip(survey.cameras, entities):
+        begin, end = np.searchsorted(camera.frames, [states[0], states[-1] + 1])
+        if begin < end and not camera.still:
+            yield timed.pose(entity, camera.frames[begin:end], *optical_pose(camera.poses[begin:end]))
+
+
+def _numbers_in_time(timed: TimedChunks, survey: Survey, piece: Piece) -> Iterator[Chunk]:
+    states = piece.states
+    skip = 1 if piece.first == 0 else 0
+    found: list[tuple[str, NDArray[np.int64], NDArray]] = []
+    for name, entity, _ in _numbers(survey):
+        if name in ("action", "reward", "terminated", "truncated"):
+            # State 0 is a reset: nothing led to it.
+            found.append((entity, states[skip:], piece.columns[name][skip:]))
+        else:
+            found.append((entity, states, piece.columns[name]))
+    for name, values in survey.flags.items():
+        found.append((f"/episode/{name}", states, values[states]))
+    if observed := [piece.columns[OBS + name] for name in survey.named(OBS)]:
+        flat = [
+            np.asarray(v, dtype=np.float64).reshape(len(states), math.prod(v.shape[1:])) for v in observed
+        ]
+        found.append((OBSERVATION, states, np.concatenate(flat, axis=1)))
+    for entity, steps, values in found:
+        if np.size(values):
+            yield timed.scalars(entity, steps, values)
+
+
+def _present(survey: Survey) -> list[tuple[int, str]]:
+    """Bodies of the episode's env and what they are called."""
+    entities = body_entities(survey.header.geometry)
+    return [(body, entity) for body, entity in enumerate(entities) if survey.present[body]]
 
 
 # --- names ----------------------------------------------------------------------------------------
@@ -153,19 +163,25 @@ def evaluate_entity(name: str) -> str:
 # --- scene ----------------------------------------------------------------------------------------
 
 
-def _log_scene(log: Log, survey: Survey, entities: dict[int, str]) -> None:
-    log.static(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+def _scene(survey: Survey) -> Iterator[Chunk]:
+    yield _world()
+    entities = dict(_present(survey))
     for body, entity in entities.items():
         if survey.still[body]:
             pose = survey.first_poses[body]
-            log.still(entity, pose[:3], xyzw(pose[3:]))
+            yield still_pose(entity, pose[:3], xyzw(pose[3:]))
     worn: Counter[int] = Counter()
     for visual in survey.header.geometry.visuals:
         worn_by = [int(body) for body in visual.bodies[visual.envs == survey.info.env_index]]
         for body in worn_by:
             if body in entities and (drawn := _drawn(visual, f"{entities[body]}/{worn[body]}")) is not None:
-                log.chunk(drawn)
+                yield drawn
                 worn[body] += 1
+
+
+@cache
+def _world() -> Chunk:
+    return static_chunk(WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP)
 
 
 _made: dict[int, tuple[weakref.ref[Visual], dict[str, Chunk | None]]] = {}
@@ -222,46 +238,51 @@ def _mesh(mesh: Mesh, material: Material) -> rr.Mesh3D | None:
 # --- cameras --------------------------------------------------------------------------------------
 
 
-def _log_lenses(log: Log, survey: Survey, entities: Sequence[str]) -> None:
+def _lenses(survey: Survey) -> Iterator[Chunk]:
     if not survey.cameras:
         return
     names = {0: "background", **survey.header.segmentation}
     # Class ids are 16 bit in rerun; a name beyond that has nowhere to go (ManiSkill's ids are int16).
     classes = [(int(id_), name) for id_, name in sorted(names.items()) if 0 <= id_ <= 0xFFFF]
-    log.static(CAMERAS, rr.AnnotationContext([(*c, (0, 0, 0)) if c[0] == 0 else c for c in classes]))
-    for camera, entity in zip(survey.cameras, entities):
+    yield static_chunk(CAMERAS, rr.AnnotationContext([(*c, (0, 0, 0)) if c[0] == 0 else c for c in classes]))
+    for camera, entity in zip(survey.cameras, camera_entities([camera.info for camera in survey.cameras])):
         info = camera.info
         if camera.still:
             translation, quaternion = optical_pose(camera.poses[0][None])
-            log.still(entity, translation[0], quaternion[0])
+            yield still_pose(entity, translation[0], quaternion[0])
         pinhole = rr.Pinhole(
             image_from_camera=info.intrinsic,
             resolution=[info.width, info.height],
             camera_xyz=rr.ViewCoordinates.RDF,
             image_plane_distance=FRUSTUM_METRES,
         )
-        log.static(entity, pinhole)
+        yield static_chunk(entity, pinhole)
         if "rgb" in camera.modalities:
-            log.static(f"{entity}/rgb", rr.EncodedImage.from_fields(media_type="image/jpeg"))
+            yield static_chunk(f"{entity}/rgb", rr.EncodedImage.from_fields(media_type="image/jpeg"))
         if "depth" in camera.modalities:
             meter = rr.EncodedDepthImage.from_fields(media_type="image/png", meter=MILLIMETRES_PER_METRE)
-            log.static(f"{entity}/depth", meter)
+            yield static_chunk(f"{entity}/depth", meter)
         if "segmentation" in camera.modalities:
             form = rr.components.ImageFormat(
                 width=info.width,
                 height=info.height,
                 channel_datatype=rr.ChannelDatatype.from_np_dtype(_ids(camera)),
             )
-            log.static(f"{entity}/segmentation", rr.SegmentationImage.from_fields(format=form))
+            yield static_chunk(f"{entity}/segmentation", rr.SegmentationImage.from_fields(format=form))
 
 
 def _ids(camera: CameraSurvey) -> np.dtype:
     return np.dtype(np.int32 if camera.wide else np.uint16)
 
 
-def _log_pictures(
-    log: Log, camera: CameraSurvey, entity: str, modality: str, frames: Sequence[int], blobs: Sequence[bytes]
-) -> None:
+def _pictures(
+    timed: TimedChunks,
+    camera: CameraSurvey,
+    entity: str,
+    modality: str,
+    frames: Sequence[int],
+    blobs: Sequence[bytes],
+) -> Chunk:
     steps = np.array(frames, dtype=np.int64)
     if modality == "rgb":
         columns = rr.EncodedImage.columns(blob=list(blobs))
@@ -271,7 +292,7 @@ def _log_pictures(
         # Rerun shows names over ids only where they are plain; its files compress them again.
         ids = np.stack([decode("segmentation", blob) for blob in blobs]).astype(_ids(camera))
         columns = rr.SegmentationImage.columns(buffer=ids.reshape(len(ids), -1).view(np.uint8))
-    log.columns(f"{entity}/{modality}", steps, columns)
+    return timed.of(f"{entity}/{modality}", steps, columns)
 
 
 # --- numbers and words ----------------------------------------------------------------------------
@@ -298,17 +319,20 @@ def series_names(name: str, column: Column) -> list[str]:
     return [f"{name}[{', '.join(map(str, index))}]" for index in np.ndindex(column.shape)]
 
 
-def _log_series(log: Log, survey: Survey) -> None:
+def _series(survey: Survey) -> Iterator[Chunk]:
     drawn: Counter[str] = Counter()
+    found: list[tuple[str, list[str], int]] = []
     for _, entity, series in _numbers(survey):
         folder = entity.split("/")[1]  # one view shows all entities of a folder
-        shared = folder in ("evaluate", "reward")
-        log.series(entity, series, first_color=drawn[folder] if shared else 0)
+        found.append((entity, series, drawn[folder] if folder in ("evaluate", "reward") else 0))
         drawn[folder] += len(series)
-    for name in survey.flags:
-        log.series(f"/episode/{name}", [name])
+    found += [(f"/episode/{name}", [name], 0) for name in survey.flags]
     observed = survey.named(OBS).items()
-    log.series(OBSERVATION, [one for name, column in observed for one in series_names(name or "obs", column)])
+    names = [one for name, column in observed for one in series_names(name or "obs", column)]
+    found.append((OBSERVATION, names, 0))
+    for entity, series, first_color in found:
+        if series:
+            yield series_chunk(entity, tuple(series), first_color)
 
 
 def events(survey: Survey) -> list[tuple[int, str, str]]:
@@ -329,10 +353,10 @@ def onsets(values: NDArray[np.bool_]) -> list[int]:
     return np.flatnonzero(values & ~before).tolist()
 
 
-def _log_events(log: Log, survey: Survey) -> None:
+def _events(survey: Survey) -> Chunk:
     steps, levels, texts = zip(*events(survey))
     columns = rr.TextLog.columns(text=list(texts), level=list(levels))
-    log.columns(EVENTS, np.array(steps, dtype=np.int64), columns)
+    return TimedChunks(survey.info.control_dt).of(EVENTS, np.array(steps, dtype=np.int64), columns)
 
 
 # --- frames ---------------------------------------------------------------------------------------

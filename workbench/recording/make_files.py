@@ -9,15 +9,15 @@ from __future__ import annotations
 import datetime
 import errno
 import re
-from contextlib import ExitStack
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.landing import RecordingError, make_last, publish, reason
 from workbench.recording.maniskill_h5 import h5_writer, write_json
-from workbench.recording.rrd import rrd_writer
-from workbench.recording.survey import Header, JournalReader, Survey
+from workbench.recording.rrd import write_rrd
+from workbench.recording.survey import Header, JournalReader, Piece, Survey
 
 SUFFIXES = (".rrd", ".h5", ".json")
 
@@ -70,14 +70,14 @@ def temporary_files(journal: Path) -> tuple[Path, ...]:
 
 def _write(reader: JournalReader, survey: Survey, paths: tuple[Path, ...], folder: Path) -> None:
     rrd, h5, json = paths
-    with ExitStack() as files:
-        writers = (
-            files.enter_context(rrd_writer(survey, rrd)),
-            files.enter_context(h5_writer(survey, h5)),
-        )
-        for piece in reader.pieces(survey):
-            for writer in writers:
-                writer.take(piece)
+    with h5_writer(survey, h5) as other:
+
+        def pieces() -> Iterator[Piece]:
+            for piece in reader.pieces(survey):
+                other.take(piece)
+                yield piece
+
+        write_rrd(survey, pieces(), rrd)
     write_json(survey, json, folder)
 
 

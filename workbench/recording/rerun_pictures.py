@@ -22,7 +22,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from workbench.recording.encoded_pictures import Modality, encode
-from workbench.recording.rerun_log import STEP
+from workbench.recording.rerun_chunks import STEP
 from workbench.recording.rerun_seam import IndexedChunk, decode_chunk
 
 KEPT_BYTES = 64 << 20

@@ -24,7 +24,7 @@ from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo
 from workbench.core.shared_shapes import SharedShapes
 from workbench.recording.encoded_pictures import EncodedPictures, Modality
-from workbench.recording.rerun_log import STEP
+from workbench.recording.rerun_chunks import STEP
 from workbench.recording.rerun_pictures import PICTURE_COMPONENTS, IdsInFile, OpenFile, PicturesInFile
 from workbench.recording.rerun_seam import IndexedChunk, index_of
 
@@ -224,7 +224,7 @@ class RerunTable:
 def rows_at(steps: NDArray[np.int64], first: int, states: int) -> NDArray[np.int64]:
     """(states - first,) which row says what was at each state: the one before where it has none; -1 where there is none yet.
 
-    Rows that say nothing new are left out (`rerun_log.telling`).
+    Rows that say nothing new are left out (`rerun_chunks.telling`).
     """
     return np.searchsorted(steps, np.arange(first, states), side="right") - 1
 

@@ -1,74 +1,95 @@
-"""Write an episode as an ``.rrd``, a piece at a time, and read back whether all of it arrived.
+"""Write an episode as an ``.rrd``, a piece at a time.
 
-Rerun works on threads of its own and turns most errors into warnings. So its strict mode is on, its bytes go
-through `recording_into` to a file that cannot fail it, and what lies there at the end is held against the account of what was handed over
-(`rerun_log.Account`).
+Its chunks are made while rerun writes them, so that an episode of any length is never in memory as a whole, and what the disk refuses is
+an error here and not on a thread of rerun's.
 """
 
 from __future__ import annotations
 
+import datetime
 import errno
 import json
-from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
+import os
+import re
+import uuid
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import rerun as rr
+from rerun.chunk import Chunk, LazyChunkStream
 from rerun.error_utils import catch_and_log_exceptions
 
-from workbench.recording.blueprint import episode_blueprint
+from workbench.recording.blueprint import Arrangement, arrangement, blueprint_of
+from workbench.recording.blueprint_in_file import BlueprintBytes, add_blueprint, encode_blueprint
 from workbench.recording.description import describe
 from workbench.recording.episode import EpisodeInfo, acted_by_in_words
-from workbench.recording.landing import RecordingError as RecordingError
-from workbench.recording.landing import SafeFile
-from workbench.recording.layout import EpisodeLog
-from workbench.recording.rerun_log import Account
-from workbench.recording.rerun_seam import read_index, recording_into, release_streams
+from workbench.recording.layout import piece_chunks, static_chunks
+from workbench.recording.rerun_chunks import static_chunk
 from workbench.recording.survey import Piece, Survey
 
 
-class RrdWriter:
-    """`take` the pieces of an episode in order. Made by `rrd_writer`."""
-
-    def __init__(self, recording: rr.RecordingStream, log: EpisodeLog, file: SafeFile) -> None:
-        self._recording = recording
-        self._log = log
-        self._file = file
-
-    def take(self, piece: Piece) -> None:
-        """Raises OSError where the file could not be written."""
-        self._log.take(piece)
-        self._recording.flush()  # else what rerun has not yet encoded adds up
-        if self._file.error is not None:
-            raise self._file.error
-
-
-@contextmanager
-def rrd_writer(survey: Survey, path: Path) -> Iterator[RrdWriter]:
-    """Write the episode of `survey` to `path`, which must not exist; the file is whole when the block is left.
+def write_rrd(survey: Survey, pieces: Iterable[Piece], path: Path) -> None:
+    """Write the episode of `survey`, whose `pieces` come in order, to `path`; what lies there is written over.
 
     Raises:
-        OSError: it cannot be written, or what arrived is not what was handed to rerun.
+        OSError: it cannot be written.
         ValueError: rerun refuses something in it.
+        Whatever `pieces` raises.
     """
-    info = survey.info
-    file = SafeFile(path)
+    application_id = _application_id(survey.info)
+    # Without strict mode a mesh that rerun refuses is a warning, and the file lacks it.
+    with catch_and_log_exceptions(strict=True):
+        write_chunks(_chunks(survey, pieces), path, application_id)
+        add_blueprint(path, _blueprint(application_id, arrangement(survey)))
+
+
+def _chunks(survey: Survey, pieces: Iterable[Piece]) -> Iterator[Chunk]:
+    written = datetime.datetime.fromisoformat(survey.info.written_at).timestamp()
+    started = rr.encodings.TimeInt(seconds=written)
+    info = rr.archetypes.RecordingInfo(name=_title(survey), start_time=started)
+    yield static_chunk("/__properties", info)
+    for name, values in properties(survey).items():
+        yield Chunk.from_property(name, rr.AnyValues(**values))
+    yield from static_chunks(survey)
+    yield from piece_chunks(survey, pieces)
+
+
+def write_chunks(chunks: Iterator[Chunk], path: Path, application_id: str) -> None:
+    """Write `chunks` as a recording of its own. Raises OSError, and whatever `chunks` raises."""
+    failed: list[BaseException] = []
+
+    def watched() -> Iterator[Chunk]:
+        try:
+            yield from chunks
+        except GeneratorExit:  # rerun wants no more
+            raise
+        except BaseException as error:
+            failed.append(error)
+            raise
+
+    stream = LazyChunkStream.from_iter(watched())
     try:
-        # Without strict mode a mesh that rerun refuses is a warning, and the file lacks it.
-        with catch_and_log_exceptions(strict=True):
-            with recording_into(file.write, _application_id(info), episode_blueprint(survey)) as recording:
-                log = EpisodeLog(recording, survey)
-                for name, values in properties(survey).items():
-                    recording.send_property(name, rr.AnyValues(**values))
-                recording.send_recording_name(_title(survey))
-                yield RrdWriter(recording, log, file)
-        file.finish()
-        check_written(path, log.account)
-    finally:
-        file.close()
-        release_streams()
+        # Rerun derives a default id from the process, so two episodes of one process would be taken for one.
+        stream.write_rrd(path, application_id=application_id, recording_id=uuid.uuid4().hex)
+    except RuntimeError as error:
+        if failed:
+            raise failed[0] from None
+        raise _disk_error(error, path) from error
+
+
+def _disk_error(error: RuntimeError, path: Path) -> OSError:
+    """What rerun says of a disk, with the number that the system gave."""
+    number = re.search(r"\(os error (\d+)\)", str(error))
+    if number is None:
+        return OSError(errno.EIO, f"{path.name} could not be written ({error})")
+    return OSError(int(number[1]), os.strerror(int(number[1])), str(path))
+
+
+@lru_cache(maxsize=64)
+def _blueprint(application_id: str, arranged: Arrangement) -> BlueprintBytes:
+    return encode_blueprint(application_id, blueprint_of(arranged))
 
 
 def _application_id(info: EpisodeInfo) -> str:
@@ -114,30 +135,3 @@ def properties(survey: Survey) -> dict[str, dict[str, Any]]:
     # The texts are megabytes in no task, and once is enough.
     values["workbench"] = {"description": json.dumps({**said, "source": None})}
     return values
-
-
-def check_written(path: Path, account: Account) -> None:
-    """Raise OSError unless the index at the end of `path` has every row and every static entity of `account`.
-
-    Rerun writes the index last, of what it encoded; that its bytes arrived is `SafeFile`'s affair. So not a chunk need be decoded.
-    """
-    rows: Counter[str] = Counter()
-    statics: set[str] = set()
-    size = path.stat().st_size
-    try:
-        indexed = read_index(path)
-    except (ValueError, RuntimeError, OSError) as error:
-        raise OSError(errno.EIO, f"{path.name} could not be read back ({error})") from error
-    for chunk in indexed:
-        if chunk.end > size:
-            raise OSError(errno.EIO, f"{path.name} ends before {chunk.entity}")
-        if chunk.static:
-            statics.add(chunk.entity)
-        else:
-            rows[chunk.entity] += chunk.rows
-    short = [
-        f"{name}: {rows[name]} of {count} rows" for name, count in account.rows.items() if rows[name] != count
-    ]
-    short += [f"{name}: missing" for name in sorted(account.statics - statics)]
-    if short:
-        raise OSError(errno.EIO, f"not everything arrived on the disk ({'; '.join(short[:3])})")

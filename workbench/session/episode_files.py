@@ -8,7 +8,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 from workbench.recording.episode_writer import EpisodeFiles
-from workbench.recording.rrd import RecordingError
+from workbench.recording.landing import RecordingError
 from workbench.session.episodes import GatheredEpisode
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from workbench.recording.episode_writer import EpisodeWriter
-from workbench.recording.rrd import RecordingError
+from workbench.recording.landing import RecordingError
 from workbench.session.background import BackgroundProcess
 from workbench.session.episode_files import EpisodeFinisher
 from workbench.session.episodes import GatheredEpisode, episode_info, first_row, next_row

@@ -26,7 +26,7 @@ from workbench.core.state_names import states_of
 from workbench.core.step import StepResult
 from workbench.core.step_pictures import step_pictures
 from workbench.recording.episode_writer import EpisodeFiles
-from workbench.recording.rrd import RecordingError
+from workbench.recording.landing import RecordingError
 from workbench.session.acting import Acting
 from workbench.session.dealer import Dealer
 from workbench.session.episode_files import EpisodeFinisher

@@ -17,8 +17,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from workbench.recording.landing import RecordingError
 from workbench.recording.recover import recover
-from workbench.recording.rrd import RecordingError
 from workbench.session.episode_files import EpisodeFinisher
 from workbench.session.episodes import EpisodeGatherer, GatheredEpisode
 from workbench.session.messages import Stepped, TaskDescription

@@ -19,7 +19,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any
 
 from workbench.authoring.problem import Problem, TaskError
-from workbench.recording.rrd import RecordingError
+from workbench.recording.landing import RecordingError
 from workbench.session.dealer import Dealer
 from workbench.session.process import describe_exit
 from workbench.session.record import (
