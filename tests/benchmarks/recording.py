@@ -21,6 +21,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -80,8 +81,6 @@ class RecordersThread(threading.Thread):
     """Every thread of this process: those of the recorder leave what they had of the processor."""
 
     ended = 0.0
-    pumped = 0.0
-    """Of `ended`, those that take an .rrd from rerun."""
 
     def run(self) -> None:
         try:
@@ -89,8 +88,6 @@ class RecordersThread(threading.Thread):
         finally:
             if self.name.startswith("episode-"):
                 RecordersThread.ended += time.thread_time()
-            if self.name == "episode-rrd":
-                RecordersThread.pumped += time.thread_time()
 
 
 threading.Thread = RecordersThread  # type: ignore[misc]
@@ -131,38 +128,26 @@ class _Rrd:
     taken = 0.0
 
     def __init__(self) -> None:
-        def timed(call: Any) -> Any:
-            def run(*args: Any) -> Any:
-                began = time.thread_time()
-                try:
-                    return call(*args)
-                finally:
-                    self.taken += time.thread_time() - began
+        write = make_files.write_rrd
 
-            return run
+        def write_rrd(survey: Any, pieces: Iterator[Any], path: Path) -> None:
+            began = time.thread_time()
+            try:
+                write(survey, self._without(pieces), path)
+            finally:
+                self.taken += time.thread_time() - began
 
-        writer = make_files.rrd_writer
+        make_files.write_rrd = write_rrd
 
-        def rrd_writer(survey: Any, path: Path) -> Any:
-            held = writer(survey, path)
-            return _Timed(held, timed)
-
-        make_files.rrd_writer = rrd_writer  # type: ignore[assignment]
-
-
-class _Timed:
-    """A context, and what it gives, timed."""
-
-    def __init__(self, held: Any, timed: Any) -> None:
-        self._held, self._timed = held, timed
-
-    def __enter__(self) -> Any:
-        given = self._timed(self._held.__enter__)()
-        given.take = self._timed(given.take)
-        return given
-
-    def __exit__(self, *error: Any) -> Any:
-        return self._timed(self._held.__exit__)(*error)
+    def _without(self, pieces: Iterator[Any]) -> Iterator[Any]:
+        """Reading them, and the .h5, which takes them first, are not the .rrd's."""
+        while True:
+            began = time.thread_time()
+            piece = next(pieces, None)
+            self.taken -= time.thread_time() - began
+            if piece is None:
+                return
+            yield piece
 
 
 rrd = _Rrd()
@@ -175,7 +160,7 @@ def run(side: str, env: Any, actions: list[torch.Tensor], camera: bool, episodes
         recorder: Any = RecordEpisode(timed, str(folder), save_video=False, trajectory_name="run")  # type: ignore[arg-type]
     else:
         recorder = workbench.Recorder(timed, folder, pictures=("base_camera",) if camera else False)
-    rrd.taken = RecordersThread.pumped = 0.0
+    rrd.taken = 0.0
     began, at_first = time.perf_counter(), time.thread_time() + on_threads()
     stepping = 0.0
     for episode in range(episodes):
@@ -197,7 +182,7 @@ def run(side: str, env: Any, actions: list[torch.Tensor], camera: bool, episodes
         stepping - timed.steps,
         whole - timed.steps - timed.resets,
         processor - timed.processor,
-        rrd.taken + RecordersThread.pumped,
+        rrd.taken,
         size,
     )
 

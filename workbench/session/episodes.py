@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
@@ -305,7 +306,7 @@ def episode_info(
         control_dt=task.control_dt,
         control_mode=task.control_mode,
         backend=task.backend,
-        versions=package_versions(),
+        versions=dict(package_versions()),
         env_kwargs=dict(task.env_kwargs),
         reset_options=dict(reset_options or {}),
         max_episode_steps=task.max_episode_steps,
@@ -314,8 +315,9 @@ def episode_info(
     )
 
 
-def package_versions() -> dict[str, str]:
-    """Versions of what an episode depends on, for its properties."""
+@cache
+def package_versions() -> Mapping[str, str]:
+    """Versions of what an episode depends on, for its properties: of what this process has, for as long as it lives."""
     found = {}
     for name in _PACKAGES:
         try:
