@@ -99,7 +99,8 @@ def _number_column() -> tuple[rr.ComponentDescriptor, pa.DataType]:
 
 def _lists(numbers: NDArray, kind: pa.DataType, per_row: int) -> pa.Array:
     """`numbers`, all of them, as rows of `kind` with `per_row` elements each, which may be fixed lists themselves."""
-    flat = pa.array(numbers.reshape(-1))
+    # Rows of a journal lie as they came, at any byte: Arrow takes them over as they lie, and rerun ends the process (seen).
+    flat = pa.array(np.require(numbers.reshape(-1), requirements=["C", "A"]))
     if pa.types.is_fixed_size_list(kind.value_type):
         flat = pa.FixedSizeListArray.from_arrays(flat, type=kind.value_type)
     begins = np.arange(0, len(flat) + 1, per_row, dtype=np.int32)
