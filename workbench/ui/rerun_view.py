@@ -138,11 +138,13 @@ class RerunPages:
             return 404, "text/plain; charset=utf-8", b"There is no such recording."
         paths, moments = shown
         names = ", ".join(path.stem for path in paths)
+        # The first moment too: rerun follows what it reads until it reads, at the end of a file, that it is to pause.
+        begins = {**dict.fromkeys(paths, 0), **{path.resolve(): step for path, step in moments().items()}}
         page = _GO_ON.format(
             title=html.escape(names),
             title_text=_in_script(names),
             paths=_in_script([self._offers.address(path) for path in paths]),
-            moments=_in_script([f"{store}@{step}" for store, step in _stores(moments()) if step > 0]),
+            moments=_in_script([f"{store}@{step}" for store, step in _stores(begins)]),
             viewer=_in_script(_VIEWER),
         )
         return 200, "text/html; charset=utf-8", page.encode()
