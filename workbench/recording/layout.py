@@ -21,6 +21,7 @@ z forward); ManiSkill has wxyz and x forward, y left, z up.
 from __future__ import annotations
 
 import math
+import threading
 import weakref
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -189,21 +190,24 @@ _made: dict[int, tuple[weakref.ref[Visual], dict[str, Chunk | None]]] = {}
 are megabytes to convert."""
 _MOST_MADE = 64
 """Of one visual. In a scene that names its bodies by env each env has an entity, and a copy, of its own."""
+_making = threading.Lock()
+"""Several threads make files, of episodes of one scene too."""
 
 
 def _drawn(visual: Visual, entity: str) -> Chunk | None:
     """`visual` as rerun is to have it at `entity`; None where it has no triangles."""
     key = id(visual)
-    held = _made.get(key)
-    if held is None or held[0]() is not visual:
-        held = _made[key] = (weakref.ref(visual, lambda _: _made.pop(key, None)), {})
-    made = held[1]
-    if entity not in made:
-        chunk = next((chunk for chunk in made.values() if chunk is not None), None)
-        if len(made) >= _MOST_MADE:
-            made.clear()
-        made[entity] = _visual_chunk(visual, entity) if chunk is None else chunk.with_entity_path(entity)
-    return made[entity]
+    with _making:
+        held = _made.get(key)
+        if held is None or held[0]() is not visual:
+            held = _made[key] = (weakref.ref(visual, lambda _: _made.pop(key, None)), {})
+        made = held[1]
+        if entity not in made:
+            chunk = next((chunk for chunk in made.values() if chunk is not None), None)
+            if len(made) >= _MOST_MADE:
+                made.clear()
+            made[entity] = _visual_chunk(visual, entity) if chunk is None else chunk.with_entity_path(entity)
+        return made[entity]
 
 
 def _visual_chunk(visual: Visual, entity: str) -> Chunk | None:
