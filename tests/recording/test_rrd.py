@@ -63,7 +63,8 @@ def test_whoever_has_turned_rerun_off_still_gets_the_whole_recording(
 ) -> None:
     monkeypatch.setenv("RERUN", "off")
     episode = make_episode()
-    episode.info = dataclasses.replace(episode.info, task="NobodyElses-v1")  # one whose blueprint nobody has made
+    # Blueprints are kept by the task's name.
+    episode.info = dataclasses.replace(episode.info, task="NobodyElses-v1")
     files = episode.write(tmp_path)
     assert len(RrdReader(files.rrd).blueprints()) == 1
     assert os.environ["RERUN"] == "off"
