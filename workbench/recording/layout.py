@@ -49,6 +49,8 @@ REWARD_TERMS = "reward_terms/"
 
 FRUSTUM_METRES = 0.12
 """How far in front of a camera its picture is drawn in the 3-D view."""
+_XYZW = [0, 1, 2, 4, 5, 6, 3]
+"""Of a pose: rerun's order of a quaternion from ours."""
 _OPTICAL_FROM_CAMERA = (0.5, -0.5, 0.5, -0.5)
 """wxyz of the OpenCV camera axes (x right, y down, z forward) within ManiSkill's (x forward, y left,
 z up): the rotation matrix [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]."""
@@ -70,11 +72,10 @@ def piece_chunks(survey: Survey, pieces: Iterable[Piece]) -> Iterator[Chunk]:
     """What is in time, piece by piece in order; an entity has one chunk a piece, or none."""
     timed = TimedChunks(survey.info.control_dt)
     cameras = camera_entities([camera.info for camera in survey.cameras])
-    bodies = [pair for pair in _present(survey) if not survey.still[pair[0]]]
+    moving = {body: entity for body, entity in _present(survey) if not survey.still[body]}
     for piece in pieces:
-        poses = piece.columns["poses"]
-        for body, entity in bodies:
-            yield timed.pose(entity, piece.states, poses[:, body, :3], xyzw(poses[:, body, 3:]))
+        poses = piece.columns["poses"][:, list(moving)]
+        yield from timed.poses(list(moving.values()), piece.states, poses[..., _XYZW])
         for (index, modality), (frames, blobs) in piece.pictures.items():
             if len(frames):
                 yield _pictures(timed, survey.cameras[index], cameras[index], modality, frames, blobs)
@@ -88,7 +89,8 @@ def _camera_poses(
     for camera, entity in zip(survey.cameras, entities):
         begin, end = np.searchsorted(camera.frames, [states[0], states[-1] + 1])
         if begin < end and not camera.still:
-            yield timed.pose(entity, camera.frames[begin:end], *optical_pose(camera.poses[begin:end]))
+            pose = np.concatenate(optical_pose(camera.poses[begin:end]), axis=1)
+            yield from timed.poses([entity], camera.frames[begin:end], pose[:, None])
 
 
 def _numbers_in_time(timed: TimedChunks, survey: Survey, piece: Piece) -> Iterator[Chunk]:
