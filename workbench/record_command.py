@@ -21,6 +21,7 @@ from rich.progress import (
 from rich.progress import Progress as Bar
 
 from workbench.authoring.problem import Problem, TaskError
+from workbench.recording.landing import try_folder
 from workbench.recording.recover import recover
 from workbench.session.record import Progress, Recorded, RecordOptions, record, with_given_actions
 
@@ -64,6 +65,7 @@ def record_in_terminal(
     )
     before = set(what.out.glob("*.json"))
     try:
+        try_folder(what.out)
         asked, _ = with_given_actions(what)
         mended = recover(what.out) if what.out.is_dir() else []
         if mended:

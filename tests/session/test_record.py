@@ -317,6 +317,7 @@ def test_ctrl_c_keeps_what_is_over(workers: str, tmp_path: Path) -> None:
         (["open", "nothing_here.py", "--port", "0"], "nothing_here.py"),
         (["record", "PickCube-v1", "--num-envs", "0"], "num-envs"),
         (["record", "PickCube-v1", "--actions", "demo.h5"], "demo.h5"),
+        (["record", "PickCube-v1", "--out", sys.executable], "is not a folder"),
         (["view", "nothing_here.rrd"], "nothing_here.rrd"),
         (["open", "PickCube-v1", "--host", "0.0.0.0", "--no-token"], "token"),
         (["open", "PickCube-v1", "--env", "robot"], "name=value"),

@@ -14,6 +14,7 @@ import errno
 import io
 import os
 import shutil
+import tempfile
 import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -23,6 +24,20 @@ _NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.E
 
 class RecordingError(OSError):
     """An episode could not be written; the message says what to do. No file was left behind."""
+
+
+def try_folder(folder: Path) -> None:
+    """Find out whether recordings can be written to `folder`, which may be missing, before minutes are spent on making one.
+
+    Raises:
+        RecordingError: they cannot.
+    """
+    there = next(parent for parent in (folder, *folder.absolute().parents) if os.path.lexists(parent))
+    try:
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        raise RecordingError(f"Cannot record to {folder}: {reason(error, folder)}") from error
 
 
 class SafeFile(io.RawIOBase):
