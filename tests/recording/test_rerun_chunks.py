@@ -10,7 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
 
-from workbench.recording.rerun_chunks import TimedChunks, telling
+from workbench.recording.rerun_chunks import TimedChunks, property_chunk, telling
 
 STEPS = np.arange(5, dtype=np.int64)
 
@@ -42,7 +42,8 @@ def unaligned(values: NDArray) -> NDArray:
 def test_poses(place: Callable[[NDArray], NDArray]) -> None:
     rng = np.random.default_rng(0)
     translation, quaternion = (rng.normal(size=(5, n)).astype(np.float32) for n in (3, 4))
-    ours = TimedChunks(0.05).pose("/world/cube", STEPS, place(translation), place(quaternion))
+    poses = place(np.concatenate([translation, quaternion], axis=1))
+    (ours,) = TimedChunks(0.05).poses(["/world/cube"], STEPS, poses[:, None])
     columns = rr.Transform3D.columns(translation=translation, quaternion=quaternion)
     assert data_of(ours) == data_of(Chunk.from_columns("/world/cube", times(), columns))
 
@@ -59,7 +60,17 @@ def test_numbers(shape: tuple[int, ...], place: Callable[[NDArray], NDArray]) ->
 
 def test_rows_between_two_equal_ones_are_left_out() -> None:
     values = np.array([0, 0, 0, 1, 1, 1, 0.0])
-    assert telling(values[:, None]) is not None
+    assert [
+        None if rows is None else rows.tolist()
+        for rows in telling(np.stack([values, np.arange(7)])[..., None])
+    ] == [[0, 2, 3, 5, 6], None]
     chunk = TimedChunks(0.05).scalars("/reward", np.arange(7, dtype=np.int64), values)
     batch = chunk.to_record_batch()
     assert batch.column("step").to_pylist() == [0, 2, 3, 5, 6]
+
+
+def test_properties() -> None:
+    values = {"task": "PickCube-v1", "seed": 3, "return": 1.5, "success": True, "files": ["a", "b"]}
+    ours = property_chunk("episode", {**values, "reset": None})
+    assert ours.entity_path == "/__properties/episode"
+    assert data_of(ours) == data_of(Chunk.from_property("episode", rr.AnyValues(**values)))

@@ -262,3 +262,20 @@ def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path, foreig
         until(rescorer, "stopped")
     finally:
         rescorer.close()
+
+
+def test_a_recording_with_a_changed_file_is_judged_by_what_is_left_or_says_why(
+    author: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(author / "recordings", tmp_path / "r")
+    one, other, whole = sorted((tmp_path / "r").glob("*.json"))
+    for path in (one.with_suffix(".h5"), other.with_suffix(".h5"), other.with_suffix(".rrd")):
+        content = bytearray(path.read_bytes())
+        content[len(content) // 2] ^= 1
+        path.write_bytes(content)
+    verdicts, _ = rescore_all(RescoreOptions((tmp_path / "r",), task=str(author / "push_cube.py")))
+    by_name = {verdict.file.path.stem: verdict for verdict in verdicts}
+    assert not by_name[one.stem].why_not and not by_name[one.stem].differs
+    assert f"{one.stem}.h5: was cut short or changed" in words.not_carried(verdicts)[0]
+    assert f"{other.stem}.h5 was cut short or changed" in by_name[other.stem].why_not
+    assert not by_name[whole.stem].why_not and by_name[whole.stem].missed == {}

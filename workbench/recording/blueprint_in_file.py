@@ -15,7 +15,9 @@ from __future__ import annotations
 import errno
 import os
 import struct
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -71,21 +73,14 @@ class BlueprintBytes:
         return write_fields([*self.manifest, (_TABLE, write_fields(table))])
 
 
+_encoding = threading.Lock()
+"""Rerun calls back from a thread of its own, for which it needs the interpreter's lock: two threads that are at this wait for each other
+for ever (seen)."""
+
+
 def encode_blueprint(application_id: str, blueprint: rrb.Blueprint) -> BlueprintBytes:
-    layout = rr.RecordingStream._from_native(
-        rerun_bindings.new_blueprint(
-            application_id=application_id, make_default=False, make_thread_default=False, default_enabled=True
-        )
-    )
-    layout.set_time("blueprint", sequence=0)
-    blueprint._log_to_stream(layout)
-    streams: list[bytes] = []
-    rerun_bindings.set_callback_sink_blueprint(streams.append, True, True, layout.to_native())
-    layout.flush()
-    layout.disconnect()
-    del layout
-    rerun_bindings.flush_and_cleanup_orphaned_recordings()  # else its threads live as long as the process
-    stream = streams[-1]  # the one before it has no message
+    with _encoding, _rerun_on():
+        stream = _encoded(application_id, blueprint)
     begin, length, _ = _read_footer(stream[-_FOOTER.size :], len(stream), "a blueprint")
     (manifest,) = [field for field in read_fields(stream[begin : begin + length]) if field[0] == _MANIFESTS]
     fields = _message(manifest)
@@ -100,6 +95,37 @@ def encode_blueprint(application_id: str, blueprint: rrb.Blueprint) -> Blueprint
         table=[pair for pair in said.items() if pair[0] not in (_PAYLOAD, _COMPRESSION, _UNPACKED)],
         places=pa.ipc.open_stream(content).read_next_batch(),
     )
+
+
+@contextmanager
+def _rerun_on() -> Iterator[None]:
+    """Whoever runs with ``RERUN=off`` means the logging in their own code: rerun would make no blueprint either."""
+    said = os.environ.get("RERUN")
+    if said is None:
+        yield
+        return
+    os.environ["RERUN"] = "on"
+    try:
+        yield
+    finally:
+        os.environ["RERUN"] = said
+
+
+def _encoded(application_id: str, blueprint: rrb.Blueprint) -> bytes:
+    layout = rr.RecordingStream._from_native(
+        rerun_bindings.new_blueprint(
+            application_id=application_id, make_default=False, make_thread_default=False, default_enabled=True
+        )
+    )
+    layout.set_time("blueprint", sequence=0)
+    blueprint._log_to_stream(layout)
+    streams: list[bytes] = []
+    rerun_bindings.set_callback_sink_blueprint(streams.append, True, True, layout.to_native())
+    layout.flush()
+    layout.disconnect()
+    del layout
+    rerun_bindings.flush_and_cleanup_orphaned_recordings()  # else its threads live as long as the process
+    return streams[-1]  # the one before it has no message
 
 
 def add_blueprint(path: Path, blueprint: BlueprintBytes) -> None:

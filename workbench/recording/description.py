@@ -13,6 +13,7 @@ neither of the two formats keeps: the types of the entries of ``evaluate()``, th
     side_files      what else the task reads and is not held here: path as seen from the task's file, to hash; may lack
     length, return, success, success_once, fail, fail_once       the last four null where the task has no such entry
     action_names, cameras, segmentation, scene, evaluate, obs    what the columns are
+    files           suffix of each of the other two files, to how many bytes it has and what they hash to; may lack; in the .json alone
     thumbnail       base64 of a JPEG at most 160 pixels wide; null without cameras; in the .json alone
 """
 
@@ -21,6 +22,7 @@ from __future__ import annotations
 import base64
 import io
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +31,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from workbench.core.geometry import SceneGeometry
+from workbench.recording.checksums import checksum
 from workbench.recording.columns import Column
 from workbench.recording.episode import EpisodeInfo, acted_by_from
 from workbench.recording.survey import Survey, camera_words
@@ -77,13 +80,14 @@ def describe(survey: Survey) -> dict[str, Any]:
     }
 
 
-def describe_beside(survey: Survey, folder: Path) -> dict[str, Any]:
-    """`describe`, with what is only worth saying in `folder`, where the recording lies."""
+def describe_beside(survey: Survey, folder: Path, files: Sequence[Path] = ()) -> dict[str, Any]:
+    """`describe`, with what is only worth saying in `folder`, where the recording lies; of which these are the other `files`."""
     info = survey.info
     source = info.source_file if info.source_file and os.path.isabs(info.source_file) else None
     return {
         **describe(survey),
         "source_path": None if source is None else _relative(source, os.fspath(folder.resolve())),
+        "files": {path.suffix: checksum(path) for path in files},
         "thumbnail": thumbnail(survey.sample),
     }
 

@@ -1,12 +1,11 @@
 """Where the files of an episode are written to, and how they get their names: whole and together, or not at all.
 
 A recording outlives its session, so it must not lie: not half written after a full disk, not short of a camera, not written
-over yesterday's. The files of an episode are made under temporary names in a folder beside the journal, checked there (the .rrd by its index, the .h5 by opening it), and only
+over yesterday's. The files of an episode are made under temporary names in a folder beside the journal, checked there (the .rrd by its end, the .h5 by opening it), and only
 then linked to their names, the .json last. **What has no .json is not there.**
 
-The libraries that write them do not take a failing disk well: rerun waits for ever for a thread of its own that ended (seen, with the
-file size limited), HDF5 leaves files half open. So neither of them ever sees it fail: `SafeFile` keeps the first error to
-itself, swallows the rest, and tells at the end.
+HDF5 does not take a failing disk well: it leaves files half open. So it never sees it fail: `SafeFile` keeps the first error to
+itself, swallows the rest, and tells at the end. What writes the .rrd raises at once.
 """
 
 from __future__ import annotations

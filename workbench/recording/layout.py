@@ -21,6 +21,7 @@ z forward); ManiSkill has wxyz and x forward, y left, z up.
 from __future__ import annotations
 
 import math
+import threading
 import weakref
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -48,6 +49,8 @@ REWARD_TERMS = "reward_terms/"
 
 FRUSTUM_METRES = 0.12
 """How far in front of a camera its picture is drawn in the 3-D view."""
+_XYZW = [0, 1, 2, 4, 5, 6, 3]
+"""Of a pose: rerun's order of a quaternion from ours."""
 _OPTICAL_FROM_CAMERA = (0.5, -0.5, 0.5, -0.5)
 """wxyz of the OpenCV camera axes (x right, y down, z forward) within ManiSkill's (x forward, y left,
 z up): the rotation matrix [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]."""
@@ -69,11 +72,10 @@ def piece_chunks(survey: Survey, pieces: Iterable[Piece]) -> Iterator[Chunk]:
     """What is in time, piece by piece in order; an entity has one chunk a piece, or none."""
     timed = TimedChunks(survey.info.control_dt)
     cameras = camera_entities([camera.info for camera in survey.cameras])
-    bodies = [pair for pair in _present(survey) if not survey.still[pair[0]]]
+    moving = {body: entity for body, entity in _present(survey) if not survey.still[body]}
     for piece in pieces:
-        poses = piece.columns["poses"]
-        for body, entity in bodies:
-            yield timed.pose(entity, piece.states, poses[:, body, :3], xyzw(poses[:, body, 3:]))
+        poses = piece.columns["poses"][:, list(moving)]
+        yield from timed.poses(list(moving.values()), piece.states, poses[..., _XYZW])
         for (index, modality), (frames, blobs) in piece.pictures.items():
             if len(frames):
                 yield _pictures(timed, survey.cameras[index], cameras[index], modality, frames, blobs)
@@ -87,7 +89,8 @@ def _camera_poses(
     for camera, entity in zip(survey.cameras, entities):
         begin, end = np.searchsorted(camera.frames, [states[0], states[-1] + 1])
         if begin < end and not camera.still:
-            yield timed.pose(entity, camera.frames[begin:end], *optical_pose(camera.poses[begin:end]))
+            pose = np.concatenate(optical_pose(camera.poses[begin:end]), axis=1)
+            yield from timed.poses([entity], camera.frames[begin:end], pose[:, None])
 
 
 def _numbers_in_time(timed: TimedChunks, survey: Survey, piece: Piece) -> Iterator[Chunk]:
@@ -189,21 +192,24 @@ _made: dict[int, tuple[weakref.ref[Visual], dict[str, Chunk | None]]] = {}
 are megabytes to convert."""
 _MOST_MADE = 64
 """Of one visual. In a scene that names its bodies by env each env has an entity, and a copy, of its own."""
+_making = threading.Lock()
+"""Several threads make files, of episodes of one scene too."""
 
 
 def _drawn(visual: Visual, entity: str) -> Chunk | None:
     """`visual` as rerun is to have it at `entity`; None where it has no triangles."""
     key = id(visual)
-    held = _made.get(key)
-    if held is None or held[0]() is not visual:
-        held = _made[key] = (weakref.ref(visual, lambda _: _made.pop(key, None)), {})
-    made = held[1]
-    if entity not in made:
-        chunk = next((chunk for chunk in made.values() if chunk is not None), None)
-        if len(made) >= _MOST_MADE:
-            made.clear()
-        made[entity] = _visual_chunk(visual, entity) if chunk is None else chunk.with_entity_path(entity)
-    return made[entity]
+    with _making:
+        held = _made.get(key)
+        if held is None or held[0]() is not visual:
+            held = _made[key] = (weakref.ref(visual, lambda _: _made.pop(key, None)), {})
+        made = held[1]
+        if entity not in made:
+            chunk = next((chunk for chunk in made.values() if chunk is not None), None)
+            if len(made) >= _MOST_MADE:
+                made.clear()
+            made[entity] = _visual_chunk(visual, entity) if chunk is None else chunk.with_entity_path(entity)
+        return made[entity]
 
 
 def _visual_chunk(visual: Visual, entity: str) -> Chunk | None:

@@ -22,6 +22,7 @@ import numpy as np
 from PIL import Image
 
 from workbench.recording.annotations import read_json, read_notes
+from workbench.recording.checksums import wrong_size
 from workbench.recording.episode import acted_by_from, acted_by_in_words
 from workbench.recording.lerobot_read import lerobot_rows
 from workbench.recording.library_row import (
@@ -106,6 +107,10 @@ def _ours(folder: Path, found: Found, described: dict[str, Any]) -> Entry:
     name = Path(found.key).name
     lost = [f"{name}{suffix}" for suffix in (".h5", ".rrd") if suffix not in found.sizes]
     problem = f"{' and '.join(lost)} {'is' if len(lost) == 1 else 'are'} missing." if lost else None
+    for suffix, size in found.sizes.items():
+        # What only the bytes tell is told when it is opened: a list of thousands reads none of them.
+        if problem is None and (why := wrong_size(described, suffix, size)) is not None:
+            problem = f"{name}{suffix} was cut short or changed: {why}."
     facts = replace(_episode("workbench", described, found.times[".json"] / 1e9), problem=problem)
     return facts, _thumbnail(described.get("thumbnail"))
 

@@ -78,7 +78,7 @@ def _write(reader: JournalReader, survey: Survey, paths: tuple[Path, ...], folde
                 yield piece
 
         write_rrd(survey, pieces(), rrd)
-    write_json(survey, json, folder)
+    write_json(survey, json, folder, (rrd, h5))
 
 
 def episode_stem(info: EpisodeInfo) -> str:

@@ -13,7 +13,7 @@ HDF5 writes into a `SafeFile`, which knows whether the disk took every byte, and
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -155,14 +155,14 @@ def h5_writer(survey: Survey, path: Path) -> Iterator[H5Writer]:
         safe.close()
 
 
-def write_json(survey: Survey, path: Path, folder: Path) -> None:
-    """Write what is to be said of the episode to `path`, for files that will lie in `folder`. Raises OSError."""
-    content = json.dumps(_document(survey, folder), indent=2, default=str).encode()
+def write_json(survey: Survey, path: Path, folder: Path, files: Sequence[Path] = ()) -> None:
+    """Write what is to be said of the episode, and of its other `files`, to `path`; they will lie in `folder`. Raises OSError."""
+    content = json.dumps(_document(survey, folder, files), indent=2, default=str).encode()
     with path.open("xb") as file:
         file.write(content)
 
 
-def _document(survey: Survey, folder: Path) -> dict[str, Any]:
+def _document(survey: Survey, folder: Path, files: Sequence[Path]) -> dict[str, Any]:
     info = survey.info
     seed = info.seed if info.seed >= 0 else None
     episode: dict[str, Any] = {
@@ -184,7 +184,7 @@ def _document(survey: Survey, folder: Path) -> dict[str, Any]:
         "episodes": [episode],
         "source_type": "workbench",
         "source_desc": f"recorded with maniskill-workbench {info.versions.get('maniskill-workbench', '')}".strip(),
-        "workbench": describe_beside(survey, folder),
+        "workbench": describe_beside(survey, folder, files),
     }
 
 

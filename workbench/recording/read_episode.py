@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from workbench.core.geometry import SceneGeometry
 from workbench.core.shared_shapes import SharedShapes
+from workbench.recording.checksums import check
 from workbench.recording.columns import Column
 from workbench.recording.description import columns_from, info_from
 from workbench.recording.encoded_pictures import EncodedPictures, Modality
@@ -53,21 +54,28 @@ def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
     if not there:
         raise UnreadableRecording(f"{path.name} is not there any more.")
     unread: list[str] = []
+    beside, not_json = _beside(there.get(".json"))
     table = states = None
     if ".rrd" in there:
         try:
+            check(there[".rrd"], beside)
             table = RerunTable(there[".rrd"], shapes)
         except (OSError, ValueError, RuntimeError) as error:
             lost = "its 3-D scene, its pictures and what evaluate() said are missing"
             unread.append(_unread(there[".rrd"], error, lost))
     if ".h5" in there:
         try:
+            check(there[".h5"], beside)
             states = _read_states(there[".h5"])
         except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
             unread.append(_unread(there[".h5"], error, "its env states are missing"))
     if table is None and states is None and unread:
         raise UnreadableRecording(" ".join(unread))
-    said = _description(there.get(".json"), table, path, unread)
+    if not_json is not None and table is not None:
+        unread.append(
+            _unread(there[".json"], not_json, "its tags, its note and the place of its task are missing")
+        )
+    said = beside or _description(there.get(".json"), not_json, table, path)
     try:
         episode = _episode(said, table, path.parent)
         if states is not None:
@@ -88,21 +96,26 @@ def _unread(file: Path, error: Exception, lost: str) -> str:
     return f"{file.name} was cut short or changed ({why}): {lost}."
 
 
+def _beside(file: Path | None) -> tuple[dict[str, Any], Exception | None]:
+    """What the .json says; nothing where it is none of ours, and why where it is none at all."""
+    if file is None:
+        return {}, None
+    try:
+        said = json.loads(file.read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        return {}, error
+    ours = said.get("workbench") if isinstance(said, dict) else None
+    return (ours if isinstance(ours, dict) else {}), None
+
+
 def _description(
-    file: Path | None, table: RerunTable | None, path: Path, unread: list[str]
+    file: Path | None, not_json: Exception | None, table: RerunTable | None, path: Path
 ) -> dict[str, Any]:
-    if file is not None:
-        said = None
-        try:
-            said = json.loads(file.read_bytes())
-        except (OSError, ValueError) as error:
-            if table is None:
-                raise UnreadableRecording(f"{file.name} is no JSON that can be read: {error}") from error
-            unread.append(_unread(file, error, "its tags, its note and the place of its task are missing"))
-        if isinstance(said, dict) and isinstance(said.get("workbench"), dict):
-            return said["workbench"]
-        if table is None:
-            raise UnreadableRecording(f"{file.name} is not from the workbench; read it as ManiSkill's.")
+    """What the recording says of itself where there is no .json of ours."""
+    if file is not None and table is None:
+        if not_json is not None:
+            raise UnreadableRecording(f"{file.name} is no JSON that can be read: {not_json}") from not_json
+        raise UnreadableRecording(f"{file.name} is not from the workbench; read it as ManiSkill's.")
     if table is None:
         raise UnreadableRecording(f"{path.stem}.json is missing, which says what is in {path.name}.")
     said = table.property("workbench", "description")

@@ -7,7 +7,7 @@ from that.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from typing import Any
@@ -35,21 +35,23 @@ SERIES_COLORS = (
 yellow: the viewer comes dark and light, and each of those vanishes on one of the two."""
 
 
-def telling(values: NDArray) -> NDArray[np.int64] | None:
-    """Which rows of `values` (R, D) say something; None for all of them.
+def telling(values: NDArray) -> list[NDArray[np.int64] | None]:
+    """Of each of K things, which rows of `values` (K, R, D) say something; None for all of them.
 
     A row between two equal ones says nothing: whoever looks there finds the one before, and a curve is the same line.
     A row of one number takes 20 bytes in the file besides that number, and most flags of a task change once in an episode. The
     first and the last row always stay, so that an entity is there for as long as it was recorded.
     """
-    if len(values) < 3:
-        return None
-    bits = np.ascontiguousarray(values).view(np.uint8).reshape(len(values), -1)  # NaN equals NaN
-    again = (bits[1:] == bits[:-1]).all(axis=1)
-    silent = again[:-1] & again[1:]
-    if not silent.any():
-        return None
-    return np.concatenate([[0], 1 + np.flatnonzero(~silent), [len(values) - 1]])
+    count, rows = values.shape[:2]
+    if rows < 3 or not values.size:
+        return [None] * count
+    bits = np.ascontiguousarray(values).view(np.uint8).reshape(count, rows, -1)  # NaN equals NaN
+    again = (bits[:, 1:] == bits[:, :-1]).all(axis=2)
+    silent = again[:, :-1] & again[:, 1:]
+    return [
+        np.concatenate([[0], 1 + np.flatnonzero(~of_one), [rows - 1]]) if some else None
+        for of_one, some in zip(silent, silent.any(axis=1))
+    ]
 
 
 def static_chunk(entity: str, *values: Any) -> Chunk:
@@ -61,6 +63,16 @@ def static_chunk(entity: str, *values: Any) -> Chunk:
     batches = [batch for value in values for batch in value.as_component_batches()]
     columns = [batch.partition([len(batch.as_arrow_array())]) for batch in batches]
     return Chunk.from_columns(entity, [], columns)
+
+
+def property_chunk(name: str, values: Mapping[str, Any]) -> Chunk:
+    """What a recording as a whole is said to be; what is None is left out, and a list is several."""
+    columns: list[Any] = [
+        _Column(rr.ComponentDescriptor(key), pa.array([value if isinstance(value, list) else [value]]))
+        for key, value in values.items()
+        if value is not None
+    ]
+    return Chunk.from_columns(rr.new_entity_path(["__properties", name]), [], columns)
 
 
 @lru_cache(maxsize=512)
@@ -103,8 +115,12 @@ def _lists(numbers: NDArray, kind: pa.DataType, per_row: int) -> pa.Array:
     flat = pa.array(np.require(numbers.reshape(-1), requirements=["C", "A"]))
     if pa.types.is_fixed_size_list(kind.value_type):
         flat = pa.FixedSizeListArray.from_arrays(flat, type=kind.value_type)
-    begins = np.arange(0, len(flat) + 1, per_row, dtype=np.int32)
-    return pa.ListArray.from_arrays(pa.array(begins), flat, type=kind)
+    return pa.ListArray.from_arrays(_begins(len(flat), per_row), flat, type=kind)
+
+
+@lru_cache(maxsize=256)
+def _begins(count: int, per_row: int) -> pa.Array:
+    return pa.array(np.arange(0, count + 1, per_row, dtype=np.int32))
 
 
 class TimedChunks:
@@ -121,27 +137,24 @@ class TimedChunks:
         """`columns` with a row for each of `steps` (R,)."""
         return Chunk.from_columns(entity, self._times_of(steps), columns)
 
-    def pose(
-        self,
-        entity: str,
-        steps: NDArray[np.int64],
-        translation: NDArray[np.float32],
-        xyzw: NDArray[np.float32],
-    ) -> Chunk:
-        """`translation` (len(steps), 3) and `xyzw` (len(steps), 4); rows that `telling` leaves out are."""
-        rows = telling(np.concatenate([translation, xyzw], axis=1))
-        if rows is not None:
-            steps, translation, xyzw = steps[rows], translation[rows], xyzw[rows]
-        columns = [
-            _Column(descriptor, _lists(values.astype(np.float32, copy=False), kind, 1))
-            for (descriptor, kind), values in zip(_pose_columns(), (translation, xyzw))
-        ]
-        return self.of(entity, steps, columns)
+    def poses(
+        self, entities: Sequence[str], steps: NDArray[np.int64], poses: NDArray[np.float32]
+    ) -> Iterator[Chunk]:
+        """`poses` (len(steps), len(entities), 7) translation and xyzw; rows that `telling` leaves out are."""
+        by_entity = np.ascontiguousarray(poses.transpose(1, 0, 2), dtype=np.float32)
+        for entity, rows, values in zip(entities, telling(by_entity), by_entity):
+            if rows is not None:
+                values = values[rows]
+            columns = [
+                _Column(descriptor, _lists(part, kind, 1))
+                for (descriptor, kind), part in zip(_pose_columns(), (values[:, :3], values[:, 3:]))
+            ]
+            yield self.of(entity, steps if rows is None else steps[rows], columns)
 
     def scalars(self, entity: str, steps: NDArray[np.int64], values: NDArray) -> Chunk:
         """`values` (len(steps), ...), all of a step as one batch, at least one; rows that `telling` leaves out are."""
         flat = np.asarray(values, dtype=np.float64).reshape(len(steps), -1)
-        rows = telling(flat)
+        (rows,) = telling(flat[None])
         if rows is not None:
             steps, flat = steps[rows], flat[rows]
         descriptor, kind = _number_column()

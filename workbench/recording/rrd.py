@@ -26,7 +26,7 @@ from workbench.recording.blueprint_in_file import BlueprintBytes, add_blueprint,
 from workbench.recording.description import describe
 from workbench.recording.episode import EpisodeInfo, acted_by_in_words
 from workbench.recording.layout import piece_chunks, static_chunks
-from workbench.recording.rerun_chunks import static_chunk
+from workbench.recording.rerun_chunks import property_chunk, static_chunk
 from workbench.recording.survey import Piece, Survey
 
 
@@ -51,7 +51,7 @@ def _chunks(survey: Survey, pieces: Iterable[Piece]) -> Iterator[Chunk]:
     info = rr.archetypes.RecordingInfo(name=_title(survey), start_time=started)
     yield static_chunk("/__properties", info)
     for name, values in properties(survey).items():
-        yield Chunk.from_property(name, rr.AnyValues(**values))
+        yield property_chunk(name, values)
     yield from static_chunks(survey)
     yield from piece_chunks(survey, pieces)
 

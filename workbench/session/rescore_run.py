@@ -30,6 +30,17 @@ _TELL_EVERY = 0.2
 """Seconds."""
 
 
+@dataclass(frozen=True)
+class _Ready:
+    """An episode that can be judged."""
+
+    file: EpisodeFile
+    task: str
+    run: RecordedRun
+    unread: dict[str, str]
+    """Files of it that it has to do without, and why."""
+
+
 @dataclass
 class _Seat:
     """An env with the episode that it lives through."""
@@ -39,6 +50,7 @@ class _Seat:
     run: RecordedRun
     beginning: Beginning
     heard: Heard
+    unread: dict[str, str]
     at: int = 0
     """The state that it is in."""
 
@@ -65,7 +77,7 @@ def rescore(
     steps = 0
     more = True
     while more or seats:
-        begun: dict[int, tuple[EpisodeFile, str, RecordedRun]] = {}
+        begun: dict[int, _Ready] = {}
         while more and len(seats) + len(begun) < task.num_envs:
             file = next(waiting, None)
             if file is None:
@@ -76,7 +88,7 @@ def rescore(
                 yield told
             else:
                 env = next(i for i in range(task.num_envs) if i not in seats and i not in begun)
-                begun[env] = (file, *told)
+                begun[env] = told
         if begun:
             seats |= _begin(opened, begun)
         if not seats:
@@ -87,7 +99,8 @@ def rescore(
         for env in [env for env, seat in seats.items() if seat.at == seat.run.length]:
             seat = seats.pop(env)
             verdict = verdict_of(seat.file, seat.run, seat.task, seat.heard)
-            yield replace(verdict, begins_otherwise=seat.beginning.otherwise, missed=seat.beginning.missed)
+            missed = seat.beginning.missed | seat.unread
+            yield replace(verdict, begins_otherwise=seat.beginning.otherwise, missed=missed)
 
 
 def answer(opened: OpenedTask, request: Rescore, send: Callable[[Rescored], None]) -> None:
@@ -112,7 +125,7 @@ def answer(opened: OpenedTask, request: Rescore, send: Callable[[Rescored], None
     send(Rescored(tuple(ready), steps, True))
 
 
-def _ready(opened: OpenedTask, file: EpisodeFile, use_env_states: bool) -> tuple[str, RecordedRun] | Verdict:
+def _ready(opened: OpenedTask, file: EpisodeFile, use_env_states: bool) -> _Ready | Verdict:
     try:
         episode = file.read()
     except (UnreadableRecording, OSError) as error:
@@ -124,19 +137,21 @@ def _ready(opened: OpenedTask, file: EpisodeFile, use_env_states: bool) -> tuple
     elif use_env_states and not run.env_states:
         why_not = "it holds no env states"
     if why_not:
+        why_not = ". ".join((why_not, *episode.unread))
         return Verdict(file, task=info.task, seed=info.seed, length=run.length, why_not=why_not)
-    return info.task, run
+    told = (sentence.partition(" was ") for sentence in episode.unread)
+    return _Ready(file, info.task, run, {name: f"was {what}" for name, _, what in told})
 
 
-def _begin(opened: OpenedTask, begun: dict[int, tuple[EpisodeFile, str, RecordedRun]]) -> dict[int, _Seat]:
+def _begin(opened: OpenedTask, begun: dict[int, _Ready]) -> dict[int, _Seat]:
     task = opened.env
-    beginnings = begin_again(opened, {env: run for env, (_, _, run) in begun.items()})
+    beginnings = begin_again(opened, {env: ready.run for env, ready in begun.items()})
     with blamed("restore", opened.loaded, task):
         first = task.judge()
     now = read_states(task.env)
     seats: dict[int, _Seat] = {}
-    for env, (file, name, run) in begun.items():
-        seat = seats[env] = _Seat(file, name, run, beginnings[env], Heard())
+    for env, ready in begun.items():
+        seat = seats[env] = _Seat(ready.file, ready.task, ready.run, beginnings[env], Heard(), ready.unread)
         _hear(seat, first, env, now)
     return seats
 

@@ -1,0 +1,81 @@
+"""A changed byte in a file of a recording is said, and what the others hold is there."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.recording.made import Made
+from workbench.recording.annotations import write_into_description
+from workbench.recording.library_read import read_found
+from workbench.recording.library_scan import scan_folder
+from workbench.recording.read_episode import UnreadableRecording, read_episode
+
+Maker = Callable[..., Made]
+
+
+def flip(path: Path, at: int) -> None:
+    content = bytearray(path.read_bytes())
+    content[at] ^= 1
+    path.write_bytes(content)
+
+
+@pytest.fixture
+def episode(make_episode: Maker) -> Made:
+    return make_episode(
+        3,
+        action=np.array([[0.5], [1.5], [2.5]], np.float32),
+        env_states={"actors/cube": np.arange(4 * 13, dtype=np.float32).reshape(4, 13)},
+    )
+
+
+@pytest.mark.parametrize("suffix", [".rrd", ".h5"])
+def test_any_changed_byte_is_said_and_the_other_file_is_read(
+    episode: Made, tmp_path: Path, suffix: str
+) -> None:
+    path = episode.write(tmp_path).json
+    file = path.with_suffix(suffix)
+    chance = random.Random(0)
+    size = file.stat().st_size
+    for at in [0, size - 1, *(chance.randrange(size) for _ in range(30))]:
+        flip(file, at)
+        found = read_episode(path)
+        (said,) = found.unread
+        assert said.startswith(f"{file.name} was cut short or changed (its checksum is not the one"), at
+        assert (found.poses is None) == (suffix == ".rrd")
+        assert (found.env_states == {}) == (suffix == ".h5")
+        np.testing.assert_array_equal(found.action, episode.action)
+        flip(file, at)
+    assert read_episode(path).unread == ()
+
+
+def test_where_both_are_changed_there_is_no_recording(episode: Made, tmp_path: Path) -> None:
+    files = episode.write(tmp_path)
+    flip(files.rrd, 3000)
+    flip(files.h5, 3000)
+    with pytest.raises(UnreadableRecording, match=r"\.rrd was cut short or changed .*\.h5 was cut short"):
+        read_episode(files.json)
+
+
+def test_tags_are_no_change_and_a_change_on_purpose_is_believed(episode: Made, tmp_path: Path) -> None:
+    files = episode.write(tmp_path)
+    write_into_description(files.json, ("good",), "a note")
+    assert read_episode(files.json).unread == ()
+    with files.rrd.open("ab") as file:
+        file.write(b" ")
+    size = files.rrd.stat().st_size
+    assert f"it has {size} bytes, and had {size - 1}" in read_episode(files.json).unread[0]
+    (row,) = scan_folder(tmp_path).found.values()
+    ((facts, _),) = read_found(tmp_path, row)
+    assert facts.problem is not None and f"{files.rrd.name} was cut short or changed" in facts.problem
+    files.rrd.write_bytes(files.rrd.read_bytes()[:-1])
+    flip(files.h5, files.h5.stat().st_size - 100)
+    said = json.loads(files.json.read_bytes())
+    del said["workbench"]["files"][".h5"]
+    files.json.write_text(json.dumps(said))
+    assert read_episode(files.json).unread == ()

@@ -1,0 +1,116 @@
+"""An .rrd is whole whatever the process and the disk around its writer are like, or it is an error."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import os
+import resource
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from tests.recording.made import Made
+from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
+from workbench.recording import rrd
+from workbench.recording.read_episode import read_episode
+from workbench.recording.survey import JournalReader
+from workbench.recording.verify import verify_rrd
+
+Maker = Callable[..., Made]
+
+
+def test_a_disk_that_is_full_at_any_byte_is_an_error_of_the_disk(make_episode: Maker, tmp_path: Path) -> None:
+    """Also where the last that it takes is a part of the blueprint, or of the index."""
+    episode = make_episode(30, action=np.random.default_rng(0).random((30, 1)).astype(np.float32))
+    writer = episode.writer(tmp_path)
+    for row in episode.rows():
+        writer.append(row)
+    writer._journal.finish()
+    reader = JournalReader(writer._journal.path)
+    survey = reader.survey(writer._header)
+    path = tmp_path / "some.rrd"
+
+    def size_with_room(room: int) -> int:
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (room, hard))
+        try:
+            rrd.write_rrd(survey, reader.pieces(survey), path)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        return path.stat().st_size
+
+    whole = size_with_room(1 << 30)
+    before = len(os.listdir("/proc/self/fd"))
+    # Where what is compressed says when it was written, two files differ by some bytes.
+    for room in [*range(0, whole - 64, whole // 80), *range(whole - 64, whole - 16, 8)]:
+        with pytest.raises(OSError) as raised:
+            size_with_room(room)
+        assert raised.value.errno == errno.EFBIG, room
+    assert len(os.listdir("/proc/self/fd")) == before
+    assert size_with_room(whole + 64) > 0
+    assert verify_rrd(path) is None
+    writer.discard()
+
+
+def test_whoever_has_turned_rerun_off_still_gets_the_whole_recording(
+    make_episode: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RERUN", "off")
+    episode = make_episode()
+    # Blueprints are kept by the task's name.
+    episode.info = dataclasses.replace(episode.info, task="NobodyElses-v1")
+    files = episode.write(tmp_path)
+    assert len(RrdReader(files.rrd).blueprints()) == 1
+    assert os.environ["RERUN"] == "off"
+
+
+def test_threads_that_write_episodes_of_one_scene_share_its_meshes(
+    make_episode: Maker, tmp_path: Path
+) -> None:
+    """A scene that names its bodies by env has more entities of one mesh than are kept."""
+    envs = 80
+    mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.uint32))
+    each = np.arange(envs, dtype=np.int32)
+    geometry = SceneGeometry(
+        num_envs=envs,
+        body_names=tuple(f"cube_{env}" for env in each),
+        body_kinds=("dynamic",) * envs,
+        body_hidden=(False,) * envs,
+        visuals=(Visual("cube", mesh, Material((1.0, 0.5, 0.0, 1.0)), each, each),),
+    )
+    failed: list[BaseException] = []
+    written: list[Path] = []
+
+    def write(envs: range) -> None:
+        try:
+            for env in envs:
+                poses = np.full((2, geometry.num_envs, 7), np.nan, np.float32)
+                poses[:, env] = [env, 0, 0, 1, 0, 0, 0]
+                episode = make_episode(1, geometry=geometry, poses=poses)
+                episode.info = dataclasses.replace(episode.info, env_index=env, id=f"{env}")
+                written.append(episode.write(tmp_path).json)
+        except BaseException as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=write, args=(range(k, envs, 8),)) for k in range(8)]
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(interval)
+    assert not failed and len(written) == envs
+    for path in written[::16]:
+        found = read_episode(path)
+        assert found.geometry is not None
+        (visual,) = found.geometry.visuals
+        assert visual.bodies.tolist() == [found.info.env_index]

@@ -1,0 +1,60 @@
+"""Whether a file of a recording is as it was written.
+
+Neither format notices a changed byte: HDF5 has a checksum for chunks alone, which most columns of an episode are too small to be, and costs
+whoever reads; rerun takes what a chunk's bytes say. An episode judged again from such a file is wrong without a word. So the ``.json``
+says how long each of the other two is and what it hashes to: both are in the system's memory when they have just been written,
+where reading and hashing them takes a hundredth of what writing them took, and no program that reads the files alone is concerned.
+
+It tells damage, not forgery: who changes a file can change the ``.json`` too. And whoever changed one on purpose (``rerun rrd optimize``) takes
+its entry out of ``workbench.files`` in the ``.json``, and is believed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import xxhash
+
+_HASH = "xxh3_128"
+_BLOCK = 1 << 20
+
+
+def checksum(path: Path) -> dict[str, Any]:
+    """Of the file at `path`, as JSON. Raises OSError."""
+    hashed = xxhash.xxh3_128()
+    block = memoryview(bytearray(_BLOCK))
+    size = 0
+    with path.open("rb", buffering=0) as file:
+        while count := file.readinto(block):
+            hashed.update(block[:count])
+            size += count
+    return {"bytes": size, _HASH: hashed.hexdigest()}
+
+
+def check(path: Path, described: Mapping[str, Any]) -> None:
+    """Compare the file at `path` with what `described`, the ``workbench`` of its ``.json``, says of it, if it says anything.
+
+    Raises:
+        OSError: it is another, and how; or it cannot be read.
+    """
+    if (why := wrong_size(described, path.suffix, path.stat().st_size)) is not None:
+        raise OSError(why)
+    said = _said(described, path.suffix).get(_HASH)
+    if isinstance(said, str) and checksum(path)[_HASH] != said:
+        raise OSError("its checksum is not the one that was written down with it")
+
+
+def wrong_size(described: Mapping[str, Any], suffix: str, size: int) -> str | None:
+    """What is wrong with a file that is `size` bytes long; None for nothing."""
+    said = _said(described, suffix).get("bytes")
+    if not isinstance(said, int) or said == size:
+        return None
+    return f"it has {size} bytes, and had {said}"
+
+
+def _said(described: Mapping[str, Any], suffix: str) -> Mapping[str, Any]:
+    files = described.get("files")
+    said = files.get(suffix) if isinstance(files, dict) else None
+    return said if isinstance(said, dict) else {}
