@@ -179,6 +179,33 @@ def test_what_is_shared_is_named_made_and_fetched(desk: tuple[Page, list[str]]) 
     assert [e for e in errors if LATE not in e] == []
 
 
+def test_of_rerun_and_the_library_the_one_unfolded_last_folds_the_other_where_there_is_no_room_for_both(
+    desk: tuple[Page, list[str]],
+) -> None:
+    page, _ = desk  # its console has what rerun says when it is taken away while it loads
+    library, rerun = page.locator(".wb-library"), page.locator("iframe.wb-rerun")
+    unfold = page.get_by_role("button", name="Expand column").first
+    page.get_by_role("button", name="Open in rerun").click()
+    expect(rerun).to_be_visible()
+    expect(library).to_have_count(0)
+    until(lambda: page.locator("canvas[data-engine]").evaluate("c => c.clientWidth") < 400, "the narrow view")
+    tops = [page.get_by_role("button", name=name, exact=True) for name in ("first", "play", "last")]
+    until(lambda: len({top.evaluate("b => b.offsetTop") for top in tops}) == 1, "the buttons in one row")
+    unfold.click()  # viser's own button, of which the server is not told
+    expect(library).to_be_visible()
+    expect(rerun).to_have_count(0)
+    unfold.click()
+    expect(rerun).to_be_visible()
+    expect(library).to_have_count(0)
+    page.keyboard.press("b")
+    expect(library).to_be_visible()
+    expect(rerun).to_have_count(0)
+    page.keyboard.press("b")
+    expect(library).to_have_count(0)
+    page.get_by_role("button", name="Close rerun").click()
+    expect(rerun).to_have_count(0)
+
+
 def test_from_the_live_page_to_the_recordings_and_back(folder: Path, browser: Browser) -> None:
     """The env is there as it was."""
     task = Path(__file__).parents[2] / "tasks" / "minimal.py"

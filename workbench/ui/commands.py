@@ -13,6 +13,18 @@ from dataclasses import dataclass
 import viser
 from viser._messages import HotkeyKey, KeyModifier  # the types of add_command's arguments (viser 1.1.1)
 
+_NAMES = {
+    "space": "Space",
+    "arrowleft": "←",
+    "arrowright": "→",
+    "arrowup": "↑",
+    "arrowdown": "↓",
+    "pageup": "Page up",
+    "pagedown": "Page down",
+    "home": "Home",
+    "end": "End",
+}
+
 
 @dataclass(frozen=True)
 class Command:
@@ -23,6 +35,15 @@ class Command:
     description: str | None = None
     registered: Callable[[viser.CommandHandle], None] | None = None
     """Gets its handle, for who wants to disable it at times."""
+
+    @property
+    def key_name(self) -> str:
+        """For a person: ``Space``, ``Shift R``."""
+        if self.key is None:
+            return ""
+        name = _NAMES.get(self.key, self.key)
+        held = [word.removeprefix("cmd/").capitalize() for word in (self.modifier or "").split("+") if word]
+        return " ".join([*held, name])
 
     @property
     def combination(self) -> str:

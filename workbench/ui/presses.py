@@ -61,6 +61,15 @@ class Presses:
             self._ids[key] = element_id(button)
         return self._ids[key]
 
+    def when_unfolded(self, unfolded: Callable[[], None]) -> None:
+        """Call this whenever the panel that the container is in comes into a page: by viser's own buttons too.
+
+        Args:
+            unfolded: called on a thread of viser's, once a page; `unfolded.js` says how.
+        """
+        pressed = self.id_of("unfolded", lambda _: unfolded())
+        self._server.gui.add_html(render("unfolded", id=pressed), order=_LAST + 2)
+
     def number_id(self, key: Hashable, pressed: Callable[[int, viser.ClientHandle | None], None]) -> str:
         """The id to put into ``data-numbers`` around ``choosable.html``; the same key is the same input for good.
 

@@ -38,6 +38,7 @@ SCRIPTS = (
     "view_stays.js",
     "library_keys.js",
     "timeline_width.js",
+    "unfolded.js",
     "typed_first.js",
     "steady_resolution.js",
 )

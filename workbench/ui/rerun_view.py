@@ -38,6 +38,7 @@ from workbench.ui.door import Door
 from workbench.ui.file_reply import FileReply
 from workbench.ui.fragments import render
 from workbench.ui.offers import Offers
+from workbench.ui.presses import Presses
 
 log = logging.getLogger(__name__)
 
@@ -181,6 +182,7 @@ class RerunView:
         pages: Where rerun is served.
         make_way: Called before the panel comes, to make room for it, with what folds and unfolds it; says how many
             pixels there are between the other panels then.
+        unfolded: Called when a page shows the panel, which may have been unfolded there.
     """
 
     def __init__(
@@ -188,8 +190,9 @@ class RerunView:
         server: viser.ViserServer,
         pages: RerunPages,
         make_way: Callable[[Callable[[bool], None]], int] = lambda fold: 0,
+        unfolded: Callable[[], None] = lambda: None,
     ) -> None:
-        self._server, self._pages, self._make_way = server, pages, make_way
+        self._server, self._pages, self._make_way, self._unfolded = server, pages, make_way, unfolded
         self._paths: tuple[Path, ...] = ()
         self._moments: Moments = {}
         self._chosen = 0
@@ -280,6 +283,7 @@ class RerunView:
             begins = {path: moments.get(path, 0) for path in paths}
             heading = [(path.stem, begins[path]) for path in paths]
             self._server.gui.add_html(render("rerun_frame", address=self._address(paths), heading=heading))
+            Presses(self._server).when_unfolded(self._unfolded)
         # Beside the scene, with a border that can be dragged.
         panel.dock_left()
         self._width = max(LEAST, round(SHARE * room))

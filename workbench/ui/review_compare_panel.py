@@ -134,7 +134,8 @@ def headline(found: Difference) -> str:
     if found.bodies is None:
         return "One of them has no scene, so only numbers are compared."
     if found.bodies.position is None:
-        return f"All bodies stay together, {found.bodies.most} apart at most."
+        apart = "" if found.bodies.most == "0" else f", {found.bodies.most} apart at most"
+        return f"All bodies stay together{apart}."
     return (
         f"They part at step {found.bodies.position}: {found.bodies.first} apart. At most {found.bodies.most}."
     )

@@ -90,16 +90,23 @@ class ReviewCurves:
         if chosen is None:
             fill(self._numbers, render("note", text="Numbers and curves appear when a recording is open."))
             return
-        steps = [step_of(view.opened[i].episode, view.states[i]) for i in shown_together(view)]
+        together = shown_together(view)
+        steps = [step_of(view.opened[i].episode, view.states[i]) for i in together]
         own = step_of(chosen.episode, view.states[view.selected])
         rows = number_rows(own, 0, chosen.length)
-        others = [{row.name: known(row.selected) for row in number_rows(step, 0, None)} for step in steps]
+        others = [
+            {row.name: known(row.selected, view.states[i]) for row in number_rows(step, 0, None)}
+            for i, step in zip(together, steps, strict=True)
+        ]
+        here = view.states[view.selected]
         heads = [letter(i) for i in shown_together(view)] if len(steps) > 1 else ["value"]
         table = [
             {
                 "name": row.name,
                 "mood": row.mood,
-                "values": [o.get(row.name, "—") for o in others] if len(steps) > 1 else [known(row.selected)],
+                "values": [o.get(row.name, "—") for o in others]
+                if len(steps) > 1
+                else [known(row.selected, here)],
             }
             for row in rows
         ]
@@ -196,9 +203,14 @@ def span_of(lines: tuple[NDArray[np.float64], ...]) -> Span:
     return value_span(lines)
 
 
-def known(number: str) -> str:
-    """A number as it is said in the table: an entry that the state lacks is kept as NaN."""
-    return "—" if number == "nan" else number
+def known(number: str, state: int) -> str:
+    """A number as it is said in the table: what the first state lacks, of which no step came before, is kept as NaN.
+
+    Later a NaN is what the task returned, and what somebody looks for.
+    """
+    if number != "nan":
+        return number
+    return "NaN" if state > 0 else "—"
 
 
 def shown_together(view: ReviewView) -> tuple[int, ...]:

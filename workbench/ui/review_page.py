@@ -29,6 +29,7 @@ from workbench.ui.commands import Command, register
 from workbench.ui.fragments import render
 from workbench.ui.library_commands import Action
 from workbench.ui.library_panel import LibraryPanel
+from workbench.ui.presses import Presses
 from workbench.ui.redraw_loop import RedrawLoop, draw_apart
 from workbench.ui.review_as_session import as_session_view
 from workbench.ui.review_compare_panel import ReviewComparePanel
@@ -48,6 +49,8 @@ LEAST_VIEW = 240
 """Pixels of the view between the library and another panel."""
 NARROW = 700
 """Pixels of the view beside the library, from which on there is room for both."""
+TOLD_WIDTH = 20.0
+"""Seconds within which a page says how wide its view has become."""
 BACK = "Back to the live env"
 
 
@@ -70,6 +73,8 @@ class Places:
     """Folds the table of recordings, for a part that opens a panel of its own; says how many pixels of the smallest
     page are between the panels then. It gets what folds and unfolds that panel in turn, where there is no room for it
     beside the table."""
+    unfolded: Callable[[], None] = lambda: None
+    """To be called when a page shows that panel: the table is folded if the two leave no view."""
 
 
 Part = Callable[[viser.ViserServer, Places], "Drawn | None"]
@@ -126,6 +131,8 @@ class ReviewPage:
         self._fold_other: Callable[[bool], None] = lambda folded: None
         """Of a part's own panel."""
         self._other_folded = False
+        self._unfolded = "", 0.0
+        """Which of the two panels came into a page last, and when, until something is done about it."""
         self._told: ReviewView | None = None
         self._told_at = 0.0
         stage = stage or Stage(server)
@@ -140,7 +147,15 @@ class ReviewPage:
         review_tab = self._add_tabs(tabs)
         share_tab = tabs.add_tab("Share", viser.Icon.SHARE) if self._offers.parts else review_tab
         self._add_library(library)
-        places = Places(review_tab, self._compare_tab, share_tab, tabs, self._library, self._make_way)
+        places = Places(
+            review_tab,
+            self._compare_tab,
+            share_tab,
+            tabs,
+            self._library,
+            self._make_way,
+            self._other_unfolded,
+        )
         made = [part(server, places) for part in self._offers.parts]
         self._parts = tuple(part for part in made if part is not None)
         with review_tab:
@@ -185,6 +200,7 @@ class ReviewPage:
             self._library_window = self._server.gui.add_panel(order=5.0)
             with self._library_window.add_tab("Library", viser.Icon.LIST_DETAILS):
                 self._library = LibraryPanel(self._server, library, self._review.open)
+                Presses(self._server).when_unfolded(self._library_unfolded)
             self._library.add_action(
                 Action(
                     "Side by side",
@@ -251,6 +267,7 @@ class ReviewPage:
             return
         self._told, self._told_at = view, now
         self._make_way_for_the_first(view)
+        self._fold_what_crowds()
         going = self._offers.going()
         fill(self._status, status_html(view, going, self._folded_keys))
         self._panel.draw(view, bool(going))
@@ -290,6 +307,7 @@ class ReviewPage:
 
     def _show_library(self, shown: bool) -> None:
         self._library_open = shown
+        self._unfolded = "", 0.0
         if self._library_window is None:
             return
         if shown:
@@ -303,6 +321,31 @@ class ReviewPage:
             if self._other_folded:
                 self._other_folded = False
                 self._fold_other(False)
+
+    def _library_unfolded(self) -> None:
+        self._library_open = True
+        self._unfolded = "library", time.monotonic()
+
+    def _other_unfolded(self) -> None:
+        self._unfolded = "other", time.monotonic()
+
+    def _fold_what_crowds(self) -> None:
+        """Of two panels that leave no view, the one that was unfolded last is the one that is wanted.
+
+        A page says how wide its view has become some time later, and where rerun is loading that takes seconds.
+        """
+        last, since = self._unfolded
+        if not last or not 0 < self._smallest_view() < LEAST_VIEW:
+            return
+        self._unfolded = "", 0.0
+        if time.monotonic() - since > TOLD_WIDTH or not self._library_open:
+            return
+        if last == "library":
+            self._other_folded = True
+            self._fold_other(True)
+        else:
+            self._other_folded = False
+            self._show_library(False)
 
     # --- cameras -----------------------------------------------------------------------------------
 

@@ -47,7 +47,7 @@ class Sharing:
             with places.share:
                 share = SharePanel(server, self._offers, self._making, library.folder)
                 server.gui.add_divider()
-                rerun = RerunView(server, self._rerun, places.make_way)
+                rerun = RerunView(server, self._rerun, places.make_way, places.unfolded)
             return SharePart(library, places.library, share, rerun)
 
         return build
