@@ -13,11 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rerun.chunk import RrdReader
+import rerun as rr
+from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
 from tests.recording.made import Made
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.recording import rrd
+from workbench.recording.blueprint_in_file import blueprint_stream
 from workbench.recording.read_episode import read_episode
 from workbench.recording.survey import JournalReader
 from workbench.recording.verify import verify_rrd
@@ -114,3 +116,22 @@ def test_threads_that_write_episodes_of_one_scene_share_its_meshes(
         assert found.geometry is not None
         (visual,) = found.geometry.visuals
         assert visual.bodies.tolist() == [found.info.env_index]
+
+
+def test_a_blueprint_can_be_shown_before_the_recording(make_episode: Maker, tmp_path: Path) -> None:
+    path = make_episode().write(tmp_path).rrd
+    (inside,) = RrdReader(path).blueprints()
+    alone = tmp_path / "alone.rbl"
+    content = blueprint_stream(path)
+    assert content is not None
+    alone.write_bytes(content)
+    again = RrdReader(alone)
+    assert [entry.recording_id for entry in again.blueprints()] == [inside.recording_id]
+    assert again.recordings() == []
+
+
+def test_a_file_of_another_writer_has_no_blueprint_to_show_before(tmp_path: Path) -> None:
+    path = tmp_path / "other.rrd"
+    chunk = Chunk.from_columns("/reward", [], rr.Scalars.columns(scalars=[1.0]))
+    LazyChunkStream.from_iter([chunk]).write_rrd(path, application_id="other", recording_id="one")
+    assert blueprint_stream(path) is None

@@ -11,9 +11,13 @@ from pathlib import Path
 
 import pytest
 import rerun as rr
+import rerun.blueprint as rrb
 from playwright.sync_api import Request, sync_playwright
+from rerun.chunk import LazyChunkStream
 
 from tests.browser.opened import until
+from workbench.recording.blueprint_in_file import add_blueprint, blueprint_stream, encode_blueprint
+from workbench.recording.rerun_chunks import static_chunk
 from workbench.recording.web_viewer import VIEWER_FILES, web_viewer_folder
 from workbench.ui.door import Door, DoorOptions, open_door
 from workbench.ui.gate import cookie_name
@@ -109,6 +113,22 @@ def test_the_viewer_is_sent_packed_to_those_who_take_it(
     assert body == gzip.decompress((web_viewer_folder() / "re_viewer.js.gz").read_bytes())
     for name in ("", "../secret", "index.html.gz"):
         assert get(door, root + name)[0] == 404
+
+
+def test_the_blueprint_of_a_recording_is_sent_before_it(
+    door: Door, pages: RerunPages, recording: Path, tmp_path: Path
+) -> None:
+    ours = tmp_path / "ours.rrd"
+    LazyChunkStream.from_iter([static_chunk("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)]).write_rrd(
+        ours, application_id="workbench", recording_id="two"
+    )
+    add_blueprint(ours, encode_blueprint("workbench", rrb.Blueprint(rrb.Spatial3DView())))
+    address = pages.address([recording, ours])
+    assert 'for (const name of ["1.rbl"])' in get(door, address)[2].decode()
+    status, _, body = get(door, address + "1.rbl")
+    assert (status, body) == (200, blueprint_stream(ours))
+    for name in ("0.rbl", "2.rbl", "../1.rbl", "1.rbl/"):
+        assert not get(door, address + name)[2].startswith(b"RRF2")
 
 
 def test_a_recordings_name_is_text_and_no_script(door: Door, pages: RerunPages, tmp_path: Path) -> None:

@@ -27,8 +27,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 import rerun_bindings
 import xxhash
+from rerun.chunk import RrdReader
 
 from workbench.recording.protobuf import Field, read_fields, write_fields
+from workbench.recording.rerun_seam import index_of
 
 _HEADER = 12
 _MESSAGE = struct.Struct("<QQ")
@@ -149,6 +151,23 @@ def add_blueprint(path: Path, blueprint: BlueprintBytes) -> None:
         file.write(_MESSAGE.pack(_INDEX_KIND, len(index)))
         file.write(index)
         file.write(_FOOTER.pack(index_at, len(index), hashed, mark))
+
+
+def blueprint_stream(path: Path) -> bytes | None:
+    """The blueprint that `add_blueprint` put into the file at `path`, as a stream of its own; None where there is none.
+
+    For who reads a file from its beginning, and would show it in an arrangement of its own until the blueprint comes. Raises OSError,
+    ValueError or RuntimeError where the file is no ``.rrd``.
+    """
+    last = max((chunk.end for chunk in index_of(RrdReader(path).store())), default=0)
+    with path.open("rb") as file:
+        header = file.read(_HEADER)
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(size - _FOOTER.size, 0))
+        begin, _, _ = _read_footer(file.read(), size, path.name)
+        file.seek(last)
+        messages = file.read(max(begin - _MESSAGE.size - last, 0))
+    return header + messages if last and messages else None
 
 
 def _message(field: Field) -> list[Field]:

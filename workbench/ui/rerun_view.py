@@ -31,6 +31,7 @@ from types import MappingProxyType
 
 import viser
 
+from workbench.recording.blueprint_in_file import blueprint_stream
 from workbench.recording.rerun_seam import store_id
 from workbench.recording.web_viewer import VIEWER_FILES, VIEWER_POLICY, is_kept, viewer_file
 from workbench.ui.changed import fill
@@ -50,12 +51,15 @@ Moments = Mapping[Path, int]
 """The step at which a recording is looked at."""
 
 _SHOW = "/rerun/show/"
+_BLUEPRINT = ".rbl"
 _VIEWER = f"/rerun/viewer-{version('rerun-sdk')}/"
 _GO_ON = """<!doctype html><meta charset="utf-8"><title>Workbench: {title}</title>
 <style>body {{ background: #0d1011; color: #cad8de; font: 14px system-ui, sans-serif; margin: 2em }}</style>
 <p>Opening {title} in rerun&hellip;</p>
 <script>
 const query = new URLSearchParams([["hide_welcome_screen", "1"], ["persist", "0"]]);
+// A recording's blueprint is at its end, and until rerun has it, it arranges things as it likes.
+for (const name of {blueprints}) query.append("url", new URL(name, location.href).href);
 for (const path of {paths}) query.append("url", location.origin + path);
 for (const moment of {moments}) query.append("at", moment);
 query.append("title", {title_text});
@@ -138,17 +142,30 @@ class RerunPages:
         if shown is None:
             return 404, "text/plain; charset=utf-8", b"There is no such recording."
         paths, moments = shown
+        part = asked.partition("/")[2]
+        for number, path in enumerate(paths):
+            if part == f"{number}{_BLUEPRINT}" and (blueprint := _blueprint(path)) is not None:
+                return 200, "application/octet-stream", blueprint
         names = ", ".join(path.stem for path in paths)
         # The first moment too: rerun follows what it reads until it reads, at the end of a file, that it is to pause.
         begins = {**dict.fromkeys(paths, 0), **{path.resolve(): step for path, step in moments().items()}}
         page = _GO_ON.format(
             title=html.escape(names),
             title_text=_in_script(names),
+            blueprints=_in_script([f"{n}{_BLUEPRINT}" for n, path in enumerate(paths) if _blueprint(path)]),
             paths=_in_script([self._offers.address(path) for path in paths]),
             moments=_in_script([f"{store}@{step}" for store, step in _stores(begins)]),
             viewer=_in_script(_VIEWER),
         )
         return 200, "text/html; charset=utf-8", page.encode()
+
+
+def _blueprint(path: Path) -> bytes | None:
+    try:
+        return blueprint_stream(path)
+    except (ValueError, OSError, RuntimeError) as error:
+        log.info("%s shows no blueprint of its own before it is read: %s", path.name, error)
+        return None
 
 
 def _in_script(value: object) -> str:
