@@ -11,9 +11,9 @@ import psutil
 import pytest
 
 from tests.browser.opened import open_workbench
+from tests.recording.verify_rrd import verify_rrd
 from tests.session.hazards import provoke, provoked, write_task
 from tests.ui.tabs import open_deaf_tab, tabs_of
-from workbench.recording.verify import verify_rrd
 
 PATIENCE = 15.0
 

@@ -12,7 +12,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from tests.browser.opened import TASK, Opened, page_on, until
-from workbench.recording.verify import verify_rrd
+from tests.recording.verify_rrd import verify_rrd
 
 pytestmark = pytest.mark.browser
 expect.set_options(timeout=60_000)

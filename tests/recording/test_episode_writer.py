@@ -24,6 +24,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.recording.made import Made, Track
+from tests.recording.verify_rrd import verify_rrd
 from workbench.core.geometry import Mesh
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.recording import rrd
@@ -35,7 +36,6 @@ from workbench.recording.make_files import episode_stem
 from workbench.recording.read_episode import read_episode
 from workbench.recording.recover import recover
 from workbench.recording.row import EpisodeRow
-from workbench.recording.verify import verify_rrd
 
 Maker = Callable[..., Made]
 

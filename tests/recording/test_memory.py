@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from workbench.recording.verify import verify_rrd
+from tests.recording.verify_rrd import verify_rrd
 
 CHILD = """
 import json, sys, time

@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 
 from tests.recording.made import Made
+from tests.recording.verify_rrd import verify_rrd
 from workbench.recording import make_files as making
 from workbench.recording.journal import FOLDER, SYNC_SECONDS, Journal, read_journal
 from workbench.recording.read_episode import read_episode
 from workbench.recording.recover import recover
-from workbench.recording.verify import verify_rrd
 
 Maker = Callable[..., Made]
 

@@ -21,13 +21,13 @@ from PIL import Image
 
 from tests.recording.made import Made, Track
 from tests.recording.read_rrd import Column, read_rrd
+from tests.recording.verify_rrd import verify_rrd
 from workbench.core.geometry import Visual
 from workbench.core.pictures import CameraInfo
 from workbench.recording.episode import Episode
 from workbench.recording.layout import body_entities
 from workbench.recording.read_episode import read_episode
 from workbench.recording.read_properties import read_properties
-from workbench.recording.verify import verify_rrd
 
 Entities = dict[str, dict[str, Column]]
 

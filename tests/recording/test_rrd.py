@@ -17,12 +17,12 @@ import rerun as rr
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
 from tests.recording.made import Made
+from tests.recording.verify_rrd import verify_rrd
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.recording import rrd
 from workbench.recording.blueprint_in_file import blueprint_stream
 from workbench.recording.read_episode import read_episode
 from workbench.recording.survey import JournalReader
-from workbench.recording.verify import verify_rrd
 
 Maker = Callable[..., Made]
 

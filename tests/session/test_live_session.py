@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.recording.verify_rrd import verify_rrd
 from tests.session.conftest import wait_until
 from workbench.recording.read_properties import read_properties
-from workbench.recording.verify import verify_rrd
 from workbench.session.messages import CameraRequest
 from workbench.session.session import Session
 

@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from tests.recording.verify_rrd import verify_rrd
 from workbench.authoring.problem import Problem, TaskError
 from workbench.record_command import record_in_terminal
 from workbench.recording.episode import Episode
 from workbench.recording.read_episode import read_episode
-from workbench.recording.verify import verify_rrd
 from workbench.session.messages import TaskOptions
 from workbench.session.record import Progress, Recorded, RecordOptions, record
 

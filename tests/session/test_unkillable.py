@@ -17,10 +17,10 @@ import numpy as np
 import psutil
 import pytest
 
+from tests.recording.verify_rrd import verify_rrd
 from tests.session.conftest import wait_until
 from tests.session.hazards import calm, edit, line_of, provoke, write_task
 from workbench.recording.read_properties import read_properties
-from workbench.recording.verify import verify_rrd
 from workbench.session.interrupts import INTERRUPT_SIGNAL
 from workbench.session.kept_worker import WorkerOptions
 from workbench.session.messages import TaskOptions

@@ -13,8 +13,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from workbench.recording.rerun_command import quiet_environment, rerun_command
 from workbench.recording.rerun_process import LOOPBACK, await_port, end, free_port
-from workbench.recording.verify import quiet_environment, rerun_command
 
 
 @dataclass

@@ -1,0 +1,32 @@
+"""Rerun's own verdict on a file."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+from workbench.recording.rerun_command import quiet_environment, rerun_command
+
+
+def verify_rrd(path: Path, timeout: float = 60.0) -> str | None:
+    """Let rerun judge the file at `path`: None where it is well, else what rerun said against it.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        subprocess.TimeoutExpired: no verdict within `timeout` seconds.
+    """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path} is not a file.")
+    verdict = subprocess.run(
+        [*rerun_command(), "rrd", "verify", os.fspath(path)],
+        env=quiet_environment(),
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=timeout,
+        check=False,
+    )
+    if verdict.returncode == 0:
+        return None
+    return (verdict.stderr + verdict.stdout).strip() or f"rerun rrd verify ended with {verdict.returncode}"
