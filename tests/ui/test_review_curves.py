@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
-from workbench.ui.review_curves import known
+from workbench.ui.numbers_table import NumberRow
+from workbench.ui.review_curves import compared, known
 
 
 def test_a_nan_that_the_task_returned_is_shown_and_what_the_first_state_lacks_is_not() -> None:
     assert known("nan", 0) == "—"
     assert known("nan", 7) == "NaN"
     assert known("0.50", 0) == known("0.50", 7) == "0.50"
+
+
+def test_what_only_another_recording_has_is_in_the_table() -> None:
+    old = [NumberRow("reward", "0.50", ""), NumberRow("success", "true", "", "good")]
+    new = [*old[:1], NumberRow("slope", "0.10", ""), NumberRow("success", "false", "")]
+    assert compared(old, [(old, 3), (new, 3)]) == [
+        {"name": "reward", "mood": "", "values": ["0.50", "0.50"]},
+        {"name": "success", "mood": "good", "values": ["true", "false"]},
+        {"name": "slope", "mood": "", "values": ["—", "0.10"]},
+    ]

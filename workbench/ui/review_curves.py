@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import viser
@@ -21,7 +22,7 @@ from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_choice
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import CURSOR, LONGEST, STEP, LineChart, Span, line, value_span
-from workbench.ui.numbers_table import number_rows
+from workbench.ui.numbers_table import NumberRow, number_rows
 from workbench.ui.review_as_session import step_of
 from workbench.ui.review_scene import COLOURS, letter
 from workbench.ui.terms_panel import COLOURS as LINE_COLOURS
@@ -94,22 +95,11 @@ class ReviewCurves:
         steps = [step_of(view.opened[i].episode, view.states[i]) for i in together]
         own = step_of(chosen.episode, view.states[view.selected])
         rows = number_rows(own, 0, chosen.length)
-        others = [
-            {row.name: known(row.selected, view.states[i]) for row in number_rows(step, 0, None)}
-            for i, step in zip(together, steps, strict=True)
+        beside = [
+            (number_rows(step, 0, None), view.states[i]) for step, i in zip(steps, together, strict=True)
         ]
-        here = view.states[view.selected]
-        heads = [letter(i) for i in shown_together(view)] if len(steps) > 1 else ["value"]
-        table = [
-            {
-                "name": row.name,
-                "mood": row.mood,
-                "values": [o.get(row.name, "—") for o in others]
-                if len(steps) > 1
-                else [known(row.selected, here)],
-            }
-            for row in rows
-        ]
+        heads = [letter(i) for i in together] if len(steps) > 1 else ["value"]
+        table = compared(rows, beside if len(steps) > 1 else [(rows, view.states[view.selected])])
         colours = [COLOURS[i % 4] for i in shown_together(view)] if len(steps) > 1 else [""]
         fill(
             self._numbers,
@@ -211,6 +201,25 @@ def known(number: str, state: int) -> str:
     if number != "nan":
         return number
     return "NaN" if state > 0 else "—"
+
+
+def compared(
+    rows: Sequence[NumberRow], beside: Sequence[tuple[Sequence[NumberRow], int]]
+) -> list[dict[str, Any]]:
+    """Rows of the table: those of the selected recording, then what only others have.
+
+    Args:
+        beside: of each recording that has a column, its rows and which state they are of.
+    """
+    moods = {row.name: row.mood for row in rows}
+    for others, _ in beside:
+        for row in others:
+            moods.setdefault(row.name, "")
+    columns = [{row.name: known(row.selected, state) for row in others} for others, state in beside]
+    return [
+        {"name": name, "mood": mood, "values": [column.get(name, "—") for column in columns]}
+        for name, mood in moods.items()
+    ]
 
 
 def shown_together(view: ReviewView) -> tuple[int, ...]:
