@@ -450,7 +450,8 @@ class LibraryPanel:
         ids = self.selected()
         if not ids:
             self._edits.notify(
-                "Nothing is selected", f"{action.label} is for recordings that are selected in the library."
+                "Nothing is selected",
+                f"Press a row of the library first: {action.label} is for what is selected there.",
             )
         elif action.most is not None and len(ids) > action.most:
             self._edits.notify(
