@@ -48,6 +48,7 @@ def counts(server: viser.ViserServer) -> dict[str, int]:
     }
 
 
+@pytest.mark.slow
 def test_twenty_swaps_leave_nothing_and_the_session_lives_on(
     place: Workplace, server: viser.ViserServer
 ) -> None:
