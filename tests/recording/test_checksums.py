@@ -46,7 +46,9 @@ def test_any_changed_byte_is_said_and_the_other_file_is_read(
         flip(file, at)
         found = read_episode(path)
         (said,) = found.unread
-        assert said.startswith(f"{file.name} was cut short or changed (its checksum is not the one"), at
+        assert said.sentence.startswith(
+            f"{file.name} was cut short or changed (its checksum is not the one"
+        ), at
         assert (found.poses is None) == (suffix == ".rrd")
         assert (found.env_states == {}) == (suffix == ".h5")
         np.testing.assert_array_equal(found.action, episode.action)
@@ -69,7 +71,7 @@ def test_tags_are_no_change_and_a_change_on_purpose_is_believed(episode: Made, t
     with files.rrd.open("ab") as file:
         file.write(b" ")
     size = files.rrd.stat().st_size
-    assert f"it has {size} bytes, and had {size - 1}" in read_episode(files.json).unread[0]
+    assert f"it has {size} bytes, and had {size - 1}" in read_episode(files.json).unread[0].what
     (row,) = scan_folder(tmp_path).found.values()
     ((facts, _),) = read_found(tmp_path, row)
     assert facts.problem is not None and f"{files.rrd.name} was cut short or changed" in facts.problem

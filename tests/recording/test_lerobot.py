@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from workbench.recording.episode import Episode
+from workbench.recording.episode import Episode, Unread
 from workbench.recording.lerobot_export import ExportOptions, export_lerobot
 from workbench.recording.lerobot_frames import Choice, frames_of
 from workbench.recording.lerobot_read import is_lerobot, lerobot_rows, read_lerobot
@@ -158,7 +158,7 @@ def test_episodes_that_do_not_fit_together_are_said_and_nothing_is_left(
     ):
         export(tmp_path / "set", episode, narrow)
     assert list(tmp_path.iterdir()) == []
-    cut = replace(episode, unread=("c.rrd was cut short.",))
+    cut = replace(episode, unread=(Unread("c.rrd", "was cut short."),))
     made = export(tmp_path / "rest", episode, narrow, cut, episode, options=ExportOptions(only_fitting=True))
     assert made.episodes == 2 and made.frames == 2 * episode.length
     assert made.not_fitting[0].startswith("episode 1 does not go") and made.not_fitting[1:] == [

@@ -211,7 +211,7 @@ def test_a_file_that_was_cut_takes_only_its_own_with_it(
     file.write_bytes(file.read_bytes()[:-100])
     read = read_episode(path)
     (said,) = read.unread
-    assert said.startswith(f"{file.name} was cut short or changed (")
+    assert said.sentence.startswith(f"{file.name} was cut short or changed (")
     np.testing.assert_array_equal(read.reward, made.reward)
     assert read.info == made.info
     assert (read.poses is None, not read.env_states) == (lost == "poses", lost == "env_states")
@@ -229,7 +229,7 @@ def test_what_is_no_recording_is_said(tmp_path: Path) -> None:
             reading()
     ours.with_suffix(".rrd").write_bytes(b"RRF2 and then nothing")
     (said,) = read_episode(ours).unread
-    assert said.startswith(f"{ours.stem}.rrd was cut short or changed")
+    assert said.sentence.startswith(f"{ours.stem}.rrd was cut short or changed")
     ours.with_suffix(".rrd").unlink()
     assert read_episode(ours).length == STEPS
     ours.with_suffix(".json").write_text('{"workbench": {"length": 3}}')

@@ -2,7 +2,7 @@
 
 What writes chunks to a file (``LazyChunkStream.write_rrd``) writes those of a recording alone. Rerun's other way, a ``RecordingStream`` that
 saves to a file, takes a blueprint, but it writes on threads of its own: a disk that is full makes it wait for ever, what it could not
-write it does not say, and half of what a short episode's file costs is their start and end (measured).
+write it does not say, and their start and end is a quarter of what a short episode's file costs (measured).
 
 An ``.rrd`` is a header of 12 bytes, messages, each with its kind and length before it (16 bytes), the last of them the index, and 32 bytes
 that say where the index is and how it hashes (crate ``re_log_encoding``, ``rrd/frames.rs``; ``rerun/proto/rerun/v1alpha1/log_msg.proto``). The index

@@ -80,7 +80,7 @@ def describe(survey: Survey) -> dict[str, Any]:
     }
 
 
-def describe_beside(survey: Survey, folder: Path, files: Sequence[Path] = ()) -> dict[str, Any]:
+def describe_beside(survey: Survey, folder: Path, files: Sequence[Path]) -> dict[str, Any]:
     """`describe`, with what is only worth saying in `folder`, where the recording lies; of which these are the other `files`."""
     info = survey.info
     source = info.source_file if info.source_file and os.path.isabs(info.source_file) else None

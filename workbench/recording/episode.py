@@ -82,6 +82,20 @@ class CameraTrack:
     segmentation: EncodedPictures | None = None
 
 
+@dataclass(frozen=True)
+class Unread:
+    """A file of a recording that is broken."""
+
+    file: str
+    """Its name."""
+    what: str
+    """How it is broken, and what it would have held: goes on from its name to a sentence."""
+
+    @property
+    def sentence(self) -> str:
+        return f"{self.file} {self.what}"
+
+
 @dataclass
 class Episode:
     """T actions and T + 1 states of one env. State 0 is the reset; action t leads to state t + 1."""
@@ -109,8 +123,8 @@ class Episode:
     """``actors/cube``, ``articulations/panda``, each (T + 1, D) as ManiSkill's ``get_state_dict`` lays it out."""
     obs: dict[str, NDArray] = field(default_factory=dict)
     """State observations flattened by ``/``, each (T + 1, ...); no pictures. The key of one that was no dict is ``""``."""
-    unread: tuple[str, ...] = ()
-    """Of a recording that was read: a sentence on each of its files that is broken, and what it would have held."""
+    unread: tuple[Unread, ...] = ()
+    """Of a recording that was read: its files that are broken."""
 
     @property
     def length(self) -> int:

@@ -183,7 +183,7 @@ class _Writer:
         except ValueError as error:
             raise DoesNotFit(str(error) if name in str(error) else f"{name}: {error}") from error
         if episode.unread:
-            raise DoesNotFit(" ".join(episode.unread))
+            raise DoesNotFit(" ".join(broken.sentence for broken in episode.unread))
         if self._options.only_successes and not _succeeds(episode):
             self._made.left_out += 1
             return None

@@ -155,7 +155,7 @@ def h5_writer(survey: Survey, path: Path) -> Iterator[H5Writer]:
         safe.close()
 
 
-def write_json(survey: Survey, path: Path, folder: Path, files: Sequence[Path] = ()) -> None:
+def write_json(survey: Survey, path: Path, folder: Path, files: Sequence[Path]) -> None:
     """Write what is to be said of the episode, and of its other `files`, to `path`; they will lie in `folder`. Raises OSError."""
     content = json.dumps(_document(survey, folder, files), indent=2, default=str).encode()
     with path.open("xb") as file:

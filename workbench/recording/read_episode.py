@@ -25,7 +25,7 @@ from workbench.recording.checksums import check
 from workbench.recording.columns import Column
 from workbench.recording.description import columns_from, info_from
 from workbench.recording.encoded_pictures import EncodedPictures, Modality
-from workbench.recording.episode import CameraTrack, Episode
+from workbench.recording.episode import CameraTrack, Episode, Unread
 from workbench.recording.layout import OBSERVATION, body_entities, camera_entities, evaluate_entity
 from workbench.recording.maniskill_h5 import TRAJECTORY
 from workbench.recording.read_maniskill import UnreadableRecording as UnreadableRecording
@@ -42,7 +42,7 @@ def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
     With `shapes`, meshes are those of other recordings that were read with it, where they look the same.
 
     What a missing file would have held is empty: without the .rrd no geometry, poses and pictures, without the .h5 no env
-    states. The same for one that is broken, with a sentence in `Episode.unread`. The geometry is that of this env alone, as
+    states. The same for one that is broken, named in `Episode.unread`. The geometry is that of this env alone, as
     env 0 of 1.
 
     Raises:
@@ -53,7 +53,7 @@ def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
     there = {suffix: file for suffix, file in files.items() if file.is_file()}
     if not there:
         raise UnreadableRecording(f"{path.name} is not there any more.")
-    unread: list[str] = []
+    unread: list[Unread] = []
     beside, not_json = _beside(there.get(".json"))
     table = states = None
     if ".rrd" in there:
@@ -70,7 +70,7 @@ def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
         except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
             unread.append(_unread(there[".h5"], error, "its env states are missing"))
     if table is None and states is None and unread:
-        raise UnreadableRecording(" ".join(unread))
+        raise UnreadableRecording(" ".join(broken.sentence for broken in unread))
     if not_json is not None and table is not None:
         unread.append(
             _unread(there[".json"], not_json, "its tags, its note and the place of its task are missing")
@@ -90,10 +90,10 @@ def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
     return episode
 
 
-def _unread(file: Path, error: Exception, lost: str) -> str:
+def _unread(file: Path, error: Exception, lost: str) -> Unread:
     why = " ".join(str(error).split()).removeprefix(f"Failed to read RRD file at {file}: ")
     why = why if len(why) <= 160 else why[:159] + "\u2026"
-    return f"{file.name} was cut short or changed ({why}): {lost}."
+    return Unread(file.name, f"was cut short or changed ({why}): {lost}.")
 
 
 def _beside(file: Path | None) -> tuple[dict[str, Any], Exception | None]:

@@ -137,10 +137,9 @@ def _ready(opened: OpenedTask, file: EpisodeFile, use_env_states: bool) -> _Read
     elif use_env_states and not run.env_states:
         why_not = "it holds no env states"
     if why_not:
-        why_not = ". ".join((why_not, *episode.unread))
+        why_not = ". ".join((why_not, *(broken.sentence for broken in episode.unread)))
         return Verdict(file, task=info.task, seed=info.seed, length=run.length, why_not=why_not)
-    told = (sentence.partition(" was ") for sentence in episode.unread)
-    return _Ready(file, info.task, run, {name: f"was {what}" for name, _, what in told})
+    return _Ready(file, info.task, run, {broken.file: broken.what for broken in episode.unread})
 
 
 def _begin(opened: OpenedTask, begun: dict[int, _Ready]) -> dict[int, _Seat]:

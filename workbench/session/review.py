@@ -214,7 +214,7 @@ class Review:
                 episode = shared(self._read(row, shapes), shapes)
                 opened.append(Opened(row.id, row.name, episode, happenings(episode)))
                 files.update(stamps)
-                said += episode.unread
+                said += [broken.sentence for broken in episode.unread]
             except (OSError, UnreadableRecording) as error:
                 said.append(f"{row.name}: {error}")
             except Exception as error:

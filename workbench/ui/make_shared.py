@@ -105,7 +105,7 @@ def _of_readable(wanted: Wanted, source: Source, on_progress: OnProgress) -> lis
         if not episode.unread:
             raise
         raise ValueError(
-            " ".join(episode.unread)
+            " ".join(broken.sentence for broken in episode.unread)
         ) from error  # it does not lack pictures, they cannot be read
 
 
