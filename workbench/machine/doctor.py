@@ -27,6 +27,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from workbench.machine.child_python import child_environment, python_command
 from workbench.machine.chromium import chromium_version, find_chromium, how_to_get_chromium
 from workbench.machine.render_device import driver_files
 from workbench.machine.software_vulkan import ensure_render_device
@@ -165,7 +166,8 @@ def _render_device() -> list[Finding]:
 def _gpu() -> list[Finding]:
     """CUDA through torch, then PhysX on it, without causing SAPIEN to fetch anything."""
     child = subprocess.run(
-        [sys.executable, "-c", GPU_QUESTIONS],
+        python_command("-c", GPU_QUESTIONS),
+        env=child_environment(),
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,

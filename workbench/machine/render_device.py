@@ -18,10 +18,11 @@ import os
 import signal
 import struct
 import subprocess
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+
+from workbench.machine.child_python import child_environment, python_command
 
 ANSWER = "render-device-answer:"
 DRIVER_VARIABLES = ("VK_DRIVER_FILES", "VK_ICD_FILENAMES")
@@ -63,8 +64,8 @@ def probe_render_device(env: Mapping[str, str] | None = None, timeout_s: float =
     added = dict(env or {})
     try:
         child = subprocess.run(
-            [sys.executable, "-m", "workbench.machine.render_device"],
-            env={**os.environ, **added},
+            python_command("-m", "workbench.machine.render_device"),
+            env=child_environment(**added),
             stdin=subprocess.DEVNULL,
             capture_output=True,
             text=True,

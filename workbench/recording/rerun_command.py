@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-import sys
 from pathlib import Path
 
 import rerun_cli
+
+from workbench.machine.child_python import python_command
 
 _BINARIES = ("rerun", "rerun.exe", "Rerun.app/Contents/MacOS/Rerun")
 
@@ -22,7 +23,7 @@ def rerun_command() -> list[str]:
         for name in _BINARIES:
             if (program := Path(folder, name)).is_file():
                 return [os.fspath(program)]
-    return [sys.executable, "-m", "rerun"]
+    return python_command("-m", "rerun")
 
 
 def quiet_environment() -> dict[str, str]:

@@ -19,13 +19,13 @@ import os
 import signal
 import socket
 import subprocess
-import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 
+from workbench.machine.child_python import child_environment, python_command
 from workbench.session.interrupts import INTERRUPT_SIGNAL, STACK_SIGNAL
 from workbench.session.memory_limit import memory_with_children, resident_memory
 from workbench.session.messages import (
@@ -76,14 +76,14 @@ class WorkerProcess:
         fds = [theirs.fileno(), pulse, self._stacks]
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "workbench.session.worker_start", *map(str, fds), str(os.getpid())],
+                python_command("-m", "workbench.session.worker_start", *map(str, fds), str(os.getpid())),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
                 bufsize=0,
                 pass_fds=fds,
                 start_new_session=True,
-                env={**os.environ, "PYTHONUNBUFFERED": "1"},
+                env=child_environment(PYTHONUNBUFFERED="1"),
             )
             self._pulse = PulseReader(pulse)
         except BaseException:

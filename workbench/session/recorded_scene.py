@@ -13,7 +13,6 @@ from __future__ import annotations
 import os
 import socket
 import subprocess
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection
@@ -24,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.geometry import SceneGeometry
+from workbench.machine.child_python import child_environment, python_command
 from workbench.recording.episode import Episode
 
 _LOOK = 0.1
@@ -100,9 +100,10 @@ class SceneProcess:
         """
         ours, theirs = socket.socketpair()
         with ours, theirs:
-            command = [sys.executable, "-m", "workbench.session.recorded_scene_worker"]
+            command = python_command("-m", "workbench.session.recorded_scene_worker")
             process = subprocess.Popen(
                 [*command, str(theirs.fileno()), str(os.getpid())],
+                env=child_environment(),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,

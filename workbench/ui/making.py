@@ -14,7 +14,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import threading
 from collections.abc import Callable
@@ -24,6 +23,7 @@ from typing import Any
 
 import msgspec
 
+from workbench.machine.child_python import child_environment, python_command
 from workbench.ui.make_shared import Made, Wanted
 
 END_SECONDS = 5.0
@@ -111,7 +111,8 @@ class Making:
 
     def _ask(self, wanted: Wanted) -> tuple[str, Made | None]:
         with subprocess.Popen(
-            [sys.executable, "-m", "workbench.ui.making_process"],
+            python_command("-m", "workbench.ui.making_process"),
+            env=child_environment(),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
