@@ -6,6 +6,9 @@ and a mistyped option answer at once.
 
 from __future__ import annotations
 
+import workbench.machine.own_path  # before anything is imported that a file in the current folder could be
+
+# isort: split
 import sys
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,24 +1,25 @@
 """A recording by several processes: the episodes are dealt out from here, so they are the same as in one.
 
 Each process opens the task and has its share of the envs and of the cores. It asks for the number of the next episode
-when an env is free, says when one is over, and is told which are kept; it writes its files itself. Ctrl-C in the
-terminal reaches all of them at once, so they do not listen to it: this one does, and tells them. One that dies takes
-its episodes under way along, and the recording ends with a sentence; what it left is mended at the next start.
+when an env is free, says when one is over, and is told which are kept; it writes its files itself (`record_worker`).
+Ctrl-C in the terminal is for this process alone, which tells them. One that dies takes its episodes under way along,
+and the recording ends with a sentence; what it left is mended at the next start.
 """
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
+import socket
+import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
 from typing import Any
 
 from workbench.authoring.problem import Problem, TaskError
+from workbench.machine.child_python import child_environment, python_command
 from workbench.recording.landing import RecordingError
 from workbench.session.dealer import Dealer
 from workbench.session.process import describe_exit
@@ -64,26 +65,37 @@ def shares(num_envs: int, workers: int) -> list[int]:
     return [num_envs // workers + (i < num_envs % workers) for i in range(workers)]
 
 
-def _start(what: RecordOptions) -> dict[Connection, BaseProcess]:
-    context = multiprocessing.get_context("spawn")
-    workers: dict[Connection, BaseProcess] = {}
+def _start(what: RecordOptions) -> dict[Connection, subprocess.Popen[bytes]]:
+    workers: dict[Connection, subprocess.Popen[bytes]] = {}
     envs = shares(what.options.num_envs, what.workers)
     cores = sorted(os.sched_getaffinity(0))
     for i, count in enumerate(envs):
-        ours, theirs = context.Pipe()
+        ours, theirs = socket.socketpair()
         share = replace(what, workers=1, options=replace(what.options, num_envs=count))
-        own_cores = cores[i :: len(envs)] or cores
-        process = context.Process(target=_work, args=(theirs, share, own_cores), daemon=True)
-        process.start()
-        theirs.close()  # or its end would not be seen
-        workers[ours] = process
+        with theirs:
+            process = subprocess.Popen(
+                python_command(
+                    "-m", "workbench.session.record_worker", str(theirs.fileno()), str(os.getpid())
+                ),
+                stdin=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                start_new_session=True,  # Ctrl-C in the terminal is for this process, which tells them
+                env=child_environment(),
+            )
+        connection = Connection(ours.detach())
+        workers[connection] = process
+        try:
+            connection.send(cores[i :: len(envs)] or cores)
+            connection.send(share)
+        except (BrokenPipeError, ConnectionResetError):
+            pass  # it is gone, and `serve` says so when it reads
     return workers
 
 
 class _Parent:
     def __init__(
         self,
-        workers: dict[Connection, BaseProcess],
+        workers: dict[Connection, subprocess.Popen[bytes]],
         dealer: Dealer,
         on_activity: Callable[[str], None],
         on_progress: Callable[[Progress], None],
@@ -120,19 +132,18 @@ class _Parent:
 
     def kill(self) -> None:
         for process in self._workers.values():
-            process.kill()
+            _kill(process)
 
     def end(self) -> None:
         for connection in self._busy:
             self._tell(connection, ("stop", None))
         deadline = time.monotonic() + _ENDING_SECONDS
         for connection, process in self._workers.items():
-            while process.is_alive() and connection in self._busy and time.monotonic() < deadline:
+            while process.poll() is None and connection in self._busy and time.monotonic() < deadline:
                 self._take_what_is_written(connection)
-            process.join(timeout=10.0)
-            if process.is_alive():
-                process.kill()
-                process.join()
+            _exit_code(process, 10.0)
+            _kill(process)
+            process.wait()
             connection.close()
 
     def _take_what_is_written(self, connection: Connection) -> None:
@@ -177,10 +188,8 @@ class _Parent:
             raise RecordingError(value)
 
     def _exit_code(self, connection: Connection) -> int | None:
-        process = self._workers[connection]
-        process.join(timeout=2.0)
         self._busy.discard(connection)
-        return process.exitcode
+        return _exit_code(self._workers[connection], 2.0)
 
     def _tell(self, connection: Connection, message: tuple[str, Any]) -> None:
         try:
@@ -189,67 +198,16 @@ class _Parent:
             pass  # it is gone, and `serve` says so when it reads
 
 
-# --- in the process --------------------------------------------------------------------------------
-
-
-class _FarDealing:
-    """The dealer, on the other side of a pipe."""
-
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
-        self._decided: list[tuple[int, bool]] = []
-        self.stopped = False
-
-    def next(self) -> int | None:
-        if self.stopped:
-            return None
-        self._connection.send(("next", None))
-        while True:
-            word, value = self._connection.recv()
-            if word == "index":
-                return value
-            self._note(word, value)
-
-    def ended(self, index: int, success: bool) -> None:
-        self._connection.send(("ended", (index, success)))
-
-    def decided(self) -> list[tuple[int, bool]]:
-        while self._connection.poll(0):
-            self._note(*self._connection.recv())
-        told, self._decided = self._decided, []
-        return told
-
-    def wait(self) -> None:
-        if not self._decided and not self.stopped:
-            self._note(*self._connection.recv())
-
-    def _note(self, word: str, value: Any) -> None:
-        if word == "decided":
-            self._decided.append(value)
-        elif word == "stop":
-            self.stopped = True
-
-
-def _work(connection: Connection, what: RecordOptions, cores: list[int]) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # PhysX and the software renderer take a thread for each core that the process may use.
-    os.sched_setaffinity(0, cores)
-    dealing = _FarDealing(connection)
+def _exit_code(process: subprocess.Popen[bytes], patience: float) -> int | None:
     try:
-        what, given = with_given_actions(what)
-        put_right = run_episodes(
-            what,
-            given,
-            dealing,
-            lambda written: connection.send(("written", written)),
-            lambda activity: connection.send(("activity", activity)),
-            lambda steps: connection.send(("steps", steps)),
-            lambda: dealing.stopped,
-        )
-        connection.send(("done", put_right))
-    except TaskError as error:
-        connection.send(("failed", error.problem))
-    except (EOFError, BrokenPipeError):
-        return  # the process that started this one is gone
-    except (OSError, ValueError, RuntimeError) as error:
-        connection.send(("failed", str(error)))
+        return process.wait(timeout=patience)
+    except subprocess.TimeoutExpired:
+        return None
+
+
+def _kill(process: subprocess.Popen[bytes]) -> None:
+    """End it with all that it started."""
+    try:
+        os.killpg(process.pid, signal.SIGKILL)
+    except ProcessLookupError:
+        pass  # it and all its children are gone already
