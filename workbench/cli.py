@@ -6,7 +6,8 @@ and a mistyped option answer at once.
 
 from __future__ import annotations
 
-import workbench.machine.own_path  # before anything is imported that a file in the current folder could be
+# First of all: a file in the current folder could have the name of anything that is imported below.
+import workbench.machine.own_path  # noqa: F401
 
 # isort: split
 import sys

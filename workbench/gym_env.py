@@ -179,13 +179,8 @@ def _find(task: str | Path | type[BaseEnv]) -> _Found:
             f"make() takes a registered id, a file or a class that inherits BaseEnv, not {type(task).__name__}"
         )
     loaded = load_task(str(task))
-    if loaded.replaced_ids:
-        ids = ", ".join(loaded.replaced_ids)
-        warnings.warn(
-            f"{task} registers {ids}, which belonged to another task: gym.make gives this file's class for it "
-            "from now on in this process. Register another id to have both.",
-            stacklevel=3,
-        )
+    for notice in loaded.notices:
+        warnings.warn(notice, stacklevel=3)
     spec = registry.environment(loaded.env_id)
     asset_ids = () if spec is None else spec.asset_download_ids or ()
     return _Found(loaded.cls, loaded.env_id, loaded.max_episode_steps, loaded.default_kwargs, asset_ids)

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import FrameType
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -20,7 +21,10 @@ from rich.progress import (
 )
 from rich.progress import Progress as Bar
 
+from workbench.authoring.library_names import named_like_library
+from workbench.authoring.modules import hidden_by_libraries
 from workbench.authoring.problem import Problem, TaskError
+from workbench.authoring.reference import named_file
 from workbench.recording.landing import try_folder
 from workbench.recording.recover import recover
 from workbench.session.record import Progress, Recorded, RecordOptions, record, with_given_actions
@@ -70,6 +74,9 @@ def record_in_terminal(
         mended = recover(what.out) if what.out.is_dir() else []
         if mended:
             console.print(f"{_episodes(len(mended))} that an earlier recording left half written: mended")
+        file = named_file(what.task)
+        for hidden in () if file is None else hidden_by_libraries(file.resolve()):
+            console.print(f"[yellow]{escape(named_like_library(hidden))}[/]", soft_wrap=True)
         with Bar(*columns, console=console) as bar:
             row = bar.add_task("opening", total=asked.successes or asked.episodes)
             with _StopAtInterrupt(lambda words: bar.update(row, description=words)) as interrupt:

@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 out = Console(highlight=False)
 err = Console(stderr=True, highlight=False)
 
+_told: set[str] = set()
+"""Notices of the task; each reload brings them again."""
+
 
 def refuse(message: str) -> int:
     """Say in a sentence why nothing is done; returns the exit code."""
@@ -50,6 +53,10 @@ def print_event(event: Event) -> None:
             f"[green]{how}[/] {escape(event.task.env_id)}{why} in {total:.0f} ms [dim]({parts})[/]",
             soft_wrap=True,
         )
+        for notice in event.task.notices:
+            if notice not in _told:
+                _told.add(notice)
+                warn(notice)
     elif isinstance(event, Failed):
         print_problem(event.problem)
         if event.kept:

@@ -23,7 +23,20 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from workbench.authoring import registry
-from workbench.authoring.modules import AuthorFinder, SetAside, decode, put_back, set_aside
+from workbench.authoring.library_names import (
+    files_named_like_libraries,
+    named_like_library,
+    search_first,
+    stop_guarding,
+)
+from workbench.authoring.modules import (
+    AuthorFinder,
+    SetAside,
+    decode,
+    hidden_by_libraries,
+    put_back,
+    set_aside,
+)
 from workbench.authoring.problem import Problem, TaskError, problem_from_exception, shorten
 
 if TYPE_CHECKING:
@@ -56,6 +69,20 @@ class LoadedTask:
     replaced_ids: tuple[str, ...] = ()
     """Ids that belonged to somebody else (``PickCube-v1``): plain ManiSkill would have skipped this
     file's class under them."""
+    named_like_libraries: tuple[Path, ...] = ()
+    """Files in the folder that it imports from, and that no import finds there."""
+
+    @property
+    def notices(self) -> tuple[str, ...]:
+        """What its author should know although it works, in sentences."""
+        found = [named_like_library(file) for file in self.named_like_libraries]
+        if self.replaced_ids:
+            ids = ", ".join(self.replaced_ids)
+            found.append(
+                f"{self.file} registers {ids}, which belonged to another task: here it is this file's class from now "
+                "on, and plain ManiSkill would skip that class. Register another id to have both."
+            )
+        return tuple(found)
 
 
 @dataclass
@@ -147,9 +174,8 @@ def _begin(finder: AuthorFinder, aside: SetAside) -> _Load:
     if before is not None:
         before.registrations.undo()
         sys.meta_path.remove(before.finder)
+    search_first(finder.search_folder)
     sys.meta_path.insert(0, finder)
-    folder = str(finder.search_folder)
-    sys.path[:] = [folder, *(entry for entry in sys.path if entry != folder)]
     # A helper that was created a moment ago is not in the listing of its folder that Python keeps.
     importlib.invalidate_caches()
     _loads[finder.file] = load = _Load(finder, registry.Registrations(), before, aside)
@@ -163,6 +189,8 @@ def _revert(load: _Load) -> None:
     put_back(load.aside, load.finder)
     if load.before is None:
         del _loads[load.finder.file]
+        if not _loads:
+            stop_guarding()
     else:
         load.before.registrations.redo()
         sys.meta_path.insert(0, load.before.finder)
@@ -342,6 +370,7 @@ def _choose(
         followed=True,
         others=tuple(other.__name__ for other in candidates if other is not cls),
         replaced_ids=registrations.replaced_names(),
+        named_like_libraries=hidden_by_libraries(finder.file),
         **_source_fields(finder),
     )
 
@@ -399,6 +428,8 @@ def _import_problem(exc: BaseException, finder: AuthorFinder) -> Problem:
         )
     elif isinstance(exc, ModuleNotFoundError) and exc.name:
         message = f"{message}; {_module_hint(exc.name, finder)}"
+    elif isinstance(exc, ImportError) and (file := _named_like(exc.name, finder)) is not None:
+        message = f"{message}; {named_like_library(file)}"
     elif isinstance(exc, OSError) and exc.filename == str(finder.file) and problem.file is None:
         message = f"{finder.file} cannot be read: {exc.strerror}; is it being written just now?"
     if problem.file is None:
@@ -407,7 +438,21 @@ def _import_problem(exc: BaseException, finder: AuthorFinder) -> Problem:
     return dataclasses.replace(problem, message=message)
 
 
+def _named_like(name: str | None, finder: AuthorFinder) -> Path | None:
+    """The author's file that was meant, where a library has its name."""
+    top = (name or "").partition(".")[0]
+    return next((file for file in files_named_like_libraries(finder.search_folder) if file.stem == top), None)
+
+
 def _module_hint(name: str, finder: AuthorFinder) -> str:
+    if (file := _named_like(name, finder)) is not None:
+        return named_like_library(file)
+    top = name.partition(".")[0]
+    if Path(f"{top}.py").is_file() or Path(top, "__init__.py").is_file():
+        return (
+            f"there is one in the folder where the command was started, which is not searched: move {top} beside the "
+            "file, or name its folder in PYTHONPATH"
+        )
     beside = [path.stem for path in finder.file.parent.glob("*.py") if path != finder.file]
     close = difflib.get_close_matches(name, beside, n=1)
     if close:

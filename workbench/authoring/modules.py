@@ -22,7 +22,6 @@ import linecache
 import os
 import re
 import sys
-import sysconfig
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
@@ -31,15 +30,9 @@ from pathlib import Path
 from types import CodeType, ModuleType
 from typing import Any
 
+from workbench.authoring.library_names import files_named_like_libraries, is_library, is_own_file
+
 _MODULE_PREFIX = "workbench_task_"
-_LIBRARY_FOLDERS = {"site-packages", "dist-packages"}
-_LIBRARY_ROOTS = tuple(
-    {
-        os.path.realpath(sysconfig.get_paths()[name]) + os.sep
-        for name in ("stdlib", "platstdlib", "purelib", "platlib")
-    }
-)
-_WORKBENCH = str(Path(__file__).resolve().parents[1]) + os.sep
 
 
 @dataclass(frozen=True)
@@ -66,6 +59,13 @@ def module_name(file: Path) -> ModuleName:
     return ModuleName(f"{_MODULE_PREFIX}{stem}_{sha256(str(file).encode()).hexdigest()[:8]}", file.parent)
 
 
+def hidden_by_libraries(file: Path) -> tuple[Path, ...]:
+    """Files beside the task `file` that it cannot import; the task's own file may have any name."""
+    return tuple(
+        found for found in files_named_like_libraries(module_name(file).search_folder) if found != file
+    )
+
+
 class AuthorFinder(MetaPathFinder):
     """Finds and executes the modules of one task: its file, and what lies in the folder beside it."""
 
@@ -84,6 +84,14 @@ class AuthorFinder(MetaPathFinder):
     ) -> importlib.machinery.ModuleSpec | None:
         if fullname == self.main:
             return self._spec(fullname, str(self.file), is_package=self.file.stem == "__init__")
+        spec = self._beside(fullname, path, target)
+        if spec is not None and path is None and is_library(fullname):
+            return None
+        return spec
+
+    def _beside(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None
+    ) -> importlib.machinery.ModuleSpec | None:
         last = fullname.rpartition(".")[2]
         for folder in [str(self.search_folder)] if path is None else list(path):
             for name, is_package in ((os.path.join(last, "__init__.py"), True), (f"{last}.py", False)):
@@ -153,7 +161,7 @@ class _AuthorLoader(importlib.machinery.SourceFileLoader):
         name = module.__name__
         self.finder.names.append(name)
         stem = self.finder.file.stem
-        if name == self.finder.main and stem not in sys.modules and stem not in sys.stdlib_module_names:
+        if name == self.finder.main and stem not in sys.modules and not is_library(stem):
             # A helper that imports the task by its file's name must get this module: executed a
             # second time under another name, it would register its ids twice.
             sys.modules[stem] = module
@@ -177,20 +185,6 @@ def decode(path: str, raw: bytes) -> str:
             message = f"{wrong}; save the file as UTF-8"
             line = raw[: wrong.start].count(b"\n") + 1
         raise SyntaxError(message, (path, line, 1, None)) from None
-
-
-def is_own_file(path: str, folder: Path) -> bool:
-    """True for the author's files in or below `folder`.
-
-    A task in a project's root has everything below it: a virtual environment, and the workbench
-    itself where it is installed from its repository. Those are nobody's helpers.
-    """
-    root = str(folder) + os.sep
-    if not path.startswith(root) or path.startswith((_WORKBENCH, *_LIBRARY_ROOTS)):
-        return False
-    return not any(
-        part in _LIBRARY_FOLDERS or part.startswith(".") for part in path[len(root) :].split(os.sep)
-    )
 
 
 @dataclass(frozen=True)

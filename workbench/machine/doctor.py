@@ -27,12 +27,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from workbench.machine import DISTRIBUTION
 from workbench.machine.child_python import child_environment, python_command
 from workbench.machine.chromium import chromium_version, find_chromium, how_to_get_chromium
 from workbench.machine.render_device import driver_files
 from workbench.machine.software_vulkan import ensure_render_device
 
-DISTRIBUTION = "maniskill-workbench"
 DEFAULT_PORT = 8080
 LEAST_MEMORY_GIB = 6.0
 """One worker with 16 envs and cameras on a software driver, its warm spare, the server and a browser."""

@@ -100,6 +100,8 @@ class TaskDescription:
     """Keywords of ``gym.make`` that make such an env, as far as JSON can say them."""
     objects: tuple[ObjectToSee, ...] = ()
     """What a camera may be asked to see."""
+    notices: tuple[str, ...] = ()
+    """What its author should know although it works, in sentences."""
 
 
 # --- requests: server to worker ------------------------------------------------------------------

@@ -177,6 +177,7 @@ def describe(
         others=loaded.others if loaded.followed else (),
         env_kwargs=env_kwargs(env, {**loaded.default_kwargs, **given}),
         objects=objects_to_see(env, task.table),
+        notices=loaded.notices if loaded.followed else (),
     )
 
 

@@ -17,9 +17,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from workbench.authoring.library_names import (
+    files_named_like_libraries,
+    is_library,
+    named_like_library,
+    searched_first,
+)
 from workbench.authoring.problem import Problem, definition_line, problem_from_exception
 
 Policy = Callable[[Any], Any]
+
+_told: set[Path] = set()
+"""Files beside policies of which it was said that a library has their name."""
 
 
 def load_policy(reference: str, beside: Path | None = None) -> Policy:
@@ -43,17 +52,31 @@ def load_policy(reference: str, beside: Path | None = None) -> Policy:
         if spec is None or spec.loader is None:
             raise ValueError(f"{path} cannot be imported")
         module = importlib.util.module_from_spec(spec)
-        sys.path.insert(0, str(path.parent))
-        try:
+        for file in files_named_like_libraries(path.parent):
+            if file not in (path, *_told):
+                _told.add(file)
+                print(named_like_library(file), file=sys.stderr)
+        with searched_first(path.parent):
             spec.loader.exec_module(module)
-        finally:
-            sys.path.remove(str(path.parent))
+    elif importlib.util.find_spec(name.partition(".")[0]) is None:
+        # Whoever names a module in words means the one that they see where they are.
+        with searched_first(Path.cwd()):
+            module = importlib.import_module(name)
     else:
         module = importlib.import_module(name)
     function = getattr(module, attribute, None)
     if not callable(function):
-        raise ValueError(f"{name} has no function {attribute}")
+        raise ValueError(f"{name} has no function {attribute}{_hint(name, attribute, beside)}")
     return function
+
+
+def _hint(name: str, attribute: str, beside: Path | None) -> str:
+    """How to name a file whose name a library has."""
+    for folder in (Path.cwd(), beside or Path.cwd()):
+        file = folder / f"{name}.py"
+        if file.is_file() and is_library(name):
+            return f", it is a library's; name the file: {file}:{attribute}"
+    return ""
 
 
 def problem_of(

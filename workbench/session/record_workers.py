@@ -28,8 +28,6 @@ from workbench.session.record import (
     Recorded,
     RecordOptions,
     Written,
-    run_episodes,
-    with_given_actions,
 )
 
 _LOOK = 0.1

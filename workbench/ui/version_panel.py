@@ -66,24 +66,30 @@ class VersionPanel:
                 self._task.handle.options = self._names
             self._task.show(names[0])
         show(self._task.handle, len(names) > 1)
-        wanted = (view.reload, view.stale, task is None)
+        notices = () if task is None else task.notices
+        wanted = (view.reload, view.stale, task is None, notices)
         if wanted != self._drawn:
             self._drawn = wanted
-            self._html.content = version_html(view.reload, loaded=task is not None)
+            self._html.content = version_html(view.reload, loaded=task is not None, notices=notices)
 
     def _load(self, value: object) -> None:
         self._session.reload(LEVELS[checked_choice(value, LEVELS, "way to load")])
 
 
-def version_html(report: ReloadReport | None, loaded: bool) -> str:
+def version_html(report: ReloadReport | None, loaded: bool, notices: tuple[str, ...] = ()) -> str:
     """What the page says of the last reload; every value escaped."""
+    shown = [
+        *notices[:MOST_SHOWN],
+        *([f"And {len(notices) - MOST_SHOWN} more."] if len(notices) > MOST_SHOWN else []),
+    ]
     if report is None:
-        return render("version", report=None, loaded=loaded)
+        return render("version", report=None, loaded=loaded, notices=shown)
     missing = list(report.not_carried.items())
     return render(
         "version",
         report=report,
         loaded=loaded,
+        notices=shown,
         took=took(report.milliseconds),
         carried=len(report.carried),
         missing=missing[:MOST_SHOWN],

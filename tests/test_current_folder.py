@@ -1,0 +1,165 @@
+"""Nothing that lies in the folder where a command is started runs, whatever it is called."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import websockets.sync.client
+
+from tests.ui.tabs import camera_message, handshake
+
+TASK = Path(__file__).parents[1] / "tasks" / "minimal.py"
+COMMAND = Path(sys.executable).with_name("workbench")
+IMPORTED_FIRST = (
+    "pathlib",
+    "json",
+    "random",
+    "queue",
+    "subprocess",
+    "socket",
+    "logging",
+    "tyro",
+    "rich",
+    "msgspec",
+)
+PLANTED = (
+    *IMPORTED_FIRST,
+    *(
+        "numpy",
+        "torch",
+        "multiprocessing",
+        "h5py",
+        "sapien",
+        "mani_skill",
+        "viser",
+        "trimesh",
+        "imageio_ffmpeg",
+    ),
+    *(
+        "workbench",
+        "sitecustomize",
+        "usercustomize",
+        "libcst",
+        "pyarrow",
+        "PIL",
+        "select",
+        "pickle",
+        "psutil",
+    ),
+)
+ENVIRONMENT = {**os.environ, "COLUMNS": "200", "PYTHONUNBUFFERED": "1"}
+
+
+def plant(folder: Path, *names: str) -> None:
+    """Files that leave a mark when they run, and break whoever imports them."""
+    for name in names:
+        (folder / f"{name}.py").write_text(
+            "from os import open, O_CREAT\n"
+            f"open({str(folder / f'ran_{name}')!r}, O_CREAT)\n"
+            "raise ImportError('a file in the current folder ran')\n"
+        )
+
+
+def ran(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.rglob("ran_*"))
+
+
+def start(folder: Path, *arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [str(COMMAND), *arguments],
+        cwd=folder,
+        env=ENVIRONMENT,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+@contextmanager
+def page(folder: Path, *arguments: str) -> Iterator[tuple[str, subprocess.Popen[str]]]:
+    """A page's address, and its process, from which all that is printed after that can be read."""
+    process = start(folder, *arguments, "--port", "0")
+    assert process.stdout is not None
+    try:
+        said = []
+        for line in process.stdout:
+            said.append(line)
+            if line.startswith("  page "):
+                break
+        else:
+            raise AssertionError("".join(said))
+        yield line.split()[-1], process
+    finally:
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(timeout=30)
+        finally:
+            process.kill()
+            process.stdout.close()
+
+
+def await_on_page(url: str, text: str) -> None:
+    """Until the page is sent something with `text` in it."""
+    address, options = handshake(url)
+    deadline = time.monotonic() + 90
+    with websockets.sync.client.connect(address, **options) as tab:
+        tab.send(camera_message())
+        from tests.ui.tabs import messages_in
+
+        while time.monotonic() < deadline:
+            frame = tab.recv(timeout=90)
+            assert isinstance(frame, bytes)
+            if text in str(messages_in(frame)):
+                return
+    raise AssertionError(f"{text!r} did not come")
+
+
+def finished(process: subprocess.Popen[str]) -> str:
+    said, _ = process.communicate(timeout=200)
+    assert process.returncode == 0, said
+    return said
+
+
+def test_no_command_runs_what_lies_in_the_current_folder(tmp_path: Path) -> None:
+    plant(tmp_path, *PLANTED)
+    plain = ("--num-envs", "2", "--env", "render_backend=none")
+    recording = start(
+        tmp_path, "record", str(TASK), "--episodes", "2", "--max-steps", "3", "--workers", "2",
+        "--no-pictures", "--out", "recordings", *plain,
+    )  # fmt: skip
+    doctor = start(tmp_path, "doctor")
+    finished(recording)
+    assert "packages" in doctor.communicate(timeout=200)[0]
+    episodes = sorted((tmp_path / "recordings").glob("*.json"))
+    assert len(episodes) == 2
+    with page(tmp_path, "review", ".") as (url, _):
+        await_on_page(url, episodes[0].stem)
+    finished(start(tmp_path, "share", str(episodes[0].with_suffix(".rrd")), "--html", "--out", "made"))
+    with page(tmp_path, "open", str(TASK), *plain) as (_, process):
+        assert process.stdout is not None
+        for line in process.stdout:
+            assert "failed" not in line
+            if line.startswith("loaded"):
+                break
+        else:
+            raise AssertionError("it did not load")
+    assert ran(tmp_path) == []
+
+
+def test_python_m_leaves_the_current_folder_out_as_well(tmp_path: Path) -> None:
+    """As far as we can: what Python itself imports to find the module comes before us."""
+    plant(tmp_path, *IMPORTED_FIRST)
+    done = subprocess.run(
+        [sys.executable, "-m", "workbench.cli", "view", "--help"],
+        cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert ran(tmp_path) == []
