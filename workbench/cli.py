@@ -17,6 +17,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from workbench.machine.guarded_terminal import guard_terminal
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.task_arguments import Backend, history_bytes, task_options
 from workbench.terminal import err, print_problem, refuse
@@ -322,6 +323,7 @@ def doctor() -> int:
 
 def main(args: Sequence[str] | None = None) -> None:
     """Entry of the ``workbench`` command."""
+    guard_terminal()
     try:
         code: Any = app.cli(
             prog="workbench",

@@ -22,7 +22,7 @@ from workbench.machine.software_vulkan import use_private_driver
 from workbench.session.kept_worker import WorkerOptions
 from workbench.session.messages import Event, Failed, TaskOptions
 from workbench.session.session import Session
-from workbench.terminal import out, print_event, print_line, refuse, warn
+from workbench.terminal import out, print_event, print_line, refuse, say, warn
 from workbench.ui.door import Door, DoorError, DoorOptions, open_door
 from workbench.ui.pages import Which
 from workbench.ui.put_together import Workplace
@@ -149,9 +149,9 @@ class _End:
 def _announce(door: Door, what: str) -> None:
     out.print(f"[bold]Workbench[/] {workbench.__version__}: {escape(what)}", soft_wrap=True)
     # Not through rich, which would break the address in a narrow terminal.
-    print(f"  page    {door.url}", flush=True)
-    print(f"  remote  {door.ssh_hint}", flush=True)
-    print("  Ctrl-C ends it.", flush=True)
+    say(f"  page    {door.url}")
+    say(f"  remote  {door.ssh_hint}")
+    say("  Ctrl-C ends it.")
 
 
 def _leave(code: int) -> NoReturn:

@@ -28,6 +28,7 @@ from workbench.authoring.reference import named_file
 from workbench.recording.landing import try_folder
 from workbench.recording.recover import recover
 from workbench.session.record import Progress, Recorded, RecordOptions, record, with_given_actions
+from workbench.terminal import say
 
 
 class _StopAtInterrupt:
@@ -60,7 +61,7 @@ def record_in_terminal(
 ) -> int:
     """Record, and say what came of it; returns the exit code."""
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
@@ -119,7 +120,7 @@ def _say_what_is_kept(asked: RecordOptions, before: set[Path]) -> None:
     kept = len(set(asked.out.glob("*.json")) - before)
     if kept:
         folder = shlex.quote(str(asked.out))
-        print(
+        say(
             f"{_episodes(kept)} that had ended before {'is' if kept == 1 else 'are'} kept: workbench review {folder}"
         )
 
@@ -127,18 +128,18 @@ def _say_what_is_kept(asked: RecordOptions, before: set[Path]) -> None:
 def _say(asked: RecordOptions, recorded: Recorded, refuse: Callable[[str], int]) -> int:
     for episode in recorded.written:
         ended = {None: "", True: "success", False: "no success"}[episode.success]
-        print(f"{episode.path}  {episode.steps} steps  return {episode.total_reward:.3f}  {ended}".rstrip())
+        say(f"{episode.path}  {episode.steps} steps  return {episode.total_reward:.3f}  {ended}".rstrip())
     kept = len(recorded.written)
     if asked.successes is not None:
-        print(f"{kept} of {recorded.tried} episodes succeeded and were kept.")
+        say(f"{kept} of {recorded.tried} episodes succeeded and were kept.")
     if recorded.put_right:
         count = _episodes(recorded.put_right)
-        print(
+        say(
             f"{count} began elsewhere than recorded with the recorded seed, and were put to the recorded first state."
         )
     if recorded.written:
         folder = shlex.quote(str(recorded.written[0].path.parent))
-        print(f"Look at them with: workbench review {folder}")
+        say(f"Look at them with: workbench review {folder}")
     if recorded.stopped:
         return refuse("interrupted; episodes that had ended are kept")
     if asked.successes is not None and kept < asked.successes:

@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsed
 from rich.progress import Progress as Bar
 from rich.table import Table
 
+from workbench.machine.terminal_text import plain_text
 from workbench.session import rescore_words as words
 from workbench.session.rescore_all import Progress, RescoreOptions, rescore_all
 from workbench.session.rescore_messages import Verdict
@@ -19,7 +20,12 @@ from workbench.session.rescore_messages import Verdict
 
 def run_rescore(what: RescoreOptions, out: Console, err: Console, csv: Path | None, json: Path | None) -> int:
     """Judge, print, write the tables that are asked for; raises as `rescore_all`, and OSError for a table."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
     with Bar(*columns, console=err) as bar:
         row = bar.add_task("reading the recordings", total=None)
 
@@ -35,9 +41,9 @@ def run_rescore(what: RescoreOptions, out: Console, err: Console, csv: Path | No
             words.write_table(path, text(verdicts))
     print_verdicts(verdicts, out)
     for note in (*notes, *words.not_carried(verdicts)):
-        err.print(f"[yellow]{escape(note)}[/]", soft_wrap=True)
+        err.print(f"[yellow]{escape(plain_text(note))}[/]", soft_wrap=True)
     if doubt := words.doubts(verdicts):
-        err.print(f"[yellow]{escape(doubt)}[/]", soft_wrap=True)
+        err.print(f"[yellow]{escape(plain_text(doubt))}[/]", soft_wrap=True)
     return 0
 
 
@@ -62,7 +68,7 @@ def print_verdicts(verdicts: list[Verdict], out: Console) -> None:
 
 def _cells(verdict: Verdict) -> list[str]:
     judged = not verdict.why_not
-    return [
+    cells = [
         verdict.file.name,
         str(verdict.seed) if verdict.seed >= 0 else "",
         str(verdict.length) if judged else "",
@@ -70,6 +76,7 @@ def _cells(verdict: Verdict) -> list[str]:
         words.what_changed(verdict),
         words.drift(verdict) if judged else "",
     ]
+    return [plain_text(cell) for cell in cells]
 
 
 def _print_lines(verdict: Verdict, out: Console) -> None:

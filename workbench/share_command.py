@@ -11,6 +11,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from workbench.recording.lerobot_export import DoesNotFit, ExportOptions
 from workbench.recording.lerobot_frames import Choice
 from workbench.recording.sources import Source, sources_among
+from workbench.terminal import say
 from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted, make
 
 SCENE, CAMERAS = "scene", "cameras"
@@ -71,7 +72,7 @@ def export_in_terminal(
 def _make_all(wanted: Sequence[Wanted], err: Console, refuse: Callable[[str], int]) -> int:
     made: list[Made] = []
     not_made: list[str] = []
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeRemainingColumn())
     try:
         with Progress(*columns, console=err) as bar:
             row = bar.add_task("reading", total=len(wanted))
@@ -94,5 +95,7 @@ def _make_all(wanted: Sequence[Wanted], err: Console, refuse: Callable[[str], in
     finally:
         for one in made:
             for path in one.paths:
-                print(path if path.is_file() else f"{path}: {one.words}")
-    return refuse("\n".join(not_made)) if not_made else 0
+                say(path if path.is_file() else f"{path}: {one.words}")
+    for why in not_made:
+        refuse(why)
+    return 2 if not_made else 0

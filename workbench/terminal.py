@@ -1,43 +1,84 @@
-"""What every command says in a terminal, and how: results to stdout, refusals and problems in colour to stderr."""
+"""What every command says in a terminal, and how: results to stdout, refusals and problems in colour to stderr.
+
+Much of it comes from elsewhere: names of files, notes of recordings, what the author's code raises and prints, the
+paths of requests. What is said here is made harmless where it is known (`terminal_text`); and for what libraries, loggers
+and tracebacks say past this module, `machine.guarded_terminal` stands before both streams of every command.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
+from typing import IO, TYPE_CHECKING
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
+from rich.segment import Segment
+
+from workbench.machine.guarded_terminal import SafeStream
+from workbench.machine.terminal_text import for_terminal, plain_text
 
 if TYPE_CHECKING:
     from workbench.authoring.problem import Problem
     from workbench.session.messages import Event
+    from workbench.session.printed import PrintedLine
 
-out = Console(highlight=False)
-err = Console(stderr=True, highlight=False)
 
+class SafeConsole(Console):
+    """Its own colours, bars and cursor moves reach the terminal; those in the text that it is given do not."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        for segment in super().render(renderable, options):
+            if segment.control is not None:
+                yield segment
+                continue
+            style = segment.style
+            # The address of a link goes to the terminal as it is.
+            if style is not None and style.link is not None:
+                style = style.update_link(None)
+            yield Segment(plain_text(segment.text, "\n"), style)
+
+    @property
+    def file(self) -> IO[str]:
+        file = super().file
+        return file.raw if isinstance(file, SafeStream) else file
+
+    @file.setter
+    def file(self, new_file: IO[str]) -> None:
+        self._file = new_file
+
+
+out = SafeConsole(highlight=False)
+err = SafeConsole(stderr=True, highlight=False)
+
+_LINES = "\n\t"
 _told: set[str] = set()
 """Notices of the task; each reload brings them again."""
 
 
+def say(text: object) -> None:
+    """One line to stdout, not broken where the terminal ends: it can be taken from there."""
+    print(plain_text(str(text)), flush=True)
+
+
 def refuse(message: str) -> int:
     """Say in a sentence why nothing is done; returns the exit code."""
-    err.print(f"[red]{escape(message)}[/]", soft_wrap=True)
+    err.print(f"[red]{escape(plain_text(message))}[/]", soft_wrap=True)
     return 2
 
 
 def warn(message: str) -> None:
-    err.print(f"[yellow]{escape(message)}[/]")
+    err.print(f"[yellow]{escape(plain_text(message))}[/]", soft_wrap=True)
 
 
 def print_problem(problem: Problem) -> None:
     """What went wrong in the author's code, with its place."""
     place = "" if problem.file is None else f"{problem.file}:{problem.line or 1}: "
-    err.print(
-        f"[red]{escape(problem.stage)} failed[/] {escape(place)}{escape(problem.message)}", soft_wrap=True
-    )
+    said = escape(plain_text(f"{place}{problem.message}"))
+    err.print(f"[red]{escape(problem.stage)} failed[/] {said}", soft_wrap=True)
     if problem.code:
-        err.print(f"    {escape(problem.code)}", soft_wrap=True)
+        err.print(f"    {escape(plain_text(problem.code))}", soft_wrap=True)
     if problem.traceback:
-        err.print(f"[dim]{escape(problem.traceback.rstrip())}[/]", soft_wrap=True)
+        err.print(f"[dim]{escape(plain_text(problem.traceback.rstrip(), _LINES))}[/]", soft_wrap=True)
 
 
 def print_event(event: Event) -> None:
@@ -45,12 +86,13 @@ def print_event(event: Event) -> None:
     from workbench.session.messages import Failed, Loaded
 
     if isinstance(event, Loaded):
-        parts = ", ".join(f"{name} {ms:.0f}" for name, ms in event.milliseconds.items())
+        parts = ", ".join(f"{plain_text(name)} {ms:.0f}" for name, ms in event.milliseconds.items())
         total = sum(event.milliseconds.values())
         how = "loaded" if event.reload is None else event.reload.level
-        why = "" if event.reload is None or not event.reload.reason else f": {escape(event.reload.reason)}"
+        why = "" if event.reload is None or not event.reload.reason else f": {event.reload.reason}"
+        what = escape(plain_text(f"{event.task.env_id}{why}"))
         out.print(
-            f"[green]{how}[/] {escape(event.task.env_id)}{why} in {total:.0f} ms [dim]({parts})[/]",
+            f"[green]{escape(how)}[/] {what} in {total:.0f} ms [dim]({escape(parts)})[/]",
             soft_wrap=True,
         )
         for notice in event.task.notices:
@@ -64,6 +106,7 @@ def print_event(event: Event) -> None:
             err.print(f"[dim]the last good version {back}[/]")
 
 
-def print_line(line: str) -> None:
+def print_line(line: PrintedLine) -> None:
     """What the author's code printed, told apart from the workbench's own lines."""
-    print(f"  | {line}", flush=True)
+    coloured = line.runs and out.color_system is not None and not out.no_color
+    print(f"  | {for_terminal(line.runs) if coloured else line.text}", flush=True)

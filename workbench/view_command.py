@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from workbench.recording.viewer import has_screen, open_window, recordings_among
-from workbench.terminal import refuse, warn
+from workbench.terminal import refuse, say, warn
 
 
 def view_in_terminal(files: Sequence[Path], web: bool, host: str, port: int) -> int:
@@ -24,7 +24,7 @@ def view_in_terminal(files: Sequence[Path], web: bool, host: str, port: int) -> 
     except RuntimeError as error:
         return refuse(str(error))
     except KeyboardInterrupt:
-        print("closing", flush=True)
+        say("closing")
     finally:
         viewer.close()
     return 0
@@ -42,11 +42,12 @@ def _in_page(files: Sequence[Path], host: str, port: int) -> int:
         address = RerunPages(door, Offers(door)).address(files)
         if door.warning:
             warn(door.warning)
-        print(f"  page    {door.address(address)}", flush=True)
-        print(f"  remote  {door.ssh_hint}\n  Ctrl-C ends it.", flush=True)
+        say(f"  page    {door.address(address)}")
+        say(f"  remote  {door.ssh_hint}")
+        say("  Ctrl-C ends it.")
         threading.Event().wait()
     except KeyboardInterrupt:
-        print("closing", flush=True)
+        say("closing")
     finally:
         door.close()
     return 0

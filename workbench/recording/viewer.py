@@ -9,10 +9,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
+from workbench.machine.terminal_text import only_colours
 from workbench.recording.rerun_command import quiet_environment, rerun_command
 from workbench.recording.rerun_process import LOOPBACK, await_port, end, free_port
 
@@ -22,6 +25,7 @@ class Viewer:
     """A window that is open; `wait` until its person is done with it, or `close` it."""
 
     _process: subprocess.Popen[bytes]
+    _says: threading.Thread
 
     def wait(self) -> None:
         """Return when the window is closed.
@@ -30,6 +34,7 @@ class Viewer:
             RuntimeError: the viewer ended by itself with an error.
         """
         if status := self._process.wait():
+            self._says.join(timeout=5.0)
             raise RuntimeError(f"rerun's viewer ended with {status}; what it said is above.")
 
     def close(self) -> None:
@@ -68,10 +73,23 @@ def open_window(paths: Sequence[Path]) -> Viewer:
     port = free_port()
     command = [*rerun_command(), "--bind", LOOPBACK, "--port", str(port), "--hide-welcome-screen"]
     process = subprocess.Popen(
-        [*command, *map(os.fspath, files)], env=quiet_environment(), stdin=subprocess.DEVNULL
+        [*command, *map(os.fspath, files)],
+        env=quiet_environment(),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
     )
+    says = threading.Thread(target=_print_all, args=(process.stdout,), name="rerun-says", daemon=True)
+    says.start()
     await_port(process, port)
-    return Viewer(process)
+    return Viewer(process, says)
+
+
+def _print_all(said: IO[bytes]) -> None:
+    """What rerun says of a file has names from the file in it."""
+    with said:
+        for line in said:
+            print(only_colours(line.decode(errors="replace")), end="", file=sys.stderr, flush=True)
 
 
 def has_screen(environment: Mapping[str, str]) -> bool:

@@ -3,6 +3,9 @@
 A print in a loop is a gigabyte in a minute. Each line that is split, decoded, kept and sent to a terminal costs
 microseconds of the server, which is the page's: a flood of millions would freeze it. So the bytes are taken as
 they come, in large pieces; so many lines a second are looked at, of the others only the number is known.
+
+What it printed may be anything: controls are shown, colours are kept apart from the text (`terminal_text`), and of a
+line that is written over, as by a progress bar, there is the last version, also while it goes on.
 """
 
 from __future__ import annotations
@@ -13,10 +16,14 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from workbench.machine.terminal_text import PLAIN, Run, Style, coloured_runs
+
 _LONGEST_LINE = 2000
 _LINES_KEPT = 1000
 _LINES_PER_SECOND = 400
 """More are counted and dropped. Faster than anybody reads, and 1 % of a core."""
+_BAR_TOLD_EVERY = 0.1
+"""Seconds."""
 _KEPT_OF_PIECE = 16_384
 """Bytes at the end of a piece that are looked at when the piece is one of a flood."""
 
@@ -26,6 +33,9 @@ class PrintedLine:
     stream: str
     """``stdout`` or ``stderr``."""
     text: str
+    """Without colours, every control shown escaped."""
+    runs: tuple[Run, ...] = ()
+    """The same text with its colours; empty where it has none."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +44,7 @@ class Printed:
 
     serial: int
     lines: tuple[PrintedLine, ...]
-    """Oldest first."""
+    """Oldest first; last what stands without an end of line, where it was written over: a progress bar."""
     dropped: int
     """Lines that came too fast to be kept."""
 
@@ -52,7 +62,8 @@ class PrintedLog:
     def __init__(self, on_lines: Callable[[list[PrintedLine], int], None]) -> None:
         """
         Args:
-            on_lines: called with new lines and how many were dropped before them, on the threads that feed.
+            on_lines: called with new lines and how many were dropped before them, on the threads that feed; with
+                none where a line that is not ended was written over.
         """
         self._on_lines = on_lines
         self._lock = threading.Lock()
@@ -60,14 +71,18 @@ class PrintedLog:
         self._dropped = 0
         self._serial = 0
         self._rest: dict[str, bytes] = {}
+        self._styles: dict[str, Style] = {}
+        """What each stream's next line begins with."""
         self._budget = float(_LINES_PER_SECOND)
         self._refilled = time.monotonic()
+        self._told_of_bar = 0.0
         self._view = NOTHING_PRINTED
 
     def feed(self, stream: str, piece: bytes) -> bool:
         """The next bytes of a stream, in any pieces; none at its end. True while they come too fast."""
+        ended = not piece
         with self._lock:
-            if not piece:
+            if ended:
                 # What stands without an end of line is the last line.
                 piece = b"\n" if self._rest.get(stream) else b""
             now = time.monotonic()
@@ -79,12 +94,18 @@ class PrintedLog:
             if over > 0:
                 found, dropped = found[over:], dropped + over
             self._budget = max(0.0, self._budget - len(found))
-            lines = [PrintedLine(stream, _text(line)) for line in found]
+            lines = [self._line(stream, line) for line in found]
+            if ended:
+                self._styles.pop(stream, None)
             self._dropped += dropped
             self._lines.extend(lines)
-            if lines or dropped:
+            bar = b"\r" in self._rest[stream]
+            if lines or dropped or bar:
                 self._serial += 1
-        if lines or dropped:
+            told = bool(lines or dropped) or (bar and now - self._told_of_bar > _BAR_TOLD_EVERY)
+            if told and bar:
+                self._told_of_bar = now
+        if told:
             self._on_lines(lines, dropped)
         return dropped > 0
 
@@ -97,7 +118,7 @@ class PrintedLog:
     def view(self) -> Printed:
         with self._lock:
             if self._view.serial != self._serial:
-                self._view = Printed(self._serial, tuple(self._lines), self._dropped)
+                self._view = Printed(self._serial, (*self._lines, *self._unfinished()), self._dropped)
             return self._view
 
     def tail(self, count: int) -> str:
@@ -113,6 +134,9 @@ class PrintedLog:
             if cut:
                 piece, self._rest[stream] = piece[cut:], b""
         *whole, rest = (self._rest.get(stream, b"") + piece).split(b"\n")
+        # Of a bar that is drawn for minutes only the last version is needed, and the one that is being written.
+        if rest.count(b"\r") > 1:
+            rest = b"\r".join(rest.rsplit(b"\r", 2)[1:])
         # Without an end of line in sight: cut there, or a gigabyte without one would fill us up.
         if len(rest) > _LONGEST_LINE:
             whole.append(rest)
@@ -120,7 +144,24 @@ class PrintedLog:
         self._rest[stream] = rest
         return whole, dropped
 
+    def _line(self, stream: str, raw: bytes) -> PrintedLine:
+        line, self._styles[stream] = _read(stream, raw, self._styles.get(stream, PLAIN))
+        return line
 
-def _text(line: bytes) -> str:
-    cut = line if len(line) <= _LONGEST_LINE else line[:_LONGEST_LINE] + "…".encode()
-    return cut.decode(errors="replace").rstrip("\r")
+    def _unfinished(self) -> list[PrintedLine]:
+        found = [
+            _read(stream, rest, self._styles.get(stream, PLAIN))[0]
+            for stream, rest in self._rest.items()
+            if b"\r" in rest
+        ]
+        return [line for line in found if line.text]
+
+
+def _read(stream: str, raw: bytes, style: Style) -> tuple[PrintedLine, Style]:
+    """A line, and the style that the one after it begins with."""
+    # What went back to the line's beginning wrote over what stood there.
+    seen = raw.rstrip(b"\r").rpartition(b"\r")[2]
+    cut = seen if len(seen) <= _LONGEST_LINE else seen[:_LONGEST_LINE] + "…".encode()
+    runs, after = coloured_runs(cut.decode(errors="replace"), style)
+    text = "".join(run.text for run in runs)
+    return PrintedLine(stream, text, tuple(runs) if any(run.style != PLAIN for run in runs) else ()), after

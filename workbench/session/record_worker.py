@@ -11,6 +11,7 @@ import sys
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
+from workbench.machine.guarded_terminal import guard_terminal
 from workbench.session.worker_start import end_with
 
 if TYPE_CHECKING:
@@ -21,6 +22,7 @@ def main() -> None:
     """Entry of the process."""
     connection, parent = map(int, sys.argv[1:3])
     end_with(parent)
+    guard_terminal()
     try:
         _work(Connection(connection))
     except (EOFError, BrokenPipeError, ConnectionResetError):

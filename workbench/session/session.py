@@ -75,7 +75,7 @@ class Session:
         history_bytes: int = HISTORY_BYTES,
         worker: WorkerOptions | None = None,
         on_event: Callable[[Event], None] = lambda event: None,
-        on_line: Callable[[str], None] = lambda line: None,
+        on_line: Callable[[PrintedLine], None] = lambda line: None,
     ) -> None:
         """
         Args:
@@ -449,7 +449,7 @@ class Session:
     def _on_lines(self, lines: list[PrintedLine], dropped: int) -> None:
         self._note()
         for line in lines:
-            self._print(line.text)
+            self._print(line)
 
     # --- small things --------------------------------------------------------------------------------
 

@@ -16,6 +16,7 @@ from workbench.session.printed import Printed
 from workbench.session.view import SessionView
 from workbench.ui.checked import checked_text
 from workbench.ui.fragments import render
+from workbench.ui.log_colours import spans_of_lines
 
 REDRAW_EVERY = 0.3
 LINES_SHOWN = 200
@@ -93,9 +94,10 @@ def log_html(printed: Printed, wanted: str) -> str:
         if (not stream or line.stream == stream) and (not part or part in line.text.lower())
     ]
     lines = fits[-LINES_SHOWN:]
+    spans = spans_of_lines([(line.text, line.runs) for line in lines])
     return render(
         "log",
-        lines=lines,
+        lines=list(zip((line.stream for line in lines), spans)),
         shown=len(lines),
         kept=len(printed.lines),
         wanted=wanted,

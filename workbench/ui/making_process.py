@@ -10,6 +10,7 @@ import time
 from types import FrameType
 from typing import NoReturn
 
+from workbench.machine.guarded_terminal import guard_terminal
 from workbench.ui.making import decode
 
 SAY_EVERY = 0.1
@@ -21,6 +22,7 @@ def main() -> None:
         raise SystemExit(1)  # through the blocks that take half-written files away
 
     signal.signal(signal.SIGTERM, on_signal)
+    guard_terminal()  # what is said of recordings has names from them in it
     # What libraries print goes where the author sees it, and not between our lines.
     ours = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)

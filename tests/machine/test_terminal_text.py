@@ -1,0 +1,154 @@
+from __future__ import annotations
+
+import re
+import unicodedata
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from workbench.machine.terminal_text import (
+    PLAIN,
+    Run,
+    Style,
+    coloured_runs,
+    for_terminal,
+    only_colours,
+    plain_text,
+)
+
+COLOURS = re.compile("\x1b\\[[0-9;:]*m")
+DIRECTIONS = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}
+EVIL = st.lists(
+    st.one_of(
+        st.text(st.characters(), max_size=8),
+        st.sampled_from(
+            [
+                *(
+                    "\x1b",
+                    "\x1b[",
+                    "\x9b",
+                    "\x1b[31m",
+                    "\x1b[38;5;208m",
+                    "\x1b[0m",
+                    "\x1b[8m",
+                    "\x1b[2J",
+                    "\x1b[m",
+                ),
+                *(
+                    "\x1b]0;title\x07",
+                    "\x1b]52;c;aGk=\x1b\\",
+                    "\x1b]8;;http://x\x1b\\",
+                    "\x1bc",
+                    "\r",
+                    "\n",
+                    "\x7f",
+                ),
+                *(
+                    "\x9b31m",
+                    "\x90q\x9c",
+                    "\u202e",
+                    "\u2066",
+                    "\u2028",
+                    "\udc80",
+                    "m",
+                    "31",
+                    "[",
+                    ";",
+                    ":",
+                    "\x1b[38",
+                ),
+            ]
+        ),
+    ),
+    max_size=12,
+).map("".join)
+
+
+def harmful(text: str) -> list[str]:
+    """Characters that do something to a terminal or to how a line reads."""
+    return [
+        c
+        for c in text
+        if unicodedata.category(c) in ("Cc", "Cs", "Zl", "Zp") or unicodedata.bidirectional(c) in DIRECTIONS
+    ]
+
+
+@given(EVIL)
+@example("\x9b31m")
+def test_plain_text_has_no_control_character(text: str) -> None:
+    assert harmful(plain_text(text)) == []
+    assert set(harmful(plain_text(text, "\n"))) <= {"\n"}
+    assert plain_text(plain_text(text)) == plain_text(text)
+
+
+@given(EVIL)
+def test_beside_colours_nothing_is_left_for_a_terminal(text: str) -> None:
+    assert set(harmful(COLOURS.sub("", only_colours(text)))) <= {"\n", "\t"}
+    runs, _ = coloured_runs(text)
+    assert set(harmful("".join(run.text for run in runs))) <= {"\t"}
+    assert set(harmful(COLOURS.sub("", for_terminal(tuple(runs))))) <= {"\t"}
+    assert all(run.text for run in runs)
+
+
+@given(EVIL)
+def test_what_a_reader_sees_is_the_same_with_and_without_colours(text: str) -> None:
+    runs, style = coloured_runs(text)
+    printed = for_terminal(tuple(runs))
+    again, after = coloured_runs(printed)
+    assert [(run.text, run.style) for run in again] == [(run.text, run.style) for run in runs]
+    assert after == PLAIN, "the workbench's own lines are not coloured by what came before"
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("reward 0.5", "reward 0.5"),
+        ("größer → ∞ 机器人", "größer → ∞ 机器人"),
+        ("\x1b]0;mine\x07", "\\x1b]0;mine\\x07"),
+        ("\x9b2J", "\\x9b2J"),
+        ("a\nb\tc\rd", "a\\nb\\tc\\rd"),
+        ("evil\u202egpj.py", "evil\\u202egpj.py"),
+        ("name\udcff", "name\\udcff"),
+        ("\U000e0041", "\\U000e0041"),
+    ],
+)
+def test_controls_are_shown_as_python_writes_them(text: str, shown: str) -> None:
+    assert plain_text(text) == shown
+
+
+@pytest.mark.parametrize(
+    ("numbers", "style"),
+    [
+        ("", PLAIN),
+        ("0", PLAIN),
+        ("31", Style(1)),
+        ("1;32", Style(2, bold=True)),
+        ("94;103", Style(12, 11)),
+        ("38;5;9", Style(9)),
+        ("38;5;208", Style((255, 135, 0))),
+        ("48;5;244", Style(background=(128, 128, 128))),
+        ("38;2;1;2;3;4", Style((1, 2, 3), underline=True)),
+        ("38:2::1:2:3", Style((1, 2, 3))),
+        ("38:2:1:2:3", Style((1, 2, 3))),
+        ("38;2;999;2;3", Style((255, 2, 3))),
+        ("38;9;1", Style(bold=True)),
+        ("38", PLAIN),
+        ("8", PLAIN),
+        ("31;39", PLAIN),
+        ("1;2;3;4;7;9;22;23;24;27;29", PLAIN),
+        ("4:3", Style(underline=True)),
+        ("4:0", PLAIN),
+    ],
+)
+def test_colours_are_read_as_terminals_do(numbers: str, style: Style) -> None:
+    runs, _ = coloured_runs(f"\x1b[{numbers}mx")
+    assert runs == [Run("x", style)]
+
+
+def test_a_style_goes_on_over_lines_and_text_that_is_hidden_is_not_hidden() -> None:
+    first, style = coloured_runs("\x1b[31mone")
+    second, _ = coloured_runs("two\x1b[0m three", style)
+    assert first == [Run("one", Style(1))]
+    assert second == [Run("two", Style(1)), Run(" three", PLAIN)]
+    assert only_colours("\x1b[31;8msecret\x1b[0m") == "\\x1b[31;8msecret\x1b[0m"
