@@ -59,6 +59,10 @@ def test_the_sixteen_colours_of_the_page_can_be_read(scheme: str, page: tuple[in
         assert found is not None, number
         red, green, blue = bytes.fromhex(found[1])
         assert contrast((red, green, blue), page) >= READABLE, (number, found[1])
+    stderr = re.search(rf"(?:^|\n){re.escape(scheme)}\.wb-log \.wb-stderr {{ color: #(\w{{6}}); }}", CSS)
+    assert stderr is not None
+    red, green, blue = bytes.fromhex(stderr[1])
+    assert contrast((red, green, blue), page) >= READABLE
 
 
 @given(
