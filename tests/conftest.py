@@ -67,8 +67,7 @@ def _children() -> list[str]:
     for child in psutil.Process().children(recursive=True):
         try:
             command = " ".join(child.cmdline())
-            # multiprocessing keeps this one for the life of the interpreter that spawned a process.
-            if child.status() != psutil.STATUS_ZOMBIE and "multiprocessing.resource_tracker" not in command:
+            if child.status() != psutil.STATUS_ZOMBIE:
                 left.append(f"{child.pid} {command[:200]}")
         except psutil.NoSuchProcess:
             continue

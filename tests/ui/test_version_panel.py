@@ -37,3 +37,14 @@ def test_before_the_first_reload_it_says_what_saving_does() -> None:
 
 def test_times_are_short() -> None:
     assert (took(42.6), took(1234.0)) == ("43 ms", "1.2 s")
+
+
+def test_what_the_author_should_know_stands_there_before_and_after_a_reload() -> None:
+    notices = tuple(f"<b>file{i}.py</b> has the name of a library" for i in range(MOST_SHOWN + 2))
+    for report in (None, ReloadReport("same", "", 1.0)):
+        html = version_html(report, True, notices)
+        assert (
+            html.count("has the name of a library") == MOST_SHOWN
+            and "And 2 more." in html
+            and "<b>file" not in html
+        )

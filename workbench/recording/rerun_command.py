@@ -7,7 +7,7 @@ from pathlib import Path
 
 import rerun_cli
 
-from workbench.machine.child_python import python_command
+from workbench.machine.child_python import child_environment, python_command
 
 _BINARIES = ("rerun", "rerun.exe", "Rerun.app/Contents/MacOS/Rerun")
 
@@ -32,7 +32,6 @@ def quiet_environment() -> dict[str, str]:
     Rerun has no variable for just that; but where ``CI`` is set it neither sends nor asks, and leaves
     the person's own settings for rerun as they are (rerun 0.41, crate re_analytics).
     """
-    environment = dict(os.environ)
+    environment = child_environment(CI="true")
     environment.pop("FORCE_RERUN_ANALYTICS", None)
-    environment["CI"] = "true"
     return environment

@@ -178,6 +178,7 @@ def _exchange(
         source=dict(loaded.source),
         max_episode_steps=loaded.max_episode_steps,
         others=loaded.others,
+        notices=loaded.notices,
     )
     if change.level == "cameras":
         description = replace(description, cameras=list_cameras(env, task.table))

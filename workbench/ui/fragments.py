@@ -2,7 +2,9 @@
 
 viser puts the text of ``add_html`` into the page as it is, so one message of an author's exception
 with a ``<script>`` in it would run there. Everything that is shown as HTML therefore goes through
-`render`, which escapes every value it is given; no other module writes a tag.
+`render`, which escapes every value it is given; no other module writes a tag. Characters that are not seen are shown:
+one that turns the direction of writing makes a name look like another, and half of a surrogate pair, as in the name of a
+file that is not UTF-8, cannot be sent to a page at all.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from typing import Any
 
 import jinja2
 
+from workbench.machine.terminal_text import plain_text
 from workbench.web_assets import web_assets_folder
 
 
@@ -20,12 +23,18 @@ def render(template: str, **values: Any) -> str:
     return _environment().get_template(f"{template}.html").render(**values)
 
 
+def _shown(value: Any) -> Any:
+    # Not Markup: that is a template's own text, whose values have been here.
+    return plain_text(value, "\n\t") if type(value) is str else value
+
+
 @cache
 def _environment() -> jinja2.Environment:
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(web_assets_folder() / "panels"),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
+        finalize=_shown,
         trim_blocks=True,
         lstrip_blocks=True,
     )
