@@ -36,12 +36,11 @@ from workbench.ui.replies import (
     folder_handler,
     refusals,
 )
+from workbench.ui.told_rarely import ToldRarely
 from workbench.web_assets import web_assets_folder
 
 DEFAULT_PORT = 8080
 PORTS_TO_TRY = 100
-MAX_MESSAGE_BYTES = 8 * 1024 * 1024
-"""The largest thing that a page sends is a picture of its own view."""
 RESPONSE_SECONDS = 300.0
 """`websockets` gives 10 s for a request and its whole answer: too little for viser's page over a slow
 line, and far too little for a recording."""
@@ -178,7 +177,7 @@ def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) ->
         return answer
 
     try:
-        gated = viser_seam.make_viser(listening, wrap, label, MAX_MESSAGE_BYTES, RESPONSE_SECONDS)
+        gated = viser_seam.make_viser(listening, wrap, label, RESPONSE_SECONDS, ToldRarely())
     except viser_seam.SeamError as error:
         raise DoorError(str(error)) from error
     door = Door(
