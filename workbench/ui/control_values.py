@@ -34,9 +34,13 @@ def check_value(control: Any, value: object) -> None:
         ValueError: The control cannot hold that; the sentence is for the person at the page.
     """
     name = control.label or "value"
-    if isinstance(control, (viser.GuiCheckboxHandle, viser.GuiButtonHandle)):
+    if isinstance(control, viser.GuiCheckboxHandle):
         if not isinstance(value, bool):
             raise ValueError(f"The {name} is on or off.")
+    elif isinstance(control, viser.GuiButtonHandle):
+        # For viser any value of a button is a press.
+        if value is not True:
+            raise ValueError(f"The {name} can be pressed, and no more.")
     elif isinstance(control, (viser.GuiDropdownHandle, viser.GuiButtonGroupHandle)):
         checked_choice(value, control.options, name)
     elif isinstance(control, viser.GuiTextHandle):

@@ -23,6 +23,7 @@ import socket
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -84,6 +85,9 @@ STOP_SECONDS = 1.0
 """How long a page gets to answer the closing handshake."""
 
 _making = threading.Lock()
+
+# A page that is told something may have gone a moment ago; nobody can know before.
+warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
 
 # Any: the checker rightly says that viser does not export these names.
 infra: Any = viser.infra._infra
