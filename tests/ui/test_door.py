@@ -18,7 +18,7 @@ import viser.infra._infra
 from playwright.sync_api import sync_playwright
 
 from workbench.ui import door as door_module
-from workbench.ui import viser_seam
+from workbench.ui import listening, viser_seam
 from workbench.ui.door import DEFAULT_PORT, Door, DoorError, DoorOptions, open_door
 from workbench.ui.gate import cookie_name
 from workbench.ui.replies import SCRIPTS, STYLES, folder_handler
@@ -129,7 +129,7 @@ def test_a_taken_port_that_was_asked_for_is_an_error_that_says_what_to_do():
 def test_the_default_port_makes_way_and_says_so(monkeypatch):
     taken, port = a_taken_port()
     # 8080 itself may be in use on the machine that runs this.
-    monkeypatch.setattr(door_module, "DEFAULT_PORT", port)
+    monkeypatch.setattr(listening, "DEFAULT_PORT", port)
     with taken:
         door = open_door(DoorOptions(port=port))
         try:

@@ -125,7 +125,11 @@ def test_no_random_claim_disturbs_another_page(served, listener, monkeypatch, ca
     monkeypatch.setattr(page_guard, "RATE", 1e6)
     served.show(which)
 
-    @settings(deadline=None, max_examples=200, suppress_health_check=list(HealthCheck))
+    @settings(
+        deadline=None,
+        max_examples=200,
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+    )
     @given(st.lists(ANYTHING, min_size=5, max_size=5).map(tuple))
     def claim_them(values: tuple[object, ...]) -> None:
         claim_all(served, values)

@@ -50,8 +50,8 @@ def check_value(control: Any, value: object) -> None:
     elif isinstance(control, (viser.GuiVector2Handle, viser.GuiVector3Handle)):
         _check_components(value, control.value, control.min, control.max, name)
     elif isinstance(control, viser.GuiMultiSliderHandle):
-        ends = [(end,) * len(control.value) for end in (control.min, control.max)]
-        _check_components(value, control.value, *ends, name)
+        count = len(control.value)
+        _check_components(value, control.value, (control.min,) * count, (control.max,) * count, name)
     elif isinstance(control, (viser.GuiRgbHandle, viser.GuiRgbaHandle)):
         count = len(control.value)
         _check_components(value, control.value, (0,) * count, (255,) * count, name)
@@ -70,8 +70,10 @@ def _check_text(control: viser.GuiTextHandle, value: object, name: str) -> None:
 
 
 def _check_number(value: object, now: float, low: Any, high: Any, name: str) -> None:
-    check, most = (checked_int, LARGEST_INT) if isinstance(now, int) else (checked_number, math.inf)
-    check(value, -most if low is None else low, most if high is None else high, name)
+    if isinstance(now, int):
+        checked_int(value, -LARGEST_INT if low is None else low, LARGEST_INT if high is None else high, name)
+    else:
+        checked_number(value, -math.inf if low is None else low, math.inf if high is None else high, name)
 
 
 def _check_components(

@@ -47,10 +47,13 @@ class ServedPage(Protocol):
     def control(self, uuid: str) -> Any | None:
         """The input with this id, of all pages or of this one alone."""
 
-    def has_form(self, uuid: str) -> bool: ...
+    def has_form(self, uuid: str) -> bool:
+        """Whether a form has this id."""
+        ...
 
     def is_from_server(self, kind: str) -> bool:
         """Whether it is a kind of message that viser knows."""
+        ...
 
     def show_again(self, control: Any) -> None:
         """Send this page alone what the control holds."""

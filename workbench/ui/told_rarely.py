@@ -8,15 +8,18 @@ import time
 from collections.abc import Callable, Hashable
 
 PAUSE = 60.0
-"""Seconds in which the same thing is said once."""
+"""Seconds in which the same thing is said once, at first."""
+LONGEST_PAUSE = 3600.0
+"""A tab that was left open knocks once a second for as long as it is there."""
 MOST_KINDS = 256
 LONGEST = 300
+"""Characters of a line."""
 
 log = logging.getLogger("workbench.door")
 
 
 class ToldRarely:
-    """Says each kind of thing at most once in `pause` seconds; it may be called from any thread.
+    """Says each kind of thing at once, and again after `pause` seconds, twice that, and so on. From any thread.
 
     Args:
         say: Prints one line.
@@ -24,7 +27,8 @@ class ToldRarely:
 
     def __init__(self, say: Callable[[str], None] = log.warning, pause: float = PAUSE) -> None:
         self._say, self._pause = say, pause
-        self._told: dict[Hashable, float] = {}
+        self._silent_until: dict[Hashable, float] = {}
+        self._pauses: dict[Hashable, float] = {}
         self._untold: dict[Hashable, int] = {}
         self._lock = threading.Lock()
 
@@ -36,13 +40,16 @@ class ToldRarely:
         """
         now = time.monotonic()
         with self._lock:
-            if now - self._told.get(kind, -self._pause) < self._pause:
+            if now < self._silent_until.get(kind, 0.0):
                 self._untold[kind] = self._untold.get(kind, 0) + 1
                 return
-            if len(self._told) >= MOST_KINDS:
-                self._told.clear()
+            if len(self._pauses) >= MOST_KINDS:
+                self._silent_until.clear()
+                self._pauses.clear()
                 self._untold.clear()
-            self._told[kind] = now
+            pause = self._pauses.get(kind, self._pause)
+            self._silent_until[kind] = now + pause
+            self._pauses[kind] = min(2 * pause, LONGEST_PAUSE)
             before = self._untold.pop(kind, 0)
         more = f" ({before} more times since this was last said.)" if before else ""
         self._say(printable(sentence) + more)

@@ -25,7 +25,7 @@ import threading
 import time
 import warnings
 from collections.abc import Awaitable, Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any
 
@@ -41,6 +41,7 @@ from websockets.http11 import Request, Response
 from workbench.ui.client_messages import KINDS, MAX_BYTES, MalformedMessage
 from workbench.ui.deaf_clients import let_go_when_deaf
 from workbench.ui.page_guard import PageGuard
+from workbench.ui.strangers import Connection, Strangers
 from workbench.ui.told_rarely import ToldRarely
 
 WRITTEN_FOR = "1.1.1"
@@ -251,6 +252,26 @@ def _quiet_viser() -> Iterator[None]:
 class GatedViser:
     server: viser.ViserServer
     _serving: websockets.asyncio.server.serve
+    _closing: set[asyncio.Task[None]] = field(default_factory=set)
+
+    def close_pages(self, reason: str) -> None:
+        """Close every page, and every answer that is on its way; returns when that has begun."""
+        listening = self._serving.server
+        begun = threading.Event()
+
+        def close() -> None:
+            for connection in list(listening.handlers):
+                if connection in listening.connections:
+                    connection.close_timeout = STOP_SECONDS
+                    closing = connection.loop.create_task(connection.close(1008, reason))
+                    self._closing.add(closing)
+                    closing.add_done_callback(self._closing.discard)
+                elif isinstance(connection, Connection) and connection.admitted:
+                    connection.transport.abort()
+            begun.set()
+
+        listening.get_loop().call_soon_threadsafe(close)
+        begun.wait(timeout=10.0)
 
     def stop(self) -> None:
         """Stop viser and close every connection, within about a second.
@@ -304,6 +325,7 @@ def make_viser(
     real_serve = websockets.asyncio.server.serve
     serving: list[websockets.asyncio.server.serve] = []
     served: list[viser.ViserServer] = []
+    strangers = Strangers(told)
 
     def serve(
         handler: Callable[[ServerConnection], Awaitable[None]], host: str, port: int, **options: Any
@@ -314,6 +336,9 @@ def make_viser(
             process_request=wrap(options["process_request"]),
             max_size=MAX_BYTES,
             open_timeout=response_seconds,
+            server_header=None,
+            create_connection=strangers.connection,
+            unix=listening.family == socket.AF_UNIX,
             logger=_quiet_logger(),
         )
         made = real_serve(_watched(handler, served, told), sock=listening, **options)
