@@ -25,6 +25,7 @@ from websockets.http11 import Request, Response
 
 from workbench.ui import gate, viser_seam
 from workbench.ui.file_reply import FileReply, send_file
+from workbench.ui.told_rarely import printable
 from workbench.web_assets import web_assets_folder
 
 Handler = Callable[[str], "tuple[int, str, bytes] | FileReply"]
@@ -45,6 +46,10 @@ SCRIPTS = (
 """Of ``web_assets/``, run by the page; each says what it is for."""
 STYLES = "panels/page.css"
 """Of ``web_assets/``. In the page's head, since an HTML element of viser's is gone while the panel that it is in is folded."""
+
+LONGEST_NAME = 255
+"""Bytes of a file's name in every usual file system, and `LONGEST_PATH` of a whole path, some of which is the folder's."""
+LONGEST_PATH = 3000
 
 _log = logging.getLogger("workbench.door")
 
@@ -142,6 +147,8 @@ async def admitted_reply(
     page = {"Content-Security-Policy": page_policy(authority), "Cache-Control": "no-cache"}
     # Decoded once, as viser does; what is still encoded after that is part of a file's name.
     path = unquote(request.path.partition("?")[0]).replace("\\", "/")
+    if not _is_path_of_files(path):
+        return _no_such_file(page)
     prefix = max((prefix for prefix in routes if path.startswith(prefix)), key=len, default=None)
     if prefix is None:
         response = viser_hook(connection, request)
@@ -156,8 +163,6 @@ async def admitted_reply(
         for name, value in {**_EVERY_REPLY, **page}.items():
             response.headers[name] = value
         return response
-    if ".." in path.split("/") or "\0" in path:
-        return _no_such_file(page)
     handler, headers = routes[prefix]
     accepts_gzip = any("gzip" in value for value in request.headers.get_all("Accept-Encoding"))
 
@@ -165,7 +170,7 @@ async def admitted_reply(
         try:
             made = handler(path[len(prefix) :])
         except Exception:
-            _log.exception("The route %s failed on %s.", prefix, path)
+            _log.exception("The route %s failed on %s.", prefix, printable(path))
             made = 500, "text/plain; charset=utf-8", b"This went wrong; the terminal says how."
         if isinstance(made, FileReply):
             return made
@@ -179,6 +184,17 @@ async def admitted_reply(
         return made
     fields = {**_EVERY_REPLY, **page, **headers}
     return await send_file(connection, made, fields, accepts_gzip, lambda: _no_such_file(page))
+
+
+def _is_path_of_files(path: str) -> bool:
+    """Whether a file could have this path: the system raises on a name that is too long, and on a NUL in it."""
+    parts = path.encode("utf-8", "surrogatepass").split(b"/")
+    return (
+        b".." not in parts
+        and "\0" not in path
+        and all(len(part) <= LONGEST_NAME for part in parts)
+        and sum(map(len, parts)) <= LONGEST_PATH
+    )
 
 
 def _no_such_file(headers: Mapping[str, str]) -> Response:
