@@ -353,7 +353,7 @@ def test_a_real_browser_opens_the_page_with_nothing_to_complain_of(door, tmp_pat
     server = door.server
     server.gui.add_markdown("**bold**")
     server.gui.add_html(
-        "<div id='from-html'>html</div><img src='/workbench/logo.svg' onload='this.id=\"logo-came\"'>"
+        "<div id='from-html' style='color: red'>html</div><img id='logo' src='/workbench/logo.svg'>"
     )
     server.gui.add_image(np.zeros((8, 8, 3), np.uint8))
     server.gui.add_uplot(
@@ -394,7 +394,7 @@ def test_a_real_browser_opens_the_page_with_nothing_to_complain_of(door, tmp_pat
         )
         page.goto(door.url, wait_until="domcontentloaded")
         page.wait_for_selector("#from-html", timeout=60_000)
-        page.wait_for_selector("#logo-came", timeout=60_000)
+        page.wait_for_function("document.getElementById('logo').naturalWidth > 0", timeout=60_000)
         assert connected.wait(60)
         assert page.url == f"http://127.0.0.1:{door.port}/"  # the token has left the address bar
         assert page.evaluate("document.cookie") == ""  # and no script can read it

@@ -41,7 +41,9 @@ def is_closed(sock: socket.socket) -> bool:
         return True
 
 
-@pytest.mark.parametrize("said", [b"", b"GET / HTTP/1.1\r\n", b"GET / HTTP/1.1\r\nHost: x\r\nX: ", b"\x16\x03"])
+@pytest.mark.parametrize(
+    "said", [b"", b"GET / HTTP/1.1\r\n", b"GET / HTTP/1.1\r\nHost: x\r\nX: ", b"\x16\x03"]
+)
 def test_a_connection_that_asks_nothing_is_closed_after_a_while(door, monkeypatch, said):
     monkeypatch.setattr(strangers, "PATIENCE", 0.3)
     with connected(door) as quiet:
@@ -122,7 +124,14 @@ def test_the_cookies_of_many_other_programs_come_with_it(door):
 
 @pytest.mark.parametrize(
     "path",
-    ["/" + "x" * LONG, "/workbench/" + "x" * LONG, "/" + "%C3%A9" * 200, "/a%00b", "/workbench/%00", "/" + "x/" * 1800],
+    [
+        "/" + "x" * LONG,
+        "/workbench/" + "x" * LONG,
+        "/" + "%C3%A9" * 200,
+        "/a%00b",
+        "/workbench/%00",
+        "/" + "x/" * 1800,
+    ],
 )
 def test_a_path_that_no_file_can_have_is_not_found(door, path, caplog, capfd):
     assert ask(door, path)[0] == 404
@@ -196,7 +205,9 @@ def test_what_is_turned_away_is_counted_and_told_once_of_each_kind(door, caplog)
     assert door.turned_away == 15
     lines = [record.getMessage() for record in caplog.records]
     assert len(lines) == 4
-    assert all("from 127.0.0.1" in line and "evil" not in line and token_of(door) not in line for line in lines)
+    assert all(
+        "from 127.0.0.1" in line and "evil" not in line and token_of(door) not in line for line in lines
+    )
 
 
 def test_the_same_thing_is_said_ever_more_rarely(monkeypatch):

@@ -1,9 +1,7 @@
 """What the door answers: the headers of every reply, and the files and routes that are not viser's.
 
-Each reply, a refusal too, tells the browser not to guess types, not to pass the address on, and not to
-show the page inside another site's. viser's page gets a Content-Security-Policy on top (`page_policy`),
-because that page obeys any server that it is pointed at. `workbench.ui.door` decides who gets which
-reply; here is how each is made.
+`workbench.ui.door` decides who gets which reply, and `workbench.ui.page_policy` what a browser may do with it; here is
+how each is made.
 """
 
 from __future__ import annotations
@@ -25,6 +23,7 @@ from websockets.http11 import Request, Response
 
 from workbench.ui import gate, viser_seam
 from workbench.ui.file_reply import FileReply, send_file
+from workbench.ui.page_policy import EVERY_REPLY, PAGE_OF_OURS, page_policy
 from workbench.ui.told_rarely import printable
 from workbench.web_assets import web_assets_folder
 
@@ -34,6 +33,9 @@ status, the content type and the body, or a file to be sent without reading it w
 of its own, so it may read files."""
 
 SCRIPTS = (
+    "no_eval.js",
+    "let_in.js",
+    "pressed.js",
     "keys.js",
     "pressed_by_key.js",
     "view_stays.js",
@@ -52,45 +54,6 @@ LONGEST_NAME = 255
 LONGEST_PATH = 3000
 
 _log = logging.getLogger("workbench.door")
-
-_EVERY_REPLY = {
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "X-Frame-Options": "SAMEORIGIN",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Connection": "close",
-}
-_PAGE_OF_OURS = {
-    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'self'",
-    "Cache-Control": "no-store",
-}
-
-
-def page_policy(authority: str) -> str:
-    """Content-Security-Policy for viser's page as seen on ``authority`` (``host:port``).
-
-    viser's page is one file of inline scripts that unpack themselves into blobs, workers and wasm, so
-    scripts have to be allowed from those. What the policy is for is ``connect-src``: viser's page takes
-    the address of another server from its own address (``?websocket=``, ``?playbackPath=``), and what
-    that server sends runs as our page. It also keeps pictures in markdown from calling home.
-    """
-    return "; ".join(
-        (
-            "default-src 'self'",
-            "script-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob:",
-            "worker-src 'self' blob:",
-            "style-src 'self' 'unsafe-inline'",
-            "img-src 'self' data: blob:",
-            "media-src 'self' data: blob:",
-            "font-src 'self' data:",
-            f"connect-src 'self' data: blob: ws://{authority} wss://{authority}",
-            "frame-src 'self' blob: data:",
-            "object-src 'none'",
-            "base-uri 'none'",
-            "form-action 'self'",
-            "frame-ancestors 'self'",
-        )
-    )
 
 
 def asked_of(request: Request) -> gate.Asked:
@@ -118,19 +81,19 @@ def refusals(example: str) -> Callable[[str], Response]:
 
     def refuse(reason: str) -> Response:
         body = page.replace("{{reason}}", html.escape(reason)).encode()
-        return reply(403, "text/html; charset=utf-8", body, _PAGE_OF_OURS)
+        return reply(403, "text/html; charset=utf-8", body, PAGE_OF_OURS)
 
     return refuse
 
 
 def reply(status: int, kind: str, body: bytes, headers: Mapping[str, str], gzipped: bool = False) -> Response:
     extra = {"Content-Encoding": "gzip", "Vary": "Accept-Encoding"} if gzipped else {}
-    fields = {"Content-Type": kind, "Content-Length": str(len(body)), **_EVERY_REPLY, **extra, **headers}
+    fields = {"Content-Type": kind, "Content-Length": str(len(body)), **EVERY_REPLY, **extra, **headers}
     return Response(status, HTTPStatus(status).phrase, Headers(fields), body)
 
 
 def entered_reply(entered: gate.Entered) -> Response:
-    cookie = {"Set-Cookie": entered.set_cookie, **_PAGE_OF_OURS}
+    cookie = {"Set-Cookie": entered.set_cookie, **PAGE_OF_OURS}
     if not entered.by_page:
         return reply(303, "text/plain; charset=utf-8", b"", {"Location": entered.location, **cookie})
     onward = f'<!doctype html><title>Workbench</title><meta http-equiv="refresh" content="0;url={html.escape(entered.location)}">'
@@ -160,7 +123,7 @@ async def admitted_reply(
             response.body = await asyncio.to_thread(with_our_head, bytes(response.body), zipped)
             del response.headers["Content-Length"]
             response.headers["Content-Length"] = str(len(response.body))
-        for name, value in {**_EVERY_REPLY, **page}.items():
+        for name, value in {**EVERY_REPLY, **page}.items():
             response.headers[name] = value
         return response
     handler, headers = routes[prefix]
@@ -182,7 +145,7 @@ async def admitted_reply(
     made = await asyncio.to_thread(work)
     if isinstance(made, Response):
         return made
-    fields = {**_EVERY_REPLY, **page, **headers}
+    fields = {**EVERY_REPLY, **page, **headers}
     return await send_file(connection, made, fields, accepts_gzip, lambda: _no_such_file(page))
 
 

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import hashlib
 import logging
 import socket
 import sys
@@ -26,6 +27,7 @@ import time
 import warnings
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -48,6 +50,9 @@ WRITTEN_FOR = "1.1.1"
 
 Hook = Callable[[ServerConnection, Request], Response | None]
 AsyncHook = Callable[[ServerConnection, Request], Awaitable[Response | None]]
+
+PAGE_SHA256 = "8c05b8bfea1ed54773a7616d1d868ebf0b45055ff8da8fc1603ccb2a7858f079"
+"""Of viser's page as it is installed: `workbench.ui.page_policy` allows the scripts of this one and no others."""
 
 REFUSED_FROM_CLIENTS = (
     "ShareUrlRequest",  # opens a tunnel that makes the page public, whoever asks
@@ -141,6 +146,11 @@ def _missing(root: object, dotted: tuple[str, ...]) -> list[str]:
 def missing_names() -> list[str]:
     """Those of `PRIVATE_NAMES` that the installed viser does not have."""
     return _missing(SimpleNamespace(infra=infra, messages=viser._messages), PRIVATE_NAMES)
+
+
+def _page_is_known() -> bool:
+    page = Path(viser.__file__).parent / "client" / "build" / "index.html"
+    return page.is_file() and hashlib.sha256(page.read_bytes()).hexdigest() == PAGE_SHA256
 
 
 def _moved(what: str) -> SeamError:
@@ -322,6 +332,9 @@ def make_viser(
     if missing:
         listening.close()
         raise _moved("viser no longer has " + ", ".join(missing))
+    if not _page_is_known():
+        listening.close()
+        raise _moved("its page in the browser is another one")
     real_serve = websockets.asyncio.server.serve
     serving: list[websockets.asyncio.server.serve] = []
     served: list[viser.ViserServer] = []
