@@ -38,6 +38,7 @@ def open_page(
     seed: int = 0,
     host: str = "127.0.0.1",
     port: int = 8080,
+    socket: Path | None = None,
     token: bool = True,
     recordings: Path = Path("recordings"),
     history: str = "256MB",
@@ -54,6 +55,8 @@ def open_page(
         seed: seed of the first reset; env i gets seed + i.
         host: address to listen on; anything but this machine's own needs the token.
         port: port of the page; 0 takes any free one.
+        socket: listen on a Unix socket with this path instead, for machines that others use too: only you can
+            connect, by the ssh line that is printed.
         token: ask for the token of the printed address (--no-token: this machine only).
         recordings: folder for recorded episodes.
         history: memory that the steps of the past may take, such as 64MB or 2GB; the oldest go first.
@@ -77,7 +80,7 @@ def open_page(
         options = task_options(num_envs, backend, seed, env)
         past = history_bytes(history)
         worker = WorkerOptions(parse_memory(memory_limit), spare)
-        at = DoorOptions(host=host, port=port, token=token)
+        at = DoorOptions(host=host, port=port, socket=socket, token=token)
     except ValueError as error:
         return refuse(str(error))
     return open_in_terminal(task, options, at, worker, recordings, past)
@@ -140,6 +143,7 @@ def review(
     /,
     host: str = "127.0.0.1",
     port: int = 8080,
+    socket: Path | None = None,
     token: bool = True,
     task: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = (),
 ) -> int:
@@ -150,6 +154,8 @@ def review(
             with .json of ManiSkill's RecordEpisode.
         host: address to listen on; anything but this machine's own needs the token.
         port: port of the page; 0 takes any free one.
+        socket: listen on a Unix socket with this path instead, for machines that others use too: only you can
+            connect, by the ssh line that is printed.
         token: ask for the token of the printed address (--no-token: this machine only).
         task: a task file in which the envs of ManiSkill's recordings may be found; repeatable. Envs that ManiSkill
             itself has need none.
@@ -165,7 +171,7 @@ def review(
     from workbench.ui.door import DoorOptions
 
     try:
-        at = DoorOptions(host=host, port=port, token=token)
+        at = DoorOptions(host=host, port=port, socket=socket, token=token)
     except ValueError as error:
         return refuse(str(error))
     return review_in_terminal(folder, task, at, WorkerOptions(parse_memory("auto")))

@@ -6,13 +6,12 @@ Both serve the same two pages, and differ in which comes first and in whether a 
 from __future__ import annotations
 
 import os
+import queue
 import signal
 import sys
-import threading
 from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
-from typing import NoReturn
+from typing import Literal, NoReturn
 
 from rich.markup import escape
 
@@ -23,6 +22,7 @@ from workbench.session.kept_worker import WorkerOptions
 from workbench.session.messages import Event, Failed, TaskOptions
 from workbench.session.session import Session
 from workbench.terminal import out, print_event, print_line, refuse, say, warn
+from workbench.ui.commands import Command
 from workbench.ui.door import Door, DoorError, DoorOptions, open_door
 from workbench.ui.pages import Which
 from workbench.ui.put_together import Workplace
@@ -108,12 +108,14 @@ def _serve(
 
     sharing = Sharing(door)
     place.offer(sharing.offer)
+    if door.options.token:
+        place.commands = (Command("Renew the token and close every page", end.renew),)
     close_others = offer_going_back_in(place, open_task)
     end.at_signals()
     try:
         place.pages.start(first)
         _announce(door, what)
-        end.wait()
+        end.wait(door)
     finally:
         out.print("closing")
         place.close()
@@ -129,28 +131,42 @@ class _End:
 
     def __init__(self) -> None:
         self.code = 0
-        self._due = threading.Event()
+        # A signal's handler may not take a lock that the main thread holds; putting into this queue takes none.
+        self._asked: queue.SimpleQueue[Literal["end", "renew"]] = queue.SimpleQueue()
 
     def now(self, code: int) -> None:
         self.code = code
-        self._due.set()
+        self._asked.put("end")
 
     def at_signals(self) -> None:
-        def on_signal(number: int, frame: FrameType | None) -> None:
-            self._due.set()
-
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, on_signal)
+            signal.signal(number, lambda number, frame: self._asked.put("end"))
+        # Not SIGHUP, with which a terminal that is closed ends what runs in it.
+        signal.signal(signal.SIGUSR1, lambda number, frame: self._asked.put("renew"))
 
-    def wait(self) -> None:
-        self._due.wait()
+    def renew(self) -> None:
+        """Ask for another token. Returns at once."""
+        self._asked.put("renew")
+
+    def wait(self, door: Door) -> None:
+        """Return at the end; until then renew the token as often as that is asked for."""
+        while self._asked.get() != "end":
+            if door.options.token:
+                door.renew_token()
+                say("  the token was renewed, and every page was closed; open the new address:")
+                say(f"  page    {door.url}")
 
 
 def _announce(door: Door, what: str) -> None:
     out.print(f"[bold]Workbench[/] {workbench.__version__}: {escape(what)}", soft_wrap=True)
     # Not through rich, which would break the address in a narrow terminal.
-    say(f"  page    {door.url}")
-    say(f"  remote  {door.ssh_hint}")
+    if door.options.socket is not None:
+        say(f"  socket  {door.options.socket}")
+        say(f"  first   {door.ssh_hint}   on the machine with the browser")
+        say(f"  page    {door.url}   there")
+    else:
+        say(f"  page    {door.url}")
+        say(f"  remote  {door.ssh_hint}")
     say("  Ctrl-C ends it.")
 
 

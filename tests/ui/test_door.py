@@ -18,7 +18,7 @@ import viser.infra._infra
 from playwright.sync_api import sync_playwright
 
 from workbench.ui import door as door_module
-from workbench.ui import viser_seam
+from workbench.ui import listening, viser_seam
 from workbench.ui.door import DEFAULT_PORT, Door, DoorError, DoorOptions, open_door
 from workbench.ui.gate import cookie_name
 from workbench.ui.replies import SCRIPTS, STYLES, folder_handler
@@ -129,7 +129,7 @@ def test_a_taken_port_that_was_asked_for_is_an_error_that_says_what_to_do():
 def test_the_default_port_makes_way_and_says_so(monkeypatch):
     taken, port = a_taken_port()
     # 8080 itself may be in use on the machine that runs this.
-    monkeypatch.setattr(door_module, "DEFAULT_PORT", port)
+    monkeypatch.setattr(listening, "DEFAULT_PORT", port)
     with taken:
         door = open_door(DoorOptions(port=port))
         try:
@@ -353,7 +353,7 @@ def test_a_real_browser_opens_the_page_with_nothing_to_complain_of(door, tmp_pat
     server = door.server
     server.gui.add_markdown("**bold**")
     server.gui.add_html(
-        "<div id='from-html'>html</div><img src='/workbench/logo.svg' onload='this.id=\"logo-came\"'>"
+        "<div id='from-html' style='color: red'>html</div><img id='logo' src='/workbench/logo.svg'>"
     )
     server.gui.add_image(np.zeros((8, 8, 3), np.uint8))
     server.gui.add_uplot(
@@ -394,7 +394,7 @@ def test_a_real_browser_opens_the_page_with_nothing_to_complain_of(door, tmp_pat
         )
         page.goto(door.url, wait_until="domcontentloaded")
         page.wait_for_selector("#from-html", timeout=60_000)
-        page.wait_for_selector("#logo-came", timeout=60_000)
+        page.wait_for_function("document.getElementById('logo').naturalWidth > 0", timeout=60_000)
         assert connected.wait(60)
         assert page.url == f"http://127.0.0.1:{door.port}/"  # the token has left the address bar
         assert page.evaluate("document.cookie") == ""  # and no script can read it

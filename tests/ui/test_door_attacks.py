@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import http.client
 import http.server
 import socket
 import threading
-import time
 from collections.abc import Callable, Iterator
 from urllib.parse import quote
 
@@ -19,31 +19,31 @@ import viser._messages
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from playwright.sync_api import Page, sync_playwright
-from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
-from websockets.sync.connection import Connection
 
+from tests.ui.knocking import (
+    CAMERA,
+    PROTOCOL,
+    ask,
+    both,
+    claim,
+    client,
+    close_code,
+    cookie_of,
+    knock,
+    say,
+    token_of,
+    until,
+)
 from workbench.ui import replies, viser_seam
-from workbench.ui.checked import checked_choice, checked_number
-from workbench.ui.door import MAX_MESSAGE_BYTES, Door, DoorOptions, open_door
+from workbench.ui.client_messages import KINDS, MAX_BYTES, MalformedMessage
+from workbench.ui.door import Door, DoorOptions, open_door
 from workbench.ui.gate import Admitted, Asked, Entered, Gate, Refused, cookie_name, host_is_ours, judge
+from workbench.ui.page_guard import PageGuard
+from workbench.ui.told_rarely import ToldRarely
 
 unhurried = settings(deadline=None)  # a busy machine is no failure
 
-PROTOCOL = f"viser-v{viser.__version__}"
 LOADED_BY = {"Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "script"}
-CAMERA = {
-    "type": "ViewerCameraMessage",
-    "wxyz": (1.0, 0.0, 0.0, 0.0),
-    "position": (1.0, 2.0, 3.0),
-    "fov": 1.0,
-    "near": 0.01,
-    "far": 100.0,
-    "image_height": 100,
-    "image_width": 100,
-    "look_at": (0.0, 0.0, 0.0),
-    "up_direction": (0.0, 0.0, 1.0),
-}
 
 
 @pytest.fixture(scope="module")
@@ -51,92 +51,6 @@ def door() -> Iterator[Door]:
     door = open_door(DoorOptions(port=0))
     yield door
     door.close()
-
-
-def token_of(door: Door) -> str:
-    return door.url.partition("token=")[2]
-
-
-def cookie_of(door: Door) -> str:
-    return f"{cookie_name(door.port)}={token_of(door)}"
-
-
-def ask(door: Door, path: str = "/", **headers: str | None) -> tuple[int, http.client.HTTPMessage, bytes]:
-    """One request. ``headers``: Host, Cookie and so on, with _ for -; the right Host and cookie are sent
-    unless they are given, None leaves one out."""
-    fields: dict[str, str | None] = {"Host": f"127.0.0.1:{door.port}", "Cookie": cookie_of(door)}
-    fields.update({name.replace("_", "-"): value for name, value in headers.items()})
-    connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=20)
-    try:
-        connection.putrequest("GET", path, skip_host=True, skip_accept_encoding=True)
-        for name, value in fields.items():
-            if value is not None:
-                connection.putheader(name, value)
-        connection.endheaders()
-        response = connection.getresponse()
-        # The body of a 101 is the open websocket.
-        return response.status, response.headers, b"" if response.status == 101 else response.read()
-    finally:
-        connection.close()
-
-
-def knock(door: Door, **headers: str | None) -> int:
-    """Status of a websocket handshake: 101 is in."""
-    handshake: dict[str, str | None] = {
-        "Upgrade": "websocket",
-        "Connection": "Upgrade",
-        "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==",
-        "Sec_WebSocket_Version": "13",
-        "Sec_WebSocket_Protocol": PROTOCOL,
-        "Origin": f"http://127.0.0.1:{door.port}",
-    }
-    return ask(door, "/", **{**handshake, **headers})[0]
-
-
-def both(door: Door, **headers: str | None) -> tuple[int, int]:
-    """Status of a page load and of a websocket handshake."""
-    return ask(door, "/", **headers)[0], knock(door, **headers)
-
-
-@contextlib.contextmanager
-def client(door: Door) -> Iterator[Connection]:
-    """An authenticated client that viser counts as connected; what it is sent is thrown away."""
-    known = set(door.server.get_clients())
-    with connect(
-        f"ws://127.0.0.1:{door.port}",
-        subprotocols=[PROTOCOL],  # type: ignore[list-item]
-        origin=f"http://127.0.0.1:{door.port}",  # type: ignore[arg-type]
-        additional_headers={"Cookie": cookie_of(door)},
-        max_size=None,
-    ) as connection:
-        say(connection, CAMERA)
-        until(lambda: set(door.server.get_clients()) - known)
-        yield connection
-
-
-def say(connection: Connection, message: object) -> None:
-    connection.send(msgspec.msgpack.encode(message))
-
-
-def claim(handle: viser.GuiInputHandle, value: object, prop: str = "value") -> dict:
-    return {"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {prop: value}}
-
-
-def until(condition: Callable[[], object]) -> None:
-    """Wait for what another thread does; a condition that stays false fails the test."""
-    deadline = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < deadline, "it never came about"
-        time.sleep(0.01)
-
-
-def close_code(connection: Connection) -> int:
-    """Read until the server hangs up."""
-    with pytest.raises(ConnectionClosed) as closed:
-        while True:
-            connection.recv(timeout=30)
-    assert closed.value.rcvd is not None
-    return closed.value.rcvd.code
 
 
 @pytest.fixture
@@ -441,6 +355,7 @@ def test_no_client_can_open_the_share_tunnel(door, bystander, caplog):
     process = psutil.Process()
     children = set(process.children())
     threads = {thread.name for thread in threading.enumerate() if "unnel" in thread.name}
+    assert not set(viser_seam.REFUSED_FROM_CLIENTS) & set(KINDS)
     for name in viser_seam.REFUSED_FROM_CLIENTS:
         assert getattr(viser._messages, name) not in door.server._websock_server._incoming_handlers
     with client(door) as connection:
@@ -518,27 +433,6 @@ def test_a_client_changes_nothing_of_a_control_but_its_value(door, bystander):
     bystander()
 
 
-def test_values_that_a_control_cannot_have_are_refused_by_the_panels_check(door, bystander):
-    slider = door.server.gui.add_slider("speed", 0.0, 10.0, 0.1, 5.0)
-    dropdown = door.server.gui.add_dropdown("camera", ("front", "wrist"))
-    with client(door) as connection:
-        for claimed in (99999, -1e300, 10.1):
-            say(connection, claim(slider, claimed))
-            until(lambda claimed=claimed: slider.value == claimed)  # viser itself takes it
-            with pytest.raises(ValueError, match="speed goes from 0 to 10"):
-                checked_number(slider.value, 0.0, 10.0, "speed")
-        say(connection, claim(slider, 3.5))
-        until(lambda: slider.value == 3.5)
-        assert checked_number(slider.value, 0.0, 10.0, "speed") == 3.5
-        say(connection, claim(dropdown, "not an option"))
-        until(lambda: dropdown.value == "not an option")
-        with pytest.raises(ValueError, match="camera is not one of those"):
-            checked_choice(dropdown.value, dropdown.options, "camera")
-    slider.remove()
-    dropdown.remove()
-    bystander()
-
-
 def without(message: dict, field: str) -> dict:
     return {key: value for key, value in message.items() if key != field}
 
@@ -562,15 +456,14 @@ def without(message: dict, field: str) -> dict:
         (msgspec.msgpack.encode({**CAMERA, "position": "abc"}), 1008),
         (msgspec.msgpack.encode({**CAMERA, "position": 5}), 1008),
         (msgspec.msgpack.encode({**CAMERA, "fov": "wide"}), 1008),
-        (b"\x82\xa4type\xb3ViewerCameraMessage\xa3fov\xcb\x7f\xf8" + b"\0" * 6, 1008),  # NaN
+        (b"\x82\xa4type\xb3ViewerCameraMessage\xa3fov\xcb\x7f\xf8" + b"\0" * 6, 1008),  # and no more
         (msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "x", "updates": [1]}), 1008),
         (msgspec.msgpack.encode({"type": "GuiUpdateMessage", "uuid": "x", "updates": 1}), 1008),
         (b"\x91" * 100_000, 1008),  # nested deeper than any stack
-        (b"x" * (MAX_MESSAGE_BYTES + 1), 1009),
+        (b"x" * (MAX_BYTES + 1), 1009),
     ],
     ids=lambda value: repr(value)[:40],
 )
-@pytest.mark.filterwarnings("ignore:.*does not match annotation")
 def test_a_malformed_frame_closes_its_own_connection_only(door, bystander, capfd, frame, code):
     with client(door) as connection:
         connection.send(frame)
@@ -594,25 +487,35 @@ def test_a_malformed_frame_closes_its_own_connection_only(door, bystander, capfd
         lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
         max_leaves=8,
     ),
-    st.sampled_from(sorted(viser_seam.MESSAGES_FROM_CLIENTS)),
+    st.sampled_from(sorted(KINDS)),
     st.data(),
 )
-@pytest.mark.filterwarnings("ignore:.*does not match annotation")
-def test_any_message_is_admitted_dropped_or_called_malformed(value, kind, data):
-    fields = list(getattr(viser._messages, kind).__dataclass_fields__)
+def test_any_message_is_admitted_dropped_or_called_malformed(door, value, kind, data):
+    fields = list(KINDS[kind].__struct_fields__)
     message = {
         "type": kind,
         **dict.fromkeys(data.draw(st.lists(st.sampled_from(fields), max_size=9)), value),
     }
-    with contextlib.suppress(viser_seam.MalformedMessage):
-        assert viser_seam.admits(msgspec.msgpack.encode(message)) in (True, False)
+    judged(door, msgspec.msgpack.encode(message))
 
 
 @unhurried
 @given(st.binary(max_size=200))
-def test_any_bytes_are_admitted_dropped_or_called_malformed(raw):
-    with contextlib.suppress(viser_seam.MalformedMessage):
-        assert viser_seam.admits(raw) in (True, False)
+def test_any_bytes_are_admitted_dropped_or_called_malformed(door, raw):
+    judged(door, raw)
+
+
+def judged(door: Door, raw: bytes) -> None:
+    """Let the guard of a page that is on no connection judge a frame; any other error fails the test."""
+    page = viser_seam.ViserPage(None, [door.server])  # type: ignore[arg-type]
+
+    async def judge_it() -> None:
+        guard = PageGuard(page, ToldRarely(lambda line: None))
+        with contextlib.suppress(MalformedMessage):
+            assert guard.admits(raw) in (True, False)
+        guard.close()
+
+    asyncio.run(judge_it())
 
 
 def test_what_only_the_server_says_is_dropped_from_a_client(door, bystander):
@@ -630,7 +533,7 @@ def test_viser_listens_to_nothing_that_the_seam_does_not_know(door, bystander):
     handled = {kind.__name__ for kind in door.server._websock_server._incoming_handlers}
     for one in door.server.get_clients().values():
         handled |= {kind.__name__ for kind in one._websock_connection._incoming_handlers}
-    assert handled - set(viser_seam.REFUSED_FROM_CLIENTS) <= viser_seam.MESSAGES_FROM_CLIENTS
+    assert handled - set(viser_seam.REFUSED_FROM_CLIENTS) <= set(KINDS)
     assert len(handled) > 5
 
 

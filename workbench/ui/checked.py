@@ -1,19 +1,16 @@
-"""What a control claims, checked against what the control can say.
+"""Checks of a value that a page sent, against what the session can do with it.
 
-viser takes a control's value from the browser as it comes: a slider from 0 to 10 holds 99999 if a
-client says so, a dropdown holds a text that is not among its options, and only the Python type is
-forced. The page itself never sends such values, but the page is not the only thing that can speak the
-protocol, and a list of options may have changed between the click and its arrival. An env index of
-99999 must not reach the worker.
-
-So a panel passes every ``handle.value`` through one of these before it uses it. A value that the
-control cannot have is refused with a sentence for the person, not quietly bent into another one: the
-session keeps what it had, and the control goes back to showing that. Only the rounding of a browser's
-arithmetic at the ends of a slider is set right in silence.
+`workbench.ui.control_values` has checked before viser stored it that the control can hold the value: type, range,
+options. What a control cannot say (is there still an env 7, how long may a name be) is asked here, where the value
+is used. A value that is refused is refused with a sentence for the person, not quietly bent into another one: the
+session keeps what it had, and the control goes back to showing that. Only the rounding of a browser's arithmetic
+at the ends of a slider is set right in silence.
 """
 
 from __future__ import annotations
 
+import math
+import sys
 from collections.abc import Iterable
 from typing import TypeVar
 
@@ -21,6 +18,7 @@ import numpy as np
 
 Choice = TypeVar("Choice")
 
+LARGEST_FLOAT = sys.float_info.max
 ROUNDING = 1e-6
 """Part of a slider's range by which its value may lie beyond the ends: ``low + n * step``, added up in a
 browser, passes ``high`` by a few units in the last place."""
@@ -31,22 +29,29 @@ def checked_number(value: object, low: float, high: float, name: str) -> float:
 
     Args:
         value: What the control holds: of any type, of any size.
-        low: Least value.
-        high: Greatest value.
+        low: Least value; -inf where there is none.
+        high: Greatest value; inf where there is none.
         name: What the sentence calls the value.
 
     Raises:
-        ValueError: It is not a real number (a bool is none here), is NaN, or lies outside.
+        ValueError: It is not a real number (a bool is none here), is not finite, or lies outside.
     """
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise ValueError(f"The {name} is not a number.")
-    if value != value:
-        raise ValueError(f"The {name} is not a number.")
-    slack = (high - low) * ROUNDING
+    value = value.item() if isinstance(value, np.generic) else value
     # Compared before it is converted: float() fails on an int of more than 308 digits.
+    if not -LARGEST_FLOAT <= value <= LARGEST_FLOAT:
+        raise ValueError(f"The {name} is not a finite number.")
+    slack = 0.0 if math.isinf(high - low) else (high - low) * ROUNDING
     if not low - slack <= value <= high + slack:
-        raise ValueError(f"The {name} goes from {low:g} to {high:g}.")
+        raise ValueError(f"The {name} {_range(low, high)}.")
     return min(max(float(value), float(low)), float(high))
+
+
+def _range(low: float, high: float) -> str:
+    if math.isinf(high):
+        return f"is at least {low:g}"
+    return f"is at most {high:g}" if math.isinf(low) else f"goes from {low:g} to {high:g}"
 
 
 def checked_int(value: object, low: int, high: int, name: str) -> int:

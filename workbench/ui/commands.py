@@ -7,7 +7,7 @@ the help that is made from it cannot disagree.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import viser
@@ -51,7 +51,7 @@ class Command:
         return "+".join(part for part in (self.modifier, (self.key or "").lower()) if part)
 
 
-def register(server: viser.ViserServer, commands: list[Command]) -> None:
+def register(server: viser.ViserServer, commands: Sequence[Command]) -> None:
     """Put the commands into the palette of every page."""
     for command in commands:
         handle = server.gui.add_command(

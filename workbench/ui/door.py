@@ -14,20 +14,20 @@ Before the address is given to anyone the door tries itself with a request that 
 from __future__ import annotations
 
 import atexit
-import errno
-import getpass
+import functools
 import http.client
-import ipaddress
 import secrets
 import socket
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import viser
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from workbench.ui import gate, viser_seam
+from workbench.ui.listening import DEFAULT_PORT, ListenError, Listening, listen_on_file, listen_on_port
 from workbench.ui.replies import (
     Handler,
     admitted_reply,
@@ -36,15 +36,20 @@ from workbench.ui.replies import (
     folder_handler,
     refusals,
 )
+from workbench.ui.strangers import Connection, of_peer
+from workbench.ui.told_rarely import ToldRarely
 from workbench.web_assets import web_assets_folder
 
-DEFAULT_PORT = 8080
-PORTS_TO_TRY = 100
-MAX_MESSAGE_BYTES = 8 * 1024 * 1024
-"""The largest thing that a page sends is a picture of its own view."""
 RESPONSE_SECONDS = 300.0
 """`websockets` gives 10 s for a request and its whole answer: too little for viser's page over a slow
 line, and far too little for a recording."""
+
+TURNED_AWAY = {
+    gate.Why.NAME: "Turned away a request{} for a host name that is not this machine's.",
+    gate.Why.SITE: "Turned away a request{} that a page of another site made in a browser.",
+    gate.Why.NO_TOKEN: "Turned away a request{} that did not show the token.",
+    gate.Why.OTHER_TOKEN: "Turned away a request{} with a token that is not valid: a page that was open before, perhaps.",
+}
 
 
 class DoorError(RuntimeError):
@@ -60,8 +65,11 @@ class DoorOptions:
     everyone who can reach this machine."""
     port: int = DEFAULT_PORT
     """0 takes any free port. If 8080, the default, is taken, the next free one is taken and said."""
+    socket: Path | None = None
+    """Listen on a Unix socket with this path instead, which only its owner can connect to; `port` is then the
+    one at the other end of ``ssh -L``, and `host` is not used."""
     token: bool = True
-    """Ask for the token of the printed address. Can be left out on loopback only."""
+    """Ask for the token of the printed address. Can be left out on a port of loopback only."""
     names: tuple[str, ...] = ()
     """Further names under which browsers reach this machine (a DNS alias). Its own host name, loopback
     names and, when bound wider than loopback, IP addresses need not be named."""
@@ -72,6 +80,13 @@ class DoorOptions:
         if not 0 <= self.port <= 65535:
             raise ValueError(
                 f"Port {self.port} does not exist; give one from 1 to 65535, or 0 for any free one."
+            )
+        if self.socket is not None and self.host != "127.0.0.1":
+            raise ValueError("A socket and a host to listen on are two places; give one of them.")
+        if self.socket is not None and not self.token:
+            raise ValueError(
+                "The other end of ssh -L is a port of that machine, to which everyone there can connect. Leave the "
+                "token on."
             )
         if not self.token and not gate.is_loopback(self.host.lower()):
             raise ValueError(
@@ -99,9 +114,16 @@ class Door:
     """For the person at the terminal: what a wider binding means. None on loopback."""
     notice: str | None
     """Said once at the start: the page is on another port than usual. None if it is not."""
+    _listening: Listening = field(repr=False)
+    _doorkeeper: _Doorkeeper = field(repr=False)
     _gated: viser_seam.GatedViser = field(repr=False)
     _routes: dict[str, tuple[Handler, Mapping[str, str]]] = field(repr=False)
     _closed: bool = field(default=False, repr=False)
+
+    @property
+    def turned_away(self) -> int:
+        """How many requests were refused so far."""
+        return self._doorkeeper.turned_away
 
     def add_route(self, prefix: str, handler: Handler, headers: Mapping[str, str] | None = None) -> None:
         """Answer GET requests below ``prefix`` (``/recordings/``), behind the same gate. The longest
@@ -126,6 +148,21 @@ class Door:
         root, _, token = self.url.partition("/?")
         return f"{root}{path}" + (f"?{token}" if token else "")
 
+    def renew_token(self) -> str:
+        """Make a new token and return the new address: who has the old one, or its cookie, does not get in any more,
+        and every page that is open is closed. From any thread but the event loop's.
+
+        Raises:
+            ValueError: this door asks for no token.
+        """
+        if not self.options.token:
+            raise ValueError("This page asks for no token; there is none to renew.")
+        token = secrets.token_urlsafe(32)
+        self._doorkeeper.gate = replace(self._doorkeeper.gate, token=token)
+        self._gated.close_pages("the token was renewed")
+        self.url = _url(self._listening, token)
+        return self.url
+
     def close(self) -> None:
         """Close every connection and stop listening. Can be called twice."""
         if self._closed:
@@ -133,6 +170,47 @@ class Door:
         self._closed = True
         atexit.unregister(self.close)
         self._gated.stop()
+        self._listening.remove()
+
+
+class _Doorkeeper:
+    """Judges each request, answers it or has it answered, and tells the terminal of those that are refused."""
+
+    def __init__(self, the_gate: gate.Gate, example: str, told: ToldRarely) -> None:
+        self.gate = the_gate
+        self.turned_away = 0
+        self.tells = False
+        self._refuse = refusals(example)
+        self._told = told
+
+    async def answer(
+        self,
+        routes: Mapping[str, tuple[Handler, Mapping[str, str]]],
+        viser_hook: viser_seam.Hook,
+        connection: ServerConnection,
+        request: Request,
+    ) -> Response | None:
+        asked = asked_of(request)
+        verdict = gate.judge(self.gate, asked)
+        if isinstance(verdict, gate.Refused):
+            self._count(verdict, connection)
+            return self._refuse(verdict.reason)
+        if isinstance(connection, Connection):
+            connection.admit()
+        # websockets gives up 10 s after the last byte was handed to the kernel; on a slow line
+        # megabytes are still on their way then.
+        connection.close_timeout = RESPONSE_SECONDS
+        if isinstance(verdict, gate.Entered):
+            return entered_reply(verdict)
+        if asked.websocket:
+            return viser_hook(connection, request)
+        return await admitted_reply(routes, viser_hook, connection, request, verdict.authority)
+
+    def _count(self, refused: gate.Refused, connection: ServerConnection) -> None:
+        if self.tells:
+            self.turned_away += 1
+            peer = connection.peer if isinstance(connection, Connection) else ""
+            self._told.happened(refused.why, TURNED_AWAY[refused.why].format(of_peer(peer)))
 
 
 def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) -> Door:
@@ -146,101 +224,66 @@ def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) ->
         DoorError: the host or port cannot be bound, or the installed viser is not one that can be gated.
     """
     listening = _listen(options)
-    host, port = listening.getsockname()[:2]
-    loopback = ipaddress.ip_address(host.partition("%")[0]).is_loopback
     token = secrets.token_urlsafe(32) if options.token else None
-    the_gate = gate.Gate(token=token, names=_our_names(options), any_address=not loopback)
-    example = f"http://{_reach(host)}:{port}/" + ("?token=…" if token else "")
+    the_gate = gate.Gate(token=token, names=_our_names(options), any_address=not listening.loopback)
+    told = ToldRarely()
+    keeper = _Doorkeeper(the_gate, f"http://{listening.authority}/" + ("?token=…" if token else ""), told)
     routes: dict[str, tuple[Handler, Mapping[str, str]]] = {}
-    refuse = refusals(example)
 
     def wrap(viser_hook: viser_seam.Hook) -> viser_seam.AsyncHook:
-        async def answer(connection: ServerConnection, request: Request) -> Response | None:
-            asked = asked_of(request)
-            verdict = gate.judge(the_gate, asked)
-            if isinstance(verdict, gate.Admitted):
-                if asked.websocket:
-                    response = viser_hook(connection, request)
-                else:
-                    response = await admitted_reply(
-                        routes, viser_hook, connection, request, verdict.authority
-                    )
-            elif isinstance(verdict, gate.Entered):
-                response = entered_reply(verdict)
-            else:
-                response = refuse(verdict.reason)
-            if response is not None:
-                # websockets gives up 10 s after the last byte was handed to the kernel; on a slow line
-                # megabytes are still on their way then.
-                connection.close_timeout = RESPONSE_SECONDS
-            return response
-
-        return answer
+        return functools.partial(keeper.answer, routes, viser_hook)
 
     try:
-        gated = viser_seam.make_viser(listening, wrap, label, MAX_MESSAGE_BYTES, RESPONSE_SECONDS)
-    except viser_seam.SeamError as error:
-        raise DoorError(str(error)) from error
+        gated = viser_seam.make_viser(listening.socket, wrap, label, RESPONSE_SECONDS, told)
+    except BaseException as error:
+        listening.remove()
+        if isinstance(error, viser_seam.SeamError):
+            raise DoorError(str(error)) from error
+        raise
     door = Door(
         options=options,
         server=gated.server,
-        port=port,
-        url=f"http://{_reach(host)}:{port}/" + (f"?token={token}" if token else ""),
-        ssh_hint=f"ssh -L {port}:{_reach(host) if loopback else '127.0.0.1'}:{port} {_user()}@{socket.gethostname()}",
+        port=listening.port,
+        url=_url(listening, token),
+        ssh_hint=listening.ssh_hint,
         warning=None
-        if loopback
+        if listening.loopback
         else (
-            f"Listening on {options.host}, port {port}: everyone who can reach this machine can try the door, and "
-            "the token and everything on the page travel unencrypted. Whoever has the address with the token can "
-            "run code here. On a network that you do not trust, listen on 127.0.0.1 and come in over ssh -L."
+            f"Listening on {options.host}, port {listening.port}: everyone who can reach this machine can try the "
+            "door, and the token and everything on the page travel unencrypted. Whoever has the address with the "
+            "token can run code here. On a network that you do not trust, listen on 127.0.0.1 and come in over ssh -L."
         ),
         notice=None
-        if options.port in (0, port)
-        else f"Port {options.port} is taken by another program, so this page is on port {port}.",
+        if listening.path is not None or options.port in (0, listening.port)
+        else f"Port {options.port} is taken by another program, so this page is on port {listening.port}.",
+        _listening=listening,
+        _doorkeeper=keeper,
         _gated=gated,
         _routes=routes,
     )
     # Before viser's own exit handler, which prints "Server stopped" into the author's terminal.
     atexit.register(door.close)
     try:
-        _try_own_door(host, port)
+        _try_own_door(listening)
     except BaseException:
         door.close()
         raise
+    keeper.tells = True
     door.add_route("/workbench/", folder_handler(web_assets_folder()))
     return door
 
 
-# Listening ---------------------------------------------------------------------------------------
+def _url(listening: Listening, token: str | None) -> str:
+    return f"http://{listening.authority}/" + (f"?token={token}" if token else "")
 
 
-def _listen(options: DoorOptions) -> socket.socket:
-    # "localhost" may be 127.0.0.1, ::1 or both; the printed address has to be the one that is bound.
-    host = "127.0.0.1" if options.host.lower() == "localhost" else options.host
+def _listen(options: DoorOptions) -> Listening:
     try:
-        family, _, _, _, address = socket.getaddrinfo(
-            host, options.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
-    except (OSError, UnicodeError) as error:
-        raise DoorError(
-            f"Cannot listen on {options.host}: {error}. Give an address of this machine."
-        ) from None
-    last = min(options.port + PORTS_TO_TRY, 65536) if options.port == DEFAULT_PORT else options.port + 1
-    for port in range(options.port, last):
-        try:
-            return socket.create_server((address[0], port), family=family, backlog=100)
-        except PermissionError:
-            raise DoorError(f"Port {port} needs root's rights; give one from 1024 on with --port.") from None
-        except OSError as error:
-            if error.errno != errno.EADDRINUSE:
-                raise DoorError(
-                    f"Cannot listen on {options.host}: {error.strerror}. Give an address of this machine."
-                ) from None
-    if options.port == DEFAULT_PORT:
-        raise DoorError(f"Ports {options.port} to {last - 1} are all taken; --port 0 takes any free one.")
-    raise DoorError(
-        f"Port {options.port} is taken by another program; give another with --port, or 0 for any."
-    )
+        if options.socket is not None:
+            return listen_on_file(options.socket, options.port)
+        return listen_on_port(options.host, options.port)
+    except ListenError as error:
+        raise DoorError(str(error)) from None
 
 
 def _our_names(options: DoorOptions) -> frozenset[str]:
@@ -249,36 +292,13 @@ def _our_names(options: DoorOptions) -> frozenset[str]:
     return frozenset(name[0] for name in split if name is not None)
 
 
-def _reach(host: str) -> str:
-    """``host`` as a browser needs it: an IPv6 address in brackets, and for "every interface" the
-    address of the one that leads out. Connecting a datagram socket sends nothing."""
-    address = ipaddress.ip_address(host.partition("%")[0])
-    if address.is_unspecified:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                probe.connect(("192.0.2.1", 9))  # TEST-NET-1, RFC 5737
-                return probe.getsockname()[0]
-            except OSError:
-                return "127.0.0.1"
-    return f"[{address}]" if address.version == 6 else str(address)
-
-
-def _user() -> str:
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):  # a container's user without a name
-        return "USER"
-
-
-def _try_own_door(host: str, port: int) -> None:
+def _try_own_door(listening: Listening) -> None:
     """Knock as a rebound name would. The gate hangs on viser's inside; if it hangs loose, nobody gets
     the address."""
-    address = ipaddress.ip_address(host.partition("%")[0])
-    if address.is_unspecified:
-        host = "::1" if address.version == 6 else "127.0.0.1"
-    knock = http.client.HTTPConnection(host, port, timeout=10)
+    knock = http.client.HTTPConnection("rebound.invalid", timeout=10)
+    knock.sock = listening.connect(timeout=10)
     try:
-        knock.request("GET", "/", headers={"Host": "rebound.invalid"})
+        knock.request("GET", "/")
         status = knock.getresponse().status
     finally:
         knock.close()

@@ -25,6 +25,7 @@ import ipaddress
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 from urllib.parse import parse_qsl, quote, unquote, urlencode
 
 _AUTHORITY = re.compile(r"(\[[0-9A-Fa-f:.]{2,45}\]|[A-Za-z0-9_](?:[A-Za-z0-9._-]{0,252}))(?::([0-9]{1,5}))?")
@@ -76,13 +77,30 @@ class Entered:
     itself makes us the initiator."""
 
 
+class Why(Enum):
+    """What was wrong with a request that is refused."""
+
+    NAME = "name"
+    """It was told to go to a host that is not ours."""
+    SITE = "site"
+    """A page of another site made it."""
+    NO_TOKEN = "no token"
+    OTHER_TOKEN = "other token"
+    """A token that is not, or no longer, this one's."""
+
+
 @dataclass(frozen=True)
 class Refused:
+    why: Why
     reason: str
     """One sentence for the person who reads the 403 page. Holds no text from the request."""
 
 
 Verdict = Admitted | Entered | Refused
+
+_OTHER_TOKEN = (
+    "The token that it showed is not this workbench's. Each start makes a new one, and so does renewing it."
+)
 
 
 def split_authority(text: str) -> tuple[str, int | None] | None:
@@ -169,12 +187,13 @@ def judge(gate: Gate, asked: Asked) -> Verdict:
     host = split_authority(asked.host[0]) if len(asked.host) == 1 else None
     if host is None or not host_is_ours(gate, host[0]):
         return Refused(
+            Why.NAME,
             "It asked for this page under a name that the workbench does not know as its own. "
-            "Use the machine's address or host name instead."
+            "Use the machine's address or host name instead.",
         )
 
     if len(asked.origin) > 1 or (asked.origin and not _same_origin(asked.origin[0], host)):
-        return Refused("It came from a page of another site.")
+        return Refused(Why.SITE, "It came from a page of another site.")
 
     # Requests without an Origin: an <img> or <script> in a foreign page. A person who follows a link
     # there is let through to the token check. Websocket handshakes always carry an Origin in browsers,
@@ -182,7 +201,7 @@ def judge(gate: Gate, asked: Asked) -> Verdict:
     opened_by_link = list(asked.fetch_mode) == ["navigate"] and list(asked.fetch_dest) == ["document"]
     foreign = any(site not in ("same-origin", "none") for site in asked.fetch_site)
     if foreign and not opened_by_link and not asked.websocket:
-        return Refused("It was made by a page of another site.")
+        return Refused(Why.SITE, "It was made by a page of another site.")
 
     if gate.token is None:
         return Admitted(asked.host[0])
@@ -192,12 +211,15 @@ def judge(gate: Gate, asked: Asked) -> Verdict:
     tokens = [value for key, value in parse_qsl(asked.path.partition("?")[2]) if key == "token"]
     if tokens and not asked.websocket:
         if len(tokens) > 1 or not _equal(tokens[0], gate.token):
-            return Refused("The token in the address is not this workbench's; each start makes a new one.")
+            return Refused(Why.OTHER_TOKEN, _OTHER_TOKEN)
         return Entered(
             location=_without_token(asked.path),
             set_cookie=f"{name}={gate.token}; Path=/; HttpOnly; SameSite=Strict",
             by_page=foreign,
         )
-    if not any(_equal(value, gate.token) for value in _cookies(asked.cookie, name)):
-        return Refused("This browser has not shown the token of this workbench; each start makes a new one.")
-    return Admitted(asked.host[0])
+    shown = _cookies(asked.cookie, name)
+    if any(_equal(value, gate.token) for value in shown):
+        return Admitted(asked.host[0])
+    if shown:
+        return Refused(Why.OTHER_TOKEN, _OTHER_TOKEN)
+    return Refused(Why.NO_TOKEN, "This browser has not shown the token of this workbench.")

@@ -58,6 +58,7 @@ class Page:
         dark: How it begins.
         on_review: Called when a person wants to see the recordings; None leaves the button out.
         stage: The 3-D view; None makes one.
+        commands: Of the program; in the palette as well.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class Page:
         dark: bool = True,
         on_review: Callable[[], None] | None = None,
         stage: Stage | None = None,
+        commands: tuple[Command, ...] = (),
     ) -> None:
         self._server = server
         self._session = session
@@ -94,7 +96,7 @@ class Page:
         self._mark = SelectionMark(server)
         self._frustums = CameraFrustums(server)
         self._forces = ForceArrows(server)
-        commands = self._commands()
+        commands = (*self._commands(), *commands)
         register(server, commands)
         with run_tab, server.gui.add_folder("Keys", expand_by_default=False):
             server.gui.add_html(render("keys", commands=commands))

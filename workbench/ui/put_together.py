@@ -19,6 +19,7 @@ from workbench.recording.library import Library
 from workbench.recording.recover import recover
 from workbench.session.recorded_scene import SceneProcess
 from workbench.session.review import Review
+from workbench.ui.commands import Command
 from workbench.ui.pages import Pages
 from workbench.ui.review_page import ReviewOffers, ReviewPage
 from workbench.ui.stage import Stage
@@ -59,6 +60,8 @@ class Workplace:
         self._lock = threading.Lock()
         self._mending: threading.Thread | None = None
         self._offers: Callable[[Workplace, ReviewOffers], ReviewOffers] = lambda _, offers: offers
+        self.commands: tuple[Command, ...] = ()
+        """In the palette of both pages; set before the first is shown."""
         self.session = session
         self._stage = Stage(server)
         self.pages = Pages(server, self._stage, {"review": self._review_page})
@@ -123,13 +126,16 @@ class Workplace:
         from workbench.ui.page import Page
 
         assert self.session is not None, "a live page is offered with its session"
-        return Page(self._server, self.session, dark, lambda: self.pages.show("review"), self._stage)
+        return Page(
+            self._server, self.session, dark, lambda: self.pages.show("review"), self._stage, self.commands
+        )
 
     def _review_page(self, dark: bool) -> ReviewPage:
         shelf = self.shelf
         shelf.library.look_soon()
         offers = ReviewOffers(
-            on_back=(lambda: self.pages.show("live")) if self.pages.can_show("live") else None
+            on_back=(lambda: self.pages.show("live")) if self.pages.can_show("live") else None,
+            commands=self.commands,
         )
         return ReviewPage(
             self._server, shelf.review, shelf.library, self._offers(self, offers), dark, self._stage

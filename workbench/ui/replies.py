@@ -1,9 +1,7 @@
 """What the door answers: the headers of every reply, and the files and routes that are not viser's.
 
-Each reply, a refusal too, tells the browser not to guess types, not to pass the address on, and not to
-show the page inside another site's. viser's page gets a Content-Security-Policy on top (`page_policy`),
-because that page obeys any server that it is pointed at. `workbench.ui.door` decides who gets which
-reply; here is how each is made.
+`workbench.ui.door` decides who gets which reply, and `workbench.ui.page_policy` what a browser may do with it; here is
+how each is made.
 """
 
 from __future__ import annotations
@@ -25,6 +23,8 @@ from websockets.http11 import Request, Response
 
 from workbench.ui import gate, viser_seam
 from workbench.ui.file_reply import FileReply, send_file
+from workbench.ui.page_policy import EVERY_REPLY, PAGE_OF_OURS, page_policy
+from workbench.ui.told_rarely import printable
 from workbench.web_assets import web_assets_folder
 
 Handler = Callable[[str], "tuple[int, str, bytes] | FileReply"]
@@ -33,6 +33,9 @@ status, the content type and the body, or a file to be sent without reading it w
 of its own, so it may read files."""
 
 SCRIPTS = (
+    "no_eval.js",
+    "let_in.js",
+    "pressed.js",
     "keys.js",
     "pressed_by_key.js",
     "view_stays.js",
@@ -46,46 +49,11 @@ SCRIPTS = (
 STYLES = "panels/page.css"
 """Of ``web_assets/``. In the page's head, since an HTML element of viser's is gone while the panel that it is in is folded."""
 
+LONGEST_NAME = 255
+"""Bytes of a file's name in every usual file system, and `LONGEST_PATH` of a whole path, some of which is the folder's."""
+LONGEST_PATH = 3000
+
 _log = logging.getLogger("workbench.door")
-
-_EVERY_REPLY = {
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "X-Frame-Options": "SAMEORIGIN",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Connection": "close",
-}
-_PAGE_OF_OURS = {
-    "Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'self'",
-    "Cache-Control": "no-store",
-}
-
-
-def page_policy(authority: str) -> str:
-    """Content-Security-Policy for viser's page as seen on ``authority`` (``host:port``).
-
-    viser's page is one file of inline scripts that unpack themselves into blobs, workers and wasm, so
-    scripts have to be allowed from those. What the policy is for is ``connect-src``: viser's page takes
-    the address of another server from its own address (``?websocket=``, ``?playbackPath=``), and what
-    that server sends runs as our page. It also keeps pictures in markdown from calling home.
-    """
-    return "; ".join(
-        (
-            "default-src 'self'",
-            "script-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob:",
-            "worker-src 'self' blob:",
-            "style-src 'self' 'unsafe-inline'",
-            "img-src 'self' data: blob:",
-            "media-src 'self' data: blob:",
-            "font-src 'self' data:",
-            f"connect-src 'self' data: blob: ws://{authority} wss://{authority}",
-            "frame-src 'self' blob: data:",
-            "object-src 'none'",
-            "base-uri 'none'",
-            "form-action 'self'",
-            "frame-ancestors 'self'",
-        )
-    )
 
 
 def asked_of(request: Request) -> gate.Asked:
@@ -113,19 +81,19 @@ def refusals(example: str) -> Callable[[str], Response]:
 
     def refuse(reason: str) -> Response:
         body = page.replace("{{reason}}", html.escape(reason)).encode()
-        return reply(403, "text/html; charset=utf-8", body, _PAGE_OF_OURS)
+        return reply(403, "text/html; charset=utf-8", body, PAGE_OF_OURS)
 
     return refuse
 
 
 def reply(status: int, kind: str, body: bytes, headers: Mapping[str, str], gzipped: bool = False) -> Response:
     extra = {"Content-Encoding": "gzip", "Vary": "Accept-Encoding"} if gzipped else {}
-    fields = {"Content-Type": kind, "Content-Length": str(len(body)), **_EVERY_REPLY, **extra, **headers}
+    fields = {"Content-Type": kind, "Content-Length": str(len(body)), **EVERY_REPLY, **extra, **headers}
     return Response(status, HTTPStatus(status).phrase, Headers(fields), body)
 
 
 def entered_reply(entered: gate.Entered) -> Response:
-    cookie = {"Set-Cookie": entered.set_cookie, **_PAGE_OF_OURS}
+    cookie = {"Set-Cookie": entered.set_cookie, **PAGE_OF_OURS}
     if not entered.by_page:
         return reply(303, "text/plain; charset=utf-8", b"", {"Location": entered.location, **cookie})
     onward = f'<!doctype html><title>Workbench</title><meta http-equiv="refresh" content="0;url={html.escape(entered.location)}">'
@@ -142,6 +110,8 @@ async def admitted_reply(
     page = {"Content-Security-Policy": page_policy(authority), "Cache-Control": "no-cache"}
     # Decoded once, as viser does; what is still encoded after that is part of a file's name.
     path = unquote(request.path.partition("?")[0]).replace("\\", "/")
+    if not _is_path_of_files(path):
+        return _no_such_file(page)
     prefix = max((prefix for prefix in routes if path.startswith(prefix)), key=len, default=None)
     if prefix is None:
         response = viser_hook(connection, request)
@@ -153,11 +123,9 @@ async def admitted_reply(
             response.body = await asyncio.to_thread(with_our_head, bytes(response.body), zipped)
             del response.headers["Content-Length"]
             response.headers["Content-Length"] = str(len(response.body))
-        for name, value in {**_EVERY_REPLY, **page}.items():
+        for name, value in {**EVERY_REPLY, **page}.items():
             response.headers[name] = value
         return response
-    if ".." in path.split("/") or "\0" in path:
-        return _no_such_file(page)
     handler, headers = routes[prefix]
     accepts_gzip = any("gzip" in value for value in request.headers.get_all("Accept-Encoding"))
 
@@ -165,7 +133,7 @@ async def admitted_reply(
         try:
             made = handler(path[len(prefix) :])
         except Exception:
-            _log.exception("The route %s failed on %s.", prefix, path)
+            _log.exception("The route %s failed on %s.", prefix, printable(path))
             made = 500, "text/plain; charset=utf-8", b"This went wrong; the terminal says how."
         if isinstance(made, FileReply):
             return made
@@ -177,8 +145,19 @@ async def admitted_reply(
     made = await asyncio.to_thread(work)
     if isinstance(made, Response):
         return made
-    fields = {**_EVERY_REPLY, **page, **headers}
+    fields = {**EVERY_REPLY, **page, **headers}
     return await send_file(connection, made, fields, accepts_gzip, lambda: _no_such_file(page))
+
+
+def _is_path_of_files(path: str) -> bool:
+    """Whether a file could have this path: the system raises on a name that is too long, and on a NUL in it."""
+    parts = path.encode("utf-8", "surrogatepass").split(b"/")
+    return (
+        b".." not in parts
+        and "\0" not in path
+        and all(len(part) <= LONGEST_NAME for part in parts)
+        and sum(map(len, parts)) <= LONGEST_PATH
+    )
 
 
 def _no_such_file(headers: Mapping[str, str]) -> Response:

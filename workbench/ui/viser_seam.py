@@ -18,18 +18,19 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import hashlib
 import logging
-import math
 import socket
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Awaitable, Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import msgspec
 import rich
 import viser
 import viser._messages
@@ -39,32 +40,19 @@ import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
+from workbench.ui.client_messages import KINDS, MAX_BYTES, MalformedMessage
 from workbench.ui.deaf_clients import let_go_when_deaf
+from workbench.ui.page_guard import PageGuard
+from workbench.ui.strangers import Connection, Strangers
+from workbench.ui.told_rarely import ToldRarely
 
 WRITTEN_FOR = "1.1.1"
 
 Hook = Callable[[ServerConnection, Request], Response | None]
 AsyncHook = Callable[[ServerConnection, Request], Awaitable[Response | None]]
 
-MESSAGES_FROM_CLIENTS = frozenset(
-    {
-        "CommandTriggerMessage",
-        "GetRenderResponseMessage",
-        "GuiButtonHoldMessage",
-        "GuiFormDirtyMessage",
-        "GuiFormSubmitMessage",
-        "GuiUpdateMessage",
-        "LocalStorageGetItemResponseMessage",
-        "SceneNodeClickMessage",
-        "SceneNodeDragMessage",
-        "ScenePointerMessage",
-        "TransformControlsDragEndMessage",
-        "TransformControlsDragStartMessage",
-        "TransformControlsUpdateMessage",
-        "ViewerCameraMessage",
-    }
-)
-"""What a page has to say: everything that viser registers a handler for, less the four below."""
+PAGE_SHA256 = "8c05b8bfea1ed54773a7616d1d868ebf0b45055ff8da8fc1603ccb2a7858f079"
+"""Of viser's page as it is installed: `workbench.ui.page_policy` allows the scripts of this one and no others."""
 
 REFUSED_FROM_CLIENTS = (
     "ShareUrlRequest",  # opens a tunnel that makes the page public, whoever asks
@@ -80,17 +68,21 @@ PRIVATE_NAMES = (
     "infra.websockets.exceptions.ConnectionClosedError",
     "infra.WebsockServer._background_worker",
     "infra.WebsockMessageHandler.unregister_handler",
-    "infra.Message.deserialize",
-    *(f"messages.{name}" for name in (*sorted(MESSAGES_FROM_CLIENTS), *REFUSED_FROM_CLIENTS)),
+    "messages.Message",
+    *(f"messages.{name}" for name in (*sorted(KINDS), *REFUSED_FROM_CLIENTS)),
 )
 """Names that this module relies on; ``infra`` is ``viser.infra._infra``, ``messages`` ``viser._messages``."""
 
 PRIVATE_ATTRIBUTES = (
     "_websock_server",
     "_websock_server._incoming_handlers",
+    "_websock_server._live_connections",
     "_websock_server._server_thread",
     "_websock_server._broadcast_buffer.message_counter",
     "_websock_server._broadcast_buffer.generator_cursors",
+    "_connected_clients",
+    "gui._container_handle_from_uuid",
+    "gui._gui_input_handle_from_uuid",
     "scene._handle_from_node_name",
 )
 """Attributes of a `viser.ViserServer` that this module relies on."""
@@ -98,8 +90,10 @@ PRIVATE_ATTRIBUTES = (
 STOP_SECONDS = 1.0
 """How long a page gets to answer the closing handshake."""
 
-_log = logging.getLogger("workbench.door")
 _making = threading.Lock()
+
+# A page that is told something may have gone a moment ago; nobody can know before.
+warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
 
 # Any: the checker rightly says that viser does not export these names.
 infra: Any = viser.infra._infra
@@ -107,10 +101,6 @@ infra: Any = viser.infra._infra
 
 class SeamError(RuntimeError):
     """viser is not the viser that this module was written for."""
-
-
-class MalformedMessage(ValueError):
-    """A client sent what no page of ours sends."""
 
 
 def element_id(handle: viser.GuiButtonHandle | viser.GuiNumberHandle) -> str:
@@ -158,6 +148,11 @@ def missing_names() -> list[str]:
     return _missing(SimpleNamespace(infra=infra, messages=viser._messages), PRIVATE_NAMES)
 
 
+def _page_is_known() -> bool:
+    page = Path(viser.__file__).parent / "client" / "build" / "index.html"
+    return page.is_file() and hashlib.sha256(page.read_bytes()).hexdigest() == PAGE_SHA256
+
+
 def _moved(what: str) -> SeamError:
     return SeamError(
         f"The page cannot be made safe: {what}. workbench/ui/viser_seam.py is written for viser {WRITTEN_FOR} "
@@ -165,69 +160,67 @@ def _moved(what: str) -> SeamError:
     )
 
 
-def _finite(value: Any) -> bool:
-    if isinstance(value, float):
-        return math.isfinite(value)
-    if isinstance(value, dict):
-        return all(_finite(item) for item in value.values())
-    if isinstance(value, list):
-        return all(_finite(item) for item in value)
-    return True
+@dataclass
+class ViserPage:
+    """What viser has for one connection: a `workbench.ui.page_guard.ServedPage`."""
 
+    connection: ServerConnection
+    served: list[viser.ViserServer]
+    """The server, once it is made."""
 
-def admits(raw: object) -> bool:
-    """Whether a message from a client goes on to viser; False drops it.
+    def control(self, uuid: str) -> Any | None:
+        for gui in self._guis():
+            control = gui._gui_input_handle_from_uuid.get(uuid)
+            if control is not None:
+                return control
+        return None
 
-    Dropped: the types in `REFUSED_FROM_CLIENTS`, types that only the server sends, and an update of
-    anything but a control's ``value`` (viser would set any attribute that it has, ``removed`` too).
+    def has_form(self, uuid: str) -> bool:
+        forms = (gui._container_handle_from_uuid.get(uuid) for gui in self._guis())
+        return any(isinstance(form, viser.GuiFormHandle) for form in forms)
 
-    Raises:
-        MalformedMessage: a text frame, not msgpack, an unknown type, missing, surplus or ill-typed
-            fields, or a number that is not finite.
-    """
-    if not isinstance(raw, bytes):
-        raise MalformedMessage("a text frame")
-    try:
-        decoded = msgspec.msgpack.decode(raw)
-        finite = _finite(decoded)
-    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
-        raise MalformedMessage(f"not msgpack ({error})") from None
-    kind = decoded.get("type") if isinstance(decoded, dict) else None
-    if not isinstance(kind, str):
-        raise MalformedMessage("a message without a type")
-    if kind not in MESSAGES_FROM_CLIENTS:
-        if isinstance(getattr(viser._messages, kind, None), type):
-            _log.warning("Dropped a message from a browser: %s is not for pages to send.", kind)
-            return False
-        raise MalformedMessage("an unknown type")
-    if not finite:
-        raise MalformedMessage(f"a number in {kind} that is not finite")
-    try:
-        message = viser._messages.Message.deserialize(raw)
-    except (TypeError, ValueError, KeyError, AttributeError, OverflowError) as error:
-        raise MalformedMessage(f"wrong fields in {kind} ({type(error).__name__})") from None
-    # viser only warns about a tuple of the wrong length, passes the list on, and every reader of
-    # client.camera.position then meets a vector of two.
-    if any(isinstance(value, list) for value in vars(message).values()):
-        raise MalformedMessage(f"a vector of the wrong length in {kind}")
-    if kind == "GuiUpdateMessage":
-        updates = decoded["updates"]
-        if not isinstance(updates, dict):
-            raise MalformedMessage("wrong fields in GuiUpdateMessage")
-        return set(updates) == {"value"}
-    return True
+    def is_from_server(self, kind: str) -> bool:
+        known = getattr(viser._messages, kind, None)
+        return isinstance(known, type) and issubclass(known, viser._messages.Message)
+
+    def show_again(self, control: Any) -> None:
+        client = self._client()
+        if client is not None and not control._impl.is_button:
+            update = viser._messages.GuiUpdateMessage(control._impl.uuid, {"value": control.value})
+            client._websock_connection.queue_message(update)
+
+    def tell(self, sentence: str) -> None:
+        client = self._client()
+        if client is not None:
+            client.add_notification("Not possible", sentence, color="orange", auto_close_seconds=6.0)
+
+    def _client(self) -> viser.ClientHandle | None:
+        for server in self.served:
+            for number, connection in list(server._websock_server._live_connections.items()):
+                if connection is self.connection:
+                    return server._connected_clients.get(number)
+        return None
+
+    def _guis(self) -> Iterator[viser.GuiApi]:
+        for server in self.served:
+            yield server.gui
+        client = self._client()
+        if client is not None:
+            yield client.gui
 
 
 def _watched(
-    handler: Callable[[ServerConnection], Awaitable[None]],
+    handler: Callable[[ServerConnection], Awaitable[None]], served: list[viser.ViserServer], told: ToldRarely
 ) -> Callable[[ServerConnection], Awaitable[None]]:
     async def watched(connection: ServerConnection) -> None:
         receive = connection.recv
+        guard = PageGuard(ViserPage(connection, served), told)
 
         async def receive_checked() -> object:
             while True:
                 raw = await receive()
-                if admits(raw):
+                await guard.wait_turn(len(raw))
+                if guard.admits(raw):
                     return raw
 
         connection.recv = receive_checked  # type: ignore[method-assign,assignment]
@@ -237,9 +230,12 @@ def _watched(
         except MalformedMessage as error:
             # Without this the connection is closed as well, but with a traceback of websockets in the
             # author's terminal for every frame that a stranger cares to send.
-            _log.warning("Closed a browser's connection: it sent %s.", error)
+            told.happened("malformed", f"Closed a page's connection: it sent {error}.")
+            # It may still be sending, and never come to the answer.
+            connection.close_timeout = STOP_SECONDS
             await connection.close(1008, "malformed message")
         finally:
+            guard.close()
             listening.cancel()
 
     return watched
@@ -266,6 +262,26 @@ def _quiet_viser() -> Iterator[None]:
 class GatedViser:
     server: viser.ViserServer
     _serving: websockets.asyncio.server.serve
+    _closing: set[asyncio.Task[None]] = field(default_factory=set)
+
+    def close_pages(self, reason: str) -> None:
+        """Close every page, and every answer that is on its way; returns when that has begun."""
+        listening = self._serving.server
+        begun = threading.Event()
+
+        def close() -> None:
+            for connection in list(listening.handlers):
+                if connection in listening.connections:
+                    connection.close_timeout = STOP_SECONDS
+                    closing = connection.loop.create_task(connection.close(1008, reason))
+                    self._closing.add(closing)
+                    closing.add_done_callback(self._closing.discard)
+                elif isinstance(connection, Connection) and connection.admitted:
+                    connection.transport.abort()
+            begun.set()
+
+        listening.get_loop().call_soon_threadsafe(close)
+        begun.wait(timeout=10.0)
 
     def stop(self) -> None:
         """Stop viser and close every connection, within about a second.
@@ -296,8 +312,8 @@ def make_viser(
     listening: socket.socket,
     wrap: Callable[[Hook], AsyncHook],
     label: str | None,
-    max_message_bytes: int,
     response_seconds: float,
+    told: ToldRarely,
 ) -> GatedViser:
     """Make a `viser.ViserServer` that serves on ``listening`` only, behind the hook that ``wrap`` makes
     of viser's own.
@@ -306,8 +322,8 @@ def make_viser(
         listening: bound and listening; the server owns it from here on.
         wrap: gets viser's ``process_request`` (files for plain requests, None for a handshake).
         label: shown at the top of viser's panel.
-        max_message_bytes: a larger message from a client closes its connection (code 1009).
         response_seconds: longest that one request may take, its whole answer included.
+        told: says what pages did that they should not.
 
     Raises:
         SeamError: the installed viser has moved. Nothing is left listening.
@@ -316,8 +332,13 @@ def make_viser(
     if missing:
         listening.close()
         raise _moved("viser no longer has " + ", ".join(missing))
+    if not _page_is_known():
+        listening.close()
+        raise _moved("its page in the browser is another one")
     real_serve = websockets.asyncio.server.serve
     serving: list[websockets.asyncio.server.serve] = []
+    served: list[viser.ViserServer] = []
+    strangers = Strangers(told)
 
     def serve(
         handler: Callable[[ServerConnection], Awaitable[None]], host: str, port: int, **options: Any
@@ -326,11 +347,14 @@ def make_viser(
         # were taken, and let the environment (_VISER_PORT_OVERRIDE) choose it.
         options.update(
             process_request=wrap(options["process_request"]),
-            max_size=max_message_bytes,
+            max_size=MAX_BYTES,
             open_timeout=response_seconds,
+            server_header=None,
+            create_connection=strangers.connection,
+            unix=listening.family == socket.AF_UNIX,
             logger=_quiet_logger(),
         )
-        made = real_serve(_watched(handler), sock=listening, **options)
+        made = real_serve(_watched(handler, served, told), sock=listening, **options)
         serving.append(made)
         return made
 
@@ -356,6 +380,7 @@ def make_viser(
         raise _moved(
             "viser did not start its server the known way" if not missing else f"viser has no {missing}"
         )
+    served.append(server)
     for name in REFUSED_FROM_CLIENTS:
         server._websock_server.unregister_handler(getattr(viser._messages, name))
     return GatedViser(server, serving[0])

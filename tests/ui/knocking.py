@@ -1,0 +1,119 @@
+"""A client of the door that says and asks whatever a test wants, over a real socket."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import time
+from collections.abc import Callable, Iterator
+
+import msgspec
+import pytest
+import viser
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
+
+from workbench.ui.door import Door
+from workbench.ui.gate import cookie_name
+
+PROTOCOL = f"viser-v{viser.__version__}"
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": (1.0, 0.0, 0.0, 0.0),
+    "position": (1.0, 2.0, 3.0),
+    "fov": 1.0,
+    "near": 0.01,
+    "far": 100.0,
+    "image_height": 100,
+    "image_width": 100,
+    "look_at": (0.0, 0.0, 0.0),
+    "up_direction": (0.0, 0.0, 1.0),
+}
+
+
+def token_of(door: Door) -> str:
+    return door.url.partition("token=")[2]
+
+
+def cookie_of(door: Door) -> str:
+    return f"{cookie_name(door.port)}={token_of(door)}"
+
+
+def ask(door: Door, path: str = "/", **headers: str | None) -> tuple[int, http.client.HTTPMessage, bytes]:
+    """One request. ``headers``: Host, Cookie and so on, with _ for -; the right Host and cookie are sent
+    unless they are given, None leaves one out."""
+    fields: dict[str, str | None] = {"Host": f"127.0.0.1:{door.port}", "Cookie": cookie_of(door)}
+    fields.update({name.replace("_", "-"): value for name, value in headers.items()})
+    connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=20)
+    try:
+        connection.putrequest("GET", path, skip_host=True, skip_accept_encoding=True)
+        for name, value in fields.items():
+            if value is not None:
+                connection.putheader(name, value)
+        connection.endheaders()
+        response = connection.getresponse()
+        # The body of a 101 is the open websocket.
+        return response.status, response.headers, b"" if response.status == 101 else response.read()
+    finally:
+        connection.close()
+
+
+def knock(door: Door, **headers: str | None) -> int:
+    """Status of a websocket handshake: 101 is in."""
+    handshake: dict[str, str | None] = {
+        "Upgrade": "websocket",
+        "Connection": "Upgrade",
+        "Sec_WebSocket_Key": "dGhlIHNhbXBsZSBub25jZQ==",
+        "Sec_WebSocket_Version": "13",
+        "Sec_WebSocket_Protocol": PROTOCOL,
+        "Origin": f"http://127.0.0.1:{door.port}",
+    }
+    return ask(door, "/", **{**handshake, **headers})[0]
+
+
+def both(door: Door, **headers: str | None) -> tuple[int, int]:
+    """Status of a page load and of a websocket handshake."""
+    return ask(door, "/", **headers)[0], knock(door, **headers)
+
+
+@contextlib.contextmanager
+def client(door: Door) -> Iterator[Connection]:
+    """An authenticated client that viser counts as connected; what it is sent is thrown away."""
+    known = set(door.server.get_clients())
+    with connect(
+        f"ws://127.0.0.1:{door.port}",
+        subprotocols=[PROTOCOL],  # type: ignore[list-item]
+        origin=f"http://127.0.0.1:{door.port}",  # type: ignore[arg-type]
+        additional_headers={"Cookie": cookie_of(door)},
+        max_size=None,
+        close_timeout=0.2,
+    ) as connection:
+        say(connection, CAMERA)
+        until(lambda: set(door.server.get_clients()) - known)
+        yield connection
+
+
+def say(connection: Connection, message: object) -> None:
+    connection.send(msgspec.msgpack.encode(message))
+
+
+def claim(handle: viser.GuiInputHandle, value: object, prop: str = "value") -> dict:
+    return {"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {prop: value}}
+
+
+def until(condition: Callable[[], object]) -> None:
+    """Wait for what another thread does; a condition that stays false fails the test."""
+    deadline = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < deadline, "it never came about"
+        time.sleep(0.01)
+
+
+def close_code(connection: Connection) -> int:
+    """Read until the server hangs up."""
+    with pytest.raises(ConnectionClosed) as closed:
+        while True:
+            connection.recv(timeout=30)
+    assert closed.value.rcvd is not None
+    return closed.value.rcvd.code

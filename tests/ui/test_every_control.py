@@ -1,0 +1,138 @@
+"""Every control of the live page and of the review, claimed to hold whatever a page can send."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+import viser
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.connection import Connection
+
+from tests.session.conftest import TASKS, wait_until
+from tests.session.recordings import made, write
+from tests.ui.knocking import claim, client, say, until
+from workbench.session.messages import TaskOptions
+from workbench.session.session import Session
+from workbench.ui import page_guard
+from workbench.ui.door import Door, DoorOptions, open_door
+from workbench.ui.put_together import Workplace
+
+NASTY = (
+    *(None, False, 0, 0.5, -1, 1e30, -1e30, 2**63, 2**64 - 1, -(2**63), 1e308, float("nan"), float("inf")),
+    *("", "x", "x" * 20_000, "a\nb", "\x1b[31m\0", "99999999999999999999999", b"x", b"x" * 10_000),
+    *([], [1.0], [1e30] * 3, [float("nan")] * 2, [True, True], ["a", "b", "c"], [0] * 1000, [[[]]]),
+    *({}, {"value": 1}, {"a": {"b": [1]}}),
+)
+NUMBERS = st.integers(-(2**63), 2**64 - 1) | st.floats()
+ANYTHING = st.recursive(
+    st.none() | st.booleans() | NUMBERS | st.text(max_size=30) | st.binary(max_size=30),
+    lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
+    max_leaves=10,
+)
+
+
+class Served:
+    """Both pages behind a real door, with a page that only listens."""
+
+    def __init__(self, door: Door, place: Workplace) -> None:
+        self.door, self.place = door, place
+
+    def show(self, which: str) -> None:
+        self.place.pages.show(which)  # type: ignore[arg-type]
+        assert self.place.pages.wait_for(which, timeout=60)  # type: ignore[arg-type]
+
+    def controls(self) -> list[viser.GuiInputHandle]:
+        gui = self.door.server.gui
+        return list(gui._gui_input_handle_from_uuid.values())  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("recordings")
+    write(folder, made(5))
+    task = Path(shutil.copy(TASKS / "minimal.py", tmp_path_factory.mktemp("author")))
+    door = open_door(DoorOptions(port=0))
+    session = Session(str(task), TaskOptions(num_envs=2), recordings=folder)
+    place = Workplace(door.server, folder, session)
+    place.pages.start("live")
+    wait_until(session, lambda view: view.task is not None, "the task")
+    yield Served(door, place)
+    place.close()
+    session.close()
+    door.close()
+
+
+@pytest.fixture
+def listener(served: Served) -> Iterator[Connection]:
+    """A page that was there before, and reads what it is sent; it must never be closed."""
+    closed: list[BaseException] = []
+
+    def listen(connection: Connection) -> None:
+        try:
+            while True:
+                connection.recv()
+        except ConnectionClosed as error:
+            closed.append(error)
+
+    with client(served.door) as connection:
+        thread = threading.Thread(target=listen, args=(connection,))
+        thread.start()
+        yield connection
+        assert not closed
+        connection.close()
+        thread.join()
+
+
+def claim_all(served: Served, values: tuple[object, ...]) -> None:
+    with client(served.door) as attacker:
+        for control in served.controls():
+            for value in values:
+                # True is a press: that is what a button is for.
+                if not (value is True and isinstance(control, viser.GuiButtonHandle)):
+                    say(attacker, claim(control, value))
+        box = served.door.server.gui.add_checkbox("after", False)
+        say(attacker, claim(box, True))
+        until(lambda: box.value)
+        box.remove()
+    for control in served.controls():
+        msgspec.msgpack.encode(control.value)
+
+
+@pytest.mark.parametrize("which", ["live", "review"])
+def test_no_claim_disturbs_another_page(served, listener, monkeypatch, capfd, which):
+    monkeypatch.setattr(page_guard, "HANDS_OFF", 0.05)
+    monkeypatch.setattr(page_guard, "RATE", 1e6)  # not a test of the pace
+    served.show(which)
+    assert len(served.controls()) > (30 if which == "live" else 10)
+    claim_all(served, NASTY)
+    with client(served.door):  # and a page that comes later is let in and gets all
+        pass
+    printed = capfd.readouterr().err
+    assert "Traceback" not in printed
+    assert len(printed.splitlines()) <= 1, printed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("which", ["live", "review"])
+def test_no_random_claim_disturbs_another_page(served, listener, monkeypatch, capfd, which):
+    monkeypatch.setattr(page_guard, "RATE", 1e6)
+    served.show(which)
+
+    @settings(
+        deadline=None,
+        max_examples=200,
+        suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large],
+    )
+    @given(st.lists(ANYTHING, min_size=5, max_size=5).map(tuple))
+    def claim_them(values: tuple[object, ...]) -> None:
+        claim_all(served, values)
+
+    claim_them()
+    assert "Traceback" not in capfd.readouterr().err

@@ -1,0 +1,70 @@
+// What the handlers in the server's templates do: press, choose, place, copy, bring into sight.
+//
+// The page's policy runs no code that is written in HTML, whoever put it there, but for a few fixed calls of what is
+// here (HANDLERS in workbench/ui/page_policy.py). Values come from data attributes, never from the text of a handler.
+"use strict";
+{
+  const setValue = Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, "value").set;
+  let presses = 0;
+
+  // As if it had been typed: an input of viser's hears the event, and React only looks when the value is another.
+  function type(input, number) {
+    setValue.call(input, number);
+    input.dispatchEvent(new Event("input", { bubbles: true }));
+  }
+
+  // The mouse counts when it goes down, since a table may be drawn anew before it comes up; a touch when it is over,
+  // or scrolling would press.
+  const counts = (event) =>
+    event.type === "pointerdown" ? event.pointerType === "mouse" && event.button === 0 : event.pointerType !== "mouse";
+
+  window.wb = {
+    press(event) {
+      if (counts(event)) document.getElementById(event.target.closest("[data-press]")?.dataset.press)?.click();
+    },
+
+    choose(event, table) {
+      const row = event.target.closest("[data-row]");
+      const input = document.getElementById(table.dataset.numbers);
+      const tick = event.target.closest(".wb-tick");
+      const twice = event.type === "dblclick";
+      if (!row || !input || (twice ? tick : !counts(event))) return;
+      const held = (event.ctrlKey || event.metaKey || tick ? 1 : 0) + (event.shiftKey ? 2 : 0);
+      presses = (presses + 1) % 89;
+      type(input, presses * 1e8 + row.dataset.row * 8 + (twice ? 4 : held));
+    },
+
+    place(event) {
+      const picture = event.target.closest("[data-place]");
+      const input = picture && event.button === 0 && document.getElementById(picture.dataset.place);
+      if (!input) return;
+      const box = picture.getBoundingClientRect();
+      const part = (at, from, size) => Math.max(0, Math.min(9999, Math.floor(((at - from) / size) * 10000)));
+      const place = part(event.clientX, box.left, box.width) * 10000 + part(event.clientY, box.top, box.height);
+      type(input, (Date.now() % 89) * 1e8 + place);
+    },
+
+    copy(event) {
+      const from = event.target.closest("[data-copy]");
+      if (!from || event.button !== 0) return;
+      if (navigator.clipboard) {
+        navigator.clipboard.writeText(from.dataset.copy);
+        from.textContent = "copied";
+      } else {
+        prompt("Copy with Ctrl+C", from.dataset.copy);
+      }
+    },
+
+    // A style sheet tells when it is in the page; what stands beside it comes a moment later.
+    intoSight(sheet) {
+      const named = sheet.dataset.intoSight;
+      const target = () => (named ? document.getElementById(named) : sheet.parentElement);
+      setTimeout(() => target()?.scrollIntoView({ block: "nearest" }), 150);
+    },
+
+    follow(sheet) {
+      const row = document.querySelector(`.wb-library [data-row="${CSS.escape(sheet.dataset.follow)}"]`);
+      row?.scrollIntoView({ block: "nearest" });
+    },
+  };
+}

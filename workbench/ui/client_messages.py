@@ -1,0 +1,242 @@
+"""Reads what a page sends into typed messages: one structure for each kind that a page has to say.
+
+A frame is decoded straight into its structure. What does not fit is refused at the first byte that does not, so
+that eight megabytes of nested lists never become millions of Python objects on the event loop. A value for a
+control is left undecoded (`GuiUpdate.updates`), since what it may be depends on the control; see
+`workbench.ui.control_values`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+import msgspec
+
+MAX_BYTES = 256 * 1024
+"""The largest thing that a page sends is a text that was pasted. viser's pictures of a view are never asked for."""
+FARTHEST = 1e12
+"""Largest number of a camera, a ray or a gizmo, in whatever unit."""
+LARGEST_PICTURE = 100_000
+"""Pixels along one side of a page."""
+
+Name = Annotated[str, msgspec.Meta(max_length=1024)]
+Uuid = Annotated[str, msgspec.Meta(max_length=64)]
+Index = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
+Pair = tuple[float, float]
+Triple = tuple[float, float, float]
+Quadruple = tuple[float, float, float, float]
+Modifier = Literal[
+    "cmd/ctrl", "alt", "shift", "cmd/ctrl+alt", "cmd/ctrl+shift", "alt+shift", "cmd/ctrl+alt+shift"
+]
+
+
+class MalformedMessage(ValueError):
+    """No page of ours sends such a frame; its connection is closed."""
+
+
+class ImpossibleValue(ValueError):
+    """A number that cannot be meant, in a message that is well formed; the message is dropped."""
+
+
+class ClientMessage(
+    msgspec.Struct, tag_field="type", tag=lambda name: f"{name}Message", forbid_unknown_fields=True
+):
+    """One of the kinds below; each has the fields of viser's message of that name."""
+
+    @classmethod
+    def kind(cls) -> str:
+        return f"{cls.__name__}Message"
+
+    def check(self) -> None:
+        """
+        Raises:
+            ImpossibleValue: A number is not finite, or out of all bounds.
+        """
+
+
+class CommandTrigger(ClientMessage):
+    uuid: Uuid
+
+
+class GuiButtonHold(ClientMessage):
+    uuid: Uuid
+    frequency: float
+
+    def check(self) -> None:
+        _check_numbers(self.frequency)
+
+
+class GuiFormDirty(ClientMessage):
+    uuid: Uuid
+
+
+class GuiFormSubmit(ClientMessage):
+    uuid: Uuid
+
+
+class GuiUpdate(ClientMessage):
+    uuid: Uuid
+    updates: Annotated[dict[str, msgspec.Raw], msgspec.Meta(max_length=16)]
+
+
+class SceneNodeClick(ClientMessage):
+    name: Name
+    instance_index: Index | None
+    ray_origin: Triple
+    ray_direction: Triple
+    screen_pos: Pair
+    modifier: Modifier | None
+    owner: Name = ""
+
+    def check(self) -> None:
+        _check_numbers(*self.ray_origin, *self.ray_direction, *self.screen_pos)
+
+
+class SceneNodeDrag(ClientMessage):
+    phase: Literal["start", "update", "end"]
+    name: Name
+    instance_index: Index | None
+    start_position: Triple
+    start_screen_pos: Pair
+    end_position: Triple
+    end_screen_pos: Pair
+    button: Literal["left", "middle", "right"]
+    modifier: Modifier | None
+    owner: Name = ""
+
+    def check(self) -> None:
+        _check_numbers(*self.start_position, *self.start_screen_pos)
+        _check_numbers(*self.end_position, *self.end_screen_pos)
+
+
+class ScenePointer(ClientMessage):
+    event_type: Literal["click", "rect-select"]
+    ray_origin: Triple | None
+    ray_direction: Triple | None
+    screen_pos: Annotated[list[Pair], msgspec.Meta(min_length=1, max_length=2)]
+    modifier: Modifier | None
+
+    def check(self) -> None:
+        # viser asserts the one and indexes the other.
+        if self.event_type == "click" and (self.ray_origin is None or self.ray_direction is None):
+            raise ImpossibleValue("a click without a ray")
+        if self.event_type == "rect-select" and len(self.screen_pos) != 2:
+            raise ImpossibleValue("a rectangle of one corner")
+        _check_numbers(*(self.ray_origin or ()), *(self.ray_direction or ()))
+        _check_numbers(*(number for pair in self.screen_pos for number in pair))
+
+
+class TransformControlsDragEnd(ClientMessage):
+    name: Name
+    owner: Name = ""
+
+
+class TransformControlsDragStart(ClientMessage):
+    name: Name
+    owner: Name = ""
+
+
+class TransformControlsUpdate(ClientMessage):
+    name: Name
+    wxyz: Quadruple
+    position: Triple
+    owner: Name = ""
+
+    def check(self) -> None:
+        _check_numbers(*self.position)
+        _check_rotation(self.wxyz)
+
+
+class ViewerCamera(ClientMessage):
+    wxyz: Quadruple
+    position: Triple
+    fov: float
+    near: float
+    far: float
+    # Some browsers have half pixels.
+    image_height: float
+    image_width: float
+    look_at: Triple
+    up_direction: Triple
+
+    def check(self) -> None:
+        _check_rotation(self.wxyz)
+        _check_numbers(*self.position, *self.look_at, *self.up_direction, self.near, self.far)
+        if not 0 < self.fov < math.pi:
+            raise ImpossibleValue("a field of view that no camera has")
+        # 0 by 0 is a page whose view is folded away.
+        if not (0 <= self.image_height <= LARGEST_PICTURE and 0 <= self.image_width <= LARGEST_PICTURE):
+            raise ImpossibleValue("a size that no page has")
+
+
+Value = bool | int | float | str | list[bool | int | float | str]
+"""What any control may hold, as it comes."""
+
+KINDS: dict[str, type[ClientMessage]] = {kind.kind(): kind for kind in ClientMessage.__subclasses__()}
+
+
+class _Any(msgspec.Struct):
+    type: str
+
+
+_kind_decoder = msgspec.msgpack.Decoder(_Any)
+_decoders = {name: msgspec.msgpack.Decoder(kind) for name, kind in KINDS.items()}
+_value_decoder = msgspec.msgpack.Decoder(Value)
+
+_DECODING = (msgspec.DecodeError, RecursionError, UnicodeDecodeError, OverflowError)
+"""What msgspec raises: a ValidationError is a DecodeError; the others are nesting without end and text that is not UTF-8."""
+
+
+def kind_of(raw: object) -> str:
+    """The ``type`` of a frame; the rest is skipped over.
+
+    Raises:
+        MalformedMessage: A text frame, too long, not msgpack, or without a type.
+    """
+    if not isinstance(raw, bytes):
+        raise MalformedMessage("a text frame")
+    if len(raw) > MAX_BYTES:
+        raise MalformedMessage("a message that is too long")
+    try:
+        return _kind_decoder.decode(raw).type
+    except _DECODING:
+        raise MalformedMessage("what is not a message") from None
+
+
+def read_message(raw: bytes, kind: str) -> ClientMessage:
+    """The message in `raw`, which is of this kind.
+
+    Raises:
+        MalformedMessage: Fields are missing, surplus, of another type or of another length.
+        ImpossibleValue: A number in it is not finite, or cannot be meant.
+    """
+    try:
+        message = _decoders[kind].decode(raw)
+    except _DECODING:
+        raise MalformedMessage(f"wrong fields in {kind}") from None
+    message.check()
+    return message
+
+
+def read_value(raw: msgspec.Raw) -> Value:
+    """What a page claims that a control holds.
+
+    Raises:
+        ValueError: It is nested, bytes, or of a kind that no control holds.
+    """
+    try:
+        return _value_decoder.decode(raw)
+    except _DECODING:
+        raise ValueError("No control holds that.") from None
+
+
+def _check_numbers(*numbers: float) -> None:
+    # Written so that NaN, of which every comparison is false, is caught as well.
+    if not all(abs(number) <= FARTHEST for number in numbers):
+        raise ImpossibleValue("a number that is not finite, or too large")
+
+
+def _check_rotation(wxyz: Quadruple) -> None:
+    if not 0.5 <= math.hypot(*wxyz) <= 2.0:
+        raise ImpossibleValue("a rotation that is none")

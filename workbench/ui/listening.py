@@ -1,0 +1,212 @@
+"""The socket that the page is served on: a port of this machine, or a file that only its owner can connect to.
+
+On a machine that others use too, everyone can connect to a port on loopback, and a browser sends its cookies to
+every port of a host. A Unix socket with mode 0600 has neither trouble: the kernel asks who connects, and the way from
+a browser to it is one's own ``ssh -L``.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import getpass
+import ipaddress
+import os
+import socket
+import stat
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+DEFAULT_PORT = 8080
+PORTS_TO_TRY = 100
+LONGEST_PATH = 107
+"""Bytes of the path of a Unix socket (unix(7)); ssh could not reach a longer one either."""
+BACKLOG = 100
+
+
+class ListenError(RuntimeError):
+    """The socket cannot be had. The message says what to do."""
+
+
+@dataclass(frozen=True)
+class Listening:
+    """A socket that listens, and how it is reached."""
+
+    socket: socket.socket
+    host: str
+    """As a browser needs it: a name, or an address with brackets where it is IPv6."""
+    port: int
+    """As a browser on this machine or behind `ssh_hint` needs it."""
+    bound_host: str
+    loopback: bool
+    """Only this machine can connect."""
+    path: Path | None = None
+    """Of a Unix socket."""
+    inode: int = 0
+
+    @property
+    def authority(self) -> str:
+        return f"{self.host}:{self.port}"
+
+    @property
+    def ssh_hint(self) -> str:
+        """What to type on one's own machine to reach it."""
+        to = f"{self.host if self.loopback else '127.0.0.1'}:{self.port}" if self.path is None else self.path
+        return f"ssh -L {self.port}:{to} {_user()}@{socket.gethostname()}"
+
+    def connect(self, timeout: float) -> socket.socket:
+        """A client's end of it, on this machine."""
+        if self.path is None:
+            address = ipaddress.ip_address(self.bound_host.partition("%")[0])
+            loopback = "::1" if address.version == 6 else "127.0.0.1"
+            host = loopback if address.is_unspecified else self.bound_host
+            return socket.create_connection((host, self.port), timeout=timeout)
+        client = socket.socket(socket.AF_UNIX)
+        client.settimeout(timeout)
+        client.connect(str(self.path))
+        return client
+
+    def remove(self) -> None:
+        """Take the file of a Unix socket away, if it is still ours."""
+        if self.path is not None:
+            with contextlib.suppress(FileNotFoundError):
+                if self.path.lstat().st_ino == self.inode:
+                    self.path.unlink()
+
+
+def listen_on_port(host: str, port: int) -> Listening:
+    """
+    Args:
+        host: An address or a name of this machine.
+        port: 0 takes any free one. If `DEFAULT_PORT` is taken, the next free one is taken.
+
+    Raises:
+        ListenError: The host is not this machine's, or the port is taken or forbidden.
+    """
+    # "localhost" may be 127.0.0.1, ::1 or both; the printed address has to be the one that is bound.
+    asked = "127.0.0.1" if host.lower() == "localhost" else host
+    try:
+        family, _, _, _, address = socket.getaddrinfo(
+            asked, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+    except (OSError, UnicodeError) as error:
+        raise ListenError(f"Cannot listen on {host}: {error}. Give an address of this machine.") from None
+    last = min(port + PORTS_TO_TRY, 65536) if port == DEFAULT_PORT else port + 1
+    for candidate in range(port, last):
+        try:
+            made = socket.create_server((address[0], candidate), family=family, backlog=BACKLOG)
+        except PermissionError:
+            raise ListenError(
+                f"Port {candidate} needs root's rights; give one from 1024 on with --port."
+            ) from None
+        except OSError as error:
+            if error.errno != errno.EADDRINUSE:
+                raise ListenError(
+                    f"Cannot listen on {host}: {error.strerror}. Give an address of this machine."
+                ) from None
+            continue
+        bound, bound_port = made.getsockname()[:2]
+        loopback = ipaddress.ip_address(bound.partition("%")[0]).is_loopback
+        return Listening(made, _reach(bound), bound_port, bound, loopback)
+    if port == DEFAULT_PORT:
+        raise ListenError(f"Ports {port} to {last - 1} are all taken; --port 0 takes any free one.")
+    raise ListenError(f"Port {port} is taken by another program; give another with --port, or 0 for any.")
+
+
+def listen_on_file(path: Path, port: int) -> Listening:
+    """
+    Args:
+        path: Where the socket is to be. What a workbench left there that was killed is taken away.
+        port: On the machine that the browser is on, at the other end of ``ssh -L``.
+
+    Raises:
+        ListenError: Something else is there, or others could put something there in its place.
+    """
+    folder = path.expanduser().absolute().parent.resolve()
+    place = folder / path.name
+    if len(os.fsencode(place)) > LONGEST_PATH:
+        raise ListenError(f"The path of a socket has at most {LONGEST_PATH} bytes; {place} is longer.")
+    made = socket.socket(socket.AF_UNIX)
+    try:
+        with _alone_in(folder):
+            _make_room(place)
+            # Linux makes the file with the mode of the socket: it is never there with a wider one.
+            os.fchmod(made.fileno(), 0o600)
+            made.bind(str(place))
+            made.listen(BACKLOG)
+            return Listening(
+                made, "localhost", port or DEFAULT_PORT, "localhost", True, place, place.lstat().st_ino
+            )
+    except OSError as error:
+        made.close()
+        raise ListenError(f"Cannot make the socket {place}: {error.strerror}.") from None
+    except ListenError:
+        made.close()
+        raise
+
+
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """No other workbench makes or removes a socket in this folder meanwhile."""
+    try:
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except (FileNotFoundError, NotADirectoryError):
+        raise ListenError(
+            f"There is no folder {folder} for the socket; mkdir -m 700 {folder} makes one that is yours alone."
+        ) from None
+    try:
+        found = os.fstat(handle)
+        others_write = found.st_mode & (stat.S_IWGRP | stat.S_IWOTH) and not found.st_mode & stat.S_ISVTX
+        if found.st_uid not in (os.getuid(), 0) or others_write:
+            raise ListenError(
+                f"Others can write into {folder}, and could put a socket of theirs in place of this one. Give a "
+                "folder that is yours alone, such as one made with mkdir -m 700."
+            )
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _make_room(place: Path) -> None:
+    try:
+        found = place.lstat()
+    except FileNotFoundError:
+        return
+    if not stat.S_ISSOCK(found.st_mode) or found.st_uid != os.getuid():
+        raise ListenError(
+            f"{place} is there, and is not a socket of yours. It is left alone; give another path."
+        )
+    with socket.socket(socket.AF_UNIX) as client:
+        client.settimeout(2.0)
+        try:
+            client.connect(str(place))
+        except ConnectionRefusedError:
+            place.unlink()
+            return
+        except OSError:  # it listens and is too busy to answer
+            pass
+    raise ListenError(f"Another program listens at {place}, a workbench perhaps; give another path.")
+
+
+def _reach(host: str) -> str:
+    """``host`` as a browser needs it: an IPv6 address in brackets, and for "every interface" the
+    address of the one that leads out. Connecting a datagram socket sends nothing."""
+    address = ipaddress.ip_address(host.partition("%")[0])
+    if address.is_unspecified:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                probe.connect(("192.0.2.1", 9))  # TEST-NET-1, RFC 5737
+                return probe.getsockname()[0]
+            except OSError:
+                return "127.0.0.1"
+    return f"[{address}]" if address.version == 6 else str(address)
+
+
+def _user() -> str:
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a container's user without a name
+        return "USER"

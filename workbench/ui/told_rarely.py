@@ -1,0 +1,61 @@
+"""Log lines that a stranger can cause: said at once, then rarely, with how often it happened meanwhile."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Hashable
+
+PAUSE = 60.0
+"""Seconds in which the same thing is said once, at first."""
+LONGEST_PAUSE = 3600.0
+"""A tab that was left open knocks once a second for as long as it is there."""
+MOST_KINDS = 256
+LONGEST = 300
+"""Characters of a line."""
+
+log = logging.getLogger("workbench.door")
+
+
+class ToldRarely:
+    """Says each kind of thing at once, and again after `pause` seconds, twice that, and so on. From any thread.
+
+    Args:
+        say: Prints one line.
+    """
+
+    def __init__(self, say: Callable[[str], None] = log.warning, pause: float = PAUSE) -> None:
+        self._say, self._pause = say, pause
+        self._silent_until: dict[Hashable, float] = {}
+        self._pauses: dict[Hashable, float] = {}
+        self._untold: dict[Hashable, int] = {}
+        self._lock = threading.Lock()
+
+    def happened(self, kind: Hashable, sentence: str) -> None:
+        """
+        Args:
+            kind: What counts as the same thing.
+            sentence: What is said, with a full stop; characters that a terminal would obey are taken out.
+        """
+        now = time.monotonic()
+        with self._lock:
+            if now < self._silent_until.get(kind, 0.0):
+                self._untold[kind] = self._untold.get(kind, 0) + 1
+                return
+            if len(self._pauses) >= MOST_KINDS:
+                self._silent_until.clear()
+                self._pauses.clear()
+                self._untold.clear()
+            pause = self._pauses.get(kind, self._pause)
+            self._silent_until[kind] = now + pause
+            self._pauses[kind] = min(2 * pause, LONGEST_PAUSE)
+            before = self._untold.pop(kind, 0)
+        more = f" ({before} more times since this was last said.)" if before else ""
+        self._say(printable(sentence) + more)
+
+
+def printable(text: str) -> str:
+    """One line of bounded length without control or direction characters, for a terminal."""
+    short = text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
+    return "".join(character if character.isprintable() else "�" for character in short)
