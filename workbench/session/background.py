@@ -17,6 +17,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from workbench.session.lane import Job, JobFailed
+from workbench.session.message_reader import Unreadable
 from workbench.session.messages import Event, Request
 from workbench.session.process import WorkerProcess, describe_exit
 
@@ -77,11 +78,11 @@ class BackgroundProcess:
             job.check()
             try:
                 event = self._receive()
-            except EOFError:
-                code = None if self._process is None else self._process.exit_code()
+            except EOFError as error:
+                why = self._why_gone(error)
                 self.end()
                 job.check()
-                raise JobFailed(f"the process {self._that} {describe_exit(code)}") from None
+                raise JobFailed(f"the process {self._that} {why}") from None
             if isinstance(event, kinds):
                 return event
 
@@ -118,6 +119,11 @@ class BackgroundProcess:
         if self._process is not None:
             self._process.stop(grace=0.0)
         self._process, self._owed = None, ()
+
+    def _why_gone(self, error: EOFError) -> str:
+        if isinstance(error, Unreadable):
+            return f"sent what cannot be read ({error}) and was ended"
+        return describe_exit(None if self._process is None else self._process.exit_code())
 
     def _receive(self) -> Event | None:
         """What is owed; None if it has not come yet."""

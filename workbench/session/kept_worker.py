@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 from workbench.session.last_words import Busy, busy_at, fatal_error
 from workbench.session.memory_limit import in_words
+from workbench.session.message_reader import Unreadable
 from workbench.session.messages import Event, Load, Loaded, Loading, Request, WarmedUp, WarmUp
 from workbench.session.process import Output, WorkerProcess, describe_exit
 from workbench.session.pulse import Beat, Doing
@@ -197,6 +198,9 @@ class KeptWorker:
         life = _Life()
         try:
             self._attend(worker, life)
+        except Unreadable as error:
+            life.why = f"sent what cannot be read ({error}) and was ended"
+            worker.kill()
         except EOFError:
             self._take_the_last_events(worker)
         self._on_busy(None)

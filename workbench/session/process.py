@@ -28,6 +28,7 @@ from multiprocessing.connection import Connection
 from workbench.machine.child_python import child_environment, python_command
 from workbench.session.interrupts import INTERRUPT_SIGNAL, STACK_SIGNAL
 from workbench.session.memory_limit import memory_with_children, resident_memory
+from workbench.session.message_reader import MessageReader
 from workbench.session.messages import (
     Event,
     Load,
@@ -94,6 +95,7 @@ class WorkerProcess:
             theirs.close()
             os.close(pulse)
         self._socket, self._connection = ours, Connection(os.dup(ours.fileno()))
+        self._reader = MessageReader(ours, Event)
         self._output = output
         self._waiting: deque[Request] = deque()
         self._wake = threading.Condition()
@@ -128,17 +130,16 @@ class WorkerProcess:
         """The next event; None after `timeout` seconds without one.
 
         Raises:
+            Unreadable: what it sent is no event, so it counts as gone; `kill` it.
             EOFError: the worker is gone (see `exit_code`), and all that it sent was received.
         """
-        try:
-            if not self._connection.poll(timeout):
-                # A process that the author's code forked may hold the socket open after its parent's death.
-                if self._process.poll() is not None and not self._connection.poll(0):
-                    raise EOFError
-                return None
-            return self._connection.recv()
-        except (ConnectionResetError, OSError) as error:
-            raise EOFError from error
+        message = self._reader.receive(timeout)
+        # A process that the author's code forked may hold the socket open after its parent's death.
+        if message is None and self._process.poll() is not None:
+            message = self._reader.receive(0)
+            if message is None:
+                raise EOFError
+        return message
 
     def hear(self, output: Output) -> None:
         """From now on what it prints goes there."""
