@@ -10,8 +10,6 @@ ended. One that dies ends the job that asked it, and the next starts another.
 
 from __future__ import annotations
 
-import contextlib
-import os
 import time
 from collections.abc import Callable
 from typing import TypeVar
@@ -137,8 +135,5 @@ class BackgroundProcess:
 
 def _start() -> WorkerProcess:
     # What the author's code prints in it is heard of the worker that plays, and not said twice.
-    process = WorkerProcess(lambda stream, piece: False)
-    with contextlib.suppress(ProcessLookupError, PermissionError):
-        # After the one that plays, where there are fewer cores than work.
-        os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
-    return process
+    # With a low priority: after the one that plays, where there are fewer cores than work.
+    return WorkerProcess(lambda stream, piece: False, _NICENESS)

@@ -26,7 +26,6 @@ from workbench.session.spare import SpareWorker
 
 _LOOK = 0.1
 """Seconds between two looks at the worker."""
-_LOOK_AT_CHILDREN = 2.0
 _BUSY = 2.0
 _LONG: dict[Doing, float] = {"starting": 20.0, "warming up": 20.0, "drawing": 20.0}
 """Seconds of one piece of work after which it is told: importing and compiling shaders takes long anyway."""
@@ -127,7 +126,8 @@ class KeptWorker:
     def pid(self) -> int | None:
         """Of the present worker; None between two."""
         with self._condition:
-            return None if self._worker is None else self._worker.pid
+            worker = self._worker
+        return None if worker is None else worker.pid
 
     @property
     def vitals(self) -> Vitals:
@@ -258,7 +258,7 @@ class KeptWorker:
         if self._replace_asked:
             life.why = "was ended by hand"
             self._end(worker, life)
-        self._look_at_memory(worker, life, now)
+        self._look_at_memory(worker, life)
         if self._load_sent is not None and beat.doing not in _LONG and beat.since < self._load_sent:
             waited = now - self._load_sent
             # Counted from the interrupt: leaving a load means to close what it had built.
@@ -279,17 +279,15 @@ class KeptWorker:
             deaf = (self._since_interrupt(beat) or 0.0) > _DEAF
             self._on_busy(busy_at(beat.seconds, beat.doing, life.stack, self._own_files(), deaf))
 
-    def _look_at_memory(self, worker: WorkerProcess, life: _Life, now: float) -> None:
-        if now - life.looked_at_children > _LOOK_AT_CHILDREN:
-            life.looked_at_children = now
-            life.children = max(0, worker.memory(with_children=True) - worker.memory())
-        used, limit = worker.memory() + life.children, self._options.memory_limit
+    def _look_at_memory(self, worker: WorkerProcess, life: _Life) -> None:
+        limit = self._options.memory_limit
+        used = worker.memory(limit)
         spare = self._spare.memory if self._spare is not None else 0
         ready = self._spare is not None and self._spare.ready
         self._vitals = Vitals(used, limit, spare or None, ready)
         if limit is not None and used > limit:
             life.why = (
-                f"was ended because it had {in_words(used)} in memory, more than the {in_words(limit)} that "
+                f"was ended because it and what it started had {in_words(used)} in memory, more than the {in_words(limit)} that "
                 "--memory-limit allows,"
             )
             self._end(worker, life)
@@ -324,8 +322,6 @@ class _Life:
     """The piece of work that it was seen in."""
     told: float | None = None
     """When it was last told that the worker is busy."""
-    looked_at_children: float = 0.0
-    children: int = 0
 
 
 def _doing(beat: Beat) -> str | None:

@@ -26,8 +26,9 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 
 from workbench.machine.child_python import child_environment, python_command
+from workbench.session.family import end_family
 from workbench.session.interrupts import INTERRUPT_SIGNAL, STACK_SIGNAL
-from workbench.session.memory_limit import memory_with_children, resident_memory
+from workbench.session.memory_limit import FamilyMemory
 from workbench.session.message_reader import MessageReader
 from workbench.session.messages import (
     Event,
@@ -52,6 +53,8 @@ _PIECE = 1 << 20
 _FLOOD_PAUSE = 0.005
 """Seconds between two reads of a flood: with pieces of a megabyte that drains 200 MB a second."""
 _F_SETPIPE_SZ = 1031
+_BEGINS = 10.0
+"""Seconds in which a worker has begun, also on a machine that is at work."""
 
 Output = Callable[[str, bytes], bool]
 """Gets ``stdout`` or ``stderr`` and the bytes that came (none at its end); True asks for a little rest."""
@@ -64,10 +67,11 @@ class WorkerProcess:
     thread that started it, so that none is left behind when the server is killed.
     """
 
-    def __init__(self, output: Output) -> None:
+    def __init__(self, output: Output, niceness: int = 0) -> None:
         """
         Args:
             output: called with what it prints, on threads of this object; see `hear`.
+            niceness: by how much other processes come first.
         """
         ours, theirs = socket.socketpair()
         pulse = make_pulse()
@@ -76,8 +80,11 @@ class WorkerProcess:
         fcntl.fcntl(self._stacks, fcntl.F_SETFL, os.O_APPEND)
         fds = [theirs.fileno(), pulse, self._stacks]
         try:
+            # What is started is the worker's keeper, and the worker its child; it ends as the worker does.
             self._process = subprocess.Popen(
-                python_command("-m", "workbench.session.worker_start", *map(str, fds), str(os.getpid())),
+                python_command(
+                    "-m", "workbench.session.worker_start", *map(str, [*fds, os.getpid(), niceness])
+                ),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
@@ -96,6 +103,7 @@ class WorkerProcess:
             os.close(pulse)
         self._socket, self._connection = ours, Connection(os.dup(ours.fileno()))
         self._reader = MessageReader(ours, Event)
+        self._memory = FamilyMemory(self._process.pid)
         self._output = output
         self._waiting: deque[Request] = deque()
         self._wake = threading.Condition()
@@ -113,7 +121,11 @@ class WorkerProcess:
 
     @property
     def pid(self) -> int:
-        return self._process.pid
+        """Of the process that runs the task. Waits for it to begin, some 50 ms after it was started."""
+        deadline = time.monotonic() + _BEGINS
+        while self._pulse.pid == 0 and self._process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.005)
+        return self._pulse.pid or self._process.pid
 
     # --- messages ----------------------------------------------------------------------------------
 
@@ -151,9 +163,9 @@ class WorkerProcess:
         """What it is doing, and since when."""
         return self._pulse.read()
 
-    def memory(self, with_children: bool = False) -> int:
-        """Bytes that are in memory; counting the children as well takes milliseconds."""
-        return memory_with_children(self.pid) if with_children else resident_memory(self.pid)
+    def memory(self, limit: int | None = None) -> int:
+        """Bytes that it has in memory together with all that it started; see `FamilyMemory.look`."""
+        return self._memory.look(limit)
 
     def stack(self, patience: float = 0.3) -> str:
         """Where it is now, as faulthandler writes it; empty when it does not say so within `patience` seconds."""
@@ -196,10 +208,7 @@ class WorkerProcess:
 
     def kill(self) -> None:
         """End it now with all that it started; `receive` then raises EOFError."""
-        try:
-            os.killpg(self._process.pid, signal.SIGKILL)
-        except ProcessLookupError:
-            pass  # it and all its children are gone already
+        self._process.terminate()
 
     def stop(self, grace: float = 1.0) -> None:
         """Ask it to end, and after `grace` seconds end it with all that it started."""
@@ -209,8 +218,7 @@ class WorkerProcess:
                 self._process.wait(timeout=grace)
             except subprocess.TimeoutExpired:
                 pass
-        self.kill()
-        self._process.wait()
+        end_family(self._process)
         with self._wake:
             self._ending = True
             self._wake.notify()

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from workbench.core.geometry import SceneGeometry
 from workbench.machine.child_python import child_environment, python_command
 from workbench.recording.episode import Episode
+from workbench.session.family import end_family
 from workbench.session.message_reader import MessageReader, Unreadable
 
 _LOOK = 0.1
@@ -101,9 +102,9 @@ class SceneProcess:
         """
         ours, theirs = socket.socketpair()
         with ours, theirs:
-            command = python_command("-m", "workbench.session.recorded_scene_worker")
+            worker = ("workbench.session.recorded_scene_worker", str(theirs.fileno()))
             process = subprocess.Popen(
-                [*command, str(theirs.fileno()), str(os.getpid())],
+                python_command("-m", "workbench.session.family", str(os.getpid()), *worker),
                 env=child_environment(),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
@@ -134,8 +135,7 @@ class SceneProcess:
                     on_end(key, replace(episode, geometry=made.geometry, poses=made.poses), made.missed)
             finally:
                 connection.close()
-                process.kill()
-                process.wait()
+                end_family(process)
 
     def _one(
         self,
@@ -167,7 +167,7 @@ class SceneProcess:
                     raise SceneError(event.why)
                 on_progress(event.words)
         except Unreadable as error:
-            process.kill()
+            process.terminate()
             raise SceneError(
                 f"The process that makes the scene of {info.task} sent what cannot be read ({error}), so there are "
                 "numbers and curves only."

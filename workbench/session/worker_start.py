@@ -1,15 +1,14 @@
 """How a worker process begins: ready to say where it died before anything that may die is imported.
 
 The heavy modules are imported last. By then a crash writes its stack, the server can look at the process by
-a signal, the kernel knows whom to end when memory is short, and the process goes when its server does.
+a signal, the kernel knows whom to end when memory is short, and the process goes when its server does (`family`).
 
-The server starts it as ``python -m workbench.session.worker_start SOCKET PULSE STACKS SERVER``: three file
-descriptors (see `process`) and the server's process id.
+The server starts it as ``python -m workbench.session.worker_start SOCKET PULSE STACKS SERVER NICENESS``: three file
+descriptors (see `process`), the server's process id, and by how much others come first.
 """
 
 from __future__ import annotations
 
-import ctypes
 import faulthandler
 import os
 import signal
@@ -17,13 +16,15 @@ import sys
 from pathlib import Path
 from typing import NoReturn
 
-_PR_SET_PDEATHSIG = 1
+from workbench.session.family import begin_family
 
 
 def main() -> None:
     """Entry of the process."""
-    connection, pulse_fd, stacks, server = map(int, sys.argv[1:5])
-    end_with(server)
+    connection, pulse_fd, stacks, server, niceness = map(int, sys.argv[1:6])
+    begin_family(server)
+    if niceness:
+        os.nice(niceness)
     _be_the_first_to_go()
     _tell_where(stacks)
     from workbench.session.pulse import PulseWriter
@@ -34,13 +35,6 @@ def main() -> None:
     from workbench.session.worker import work
 
     work(connection, pulse)
-
-
-def end_with(server: int) -> None:
-    """Ask the kernel to end this process with its server, also when that is killed while we hang."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != server:
-        sys.exit("the server is gone")
 
 
 def _be_the_first_to_go() -> None:
