@@ -51,8 +51,11 @@ def proportional_memory(pids: Iterable[int]) -> int:
 
 
 def main_thread_ended(pid: int) -> bool:
-    """Whether its main thread has ended, while others may live on; False when all of it is gone."""
-    return _state_and_parent(pid)[0] == "Z"
+    """Whether its main thread has ended and others have not, as also for a moment in the midst of any end."""
+    try:
+        return _state_and_parent(pid)[0] == "Z" and len(os.listdir(f"/proc/{pid}/task")) > 1
+    except OSError:
+        return False
 
 
 def _proportional(pid: int) -> int:

@@ -26,6 +26,8 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 
 from workbench.machine.child_python import child_environment, python_command
+from workbench.machine.process_tree import main_thread_ended
+from workbench.machine.watched_thread import say_failure
 from workbench.session.family import end_family
 from workbench.session.interrupts import INTERRUPT_SIGNAL, STACK_SIGNAL
 from workbench.session.memory_limit import FamilyMemory
@@ -167,6 +169,11 @@ class WorkerProcess:
         """Bytes that it has in memory together with all that it started; see `FamilyMemory.look`."""
         return self._memory.look(limit)
 
+    def main_thread_ended(self) -> bool:
+        """Whether the thread that takes requests is gone while another keeps the process alive."""
+        pid = self._pulse.pid
+        return pid != 0 and main_thread_ended(pid) and self._process.poll() is None
+
     def stack(self, patience: float = 0.3) -> str:
         """Where it is now, as faulthandler writes it; empty when it does not say so within `patience` seconds."""
         if self.beat().number == 0 or self._process.poll() is not None:
@@ -243,8 +250,10 @@ class WorkerProcess:
                 request = self._waiting.popleft()
             try:
                 self._connection.send(request)
-            except (BrokenPipeError, OSError):
+            except OSError:
                 return  # it is gone, and `receive` says so
+            except Exception as error:
+                say_failure(f"A {type(request).__name__} could not be sent to the worker", error)
 
     def _read_output(self, name: str, stream: object) -> None:
         with stream as pipe:  # type: ignore[attr-defined]
@@ -253,10 +262,21 @@ class WorkerProcess:
                 fcntl.fcntl(fd, _F_SETPIPE_SZ, _PIECE)
             except OSError:
                 pass  # the system's limit for pipes is reached: smaller pieces then
-            while piece := os.read(fd, _PIECE):
-                if self._output(name, piece):
+            failed = False
+            while True:
+                piece = os.read(fd, _PIECE)
+                try:
+                    too_fast = self._output(name, piece)
+                except Exception as error:
+                    # Such as a terminal that is closed. It is read on: a worker whose pipe is full stands still.
+                    too_fast = False
+                    if not failed:
+                        say_failure("What the task printed could not be shown", error)
+                    failed = True
+                if not piece:
+                    return
+                if too_fast:
                     time.sleep(_FLOOD_PAUSE)
-            self._output(name, b"")
 
 
 def _takes_the_place_of(request: Request, before: Request) -> bool:

@@ -13,6 +13,8 @@ import faulthandler
 import os
 import signal
 import sys
+import threading
+import traceback
 from pathlib import Path
 from typing import NoReturn
 
@@ -26,15 +28,29 @@ def main() -> None:
     if niceness:
         os.nice(niceness)
     _be_the_first_to_go()
+    leave = os._exit
     _tell_where(stacks)
     from workbench.session.pulse import PulseWriter
 
     pulse = PulseWriter(pulse_fd)
     pulse.begin("starting")
 
-    from workbench.session.worker import work
+    code = 0
+    try:
+        from workbench.session.worker import work
 
-    work(connection, pulse)
+        work(connection, pulse)
+    except BaseException:
+        traceback.print_exc()
+        code = 1
+    # Else the interpreter would wait for threads of the task, and the page for a process that answers nothing.
+    others = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
+    if code or not all(thread.daemon for thread in others):
+        try:
+            sys.stdout.flush()
+            sys.stderr.flush()
+        finally:  # the task may have closed them
+            leave(code)
 
 
 def _be_the_first_to_go() -> None:
