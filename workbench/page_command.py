@@ -59,8 +59,9 @@ def open_in_terminal(
         worker=worker,
         on_event=on_event,
         on_line=print_line,
+        on_notice=warn,
     )
-    place = Workplace(door.server, recordings, session)
+    place = Workplace(door.server, recordings, session, on_notice=warn)
     what = f"{task}, {options.num_envs} envs"
     _serve(door, place, "live", what, recordings, WorkerOptions(worker.memory_limit), end, session.close)
 
@@ -74,7 +75,7 @@ def review_in_terminal(folder: Path, tasks: tuple[Path, ...], at: DoorOptions, w
     door = _opened(at, "Recordings")
     if isinstance(door, int):
         return door
-    place = Workplace(door.server, folder, tasks=tasks)
+    place = Workplace(door.server, folder, tasks=tasks, on_notice=warn)
     _serve(door, place, "review", f"recordings in {folder}", folder, worker, _End(), lambda: None)
 
 
@@ -103,7 +104,13 @@ def _serve(
 ) -> NoReturn:
     def open_task(task: str, options: TaskOptions) -> Session:
         return Session(
-            task, options, recordings=recordings, worker=worker, on_event=print_event, on_line=print_line
+            task,
+            options,
+            recordings=recordings,
+            worker=worker,
+            on_event=print_event,
+            on_line=print_line,
+            on_notice=warn,
         )
 
     sharing = Sharing(door)

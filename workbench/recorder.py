@@ -19,6 +19,7 @@ recording ends, and `problem` keeps it.
 
 from __future__ import annotations
 
+import logging
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import Future
@@ -49,7 +50,10 @@ from workbench.session.episodes import EpisodeGatherer, GatheredEpisode
 from workbench.session.gather_later import LaterSteps
 from workbench.session.messages import Stepped, TaskDescription
 from workbench.session.open_task import describe
+from workbench.session.record_live import recovered_in_words
 from workbench.session.recorded_pictures import recorded_pictures
+
+logger = logging.getLogger(__name__)
 
 
 class Recorder(gym.Wrapper):
@@ -87,10 +91,12 @@ class Recorder(gym.Wrapper):
         chosen = list(range(base.num_envs)) if env_idx is None else [int(i) for i in env_idx]
         if any(not 0 <= i < base.num_envs for i in chosen):
             raise IndexError(f"env_idx {chosen} is out of range for {base.num_envs} envs")
-        self._folder, self._envs, self._pictures = Path(folder), chosen, pictures
+        self._folder, self._envs, self._pictures = Path(folder).absolute(), chosen, pictures
         self._acted_by = acted_by
         if self._folder.is_dir():
-            recover(self._folder)
+            mended = [str(files.rrd) for files in recover(self._folder)]
+            if said := recovered_in_words(mended):
+                logger.warning("%s", said)
         self._task = TaskEnv(base)
         self._finisher = EpisodeFinisher()
         self._made: list[Future[EpisodeFiles | str]] = []

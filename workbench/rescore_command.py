@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsed
 from rich.progress import Progress as Bar
 from rich.table import Table
 
+from workbench.machine.start_folder import in_start_folder
 from workbench.machine.terminal_text import plain_text
 from workbench.session import rescore_words as words
 from workbench.session.rescore_all import Progress, RescoreOptions, rescore_all
@@ -38,7 +39,8 @@ def run_rescore(what: RescoreOptions, out: Console, err: Console, csv: Path | No
         bar.update(row, total=len(verdicts), completed=len(verdicts), description="judged")
     for path, text in ((csv, words.as_csv), (json, words.as_json)):
         if path is not None:
-            words.write_table(path, text(verdicts))
+            with in_start_folder():
+                words.write_table(path, text(verdicts))
     print_verdicts(verdicts, out)
     for note in (*notes, *words.not_carried(verdicts)):
         err.print(f"[yellow]{escape(plain_text(note))}[/]", soft_wrap=True)

@@ -218,3 +218,25 @@ def test_it_stops_from_outside_and_from_its_own_call(tmp_path: Path) -> None:
     idle = SourceWatcher(calls)
     idle.stop()
     idle.stop()
+
+
+@pytest.mark.parametrize("what", ["pipe", "device", "large"])
+def test_what_is_no_file_any_more_counts_as_gone_and_is_followed_on(tmp_path: Path, what: str) -> None:
+    file, other = tmp_path / "task.py", tmp_path / "other"
+    file.write_text("x = 1\n")
+    seen: queue.Queue[set[Path]] = queue.Queue()
+    watcher = SourceWatcher(seen.put)
+    watcher.follow([file])
+    if what == "pipe":
+        os.mkfifo(other)
+    elif what == "device":
+        other.symlink_to("/dev/zero")
+    else:
+        with other.open("wb") as large:
+            large.truncate(2**40)
+    other.replace(file)
+    assert seen.get(timeout=PATIENCE) == {file}
+    other.write_text("x = 2\n")
+    other.replace(file)
+    assert seen.get(timeout=PATIENCE) == {file}
+    watcher.stop()

@@ -9,8 +9,20 @@ from pathlib import Path
 from tests.session.conftest import TASKS
 
 _MISCHIEF = """
-import ctypes as _ctypes, os as _os, signal as _signal, sys as _sys, time as _time
+import ctypes as _ctypes, os as _os, signal as _signal, sys as _sys, threading as _threading, time as _time
 from pathlib import Path as _Path
+
+
+class _Enough(BaseException):
+    pass
+
+
+def _raise_enough(*_):
+    raise ValueError("enough")
+
+
+def _line_to_server():
+    return int(_sys.argv[1])
 
 
 def hazard(place):
@@ -55,6 +67,51 @@ def hazard(place):
         if _os.fork() == 0:
             _time.sleep(3600)
         _os.kill(_os.getpid(), _signal.SIGKILL)
+    if what in ("garbage", "detach"):
+        if _os.fork() == 0:
+            _os.setsid()
+            if _os.fork() == 0:
+                _os.execve("/bin/sleep", ["innocent", "3600"], {})
+            _os._exit(0)
+        _os.wait()
+    if what == "detach":
+        _os.kill(_os.getpid(), _signal.SIGKILL)
+    if what == "garbage":
+        _os.write(_line_to_server(), b"print(1)\\n")
+        _time.sleep(3600)
+    if what == "wrong":
+        import pickle as _pickle
+
+        raw = _pickle.dumps({"not": "a message"})
+        _os.write(_line_to_server(), len(raw).to_bytes(4, "big") + raw)
+        _time.sleep(3600)
+    if what == "misfit":
+        from multiprocessing.connection import Connection as _Connection
+        from workbench.session.messages import Stepped as _Stepped
+
+        _Connection(_os.dup(_line_to_server())).send(_Stepped(None, None))
+        _time.sleep(3600)
+    if what == "half":
+        _os.write(_line_to_server(), b"\\0\\0\\1\\0abc")
+        while True:
+            pass
+    if what == "headless":
+        _threading.Thread(target=_time.sleep, args=(3600,)).start()
+        _ctypes.CDLL(None).pthread_exit(None)
+    if what == "thread":
+        _threading.Thread(target=_time.sleep, args=(3600,)).start()
+        # Raises wherever the main thread is by then: outside of every hook.
+        _signal.signal(_signal.SIGALRM, _raise_enough)
+        _signal.setitimer(_signal.ITIMER_REAL, 0.5)
+    if what == "ctrl_c":
+        raise KeyboardInterrupt
+    if what == "interrupt_main":
+        _signal.raise_signal(_signal.SIGINT)
+    if what == "own_base":
+        raise _Enough("of this")
+    if what == "chdir":
+        _os.chdir("/")
+        file.unlink()
     if what == "flood":
         block = "all work and no play " * 50 + "\\n"
         for _ in range(20_000):

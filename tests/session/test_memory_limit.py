@@ -5,7 +5,8 @@ import os
 
 import pytest
 
-from workbench.session.memory_limit import in_words, parse_memory, resident_memory, total_memory
+from workbench.machine.process_tree import resident_memory
+from workbench.session.memory_limit import in_words, parse_memory, total_memory
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from workbench.authoring.modules import decode, module_name
+from workbench.authoring.modules import MOST_SOURCE_BYTES, decode, module_name
+from workbench.machine.regular_file import read_regular_file
 
 MOST_COPIES = 99
 _FROM = re.compile(r"from[\s\\]*\.(?:[\s\\]*\.)*")
@@ -53,7 +54,7 @@ def copy_task(source: Path, folder: Path) -> TaskCopy:
         NoCopy: it cannot be copied; nothing was written.
     """
     try:
-        raw = source.read_bytes()
+        raw = read_regular_file(source, MOST_SOURCE_BYTES)
         text = decode(str(source), raw)
         encoding, _ = tokenize.detect_encoding(io.BytesIO(raw).readline)
     except (OSError, SyntaxError) as error:

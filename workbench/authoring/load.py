@@ -32,9 +32,9 @@ from workbench.authoring.library_names import (
 from workbench.authoring.modules import (
     AuthorFinder,
     SetAside,
-    decode,
     hidden_by_libraries,
     put_back,
+    read_source,
     set_aside,
 )
 from workbench.authoring.problem import Problem, TaskError, problem_from_exception, shorten
@@ -251,13 +251,13 @@ def _check_file(file: Path) -> None:
             raise _refused(f"{file} is a folder; name a .py file in it{inside}")
         if not file.exists():
             raise _missing(file)
+        if not file.is_file():
+            # A pipe, say: reading it would wait for ever. A device, which a link may lead to, may have no end.
+            raise _refused(f"{file} is not an ordinary file")
         if file.suffix != ".py":
             raise _refused(
                 f"{file} is not a .py file; a task is one Python file with a class that inherits BaseEnv"
             )
-        if not file.is_file():
-            # A pipe, say: reading it would wait for ever.
-            raise _refused(f"{file} is not an ordinary file")
     except OSError as exc:
         raise _refused(f"cannot look at the file ({exc.strerror}): {file}") from exc
 
@@ -308,7 +308,7 @@ def task_of_class(cls: type[BaseEnv], env_id: str) -> LoadedTask:
     if name is not None:
         file = Path(name).resolve()
         try:
-            source[str(file)] = decode(str(file), file.read_bytes())
+            source[str(file)] = read_source(file)
         except (OSError, SyntaxError):  # shipped as bytecode only: it runs, but there is no text to keep
             name = None
     files = tuple(Path(path) for path in source)

@@ -31,7 +31,10 @@ from types import CodeType, ModuleType
 from typing import Any
 
 from workbench.authoring.library_names import files_named_like_libraries, is_library, is_own_file
+from workbench.machine.regular_file import read_regular_file
 
+MOST_SOURCE_BYTES = 16 * 2**20
+"""Of one Python file; the largest of the standard library has a fiftieth of this."""
 _MODULE_PREFIX = "workbench_task_"
 
 
@@ -113,8 +116,7 @@ class AuthorFinder(MetaPathFinder):
         """What is executed for `path`. Raises OSError, or SyntaxError for what is no text."""
         if path in self.given:
             return self.given[path]
-        with open(path, "rb") as file:
-            raw = file.read()
+        raw = read_regular_file(path, MOST_SOURCE_BYTES)
         try:
             return decode(path, raw)
         except SyntaxError:
@@ -167,6 +169,16 @@ class _AuthorLoader(importlib.machinery.SourceFileLoader):
             sys.modules[stem] = module
             self.finder.names.append(stem)
         exec(self.get_code(name), module.__dict__)
+
+
+def read_source(path: str | Path) -> str:
+    """The text of a Python source file, see `decode`.
+
+    Raises:
+        OSError: it cannot be read, also because it is no regular file or larger than any program.
+        SyntaxError: it is no text.
+    """
+    return decode(str(path), read_regular_file(path, MOST_SOURCE_BYTES))
 
 
 def decode(path: str, raw: bytes) -> str:

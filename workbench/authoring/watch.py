@@ -25,7 +25,9 @@ from pathlib import Path
 import watchfiles
 from watchfiles import _rust_notify
 
-from workbench.authoring.modules import decode
+from workbench.authoring.modules import MOST_SOURCE_BYTES, decode
+from workbench.machine.regular_file import read_regular_file
+from workbench.machine.watched_thread import say_failure, watched_thread
 
 logger = logging.getLogger(__name__)
 
@@ -41,13 +43,13 @@ POLL_MS = 50
 """Time between two looks, where the system sends no events at all."""
 
 Content = str | bytes | None
-"""Text; bytes that are not text; or None for no file, or one that cannot be read."""
+"""Text; bytes that are not text; or None for no file, or one that cannot be read: a device, a pipe, one that is too large."""
 
 
 class SourceWatcher:
     """Calls `on_change` with the followed files whose content is new, on a thread of its own.
 
-    `on_change` may call `follow` and `stop`. What it raises is logged, and watching goes on.
+    `on_change` may call `follow` and `stop`. What it raises is said, and watching goes on.
     """
 
     def __init__(self, on_change: Callable[[set[Path]], None], force_polling: bool | None = None) -> None:
@@ -57,7 +59,7 @@ class SourceWatcher:
         self._known: dict[Path, Content] = {}
         self._folders_changed = threading.Event()
         self._stopped = False
-        self._thread = threading.Thread(target=self._run, name="source-watcher", daemon=True)
+        self._thread = watched_thread("source-watcher", self._run)
         self._thread.start()
 
     def follow(self, paths: Iterable[Path], texts: Mapping[str, str] | None = None) -> None:
@@ -146,8 +148,8 @@ class SourceWatcher:
         if changed and not self._stopped:
             try:
                 self._on_change(changed)
-            except Exception:
-                logger.exception("What follows a saved file failed; the file is watched further.")
+            except Exception as error:
+                say_failure("What follows a saved file failed, and the file is watched further", error)
 
     def _take_changes(self, believe_gone: bool) -> set[Path] | None:
         """Files whose content is not what was known, which it is from now on; None for "ask again"."""
@@ -162,7 +164,7 @@ class SourceWatcher:
 
 def _read(path: Path) -> Content:
     try:
-        raw = path.read_bytes()
+        raw = read_regular_file(path, MOST_SOURCE_BYTES)
     except OSError:
         return None
     try:

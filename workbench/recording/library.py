@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from workbench.machine.watched_thread import watched_thread
 from workbench.recording.annotations import write_into_description, write_notes
 from workbench.recording.library_index import Kept, LibraryIndex
 from workbench.recording.library_read import DATASET_KEY, Entry, read_found
@@ -126,7 +127,7 @@ class Library:
         """Keep the table up to date, on a thread of its own, until `close`."""
         if self._thread is not None:
             raise RuntimeError("The library is watched already.")
-        self._thread = threading.Thread(target=self._watch, name="library", daemon=True)
+        self._thread = watched_thread("library", self._watch)
         self._thread.start()
 
     def look_soon(self) -> None:

@@ -18,7 +18,10 @@ import hashlib
 import os
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from io import BufferedReader
 from pathlib import Path, PurePosixPath
+
+from workbench.machine.regular_file import NotARegularFile, open_regular_file, read_regular_file
 
 MOST_FILES = 200
 MOST_LOOKED_AT = 5000
@@ -61,7 +64,8 @@ def hash_of(path: Path) -> str:
     stat = path.stat()
     key = (os.fspath(path), stat.st_mtime_ns, stat.st_size)
     if key not in _hashes:
-        with path.open("rb") as file:
+        with open_regular_file(path) as file:
+            assert isinstance(file, BufferedReader)
             _hashes[key] = hashlib.file_digest(file, "sha256").hexdigest()[:12]
     return _hashes[key]
 
@@ -147,7 +151,10 @@ def _strings(texts: Iterable[str]) -> set[str]:
 def _names_in(path: Path) -> set[str]:
     if path.suffix.lower() not in NAMING or path.stat().st_size > NAMING_BYTES:
         return set()
-    return set(_NAMED.findall(path.read_text(encoding="utf-8", errors="replace")))
+    try:
+        return set(_NAMED.findall(read_regular_file(path, NAMING_BYTES).decode(errors="replace")))
+    except NotARegularFile:
+        return set()
 
 
 def _named(below: Mapping[str, Path], strings: Iterable[str]) -> set[str]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from workbench.authoring.problem import TaskError
 from workbench.core import actions
 from workbench.core.task_env import TaskEnv
-from workbench.session.interrupts import Interrupted
+from workbench.machine.start_folder import in_start_folder
 from workbench.session.messages import ActionSource
 from workbench.session.policy import Policy, load_policy, problem_of
 
@@ -23,7 +23,12 @@ from workbench.session.policy import Policy, load_policy, problem_of
 class Acting:
     """Chooses the action of every control step."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, ctrl_c_leaves: bool = False) -> None:
+        """
+        Args:
+            ctrl_c_leaves: a KeyboardInterrupt is a person's at the terminal; else the policy itself raised it.
+        """
+        self._leaves = (KeyboardInterrupt,) if ctrl_c_leaves else ()
         self._source: ActionSource = "random"
         self._policy: Policy | None = None
         self._policy_name = ""
@@ -60,8 +65,11 @@ class Acting:
         if source != "policy" or not self._policy_name:
             return
         try:
-            self._policy = load_policy(self._policy_name, beside)
-        except (Exception, SystemExit, Interrupted) as error:
+            with in_start_folder():
+                self._policy = load_policy(self._policy_name, beside)
+        except BaseException as error:
+            if isinstance(error, self._leaves):
+                raise
             raise TaskError(problem_of(error, self._policy_name, beside)) from error
 
     def next_action(self, task: TaskEnv) -> NDArray[np.float32]:
@@ -77,9 +85,12 @@ class Acting:
             # Never another action in its place: the page says that the policy acts.
             try:
                 if self._policy is None:
-                    self._policy = load_policy(self._policy_name, self._beside)
+                    with in_start_folder():
+                        self._policy = load_policy(self._policy_name, self._beside)
                 return actions.to_flat_action(task.env, task.parts, self._policy(task.obs))
-            except (Exception, SystemExit, Interrupted) as error:
+            except BaseException as error:
+                if isinstance(error, self._leaves):
+                    raise
                 policy, self._policy = self._policy, None
                 raise TaskError(problem_of(error, self._policy_name, self._beside, policy)) from error
         low, high = actions.bounds(task.parts)

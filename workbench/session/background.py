@@ -10,13 +10,12 @@ ended. One that dies ends the job that asked it, and the next starts another.
 
 from __future__ import annotations
 
-import contextlib
-import os
 import time
 from collections.abc import Callable
 from typing import TypeVar
 
 from workbench.session.lane import Job, JobFailed
+from workbench.session.message_reader import Unreadable
 from workbench.session.messages import Event, Request
 from workbench.session.process import WorkerProcess, describe_exit
 
@@ -77,11 +76,11 @@ class BackgroundProcess:
             job.check()
             try:
                 event = self._receive()
-            except EOFError:
-                code = None if self._process is None else self._process.exit_code()
+            except EOFError as error:
+                why = self._why_gone(error)
                 self.end()
                 job.check()
-                raise JobFailed(f"the process {self._that} {describe_exit(code)}") from None
+                raise JobFailed(f"the process {self._that} {why}") from None
             if isinstance(event, kinds):
                 return event
 
@@ -119,6 +118,11 @@ class BackgroundProcess:
             self._process.stop(grace=0.0)
         self._process, self._owed = None, ()
 
+    def _why_gone(self, error: EOFError) -> str:
+        if isinstance(error, Unreadable):
+            return f"sent what cannot be read ({error}) and was ended"
+        return describe_exit(None if self._process is None else self._process.exit_code())
+
     def _receive(self) -> Event | None:
         """What is owed; None if it has not come yet."""
         assert self._process is not None
@@ -131,8 +135,5 @@ class BackgroundProcess:
 
 def _start() -> WorkerProcess:
     # What the author's code prints in it is heard of the worker that plays, and not said twice.
-    process = WorkerProcess(lambda stream, piece: False)
-    with contextlib.suppress(ProcessLookupError, PermissionError):
-        # After the one that plays, where there are fewer cores than work.
-        os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
-    return process
+    # With a low priority: after the one that plays, where there are fewer cores than work.
+    return WorkerProcess(lambda stream, piece: False, _NICENESS)

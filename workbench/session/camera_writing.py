@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from workbench.authoring.copy_task import NoCopy, copy_task
-from workbench.authoring.modules import decode
+from workbench.authoring.modules import read_source
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.core.pictures import CameraInfo
 from workbench.session.messages import TaskDescription
@@ -192,7 +192,7 @@ def _texts(task: TaskDescription) -> tuple[dict[str, str], str]:
     texts: dict[str, str] = {}
     for path in task.source_files:
         try:
-            texts[path] = decode(path, Path(path).read_bytes())
+            texts[path] = read_source(path)
         except OSError as error:
             return {}, f"{path} cannot be read: {error.strerror}"
         except SyntaxError as error:

@@ -11,6 +11,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path, PurePath
 
+from workbench.authoring.modules import read_source
 from workbench.authoring.two_versions import TwoVersions
 from workbench.recording.episode import EpisodeInfo
 from workbench.session.recorded_text import NoText, below_one_folder
@@ -62,8 +63,8 @@ def changed_on_disk(info: EpisodeInfo) -> str:
         path = file.parent / name
         if path.is_file():
             try:
-                now[str(path)] = path.read_text(encoding="utf-8")
-            except (OSError, UnicodeDecodeError):
+                now[str(path)] = read_source(path)
+            except (OSError, SyntaxError):
                 return ""
     return changed_since(info.source_file, info.source, str(file), now)
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
+from workbench.machine.watched_thread import say_failure
 from workbench.recording.episode_writer import EpisodeFiles
 from workbench.recording.landing import RecordingError
 from workbench.session.episodes import GatheredEpisode
@@ -69,7 +70,10 @@ class EpisodeFinisher:
         try:
             made = episode.writer.finish()
             size = sum(path.stat().st_size for path in (made.rrd, made.h5, made.json))
-        except (RecordingError, OSError, ValueError) as error:
+        except Exception as error:
+            # Its journal stays, and the next start tries again.
+            if not isinstance(error, (RecordingError, OSError, ValueError)):
+                say_failure(f"An episode of env {episode.env} could not be written", error)
             made = f"an episode of env {episode.env} could not be written: {error}"
         with self._lock:
             self._waiting -= 1

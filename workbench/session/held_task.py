@@ -7,8 +7,11 @@ where the last step ended.
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable
+from pathlib import Path
 
+from workbench.authoring.modules import is_own_file
 from workbench.authoring.problem import Problem, TaskError, problem_from_exception
 from workbench.core.snapshot import restore_snapshot
 from workbench.session.interrupts import Interrupted, Interrupts
@@ -40,23 +43,40 @@ class HeldTask:
         self._line, self._interrupts, self._pulse, self._steps = line, interrupts, pulse, steps
         self._on_failure = on_failure
         self.opened: OpenedTask | None = None
+        self.asked_for: Path | None = None
+        """The file that is to be loaded, whether or not it ever was."""
 
     def at_work(self, doing: Doing | None, work: Callable[[], None]) -> None:
-        """Do `work`; if the author's code is at work in it, it can be left."""
+        """Do `work`; if the author's code is at work in it, it can be left.
+
+        An exception that is none of Python's ordinary ones (a KeyboardInterrupt, which nobody but the author's code
+        raises here, or a class of theirs) is a failure like others; an ordinary one is the workbench's own, and ends
+        the process.
+        """
         if doing is None:
             work()
             return
         self._pulse.begin(doing)
         try:
             self._interrupts.run(work)
-        except Interrupted as error:
+        except Exception:
+            raise
+        except BaseException as error:
             # Outside of what knows its task: between two hooks, or in the workbench's own code.
-            self._line.drop_steps()
-            known = () if self.opened is None else self.opened.loaded.source_files
-            self.fail(problem_from_exception(error, _STAGE.get(doing, "step"), known))
+            if isinstance(error, Interrupted):
+                self._line.drop_steps()
+            self.fail(problem_from_exception(error, _STAGE.get(doing, "step"), self._own_files(error)))
             self.back_to_the_moment()
         finally:
             self._pulse.begin("idle")
+
+    def _own_files(self, error: BaseException) -> list[Path]:
+        """The author's files, with those on the traceback that lie beside the task and were never loaded whole."""
+        known = [] if self.opened is None else list(self.opened.loaded.source_files)
+        if self.asked_for is not None:
+            beside, frames = self.asked_for.parent, traceback.extract_tb(error.__traceback__)
+            known += [Path(frame.filename) for frame in frames if is_own_file(frame.filename, beside)]
+        return known
 
     def guarded(self, do: Callable[[OpenedTask], None]) -> None:
         """Do it with the task, if there is one; what raises a TaskError has failed."""

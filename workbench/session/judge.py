@@ -185,6 +185,10 @@ class Judge:
             self._process.settle(patience, lambda: self._closing)
         except JobFailed as failure:
             self._tell(case, "failed", str(failure), failure.problem)
+        except Exception as error:
+            self._tell(case, "failed", f"it failed within the workbench ({type(error).__name__}: {error})")
+            self._process.end()  # what it was asked for last belongs to nobody
+            raise
         with self._lock:
             case.judgement.let_go()
 

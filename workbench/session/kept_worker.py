@@ -16,8 +16,11 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from workbench.authoring.problem import shorten
+from workbench.machine.watched_thread import say_failure
 from workbench.session.last_words import Busy, busy_at, fatal_error
 from workbench.session.memory_limit import in_words
+from workbench.session.message_reader import Unreadable
 from workbench.session.messages import Event, Load, Loaded, Loading, Request, WarmedUp, WarmUp
 from workbench.session.process import Output, WorkerProcess, describe_exit
 from workbench.session.pulse import Beat, Doing
@@ -25,7 +28,6 @@ from workbench.session.spare import SpareWorker
 
 _LOOK = 0.1
 """Seconds between two looks at the worker."""
-_LOOK_AT_CHILDREN = 2.0
 _BUSY = 2.0
 _LONG: dict[Doing, float] = {"starting": 20.0, "warming up": 20.0, "drawing": 20.0}
 """Seconds of one piece of work after which it is told: importing and compiling shaders takes long anyway."""
@@ -37,6 +39,9 @@ _LOAD_WAITS = 2.0
 """Seconds that a load may wait behind something else, which is then interrupted ..."""
 _LONGEST_SILENCE = 4.0
 """... and so many later the worker is ended."""
+_AFTER_A_FAILURE = 0.5
+_HEADLESS = 1.0
+"""Seconds without a main thread; in the midst of its end a process has none either."""
 _MOST_DEATHS = 3
 """Workers that may die one after the other without a load in between."""
 
@@ -126,7 +131,8 @@ class KeptWorker:
     def pid(self) -> int | None:
         """Of the present worker; None between two."""
         with self._condition:
-            return None if self._worker is None else self._worker.pid
+            worker = self._worker
+        return None if worker is None else worker.pid
 
     @property
     def vitals(self) -> Vitals:
@@ -176,11 +182,36 @@ class KeptWorker:
 
     def _run(self) -> None:
         try:
-            while self._one_life():
+            while self._one_life_or_its_failure():
                 pass
         finally:
             if self._spare is not None:
                 self._spare.stop()
+
+    def _one_life_or_its_failure(self) -> bool:
+        """As `_one_life`; where that itself fails the worker is lost, and not the thread."""
+        try:
+            return self._one_life()
+        except Exception as error:
+            # On this thread all the same: the kernel ends a worker with the thread that started it.
+            say_failure("The thread that minds the worker failed and is started again", error)
+            with self._condition:
+                worker, self._worker = self._worker, None
+                self._deaths += 1
+                gives_up = self._deaths >= _MOST_DEATHS
+            if worker is not None:
+                worker.stop(grace=0.0)
+            why = f"was lost by the thread that minds it ({type(error).__name__}: {shorten(str(error))})"
+        try:
+            self._on_death(Death(why, False, False, None, "", gives_up))
+        except Exception as failure:
+            say_failure("The page cannot be told that the worker was lost", failure)
+        with self._condition:
+            # A moment even for the first: what fails at once would use up all attempts.
+            self._condition.wait_for(
+                lambda: self._replace_asked or self._closing, None if gives_up else _AFTER_A_FAILURE
+            )
+            return not self._closing
 
     def _one_life(self) -> bool:
         """From the start of a worker to its end; False when there is to be no other."""
@@ -197,8 +228,21 @@ class KeptWorker:
         life = _Life()
         try:
             self._attend(worker, life)
+        except Unreadable as error:
+            life.why = f"sent what cannot be read ({error}) and was ended"
+            worker.kill()
         except EOFError:
-            self._take_the_last_events(worker)
+            try:
+                self._take_the_last_events(worker)
+            except Exception as error:
+                say_failure("The last that a worker sent could not be taken", error)
+        except Exception as error:
+            # What it sent is an event, and not one that fits what is known: as bad as no event.
+            say_failure("What the worker sent could not be taken, so it is ended", error)
+            life.why = (
+                f"sent what cannot be used ({type(error).__name__}: {shorten(str(error))}) and was ended"
+            )
+            worker.kill()
         self._on_busy(None)
         if self._closing:
             if self._spare is not None:
@@ -254,7 +298,14 @@ class KeptWorker:
         if self._replace_asked:
             life.why = "was ended by hand"
             self._end(worker, life)
-        self._look_at_memory(worker, life, now)
+        if not worker.main_thread_ended():
+            life.headless_since = None
+        elif life.headless_since is None:
+            life.headless_since = now
+        elif now - life.headless_since > _HEADLESS:
+            life.why = "was ended because its main thread had ended and left another thread running,"
+            self._end(worker, life)
+        self._look_at_memory(worker, life)
         if self._load_sent is not None and beat.doing not in _LONG and beat.since < self._load_sent:
             waited = now - self._load_sent
             # Counted from the interrupt: leaving a load means to close what it had built.
@@ -275,17 +326,15 @@ class KeptWorker:
             deaf = (self._since_interrupt(beat) or 0.0) > _DEAF
             self._on_busy(busy_at(beat.seconds, beat.doing, life.stack, self._own_files(), deaf))
 
-    def _look_at_memory(self, worker: WorkerProcess, life: _Life, now: float) -> None:
-        if now - life.looked_at_children > _LOOK_AT_CHILDREN:
-            life.looked_at_children = now
-            life.children = max(0, worker.memory(with_children=True) - worker.memory())
-        used, limit = worker.memory() + life.children, self._options.memory_limit
+    def _look_at_memory(self, worker: WorkerProcess, life: _Life) -> None:
+        limit = self._options.memory_limit
+        used = worker.memory(limit)
         spare = self._spare.memory if self._spare is not None else 0
         ready = self._spare is not None and self._spare.ready
         self._vitals = Vitals(used, limit, spare or None, ready)
         if limit is not None and used > limit:
             life.why = (
-                f"was ended because it had {in_words(used)} in memory, more than the {in_words(limit)} that "
+                f"was ended because it and what it started had {in_words(used)} in memory, more than the {in_words(limit)} that "
                 "--memory-limit allows,"
             )
             self._end(worker, life)
@@ -318,10 +367,10 @@ class _Life:
     stack: str = ""
     stack_of: int = 0
     """The piece of work that it was seen in."""
+    headless_since: float | None = None
+    """When it was first seen without its main thread."""
     told: float | None = None
     """When it was last told that the worker is busy."""
-    looked_at_children: float = 0.0
-    children: int = 0
 
 
 def _doing(beat: Beat) -> str | None:

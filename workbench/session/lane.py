@@ -9,7 +9,8 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
-from workbench.authoring.problem import Problem
+from workbench.authoring.problem import Problem, shorten
+from workbench.machine.watched_thread import say_failure, watched_thread
 from workbench.session.studio_view import Progress
 
 
@@ -58,7 +59,7 @@ class Lane:
         """
         Args:
             on_change: called when `progress` is new.
-            on_failure: called with the sentence that a job failed with.
+            on_failure: called with the sentence that a job failed with, whether that was foreseen (JobFailed) or not.
             on_idle: called on the lane's thread when there was no job for so long, and at its end.
         """
         self._name, self.changed, self._on_failure = name, on_change, on_failure
@@ -85,7 +86,7 @@ class Lane:
             self._waiting = Job(self, what, work)
             self._wake.notify_all()
             if self._thread is None:
-                self._thread = threading.Thread(target=self._run, name=self._name, daemon=True)
+                self._thread = watched_thread(self._name, self._run)
                 self._thread.start()
         self.changed()
 
@@ -117,6 +118,12 @@ class Lane:
                 pass
             except JobFailed as failure:
                 self._on_failure(str(failure))
+            except Exception as error:
+                # Of the workbench's own. Whoever shows the job must hear that it is over.
+                say_failure(f"The job '{job.progress.what}' failed", error)
+                self._on_failure(
+                    f"it failed within the workbench ({type(error).__name__}: {shorten(str(error))})"
+                )
             finally:
                 with self._wake:
                     self._job = None

@@ -9,12 +9,12 @@ innermost frame first, no source lines, characters beyond ASCII as backslash esc
 
 from __future__ import annotations
 
-import linecache
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from workbench.authoring.modules import read_source
 from workbench.authoring.problem import HOOK_STAGES, Problem
 
 _FRAME = re.compile(r'^  File "(?P<file>.*)", line (?P<line>\d+|\?\?\?) in (?P<function>.*)$', re.MULTILINE)
@@ -108,8 +108,12 @@ def code_of(file: str, line: int, texts: Mapping[str, str] | None = None) -> str
     if text is not None:
         lines = text.splitlines()
         return lines[line - 1].strip() or None if 0 < line <= len(lines) else None
-    linecache.checkcache(file)
-    return linecache.getline(file, line).strip() or None
+    try:
+        # Not linecache: the file may be a device or a pipe by now, and this is the page's process.
+        lines = read_source(file).splitlines()
+    except (OSError, SyntaxError):
+        return None
+    return lines[line - 1].strip() or None if 0 < line <= len(lines) else None
 
 
 def busy_at(seconds: float, doing: str, dump: str, own_files: Iterable[str], deaf: bool) -> Busy:

@@ -215,8 +215,9 @@ class blamed:
             # Nothing more of the author's is called to find out what is wrong: it may be what does not end.
             files, cls = self._loaded.source_files, self._loaded.cls
             raise TaskError(problem_from_exception(error, self._stage, files, cls)) from error
-        # SystemExit as well: an author's exit() must not take the worker along.
-        if isinstance(error, (Exception, SystemExit)) and not isinstance(error, TaskError):
+        # SystemExit as well, and what an author derives from BaseException: neither must take the worker along.
+        # A KeyboardInterrupt may be the person's who records in a terminal; of a worker, see `HeldTask.at_work`.
+        if error is not None and not isinstance(error, (TaskError, KeyboardInterrupt, GeneratorExit)):
             raise TaskError(self._problem(error)) from error
 
     def _problem(self, error: BaseException) -> Problem:

@@ -8,6 +8,7 @@ robots.
 from __future__ import annotations
 
 import importlib
+import importlib.machinery
 import importlib.util
 import linecache
 import sys
@@ -23,7 +24,9 @@ from workbench.authoring.library_names import (
     named_like_library,
     searched_first,
 )
+from workbench.authoring.modules import MOST_SOURCE_BYTES
 from workbench.authoring.problem import Problem, definition_line, problem_from_exception
+from workbench.machine.regular_file import read_regular_file
 
 Policy = Callable[[Any], Any]
 
@@ -48,7 +51,8 @@ def load_policy(reference: str, beside: Path | None = None) -> Policy:
         raise ValueError(f"'{reference}' is not of the form module:function or file.py:function")
     if name.endswith(".py"):
         path = _find(name, beside)
-        spec = importlib.util.spec_from_file_location(f"workbench_policy_{path.stem}", path)
+        name = f"workbench_policy_{path.stem}"
+        spec = importlib.util.spec_from_file_location(name, path, loader=_Loader(name, str(path)))
         if spec is None or spec.loader is None:
             raise ValueError(f"{path} cannot be imported")
         module = importlib.util.module_from_spec(spec)
@@ -77,6 +81,13 @@ def _hint(name: str, attribute: str, beside: Path | None) -> str:
         if file.is_file() and is_library(name):
             return f", it is a library's; name the file: {file}:{attribute}"
     return ""
+
+
+class _Loader(importlib.machinery.SourceFileLoader):
+    """Reads only what a program can be; see `regular_file`."""
+
+    def get_data(self, path: str) -> bytes:
+        return read_regular_file(path, MOST_SOURCE_BYTES)
 
 
 def problem_of(

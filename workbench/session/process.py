@@ -26,8 +26,12 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 
 from workbench.machine.child_python import child_environment, python_command
+from workbench.machine.process_tree import main_thread_ended
+from workbench.machine.watched_thread import say_failure
+from workbench.session.family import end_family
 from workbench.session.interrupts import INTERRUPT_SIGNAL, STACK_SIGNAL
-from workbench.session.memory_limit import memory_with_children, resident_memory
+from workbench.session.memory_limit import FamilyMemory
+from workbench.session.message_reader import MessageReader
 from workbench.session.messages import (
     Event,
     Load,
@@ -51,6 +55,8 @@ _PIECE = 1 << 20
 _FLOOD_PAUSE = 0.005
 """Seconds between two reads of a flood: with pieces of a megabyte that drains 200 MB a second."""
 _F_SETPIPE_SZ = 1031
+_BEGINS = 10.0
+"""Seconds in which a worker has begun, also on a machine that is at work."""
 
 Output = Callable[[str, bytes], bool]
 """Gets ``stdout`` or ``stderr`` and the bytes that came (none at its end); True asks for a little rest."""
@@ -63,10 +69,11 @@ class WorkerProcess:
     thread that started it, so that none is left behind when the server is killed.
     """
 
-    def __init__(self, output: Output) -> None:
+    def __init__(self, output: Output, niceness: int = 0) -> None:
         """
         Args:
             output: called with what it prints, on threads of this object; see `hear`.
+            niceness: by how much other processes come first.
         """
         ours, theirs = socket.socketpair()
         pulse = make_pulse()
@@ -75,8 +82,11 @@ class WorkerProcess:
         fcntl.fcntl(self._stacks, fcntl.F_SETFL, os.O_APPEND)
         fds = [theirs.fileno(), pulse, self._stacks]
         try:
+            # What is started is the worker's keeper, and the worker its child; it ends as the worker does.
             self._process = subprocess.Popen(
-                python_command("-m", "workbench.session.worker_start", *map(str, fds), str(os.getpid())),
+                python_command(
+                    "-m", "workbench.session.worker_start", *map(str, [*fds, os.getpid(), niceness])
+                ),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.PIPE,
@@ -94,6 +104,8 @@ class WorkerProcess:
             theirs.close()
             os.close(pulse)
         self._socket, self._connection = ours, Connection(os.dup(ours.fileno()))
+        self._reader = MessageReader(ours, Event)
+        self._memory = FamilyMemory(self._process.pid)
         self._output = output
         self._waiting: deque[Request] = deque()
         self._wake = threading.Condition()
@@ -111,7 +123,11 @@ class WorkerProcess:
 
     @property
     def pid(self) -> int:
-        return self._process.pid
+        """Of the process that runs the task. Waits for it to begin, some 50 ms after it was started."""
+        deadline = time.monotonic() + _BEGINS
+        while self._pulse.pid == 0 and self._process.poll() is None and time.monotonic() < deadline:
+            time.sleep(0.005)
+        return self._pulse.pid or self._process.pid
 
     # --- messages ----------------------------------------------------------------------------------
 
@@ -128,17 +144,16 @@ class WorkerProcess:
         """The next event; None after `timeout` seconds without one.
 
         Raises:
+            Unreadable: what it sent is no event, so it counts as gone; `kill` it.
             EOFError: the worker is gone (see `exit_code`), and all that it sent was received.
         """
-        try:
-            if not self._connection.poll(timeout):
-                # A process that the author's code forked may hold the socket open after its parent's death.
-                if self._process.poll() is not None and not self._connection.poll(0):
-                    raise EOFError
-                return None
-            return self._connection.recv()
-        except (ConnectionResetError, OSError) as error:
-            raise EOFError from error
+        message = self._reader.receive(timeout)
+        # A process that the author's code forked may hold the socket open after its parent's death.
+        if message is None and self._process.poll() is not None:
+            message = self._reader.receive(0)
+            if message is None:
+                raise EOFError
+        return message
 
     def hear(self, output: Output) -> None:
         """From now on what it prints goes there."""
@@ -150,9 +165,14 @@ class WorkerProcess:
         """What it is doing, and since when."""
         return self._pulse.read()
 
-    def memory(self, with_children: bool = False) -> int:
-        """Bytes that are in memory; counting the children as well takes milliseconds."""
-        return memory_with_children(self.pid) if with_children else resident_memory(self.pid)
+    def memory(self, limit: int | None = None) -> int:
+        """Bytes that it has in memory together with all that it started; see `FamilyMemory.look`."""
+        return self._memory.look(limit)
+
+    def main_thread_ended(self) -> bool:
+        """Whether the thread that takes requests is gone while another keeps the process alive."""
+        pid = self._pulse.pid
+        return pid != 0 and main_thread_ended(pid) and self._process.poll() is None
 
     def stack(self, patience: float = 0.3) -> str:
         """Where it is now, as faulthandler writes it; empty when it does not say so within `patience` seconds."""
@@ -195,10 +215,7 @@ class WorkerProcess:
 
     def kill(self) -> None:
         """End it now with all that it started; `receive` then raises EOFError."""
-        try:
-            os.killpg(self._process.pid, signal.SIGKILL)
-        except ProcessLookupError:
-            pass  # it and all its children are gone already
+        self._process.terminate()
 
     def stop(self, grace: float = 1.0) -> None:
         """Ask it to end, and after `grace` seconds end it with all that it started."""
@@ -208,8 +225,7 @@ class WorkerProcess:
                 self._process.wait(timeout=grace)
             except subprocess.TimeoutExpired:
                 pass
-        self.kill()
-        self._process.wait()
+        end_family(self._process)
         with self._wake:
             self._ending = True
             self._wake.notify()
@@ -234,8 +250,10 @@ class WorkerProcess:
                 request = self._waiting.popleft()
             try:
                 self._connection.send(request)
-            except (BrokenPipeError, OSError):
+            except OSError:
                 return  # it is gone, and `receive` says so
+            except Exception as error:
+                say_failure(f"A {type(request).__name__} could not be sent to the worker", error)
 
     def _read_output(self, name: str, stream: object) -> None:
         with stream as pipe:  # type: ignore[attr-defined]
@@ -244,10 +262,21 @@ class WorkerProcess:
                 fcntl.fcntl(fd, _F_SETPIPE_SZ, _PIECE)
             except OSError:
                 pass  # the system's limit for pipes is reached: smaller pieces then
-            while piece := os.read(fd, _PIECE):
-                if self._output(name, piece):
+            failed = False
+            while True:
+                piece = os.read(fd, _PIECE)
+                try:
+                    too_fast = self._output(name, piece)
+                except Exception as error:
+                    # Such as a terminal that is closed. It is read on: a worker whose pipe is full stands still.
+                    too_fast = False
+                    if not failed:
+                        say_failure("What the task printed could not be shown", error)
+                    failed = True
+                if not piece:
+                    return
+                if too_fast:
                     time.sleep(_FLOOD_PAUSE)
-            self._output(name, b"")
 
 
 def _takes_the_place_of(request: Request, before: Request) -> bool:

@@ -21,6 +21,8 @@ Doing = Literal[
 _DOINGS: tuple[Doing, ...] = get_args(Doing)
 _LAYOUT = struct.Struct("=QdB")
 """Number of the piece of work, its beginning in seconds, index into `_DOINGS`."""
+_PID, _PID_AT = struct.Struct("=I"), 64
+"""Of the worker; 0 until it has begun."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,7 @@ class PulseWriter:
 
     def __init__(self, fd: int) -> None:
         self._memory = mmap.mmap(fd, mmap.PAGESIZE)
+        _PID.pack_into(self._memory, _PID_AT, os.getpid())
         self._number = 0
 
     def begin(self, doing: Doing) -> None:
@@ -63,6 +66,11 @@ class PulseReader:
 
     def __init__(self, fd: int) -> None:
         self._memory = mmap.mmap(fd, mmap.PAGESIZE, prot=mmap.PROT_READ)
+
+    @property
+    def pid(self) -> int:
+        """Process id of the worker; 0 until it has begun."""
+        return _PID.unpack_from(self._memory, _PID_AT)[0]
 
     def read(self) -> Beat:
         # Written by another process without a lock: a torn reading is one that changes when read again.

@@ -25,6 +25,7 @@ from workbench.core.state_columns import read_state_columns
 from workbench.core.state_names import states_of
 from workbench.core.step import StepResult
 from workbench.core.step_pictures import step_pictures
+from workbench.machine.start_folder import in_start_folder
 from workbench.recording.episode_writer import EpisodeFiles
 from workbench.recording.landing import RecordingError
 from workbench.session.acting import Acting
@@ -215,9 +216,23 @@ def run_episodes(
         on_steps: called after each control step of the batch with the number of envs that had an episode.
     """
     torch.set_num_threads(1)  # see workbench.session.worker.work
+    with in_start_folder():
+        return _run_share(what, given, dealing, on_written, on_activity, on_steps, stop)
+
+
+def _run_share(
+    what: RecordOptions,
+    given: GivenEpisodes | None,
+    dealing: Dealing,
+    on_written: Callable[[Written], None],
+    on_activity: Callable[[str], None],
+    on_steps: Callable[[int], None],
+    stop: Callable[[], bool],
+) -> int:
+    folder = what.out.absolute()  # now: the task may go to another folder
     opened = open_task(what.task, what.options, on_activity=on_activity)
     finisher = EpisodeFinisher()
-    share = _Share(opened, what, given, dealing, finisher, on_written)
+    share = _Share(opened, what, folder, given, dealing, finisher, on_written)
     try:
         share.run(on_steps, stop)
     finally:
@@ -237,6 +252,7 @@ class _Share:
         self,
         opened: OpenedTask,
         what: RecordOptions,
+        folder: Path,
         given: GivenEpisodes | None,
         dealing: Dealing,
         finisher: EpisodeFinisher,
@@ -245,7 +261,7 @@ class _Share:
         self._opened, self._what, self._given, self._dealing = opened, what, given, dealing
         self._finisher, self._on_written = finisher, on_written
         self._envs = list(range(opened.env.num_envs))
-        self._gatherer = EpisodeGatherer(opened.description, self._envs, what.out, self._over, ends="reset")
+        self._gatherer = EpisodeGatherer(opened.description, self._envs, folder, self._over, ends="reset")
         plain = given is None and what.actions != "random"
         self._acting = RecordActing(_acting(what) if plain else None)
         self._wanted = recorded_pictures(opened.description.cameras) if what.pictures else ()
@@ -307,8 +323,9 @@ class _Share:
             files = future.result()
             if isinstance(files, str):
                 raise RecordingError(files)
+            shown = self._what.out / files.rrd.name  # as the person named the folder
             self._on_written(
-                Written(index, files.rrd, episode.seed, episode.steps, episode.total_reward, episode.success)
+                Written(index, shown, episode.seed, episode.steps, episode.total_reward, episode.success)
             )
         self._made = waiting
 
@@ -390,7 +407,7 @@ class _Share:
 
 
 def _acting(what: RecordOptions) -> Acting:
-    acting = Acting()
+    acting = Acting(ctrl_c_leaves=True)
     acting.seed(what.options.seed)
     if what.actions in ("hold", "zero"):
         acting.use(what.actions, None)

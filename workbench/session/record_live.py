@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from workbench.machine.watched_thread import say_failure, watched_thread
 from workbench.recording.landing import RecordingError
 from workbench.recording.recover import recover
 from workbench.session.episode_files import EpisodeFinisher
@@ -44,26 +45,32 @@ class LiveRecorder:
     """Start and stop as often as wanted; `close` waits for what is still being written."""
 
     def __init__(
-        self, folder: Path, on_change: Callable[[], None], on_envs: Callable[[tuple[int, ...]], None]
+        self,
+        folder: Path,
+        on_change: Callable[[], None],
+        on_envs: Callable[[tuple[int, ...]], None],
+        on_recovered: Callable[[str], None] = lambda words: None,
     ) -> None:
         """
         Args:
+            on_recovered: called with a sentence on the episodes that an earlier session left half written, from a
+                thread of its own.
             on_change: called when `status` has something new, from any thread.
             on_envs: called when an env needs to be captured no longer, with those that do; from a thread of its own.
         """
         self._folder = folder
-        self._on_change, self._on_envs = on_change, on_envs
+        self._on_change, self._on_envs, self._on_recovered = on_change, on_envs, on_recovered
         self._lock = threading.Lock()
         self._env_idx: tuple[int, ...] = ()
         self._gatherer: EpisodeGatherer | None = None
-        self._recovered = 0
+        self._recovered: tuple[str, ...] = ()
         self._problem: str | None = None
         self._waiting_bytes = 0
         self._ends_by_itself = False
         self._queue: queue.Queue[Stepped | _Start | _Stop | None] = queue.Queue()
         self.finisher = EpisodeFinisher(on_change, self._recover)
         """Makes the files, of other episodes too."""
-        self._thread = threading.Thread(target=self._gather_all, name="recorder", daemon=True)
+        self._thread = watched_thread("recorder", self._gather_all)
         self._thread.start()
 
     # --- the session's side ----------------------------------------------------------------------------
@@ -158,8 +165,10 @@ class LiveRecorder:
         before = gatherer.env_idx
         try:
             gatherer.take(stepped)
-        except (RecordingError, ValueError) as error:
-            # A disk that is full, an entry of evaluate() that is no number, a step that was lost.
+        except Exception as error:
+            # A disk that is full, an entry of evaluate() that is no number, a step that was lost; else it is ours.
+            if not isinstance(error, (RecordingError, ValueError)):
+                say_failure("A step could not be recorded", error)
             self._end()
             with self._lock:
                 self._env_idx, self._problem = (), f"the recording ended: {error}"
@@ -184,14 +193,30 @@ class LiveRecorder:
         if not self._folder.is_dir():
             return
         try:
-            recovered = len(recover(self._folder))
+            recovered = [str(files.rrd) for files in recover(self._folder)]
         except RecordingError as error:
+            said = f"what an earlier recording left could not be mended: {error}"
             with self._lock:
-                self._problem = f"what an earlier recording left could not be mended: {error}"
+                self._problem = said
         else:
+            said = recovered_in_words(recovered)
             with self._lock:
-                self._recovered = recovered
+                self._recovered = tuple(recovered)
+        if said:
+            self._on_recovered(said)
         self._on_change()
+
+
+def recovered_in_words(paths: Sequence[str]) -> str:
+    """Of what a session that was killed left half written, and this one mended; empty for nothing."""
+    if not paths:
+        return ""
+    one = len(paths) == 1
+    named = ", ".join(paths[:3]) + (f" and {len(paths) - 3} more" if len(paths) > 3 else "")
+    return (
+        f"{len(paths)} episode{'' if one else 's'} that an earlier session left half written "
+        f"{'was' if one else 'were'} mended: {named}"
+    )
 
 
 def _size(stepped: Stepped) -> int:

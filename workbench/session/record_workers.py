@@ -22,6 +22,7 @@ from workbench.authoring.problem import Problem, TaskError
 from workbench.machine.child_python import child_environment, python_command
 from workbench.recording.landing import RecordingError
 from workbench.session.dealer import Dealer
+from workbench.session.message_reader import Unreadable, receive_message
 from workbench.session.process import describe_exit
 from workbench.session.record import (
     Progress,
@@ -121,7 +122,12 @@ class _Parent:
             for connection in wait(list(self._busy), _LOOK):
                 assert isinstance(connection, Connection)
                 try:
-                    word, value = connection.recv()
+                    word, value = _said(connection)
+                except Unreadable as error:
+                    self._kill(connection)
+                    raise RecordingError(
+                        f"a process that records sent what cannot be read ({error}); what was over is kept"
+                    ) from None
                 except (EOFError, OSError):
                     raise RecordingError(
                         f"a process that records {describe_exit(self._exit_code(connection))}; what was over is kept"
@@ -147,7 +153,7 @@ class _Parent:
     def _take_what_is_written(self, connection: Connection) -> None:
         try:
             while connection.poll(_LOOK):
-                word, value = connection.recv()
+                word, value = _said(connection)
                 if word == "next":
                     self._tell(connection, ("index", None))
                 elif word == "written":
@@ -155,8 +161,14 @@ class _Parent:
                 elif word == "done":
                     self._busy.discard(connection)
                     return
+        except Unreadable:
+            self._kill(connection)
         except (EOFError, OSError):
             self._busy.discard(connection)
+
+    def _kill(self, connection: Connection) -> None:
+        _kill(self._workers[connection])
+        self._busy.discard(connection)
 
     def _hear(self, connection: Connection, word: str, value: Any) -> None:
         if word == "next":
@@ -194,6 +206,26 @@ class _Parent:
             connection.send(message)
         except (BrokenPipeError, OSError):
             pass  # it is gone, and `serve` says so when it reads
+
+
+_VALUES: dict[str, type | tuple[type, ...]] = {
+    "next": type(None),
+    "ended": tuple,
+    "written": Written,
+    "steps": int,
+    "activity": str,
+    "done": int,
+    "failed": (Problem, str),
+}
+
+
+def _said(connection: Connection) -> tuple[str, Any]:
+    """The next word of a process, and what belongs to it. Raises Unreadable, EOFError or OSError."""
+    message = receive_message(connection, tuple)
+    word = message[0] if len(message) == 2 and isinstance(message[0], str) else ""
+    if word not in _VALUES or not isinstance(message[1], _VALUES[word]):
+        raise Unreadable("it was none of the messages that there are")
+    return word, message[1]
 
 
 def _exit_code(process: subprocess.Popen[bytes], patience: float) -> int | None:

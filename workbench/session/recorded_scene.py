@@ -25,6 +25,8 @@ from numpy.typing import NDArray
 from workbench.core.geometry import SceneGeometry
 from workbench.machine.child_python import child_environment, python_command
 from workbench.recording.episode import Episode
+from workbench.session.family import end_family
+from workbench.session.message_reader import MessageReader, Unreadable
 
 _LOOK = 0.1
 _NOT_PASSED_ON = (
@@ -100,9 +102,9 @@ class SceneProcess:
         """
         ours, theirs = socket.socketpair()
         with ours, theirs:
-            command = python_command("-m", "workbench.session.recorded_scene_worker")
+            worker = ("workbench.session.recorded_scene_worker", str(theirs.fileno()))
             process = subprocess.Popen(
-                [*command, str(theirs.fileno()), str(os.getpid())],
+                python_command("-m", "workbench.session.family", str(os.getpid()), *worker),
                 env=child_environment(),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
@@ -112,12 +114,18 @@ class SceneProcess:
             )
             theirs.close()
             connection = Connection(os.dup(ours.fileno()))
+            reader = MessageReader(ours, SceneMade | SceneFailed | Said)
             try:
                 for key, episode in episodes.items():
                     on_progress(key, "making its scene")
                     try:
                         made = self._one(
-                            process, connection, episode, stop, lambda words, k=key: on_progress(k, words)
+                            process,
+                            connection,
+                            reader,
+                            episode,
+                            stop,
+                            lambda words, k=key: on_progress(k, words),
                         )
                     except SceneError as error:
                         on_end(key, error, ())
@@ -127,13 +135,13 @@ class SceneProcess:
                     on_end(key, replace(episode, geometry=made.geometry, poses=made.poses), made.missed)
             finally:
                 connection.close()
-                process.kill()
-                process.wait()
+                end_family(process)
 
     def _one(
         self,
         process: subprocess.Popen[bytes],
         connection: Connection,
+        reader: MessageReader,
         episode: Episode,
         stop: Callable[[], bool],
         on_progress: Callable[[str], None],
@@ -147,16 +155,23 @@ class SceneProcess:
         try:
             connection.send(wanted)
             while not stop():
-                if not connection.poll(_LOOK):
-                    if process.poll() is not None and not connection.poll(0):
+                event = reader.receive(_LOOK)
+                if event is None:
+                    if process.poll() is not None and (event := reader.receive(0)) is None:
                         raise EOFError
-                    continue
-                event = connection.recv()
+                    if event is None:
+                        continue
                 if isinstance(event, SceneMade):
                     return event
                 if isinstance(event, SceneFailed):
                     raise SceneError(event.why)
                 on_progress(event.words)
+        except Unreadable as error:
+            process.terminate()
+            raise SceneError(
+                f"The process that makes the scene of {info.task} sent what cannot be read ({error}), so there are "
+                "numbers and curves only."
+            ) from error
         except (EOFError, OSError) as error:
             raise SceneError(
                 f"The process that makes the scene of {info.task} ended in the middle of it, so there are numbers and "

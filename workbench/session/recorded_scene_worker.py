@@ -1,12 +1,11 @@
 """The process that makes scenes of recordings that hold none; see `recorded_scene`.
 
-It is started as ``python -m workbench.session.recorded_scene_worker SOCKET SERVER`` and ends with its server, or when
-nobody listens any more. An env is kept for the next episode as long as that was made in the same way.
+It is started by `family` with its end of a socket pair, and ends with its server, or when nobody listens any more. An
+env is kept for the next episode as long as that was made in the same way.
 """
 
 from __future__ import annotations
 
-import sys
 import traceback
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -15,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from workbench.session.recorded_scene import Said, SceneFailed, SceneMade, SceneWanted
-from workbench.session.worker_start import end_with
 
 if TYPE_CHECKING:
     from workbench.core.task_env import TaskEnv
@@ -28,10 +26,9 @@ class _CannotMake(Exception):
     """A sentence for a person."""
 
 
-def main() -> None:
-    """Entry of the process."""
-    connection = Connection(int(sys.argv[1]))
-    end_with(int(sys.argv[2]))
+def main(socket: str) -> None:
+    """Entry of the process; `socket` is a file descriptor."""
+    connection = Connection(int(socket))
     made: tuple[object, TaskEnv] | None = None
     while True:
         try:
@@ -122,7 +119,3 @@ def scene_of(env: TaskEnv, wanted: SceneWanted, connection: Connection) -> Scene
 
 def _line(error: Exception) -> str:
     return (str(error).strip() or "no reason given").splitlines()[0][:300]
-
-
-if __name__ == "__main__":
-    main()

@@ -11,10 +11,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
-from workbench.authoring.modules import decode
+from workbench.authoring.modules import read_source
 from workbench.session.messages import TaskDescription
 
 Rung = Literal["file", "moment", "version", "nothing"]
@@ -34,7 +33,7 @@ def is_on_disk(source: Mapping[str, str]) -> bool:
     """Whether the files still have these texts."""
     for path, text in source.items():
         try:
-            if decode(path, Path(path).read_bytes()) != text:
+            if read_source(path) != text:
                 return False
         except (OSError, SyntaxError):
             return False

@@ -12,7 +12,6 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from time import perf_counter
 
 import numpy as np
@@ -20,7 +19,7 @@ import numpy as np
 from workbench.authoring.changes import RESET_HOOKS, Change, find_change
 from workbench.authoring.inherited import inherited_by
 from workbench.authoring.load import LoadedTask, load_task, take_back, with_late_imports
-from workbench.authoring.modules import decode
+from workbench.authoring.modules import read_source
 from workbench.authoring.problem import TaskError
 from workbench.core import actions
 from workbench.core.exchange import (
@@ -132,7 +131,7 @@ def _still_there(before: LoadedTask, request: Load) -> dict[str, str]:
     for path in before.source:
         given = (request.source or {}).get(path)
         try:
-            texts[path] = given if given is not None else decode(path, Path(path).read_bytes())
+            texts[path] = given if given is not None else read_source(path)
         except (OSError, SyntaxError):
             continue
     return texts

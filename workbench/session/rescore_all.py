@@ -10,6 +10,7 @@ from pathlib import Path
 import torch
 
 from workbench.authoring.problem import TaskError
+from workbench.machine.start_folder import in_start_folder
 from workbench.session.messages import TaskOptions
 from workbench.session.open_task import OpenedTask, open_task
 from workbench.session.rescore import find_episodes, group_episodes, not_judged, with_renderer
@@ -51,7 +52,7 @@ def rescore_all(
         CannotStepIn: as TaskError, where a recorded text cannot be opened.
     """
     torch.set_num_threads(1)  # see workbench.session.worker.work
-    files = find_episodes(what.places)
+    files = find_episodes([place.absolute() for place in what.places])
     groups, verdicts = group_episodes(
         files, what.num_envs, what.base, task=what.task, recorded_source=what.recorded_source
     )
@@ -93,7 +94,8 @@ def rescore_all(
 
 
 def _open(reference: str, options: TaskOptions, on_activity: Callable[[str], None]) -> OpenedTask:
-    try:
-        return open_task(reference, options, on_activity=on_activity)
-    except TaskError:
-        return open_task(reference, with_renderer(options), on_activity=on_activity)
+    with in_start_folder(stay=True):  # the task before may have gone to another one
+        try:
+            return open_task(reference, options, on_activity=on_activity)
+        except TaskError:
+            return open_task(reference, with_renderer(options), on_activity=on_activity)

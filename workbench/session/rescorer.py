@@ -149,6 +149,12 @@ class Rescorer:
             raise
         except JobFailed as failure:
             self._tell(job, state="failed", why=str(failure), problem=failure.problem)
+        except Exception as error:
+            self._tell(
+                job, state="failed", why=f"it failed within the workbench ({type(error).__name__}: {error})"
+            )
+            self._process.end()  # what it was asked for last belongs to nobody
+            raise
 
     def _judge(self, job: Job, asked: _Asked, group: Group) -> None:
         process = self._process

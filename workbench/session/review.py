@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Protocol
 
 from workbench.core.shared_shapes import SharedShapes
+from workbench.machine.watched_thread import say_failure
 from workbench.recording.episode import Episode
 from workbench.recording.read_episode import UnreadableRecording
 from workbench.session.recorded_scene import SceneError
@@ -278,6 +279,11 @@ class Review:
             except OSError as error:
                 for index in wanted:
                     say(index, f"The process that makes its scene could not be started: {error}.", False)
+            except Exception as error:
+                # What that process sent may fit nothing; a page that stays on "making" says nothing.
+                say_failure("Scenes of recordings could not be made", error)
+                for index in wanted:
+                    say(index, f"Its scene could not be made ({type(error).__name__}: {error}).", False)
 
     def _replace_opened(self, number: int, id: str, change: Callable[[Opened], Opened]) -> None:
         with self._changed:

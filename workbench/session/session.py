@@ -19,6 +19,7 @@ from typing import get_args
 
 from workbench.core.inspection import Section
 from workbench.core.recorded_run import RecordedRun
+from workbench.machine.watched_thread import listen, stop_listening
 from workbench.session.camera_messages import CameraAnswer
 from workbench.session.camera_studio import CameraStudio
 from workbench.session.env_table import EnvRows
@@ -76,6 +77,7 @@ class Session:
         worker: WorkerOptions | None = None,
         on_event: Callable[[Event], None] = lambda event: None,
         on_line: Callable[[PrintedLine], None] = lambda line: None,
+        on_notice: Callable[[str], None] = lambda words: None,
     ) -> None:
         """
         Args:
@@ -86,6 +88,7 @@ class Session:
             on_event: called with every event of the worker, and its death as a failure, on the session's thread
                 (the terminal).
             on_line: called with the lines that the worker printed, from its own threads; not with all of a flood.
+            on_notice: called, on any thread, with a sentence that is to be seen in the terminal too.
         """
         self._on_event = on_event
         self._print = on_line
@@ -109,7 +112,7 @@ class Session:
             output=self._printed.feed,
         )
         self._recorder = LiveRecorder(
-            recordings, self._note, lambda envs: self._send(SetCapture(envs, from_reset=True))
+            recordings, self._note, lambda envs: self._send(SetCapture(envs, from_reset=True)), on_notice
         )
         self._keeper = PastKeeper(recordings, self._recorder.finisher, self._note)
         self._judge = Judge(self._note)
@@ -124,6 +127,7 @@ class Session:
             self.open_file,
         )
         """Cameras placed by hand."""
+        listen(self._say_failure)
         self._versions.start()
         self._worker.start()
 
@@ -348,6 +352,7 @@ class Session:
 
     def close(self) -> None:
         """End the worker and the watcher, and wait for episodes that are being written."""
+        stop_listening(self._say_failure)
         self._shared.close()
         self._versions.close()
         self._worker.stop()
@@ -450,6 +455,11 @@ class Session:
         self._note()
         for line in lines:
             self._print(line)
+
+    def _say_failure(self, text: str) -> None:
+        """Of the workbench itself; in the log on the page and in the terminal."""
+        for line in text.splitlines():
+            self._printed.feed("stderr", f"workbench: {line}\n".encode(errors="replace"))
 
     # --- small things --------------------------------------------------------------------------------
 

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
+from workbench.authoring.modules import read_source
 from workbench.core.recorded_run import RecordedRun
 from workbench.recording.episode import Episode, EpisodeInfo
 from workbench.recording.side_files import folder_of, place_of
@@ -73,8 +74,8 @@ def reference_of(info: EpisodeInfo) -> str:
     if file is None or not file.is_absolute() or not file.is_file() or _is_installed(file):
         return info.task
     try:
-        text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
+        text = read_source(file)
+    except (OSError, SyntaxError):
         return str(file)
     return _with_class(str(file), text, info.task)
 
@@ -82,8 +83,8 @@ def reference_of(info: EpisodeInfo) -> str:
 def class_in(file: Path, env_id: str) -> str | None:
     """What would be opened for this task of this file; None if the file has no such task, or cannot be read."""
     try:
-        reference = _with_class(str(file), file.read_text(encoding="utf-8"), env_id)
-    except (OSError, UnicodeDecodeError):
+        reference = _with_class(str(file), read_source(file), env_id)
+    except (OSError, SyntaxError):
         return None
     return None if reference == str(file) else reference
 

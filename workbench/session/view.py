@@ -60,8 +60,8 @@ class RecordingStatus:
     episodes_written: int = 0
     being_written: int = 0
     """Episodes that are over, and whose files are being made."""
-    recovered: int = 0
-    """Episodes that an earlier server left half written, and that were mended at the start."""
+    recovered: tuple[str, ...] = ()
+    """Episodes that an earlier server left half written, and that were mended at the start: their .rrd files."""
     folder: str = ""
     last_file: str | None = None
     problem: str | None = None

@@ -29,9 +29,11 @@ import numpy as np
 import torch
 
 from workbench.authoring.problem import TaskError
+from workbench.authoring.reference import named_file
 from workbench.core.camera_configs import note_camera_sites
 from workbench.core.inspect_env import inspect_env
 from workbench.core.step import StepResult
+from workbench.machine.start_folder import in_start_folder
 from workbench.session import rescore_run
 from workbench.session.acting import Acting
 from workbench.session.camera_messages import (
@@ -165,13 +167,16 @@ class Worker:
 
     def _load(self, request: Load) -> None:
         self._cameras.settle()
+        self._held.asked_for = named_file(request.task)
         before, running = self._held.opened, None
         if before is not None and self._loaded_by is not None and self._last is not None:
             running = Running(self._loaded_by, before, self._last)
         try:
-            opened, report = load_version(
-                request, running, on_activity=lambda activity: self._line.send(Loading(activity))
-            )
+            # What the version before did to the current folder is not for this one, unless it fails.
+            with in_start_folder(stay=True):
+                opened, report = load_version(
+                    request, running, on_activity=lambda activity: self._line.send(Loading(activity))
+                )
         except TaskError as error:
             self._cameras.put_back()  # trying new cameras took the old ones away
             self._held.drop_steps_if_left(error)

@@ -1,46 +1,56 @@
 """How a worker process begins: ready to say where it died before anything that may die is imported.
 
 The heavy modules are imported last. By then a crash writes its stack, the server can look at the process by
-a signal, the kernel knows whom to end when memory is short, and the process goes when its server does.
+a signal, the kernel knows whom to end when memory is short, and the process goes when its server does (`family`).
 
-The server starts it as ``python -m workbench.session.worker_start SOCKET PULSE STACKS SERVER``: three file
-descriptors (see `process`) and the server's process id.
+The server starts it as ``python -m workbench.session.worker_start SOCKET PULSE STACKS SERVER NICENESS``: three file
+descriptors (see `process`), the server's process id, and by how much others come first.
 """
 
 from __future__ import annotations
 
-import ctypes
 import faulthandler
 import os
 import signal
 import sys
+import threading
+import traceback
 from pathlib import Path
 from typing import NoReturn
 
-_PR_SET_PDEATHSIG = 1
+from workbench.session.family import begin_family
 
 
 def main() -> None:
     """Entry of the process."""
-    connection, pulse_fd, stacks, server = map(int, sys.argv[1:5])
-    end_with(server)
+    connection, pulse_fd, stacks, server, niceness = map(int, sys.argv[1:6])
+    begin_family(server)
+    if niceness:
+        os.nice(niceness)
     _be_the_first_to_go()
+    leave = os._exit
     _tell_where(stacks)
     from workbench.session.pulse import PulseWriter
 
     pulse = PulseWriter(pulse_fd)
     pulse.begin("starting")
 
-    from workbench.session.worker import work
+    code = 0
+    try:
+        from workbench.session.worker import work
 
-    work(connection, pulse)
-
-
-def end_with(server: int) -> None:
-    """Ask the kernel to end this process with its server, also when that is killed while we hang."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != server:
-        sys.exit("the server is gone")
+        work(connection, pulse)
+    except BaseException:
+        traceback.print_exc()
+        code = 1
+    # Else the interpreter would wait for threads of the task, and the page for a process that answers nothing.
+    others = [thread for thread in threading.enumerate() if thread is not threading.main_thread()]
+    if code or not all(thread.daemon for thread in others):
+        try:
+            sys.stdout.flush()
+            sys.stderr.flush()
+        finally:  # the task may have closed them
+            leave(code)
 
 
 def _be_the_first_to_go() -> None:

@@ -24,6 +24,7 @@ from typing import Any
 import msgspec
 
 from workbench.machine.child_python import child_environment, python_command
+from workbench.machine.watched_thread import say_failure
 from workbench.ui.make_shared import Made, Wanted
 
 END_SECONDS = 5.0
@@ -103,6 +104,9 @@ class Making:
             problem, made = self._ask(wanted)
         except OSError as error:
             problem = f"The process that makes it could not be started: {error}."
+        except (ValueError, KeyError, TypeError) as error:
+            say_failure("What the process that makes it said could not be read", error)
+            problem = "The process that makes it said what cannot be read; the terminal says more."
         with self._lock:
             self._process = None
             known = self._view.made if made is None else (made, *self._view.made)

@@ -19,6 +19,7 @@ from typing import Literal, Protocol
 
 import viser
 
+from workbench.machine.watched_thread import watched_thread
 from workbench.ui.stage import Stage
 
 log = logging.getLogger(__name__)
@@ -53,7 +54,7 @@ class Pages:
         self._shown: Which | None = None
         self._page: AnyPage | None = None
         self._ending = False
-        self._thread = threading.Thread(target=self._serve, name="pages", daemon=True)
+        self._thread = watched_thread("pages", self._serve)
 
     @property
     def shown(self) -> Which | None:

@@ -17,6 +17,7 @@ import viser
 
 from workbench.recording.library import Library
 from workbench.recording.recover import recover
+from workbench.session.record_live import recovered_in_words
 from workbench.session.recorded_scene import SceneProcess
 from workbench.session.review import Review
 from workbench.ui.commands import Command
@@ -46,6 +47,7 @@ class Workplace:
         recordings: The folder that is recorded to and reviewed.
         session: The live env, if there is one.
         tasks: Task files in which envs of foreign recordings may be found.
+        on_notice: Called, on any thread, with a sentence that is to be seen in the terminal too.
     """
 
     def __init__(
@@ -54,8 +56,10 @@ class Workplace:
         recordings: Path,
         session: Session | None = None,
         tasks: tuple[Path, ...] = (),
+        on_notice: Callable[[str], None] = lambda words: None,
     ) -> None:
         self._server, self._recordings, self._tasks = server, recordings, tasks
+        self._on_notice = on_notice
         self._shelf: Shelf | None = None
         self._lock = threading.Lock()
         self._mending: threading.Thread | None = None
@@ -87,13 +91,15 @@ class Workplace:
     def _mend(self, shelf: Shelf) -> None:
         """Make episodes of what a writer left that was killed."""
         try:
-            mended = len(recover(self._recordings))
+            mended = [str(files.rrd) for files in recover(self._recordings)]
         except OSError as error:
             shelf.review.say(str(error))
+            self._on_notice(str(error))
             return
         if mended:
-            what = "An episode that was" if mended == 1 else f"{mended} episodes that were"
+            what = "An episode that was" if len(mended) == 1 else f"{len(mended)} episodes that were"
             shelf.review.say(f"{what} left half written by a program that was killed can be seen again.")
+            self._on_notice(recovered_in_words(mended))
             shelf.library.look_soon()
 
     def go_live_with(self, session: Session) -> None:

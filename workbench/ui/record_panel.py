@@ -13,6 +13,7 @@ from typing import Protocol
 import viser
 
 from workbench.session.keep_status import KeepStatus
+from workbench.session.record_live import recovered_in_words
 from workbench.session.session import Session
 from workbench.session.view import RecordingStatus, SessionView
 from workbench.ui.changed import fill, show
@@ -152,7 +153,7 @@ def recording_html(recording: RecordingStatus) -> str:
         steps=recording.steps,
         written=recording.episodes_written,
         being_written=recording.being_written,
-        recovered=recording.recovered,
+        recovered=recovered_in_words(recording.recovered),
         size=size_in_words(recording.bytes_written),
         folder=recording.folder,
         command=None if last is None else f"workbench view {shlex.quote(last)}",

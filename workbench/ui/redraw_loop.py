@@ -17,6 +17,7 @@ from collections.abc import Callable
 
 import viser
 
+from workbench.machine.watched_thread import watched_thread
 from workbench.ui.viser_seam import wait_until_taken
 
 log = logging.getLogger(__name__)
@@ -49,7 +50,7 @@ class RedrawLoop:
     ) -> None:
         self._server, self._wait, self._has_viewers, self._draw = server, wait, has_viewers, draw
         self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread = watched_thread(name, self._run)
 
     def start(self) -> None:
         """Draw the page, and go on with that in a thread."""

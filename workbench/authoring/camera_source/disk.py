@@ -23,6 +23,8 @@ from pathlib import Path
 from workbench.authoring.camera_source.find import check_own
 from workbench.authoring.camera_source.result import FileChange, Refusal, Refused, SourceEdit
 from workbench.authoring.camera_source.source_file import BOM
+from workbench.authoring.modules import MOST_SOURCE_BYTES
+from workbench.machine.regular_file import read_regular_file
 
 _LINES = re.compile(r"[^\r\n]*(?:\r\n|\r|\n|$)")
 
@@ -82,7 +84,7 @@ def _exchange(path: str, expected: str, wanted: str | None, since: str) -> Refus
         return Refusal(reason)
     real = Path(path).resolve()
     try:
-        raw = real.read_bytes()
+        raw = read_regular_file(real, MOST_SOURCE_BYTES)
         encoding, _ = tokenize.detect_encoding(io.BytesIO(raw).readline)
         text = raw.decode(encoding)
         if _plain(text) != _plain(expected):
@@ -113,7 +115,7 @@ def _replace(real: Path, old: bytes, new: bytes) -> bool:
         os.chmod(name, stat.S_IMODE(status.st_mode))
         with suppress(PermissionError):  # a group's file that somebody else in the group owns
             os.chown(name, status.st_uid, status.st_gid)
-        if real.read_bytes() != old:
+        if read_regular_file(real, MOST_SOURCE_BYTES) != old:
             return False
         os.replace(name, real)
         return True

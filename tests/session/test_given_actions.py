@@ -1,0 +1,65 @@
+"""A file of actions is read only as far as it is one."""
+
+from __future__ import annotations
+
+import io
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from workbench.session.given_actions import read_given
+
+
+def npy(shape: tuple[int, ...], content: bytes, dtype: str = "<f8") -> bytes:
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": dtype, "fortran_order": False, "shape": shape})
+    return file.getvalue() + content
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_arrays_are_as_numpy_writes_them(tmp_path: Path, order: str) -> None:
+    one = np.asarray(np.arange(12.0).reshape(4, 3), order=order)  # type: ignore[call-overload]
+    np.save(tmp_path / "a.npy", one)
+    np.savez_compressed(tmp_path / "b.npz", one, 2 * one)
+    assert read_given(tmp_path / "a.npy").episodes[0].actions.tolist() == one.tolist()
+    assert [e.actions.tolist() for e in read_given(tmp_path / "b.npz").episodes] == [
+        one.tolist(),
+        (2 * one).tolist(),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("a.npy", npy((10**12, 7), b"x" * 100), "says that it holds 56000000000000 bytes"),
+        ("a.npy", npy((2, 2), b"x" * 8), "cannot be read as a NumPy file"),
+        ("a.npy", npy((1, 1), b"x" * 8, "|O"), "Python objects"),
+        ("a.npy", b"nothing of the kind", "cannot be read as a NumPy file"),
+        ("a.npz", b"nothing of the kind", "cannot be read as a NumPy file"),
+    ],
+)
+def test_what_claims_more_than_it_has_is_refused_in_a_sentence(
+    tmp_path: Path, name: str, content: bytes, says: str
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=says):
+        read_given(tmp_path / name)
+
+
+def test_an_archive_that_unpacks_to_more_than_any_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("workbench.session.given_actions.MOST_BYTES", 2**20)
+    np.savez_compressed(tmp_path / "a.npz", *[np.zeros((2**13, 8))] * 3)
+    with pytest.raises(ValueError, match="larger than any file of actions"):
+        read_given(tmp_path / "a.npz")
+
+
+def test_what_is_no_file_is_not_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "a.npy")
+    (tmp_path / "b.npz").symlink_to("/dev/zero")
+    for name in ("a.npy", "b.npz"):
+        with pytest.raises(FileNotFoundError):
+            read_given(tmp_path / name)

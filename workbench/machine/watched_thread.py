@@ -1,0 +1,67 @@
+"""Threads that do not end unheard: what one raises is said, and it begins again."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import traceback
+from collections.abc import Callable
+
+logger = logging.getLogger(__name__)
+
+FIRST_PAUSE, LONGEST_PAUSE = 0.05, 5.0
+"""Seconds before a thread begins again; twice as long each time that it fails."""
+
+_listeners: list[Callable[[str], None]] = []
+_lock = threading.Lock()
+
+
+def watched_thread(name: str, work: Callable[[], None]) -> threading.Thread:
+    """A thread, not started, that does `work` until that returns.
+
+    `work` must be such that it can be begun again where it raised: a loop that takes what is to be done from a queue.
+    """
+
+    def keep_at_it() -> None:
+        pause = FIRST_PAUSE
+        while True:
+            try:
+                return work()
+            except Exception as error:
+                say_failure(f"The thread '{name}' failed and is started again", error)
+            threading.Event().wait(pause)
+            pause = min(2 * pause, LONGEST_PAUSE)
+
+    return threading.Thread(target=keep_at_it, name=name, daemon=True)
+
+
+def say_failure(what: str, error: BaseException) -> None:
+    """Tell whoever listens, or else the log, that part of the workbench itself failed.
+
+    Args:
+        what: a sentence without its full stop.
+    """
+    text = f"{what}: {type(error).__name__}: {error}. This is a fault of the workbench.\n"
+    text += "".join(traceback.format_exception(error))
+    with _lock:
+        told = list(_listeners)
+    if not told:
+        logger.error("%s", text)
+    for listener in told:
+        try:
+            listener(text)
+        except Exception:
+            # Its terminal may be what failed.
+            logger.exception("%s", text)
+
+
+def listen(listener: Callable[[str], None]) -> None:
+    """Have `listener` called, on any thread, with the text of each failure, until `stop_listening`."""
+    with _lock:
+        _listeners.append(listener)
+
+
+def stop_listening(listener: Callable[[str], None]) -> None:
+    with _lock:
+        if listener in _listeners:
+            _listeners.remove(listener)
