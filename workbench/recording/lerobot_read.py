@@ -7,7 +7,6 @@ is first looked at.
 
 from __future__ import annotations
 
-import json
 import math
 import subprocess
 import threading
@@ -25,6 +24,7 @@ from workbench.core.pictures import CameraInfo
 from workbench.recording import lerobot_format as form
 from workbench.recording.encoded_pictures import EncodedPictures, encode_jpeg
 from workbench.recording.episode import CameraTrack, Episode, EpisodeInfo
+from workbench.recording.json_file import read_json
 from workbench.recording.read_maniskill import UnreadableRecording
 
 USUAL_FOVY = math.radians(60)
@@ -235,7 +235,7 @@ class FilmPictures(Sequence[bytes]):
 
 def _info(folder: Path) -> dict[str, Any]:
     try:
-        info = json.loads((Path(folder) / form.INFO).read_text(encoding="utf-8"))
+        info = read_json(Path(folder) / form.INFO)
         version = str(info["codebase_version"])
         if not isinstance(info["features"], dict) or not float(info["fps"]) > 0:
             raise ValueError("it names no features or no rate")
@@ -258,7 +258,7 @@ def _entries(folder: Path) -> list[dict[str, Any]]:
 def _ours(folder: Path) -> list[dict[str, Any]]:
     """Which recordings the episodes come from, where we wrote the dataset."""
     try:
-        found = json.loads((Path(folder) / form.OURS).read_text(encoding="utf-8"))["episodes"]
+        found = read_json(Path(folder) / form.OURS)["episodes"]
     except (OSError, ValueError, KeyError, TypeError):
         return []
     return found if isinstance(found, list) and all(isinstance(one, dict) for one in found) else []

@@ -17,13 +17,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from PIL import Image
 
-from workbench.recording.annotations import read_json, read_notes
+from workbench.recording.annotations import read_notes
 from workbench.recording.checksums import wrong_size
 from workbench.recording.episode import acted_by_from, acted_by_in_words
+from workbench.recording.json_file import NotJson, read_json
 from workbench.recording.lerobot_read import lerobot_rows
 from workbench.recording.library_row import (
     Facts,
@@ -38,6 +38,7 @@ from workbench.recording.library_row import (
 )
 from workbench.recording.library_scan import NOTES, Found
 from workbench.recording.read_maniskill import UnreadableRecording
+from workbench.recording.safe_h5 import H5Dataset, H5Group, RefusedH5, open_h5
 
 DATASET_KEY = ["meta", "info"]
 """How the key of a LeRobot dataset ends."""
@@ -72,7 +73,7 @@ def _read(folder: Path, found: Found) -> list[Entry]:
     if ".json" in found.sizes:
         try:
             described = read_json(found.path(folder, ".json"))
-        except ValueError as error:
+        except NotJson as error:
             return [_broken(folder, found, str(error))]
         if isinstance(described, dict) and isinstance(described.get("workbench"), dict):
             return [_ours(folder, found, described["workbench"])]
@@ -251,32 +252,33 @@ def _look_into(
     totals: dict[str, float | None] = {}
     pictures: dict[str, bytes] = {}
     try:
-        # Without a lock: a recorder that has the file open would be a reason to show nothing.
-        with h5py.File(path, "r", locking=False) as file:
+        with open_h5(path) as file:
             for name in trajectories:
-                group = file.get(name)
-                if not isinstance(group, h5py.Group):
+                group = file.group(name)
+                if group is None:
                     continue
+                totals[name] = None
                 rewards = group.get("rewards")
-                is_numbers = isinstance(rewards, h5py.Dataset) and rewards.dtype.kind in "fiu"
-                totals[name] = (
-                    number(float(np.asarray(rewards, dtype=np.float64).sum())) if is_numbers else None
-                )
+                if isinstance(rewards, H5Dataset) and rewards.is_numbers:
+                    totals[name] = number(float(rewards.read().sum(dtype=np.float64)))
                 if (picture := _last_picture(group)) is not None:
                     pictures[name] = picture
+    except RefusedH5 as error:
+        return totals, pictures, f"{path.name} {error}."
     except (OSError, RuntimeError, KeyError, ValueError):
         return totals, pictures, f"{path.name} is damaged, or still being written."
     return totals, pictures, None
 
 
-def _last_picture(group: h5py.Group) -> bytes | None:
+def _last_picture(group: H5Group) -> bytes | None:
     """A small jpeg of what the first camera saw last, in colour; None where no picture was recorded."""
-    cameras = group.get("obs/sensor_data")
-    for camera in cameras.values() if isinstance(cameras, h5py.Group) else ():
-        rgb = camera.get("rgb") if isinstance(camera, h5py.Group) else None
-        if isinstance(rgb, h5py.Dataset) and rgb.dtype == np.uint8 and rgb.ndim == 4 and len(rgb):
+    cameras = group.group("obs/sensor_data")
+    for name in cameras or ():
+        camera = None if cameras is None else cameras.group(name)
+        rgb = None if camera is None else camera.get("rgb")
+        if isinstance(rgb, H5Dataset) and rgb.dtype == np.uint8 and rgb.ndim == 4 and len(rgb):
             if rgb.shape[3] == 3 and max(rgb.shape[1:3]) <= _LARGEST_PICTURE:
-                return _small_jpeg(Image.fromarray(rgb[len(rgb) - 1]))
+                return _small_jpeg(Image.fromarray(rgb.row(len(rgb) - 1)))
     return None
 
 

@@ -9,13 +9,11 @@ Pictures stay in the file until one is asked for.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +24,7 @@ from workbench.recording.columns import Column
 from workbench.recording.description import columns_from, info_from
 from workbench.recording.encoded_pictures import EncodedPictures, Modality
 from workbench.recording.episode import CameraTrack, Episode, Unread
+from workbench.recording.json_file import NotJson, parse_json, read_json
 from workbench.recording.layout import OBSERVATION, body_entities, camera_entities, evaluate_entity
 from workbench.recording.maniskill_h5 import TRAJECTORY
 from workbench.recording.read_maniskill import UnreadableRecording as UnreadableRecording
@@ -33,6 +32,7 @@ from workbench.recording.read_maniskill import leaves
 from workbench.recording.read_maniskill import read_maniskill as read_maniskill
 from workbench.recording.read_maniskill import trajectories as trajectories
 from workbench.recording.rerun_table import RerunTable, rows_at, wxyz_from_optical
+from workbench.recording.safe_h5 import open_h5
 from workbench.recording.survey import camera_from
 
 
@@ -101,8 +101,8 @@ def _beside(file: Path | None) -> tuple[dict[str, Any], Exception | None]:
     if file is None:
         return {}, None
     try:
-        said = json.loads(file.read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
+        said = read_json(file)
+    except (OSError, NotJson) as error:
         return {}, error
     ours = said.get("workbench") if isinstance(said, dict) else None
     return (ours if isinstance(ours, dict) else {}), None
@@ -122,7 +122,7 @@ def _description(
     if not isinstance(said, str):
         raise UnreadableRecording(f"{path.stem}.rrd is from another program, or from an older workbench.")
     files, texts = (_list(table.property("source", key)) for key in ("files", "texts"))
-    return {**json.loads(said), "source": dict(zip(files, texts))}
+    return {**parse_json(said), "source": dict(zip(files, texts))}
 
 
 def _list(value: Any) -> list[Any]:
@@ -216,13 +216,13 @@ _FLAGS = ("success", "fail")
 
 def _read_states(path: Path) -> dict[str, Any]:
     """What the .h5 holds; where the .rrd holds it too, this is what ManiSkill reads."""
-    with h5py.File(path, "r") as file:
-        if TRAJECTORY not in file:
+    with open_h5(path) as file:
+        group = file.group(TRAJECTORY)
+        if group is None:
             raise KeyError(f"it has no {TRAJECTORY}")
-        group: Any = file[TRAJECTORY]
         held: dict[str, Any] = {name: dict(leaves(group.get(name))) for name in ("env_states", "obs")}
-        held |= {name: group[name][:] for name in ("actions", "rewards", "terminated", "truncated")}
-        return held | {name: group[name][:] for name in _FLAGS if name in group}
+        held |= {name: group.numbers(name) for name in ("actions", "rewards", "terminated", "truncated")}
+        return held | {name: group.numbers(name) for name in _FLAGS if name in group}
 
 
 def _add_states(episode: Episode, held: dict[str, Any]) -> None:

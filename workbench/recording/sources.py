@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from workbench.recording.episode import Episode
+from workbench.recording.json_file import read_json
 from workbench.recording.lerobot_read import is_lerobot, lerobot_rows, read_lerobot
 from workbench.recording.read_episode import UnreadableRecording, read_episode, read_maniskill, trajectories
 
@@ -89,7 +89,7 @@ def _in_folder(folder: Path) -> Iterator[Source]:
 
 def _is_ours(path: Path) -> bool:
     try:
-        said = json.loads(path.read_text(encoding="utf-8"))
+        said = read_json(path)
     except (OSError, ValueError):
         return False
     return isinstance(said, dict) and isinstance(said.get("workbench"), dict)
