@@ -23,8 +23,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from workbench.recording.library_read import Entry
-from workbench.recording.library_row import Facts, facts_as_dict, facts_from_dict
+from workbench.recording.library_row import Entry, Facts, facts_as_dict, facts_from_dict
 from workbench.recording.library_scan import found_of
 
 log = logging.getLogger(__name__)

@@ -20,6 +20,7 @@ from workbench.core.pictures import CameraInfo
 from workbench.recording.encoded_pictures import (
     MILLIMETRES_PER_METRE,
     MODALITIES,
+    MOST_PIXELS,
     EncodedPictures,
     Modality,
     encode,
@@ -27,14 +28,11 @@ from workbench.recording.encoded_pictures import (
 from workbench.recording.episode import NO_SEED, CameraTrack, Episode, EpisodeInfo
 from workbench.recording.json_file import read_json
 from workbench.recording.safe_h5 import H5Dataset, H5Group, RefusedH5, open_h5
+from workbench.recording.unreadable import UnreadableRecording
 
 _PICTURES = ("sensor_data", "sensor_param")
 _UNKNOWN_DT = 0.05
 """ManiSkill's default control period (20 Hz); the file does not say it."""
-
-
-class UnreadableRecording(ValueError):
-    """A file that is no recording, or a broken one; the message says what is wrong with it in a sentence."""
 
 
 def trajectories(path: Path) -> tuple[str, ...]:
@@ -230,6 +228,10 @@ def _cameras(obs: H5Group | H5Dataset | None, path: Path) -> list[CameraTrack]:
                     f"has pictures of shape {dataset.shape} and type {dataset.dtype} (at {dataset.name})"
                 )
             count, size = len(dataset), (dataset.shape[1], dataset.shape[2])
+            if dataset.shape[1] * dataset.shape[2] > MOST_PIXELS:
+                raise RefusedH5(
+                    f"claims pictures of {dataset.shape[2]} x {dataset.shape[1]} pixels (at {dataset.name})"
+                )
             held[modality] = EncodedPictures(modality, _H5Pictures(path, dataset.name, count, modality))
         if held:
             parameters = obs.group(f"sensor_param/{name}")

@@ -24,7 +24,7 @@ from typing import Protocol
 
 from workbench.core.shared_shapes import SharedShapes
 from workbench.recording.episode import Episode
-from workbench.recording.read_episode import UnreadableRecording
+from workbench.recording.unreadable import UnreadableRecording
 from workbench.session.recorded_scene import SceneError
 from workbench.session.review_events import happenings
 from workbench.session.review_rows import (

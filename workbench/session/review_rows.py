@@ -15,8 +15,7 @@ from typing import Protocol
 
 from workbench.core.shared_shapes import SharedShapes
 from workbench.recording.episode import Episode
-from workbench.recording.lerobot_read import read_lerobot
-from workbench.recording.read_episode import read_episode, read_maniskill
+from workbench.recording.reading import read_recording
 
 
 class Row(Protocol):
@@ -52,14 +51,14 @@ class Stamp:
     """Size and time of change then; None if it was not there."""
 
 
-def read_row(row: Row, shapes: SharedShapes | None = None) -> Episode:
-    """The recording of a row, with those shapes where it looks the same. Raises as `read_episode`."""
+def read_row(row: Row, shapes: SharedShapes | None = None, folder: Path | None = None) -> Episode:
+    """The recording of a row, with those shapes where it looks the same; `folder` is the library's. Raises as `read_recording`."""
     if row.kind == "lerobot" and row.trajectory is not None:
-        return read_lerobot(row.paths[0].parents[1], int(row.trajectory))
+        return read_recording("lerobot", row.paths[0].parents[1], row.trajectory, shapes, folder)
     if row.trajectory is not None:
         # The library opens it by its .json, which is where the words are.
-        return read_maniskill(row.paths[0].with_suffix(".h5"), row.trajectory)
-    return read_episode(row.paths[0], shapes)
+        return read_recording("maniskill", row.paths[0].with_suffix(".h5"), row.trajectory, shapes, folder)
+    return read_recording("ours", row.paths[0], "", shapes, folder)
 
 
 def shared(episode: Episode, shapes: SharedShapes) -> Episode:
