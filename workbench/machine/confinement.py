@@ -29,7 +29,7 @@ _SCOPES = 0b11
 """Abstract sockets of others, and signals to others, from version 6 on."""
 _PR_SET_PDEATHSIG, _PR_SET_NO_NEW_PRIVS = 1, 38
 _SYSTEM = ("/usr", "/lib", "/lib64", "/nix/store", "/gnu/store", "/etc/ld.so.cache", "/etc/localtime",
-           "/proc", "/sys/devices/system", "/dev/urandom")  # fmt: skip
+           "/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/sys", "/sys/devices/system", "/dev/urandom")  # fmt: skip
 MOST_WRITTEN = 1 << 20
 """Bytes of a file that is written all the same, where there is no Landlock."""
 MOST_OPEN_FILES = 512

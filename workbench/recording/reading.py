@@ -22,7 +22,14 @@ from workbench.recording.episode import Episode
 from workbench.recording.library_row import Entry, Facts, facts_from_dict, text
 from workbench.recording.library_scan import Found
 from workbench.recording.reader.episode_wire import KnownShapes, unpacked
-from workbench.recording.reader.processes import Answered, NotThere, Reader, ReaderEnded, start_nursery
+from workbench.recording.reader.processes import (
+    Answered,
+    NotThere,
+    Reader,
+    ReaderEnded,
+    end_nursery,
+    start_nursery,
+)
 from workbench.recording.reader.requests import (
     EpisodeRead,
     Failed,
@@ -60,6 +67,16 @@ _shapes = KnownShapes()
 def start_reading() -> None:
     """Begin to start what reads recordings, before one is wanted. Returns at once; raises OSError."""
     start_nursery()
+
+
+def stop_reading() -> None:
+    """End all processes that read recordings; who wants one read has them started again."""
+    with _lock:
+        readers = list(_readers.values())
+        _readers.clear()
+    for reader in readers:
+        reader.close()
+    end_nursery()
 
 
 def read_rows(folder: Path, wanted: Iterable[Found]) -> Iterator[tuple[Found, list[Entry]]]:

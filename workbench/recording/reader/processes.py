@@ -6,6 +6,7 @@ import contextlib
 import enum
 import itertools
 import os
+import select
 import signal
 import socket
 import subprocess
@@ -118,6 +119,10 @@ class _Nursery:
                 self._end()
                 return None
 
+    def end(self) -> None:
+        with self._lock:
+            self._end()
+
     def _start(self) -> socket.socket:
         if self._control is None or self._process is None or self._process.poll() is not None:
             self._end()
@@ -157,6 +162,11 @@ _nursery = _Nursery()
 def start_nursery() -> None:
     """Have a nursery started while something else is done. Returns at once; raises OSError."""
     _nursery.start()
+
+
+def end_nursery() -> None:
+    """End it, and the readers that it made with it."""
+    _nursery.end()
 
 
 class Reader:
@@ -217,9 +227,9 @@ class Reader:
         answers: list[Answered | ReaderEnded] = []
         with self._turns.turn(patience):
             while len(answers) < len(requests):
+                connection = self._started()
                 if process is not None and process != self.process:
                     raise NotThere
-                connection = self._started()
                 begun = len(answers)
                 try:
                     self._send_forgotten(connection)
@@ -249,6 +259,9 @@ class Reader:
             self._kill()
 
     def _started(self) -> socket.socket:
+        if self._connection is not None and select.select([self._connection], [], [], 0)[0]:
+            # Nothing is asked, so this is its end: nobody's fault but of who ended it.
+            self._kill()
         if self._connection is None:
             paths = (self._folder, *sorted(self._allowed))
             self._pid, self._connection = _nursery.new_reader(paths, self._episodes)
