@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import shutil
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -56,6 +57,9 @@ def imported_modules_are_not_searched_for_garbage() -> None:
 def no_process_left_behind() -> Iterator[None]:
     """Workers and browsers that tests started must be gone when the tests are."""
     yield
+    if "workbench.recording.reading" in sys.modules:
+        # It serves the whole process, for as long as that lives.
+        sys.modules["workbench.recording.reading"].stop_reading()
     deadline = time.monotonic() + 10
     while (left := _children()) and time.monotonic() < deadline:
         time.sleep(0.2)

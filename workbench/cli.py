@@ -165,6 +165,10 @@ def review(
     for file in task:
         if not file.is_file():
             return refuse(f"there is no file {file}")
+    from workbench.recording.reading import start_reading
+
+    # While the page is imported, so that its first rows need not wait for it.
+    start_reading()
     from workbench.page_command import review_in_terminal
     from workbench.session.kept_worker import WorkerOptions
     from workbench.session.memory_limit import parse_memory

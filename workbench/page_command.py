@@ -18,8 +18,9 @@ from rich.markup import escape
 import workbench
 from workbench.authoring.reference import named_file
 from workbench.machine.software_vulkan import use_private_driver
+from workbench.recording.reading import start_reading
 from workbench.session.kept_worker import WorkerOptions
-from workbench.session.messages import Event, Failed, TaskOptions
+from workbench.session.messages import Event, Failed, Loaded, TaskOptions
 from workbench.session.session import Session
 from workbench.terminal import out, print_event, print_line, refuse, say, warn
 from workbench.ui.commands import Command
@@ -50,6 +51,9 @@ def open_in_terminal(
         # A broken file is mended and saved; an env id that cannot be opened has nothing to wait for.
         if isinstance(event, Failed) and not event.kept and not waits_for_a_file:
             end.now(1)
+        if isinstance(event, Loaded):
+            # Not before: the task is what is waited for.
+            start_reading()
 
     session = Session(
         task,

@@ -102,6 +102,10 @@ def make(folder: Path, count: int) -> None:
 
 
 def open_once(folder: Path, count: int, browser: bool) -> dict[str, float]:
+    from workbench.recording.reading import start_reading
+
+    # As the command does, before it imports what a page needs.
+    start_reading()
     import viser
 
     from workbench.recording.library import Library
@@ -169,13 +173,15 @@ def main(options: Options) -> None:
         assert options.folder is not None
         print(json.dumps(open_once(options.folder, options.recordings, options.browser)))
         return
+    from workbench.recording.library_index import index_path
+
     with tempfile.TemporaryDirectory() as made:
         folder = options.folder or Path(made) / "recordings"
         if not folder.exists():
             began = time.perf_counter()
             make(folder, options.recordings)
             print(f"{options.recordings} recordings made in {time.perf_counter() - began:.1f} s")
-        index = folder / ".workbench" / "library.sqlite"
+        index = index_path(folder)
         for name in ("without an index", "with an index"):
             runs = []
             for _ in range(options.repeats):

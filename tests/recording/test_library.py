@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +27,12 @@ from PIL import Image
 from tests.recording.library_files import describe, jpeg
 from tests.recording.made import Made
 from workbench.recording.library import Library, LibraryError
-from workbench.recording.library_index import LibraryIndex
+from workbench.recording.library_index import LibraryIndex, index_path
 from workbench.recording.library_read import read_found
-from workbench.recording.library_row import LibraryRow, facts_as_dict, facts_from_dict
-from workbench.recording.library_scan import scan_folder
+from workbench.recording.library_row import Entry, LibraryRow, facts_as_dict, facts_from_dict
+from workbench.recording.library_scan import Found, scan_folder
 from workbench.recording.read_episode import read_episode
+from workbench.recording.reading import read_rows
 
 
 @pytest.fixture(scope="module")
@@ -66,9 +67,7 @@ def read(folder: Path) -> list[LibraryRow]:
 def tree(folder: Path) -> dict[str, bytes]:
     """All files that a person sees."""
     return {
-        path.relative_to(folder).as_posix(): path.read_bytes()
-        for path in folder.rglob("*")
-        if path.is_file() and ".workbench" not in path.parts
+        path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()
     }
 
 
@@ -257,26 +256,26 @@ def test_only_what_changed_is_read_again(
     for name in "abc":
         describe(tmp_path, name, note=name)
     library.refresh()
-    opened: list[str] = []
-    real = Path.open
+    read_keys: list[str] = []
 
-    def spy(path: Path, *arguments: Any, **options: Any) -> Any:
-        opened.append(path.name)
-        return real(path, *arguments, **options)
+    def spy(folder: Path, wanted: Iterable[Found]) -> Iterator[tuple[Found, list[Entry]]]:
+        wanted = list(wanted)
+        read_keys.extend(found.key for found in wanted)
+        return read_rows(folder, wanted)
 
-    monkeypatch.setattr(Path, "open", spy)
+    monkeypatch.setattr("workbench.recording.library.read_rows", spy)
     library.refresh()
-    assert opened == []
+    assert read_keys == []
     describe(tmp_path, "b", note="changed")
-    opened.clear()
+    read_keys.clear()
     for suffix in (".json", ".h5", ".rrd"):
         (tmp_path / f"c{suffix}").unlink()
     library.refresh()
-    assert opened == ["b.json"]
+    assert read_keys == ["b"]
     assert [(row.name, row.note) for row in library.rows()] == [("a", "a"), ("b", "changed")]
-    opened.clear()
+    read_keys.clear()
     assert [row.note for row in read(tmp_path)] == ["a", "changed"]
-    assert opened == []  # from the index
+    assert read_keys == []  # from the index
 
 
 @pytest.mark.parametrize(
@@ -286,7 +285,7 @@ def test_an_index_that_is_wrong_is_made_anew(tmp_path: Path, damage: str) -> Non
     for k in range(30):
         describe(tmp_path, f"r{k:02}", seed=k)
     good = read(tmp_path)
-    index = tmp_path / ".workbench" / "library.sqlite"
+    index = index_path(tmp_path)
     content = index.read_bytes()
     if damage == "deleted":
         index.unlink()
@@ -313,7 +312,7 @@ def test_a_page_of_garbage_within_the_index_costs_no_more_than_reading_again(tmp
     for k in range(120):
         describe(tmp_path, f"r{k:03}", seed=k)
     good = read(tmp_path)
-    index = tmp_path / ".workbench" / "library.sqlite"
+    index = index_path(tmp_path)
     content = bytearray(index.read_bytes())
     for page in range(1, len(content) // 4096):
         content[page * 4096 : page * 4096 + 200] = os.urandom(200)
@@ -321,19 +320,44 @@ def test_a_page_of_garbage_within_the_index_costs_no_more_than_reading_again(tmp
     assert read(tmp_path) == good
 
 
-def test_where_the_folder_cannot_be_written_the_index_lies_in_the_cache(
+def test_an_index_that_came_with_the_folder_is_left_alone(tmp_path: Path) -> None:
+    folder, mine = tmp_path / "recordings", tmp_path / "another program's.sqlite"
+    describe(folder, "a")
+    with sqlite3.connect(mine) as database:
+        database.execute("CREATE TABLE read (theirs)")
+    database.close()
+    (folder / ".workbench").mkdir()
+    (folder / ".workbench" / "library.sqlite").symlink_to(mine)
+    before = mine.read_bytes()
+    assert [row.name for row in read(folder)] == ["a"]
+    assert mine.read_bytes() == before
+    assert sorted(path.name for path in (folder / ".workbench").iterdir()) == ["library.sqlite"]
+
+
+def test_without_a_place_for_the_index_it_is_in_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, cache = tmp_path / "recordings", tmp_path / "cache"
     monkeypatch.setenv("XDG_CACHE_HOME", str(cache))
     describe(folder, "a")
-    (folder / ".workbench").write_text("a file where the folder should be")
     index = LibraryIndex(folder)
     assert index.path is not None and index.path.is_relative_to(cache)
     index.close()
     shutil.rmtree(cache)
-    cache.write_text("no place here either")
+    cache.write_text("no place here")
     assert [row.name for row in read(folder)] == ["a"]
+
+
+def test_indices_of_many_folders_do_not_add_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr("workbench.recording.library_index.MOST_INDICES", 3)
+    for k in range(6):
+        index = LibraryIndex(tmp_path / f"{k}")
+        os.utime(index_path(tmp_path / f"{k}"), (k, k))
+        index.close()
+    LibraryIndex(tmp_path / "last").close()
+    left = {path.name for path in index_path(tmp_path).parent.iterdir()}
+    assert left == {index_path(tmp_path / name).name for name in ("4", "5", "last")}
 
 
 def test_two_processes_at_once_have_the_same_rows(tmp_path: Path) -> None:

@@ -15,38 +15,22 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
+from workbench.machine.regular_file import open_regular_file
+from workbench.recording.json_file import read_json
 from workbench.recording.library_row import clean_note, clean_tags
 from workbench.recording.replace_file import replace_file
 
-MOST_BYTES = 64 << 20
-"""Of a .json: more is no description of episodes, and would fill the memory."""
+MOST_NOTES_BYTES = 16 << 20
+"""Of a ``.notes``, and of the ``.json`` of a recording of ours, which holds its task's source and one small picture."""
 _NOTES = "workbench_notes"
-
-
-def read_json(path: Path) -> Any:
-    """What a ``.json`` holds.
-
-    Raises:
-        OSError: it cannot be read.
-        ValueError: it is no JSON, or much too long. The message is the end of a sentence.
-    """
-    with path.open("rb") as file:
-        content = file.read(MOST_BYTES + 1)
-    if len(content) > MOST_BYTES:
-        raise ValueError(f"is longer than {MOST_BYTES >> 20} MB")
-    try:
-        return json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise ValueError("is not JSON, or was cut short") from error
 
 
 def read_notes(path: Path) -> dict[str, tuple[tuple[str, ...], str]]:
     """Tags and note of each trajectory ("" where the file has no trajectories) in a ``.notes``; what is not
     one holds none."""
     try:
-        entries = read_json(path)[_NOTES]
+        entries = read_json(path, MOST_NOTES_BYTES)[_NOTES]
         return {
             str(name): (clean_tags(entry.get("tags")), clean_note(entry.get("note")))
             for name, entry in entries.items()
@@ -79,11 +63,11 @@ def write_into_description(path: Path, tags: tuple[str, ...], note: str) -> None
         OSError: it cannot be read or written.
         ValueError: it is no recording of ours. The message is the end of a sentence.
     """
-    described = read_json(path)
+    described = read_json(path, MOST_NOTES_BYTES)
     if not isinstance(described, dict) or not isinstance(described.get("workbench"), dict):
         raise ValueError("is not a recording of the workbench")
     described["workbench"] |= {"tags": list(tags), "note": note}
     # Indented as what was read: these files are looked at.
-    with path.open("rb") as file:
+    with open_regular_file(path) as file:
         indent = 2 if b"\n" in file.read(4) else None
     replace_file(path, json.dumps(described, indent=indent).encode())

@@ -17,6 +17,8 @@ from typing import Any
 
 import xxhash
 
+from workbench.machine.regular_file import open_regular_file
+
 _HASH = "xxh3_128"
 _BLOCK = 1 << 20
 
@@ -24,12 +26,11 @@ _BLOCK = 1 << 20
 def checksum(path: Path) -> dict[str, Any]:
     """Of the file at `path`, as JSON. Raises OSError."""
     hashed = xxhash.xxh3_128()
-    block = memoryview(bytearray(_BLOCK))
     size = 0
-    with path.open("rb", buffering=0) as file:
-        while count := file.readinto(block):
-            hashed.update(block[:count])
-            size += count
+    with open_regular_file(path) as file:
+        while block := file.read(_BLOCK):
+            hashed.update(block)
+            size += len(block)
     return {"bytes": size, _HASH: hashed.hexdigest()}
 
 

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from workbench.core.geometry import SceneGeometry
+from workbench.machine.regular_file import read_regular_file
 from workbench.recording.checksums import checksum
 from workbench.recording.columns import Column
 from workbench.recording.episode import EpisodeInfo, acted_by_from
@@ -38,6 +39,8 @@ from workbench.recording.survey import Survey, camera_words
 
 FORMAT = 1
 THUMBNAIL_WIDTH = 160
+MOST_SOURCE_BYTES = 4 << 20
+"""Of a task's file that is looked for by what it names."""
 
 
 def describe(survey: Survey) -> dict[str, Any]:
@@ -106,11 +109,7 @@ def thumbnail(picture: bytes | None) -> str | None:
 
 def info_from(said: dict[str, Any], folder: Path) -> EpisodeInfo:
     """The info that `said` describes, of a recording in `folder`. Raises KeyError or TypeError."""
-    source_file = said["source_file"]
-    if said.get("source_path") and (
-        found := _source_where(str(said["source_path"]), str(said["task"]), folder)
-    ):
-        source_file = os.fspath(found.resolve())
+    source_file = task_file(said.get("source_path"), said["task"], folder) or said["source_file"]
     return EpisodeInfo(
         task=said["task"],
         env_index=said["env_index"],
@@ -133,6 +132,12 @@ def info_from(said: dict[str, Any], folder: Path) -> EpisodeInfo:
     )
 
 
+def task_file(source_path: object, task: object, folder: Path) -> str | None:
+    """The task's own file, where `source_path` leads to from the recording's `folder`; None where it is not found."""
+    found = _source_where(str(source_path), str(task), folder) if source_path else None
+    return None if found is None else os.fspath(found.resolve())
+
+
 def _source_where(path: str, task: str, folder: Path) -> Path | None:
     """The task's file, where `path` leads to from `folder`; None where it is not found.
 
@@ -146,9 +151,10 @@ def _source_where(path: str, task: str, folder: Path) -> Path | None:
         for begin in range(len(parts)):
             candidate = place.joinpath(*parts[begin:])
             try:
-                if candidate.is_file() and task in candidate.read_text(encoding="utf-8"):
+                content = read_regular_file(candidate, MOST_SOURCE_BYTES)
+                if task.encode() in content:
                     return candidate
-            except (OSError, UnicodeDecodeError):
+            except (OSError, ValueError):
                 continue
     return None
 

@@ -10,8 +10,11 @@ of ids; ids that 16 bits do not hold are the four bytes of an RGBA PNG.
 
 from __future__ import annotations
 
+import contextlib
 import io
-from collections.abc import Sequence
+import struct
+import zlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -26,6 +29,8 @@ MODALITIES: tuple[Modality, ...] = ("rgb", "depth", "segmentation")
 
 JPEG_QUALITY = 85
 MILLIMETRES_PER_METRE = 1000.0
+MOST_PIXELS = 1 << 24
+"""Of one picture: 4096 x 4096. A PNG of 100 kB can claim a hundred times as many."""
 
 
 @dataclass(frozen=True)
@@ -63,13 +68,27 @@ def encode(modality: Modality, picture: NDArray) -> bytes:
 
 def decode(modality: Modality, blob: bytes) -> NDArray:
     """The inverse of `encode`, as far as JPEG and whole millimetres allow. Raises OSError where `blob` is no picture."""
-    with Image.open(io.BytesIO(blob)) as image:
+    with open_picture(blob) as image:
         if modality == "rgb":
             return np.array(image.convert("RGB"))
         pixels = np.array(image)
+    if pixels.ndim == 3 and (pixels.shape[2] != 4 or modality != "segmentation"):
+        raise OSError(f"it is a picture of {pixels.shape[2]} colours, and no {modality}")
     if modality == "depth":
         return (pixels / MILLIMETRES_PER_METRE).astype(np.float32)
     return pixels.view(np.int32)[..., 0] if pixels.ndim == 3 else pixels.astype(np.int32)
+
+
+@contextlib.contextmanager
+def open_picture(blob: bytes) -> Iterator[Image.Image]:
+    """A JPEG or PNG of at most `MOST_PIXELS`, not decoded yet. Raises OSError where it is none, also from the block."""
+    try:
+        with Image.open(io.BytesIO(blob), formats=("JPEG", "PNG")) as image:
+            if image.width * image.height > MOST_PIXELS:
+                raise OSError(f"it claims {image.width} x {image.height} pixels")
+            yield image
+    except (ValueError, SyntaxError, struct.error, zlib.error, Image.DecompressionBombError) as error:
+        raise OSError(f"it is no picture ({error})") from error
 
 
 def encode_jpeg(image: NDArray[np.uint8]) -> bytes:

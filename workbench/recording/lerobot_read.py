@@ -2,33 +2,43 @@
 
 A dataset holds no scene, so there is nothing to show in 3-D. What it holds of an episode is T decisions; the state
 after the last of them was never written down and is NaN here, without a picture. Films are taken apart when a camera
-is first looked at.
+is first looked at. A dataset that somebody was sent may say anything of itself: what it names has to lie in it, and
+what it claims is bounded.
 """
 
 from __future__ import annotations
 
-import json
 import math
-import subprocess
-import threading
-from collections.abc import Sequence
+import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
-import imageio_ffmpeg
 import numpy as np
+import pyarrow as pa
 import pyarrow.dataset as ds
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from workbench.core.pictures import CameraInfo
+from workbench.machine.regular_file import open_regular_file
 from workbench.recording import lerobot_format as form
-from workbench.recording.encoded_pictures import EncodedPictures, encode_jpeg
-from workbench.recording.episode import CameraTrack, Episode, EpisodeInfo
-from workbench.recording.read_maniskill import UnreadableRecording
+from workbench.recording.encoded_pictures import MOST_PIXELS, EncodedPictures
+from workbench.recording.episode import NO_SEED, CameraTrack, Episode, EpisodeInfo
+from workbench.recording.film_pictures import FilmPictures
+from workbench.recording.json_file import read_json
+from workbench.recording.unreadable import UnreadableRecording
 
 USUAL_FOVY = math.radians(60)
 """A dataset does not say how its cameras see; nothing is computed from this."""
+MOST_EPISODES = 100_000
+MOST_FRAMES = 20_000_000
+"""Of a dataset."""
+MOST_LENGTH = 1_000_000
+"""Frames of an episode."""
+_PLACE = re.compile(r"\{(?P<name>chunk_index|file_index|video_key)(:0?(?P<width>\d)d)?\}")
+_NUMBER = re.compile(r"bool|u?int(8|16|32|64)|float(16|32|64)")
 
 
 @dataclass(frozen=True)
@@ -56,29 +66,54 @@ def lerobot_rows(folder: Path) -> tuple[LeRobotRow, ...]:
     """
     info = _info(folder)
     try:
-        wanted = [key for key in (form.REWARD, form.SUCCESS) if key in info["features"]]
-        table = ds.dataset(Path(folder) / "data", format="parquet").to_table(["episode_index", *wanted])
-        of = table["episode_index"].to_numpy()
-        values = {key: table[key].to_numpy().astype(np.float64) for key in wanted}
+        totals, successes = _of_episodes(Path(folder), info)
         ours = _ours(folder)
         rows = []
         for entry in _entries(folder):
             index = int(entry["episode_index"])
-            mine = of == index
-            reward, success = values.get(form.REWARD), values.get(form.SUCCESS)
+            seed = ours[index].get("seed") if 0 <= index < len(ours) else None
             rows.append(
                 LeRobotRow(
                     index,
-                    ", ".join(entry["tasks"]),
+                    _task(entry),
                     int(entry["length"]),
-                    None if reward is None else float(reward[mine].sum()),
-                    None if success is None else bool(success[mine].any()),
-                    ours[index].get("seed") if index < len(ours) else None,
+                    None if totals is None else totals.get(index, 0.0),
+                    None if successes is None else successes.get(index, 0.0) > 0,
+                    seed if isinstance(seed, int) else None,
                 )
             )
     except (OSError, KeyError, ValueError, TypeError) as error:
         raise _broken(folder, error) from error
     return tuple(rows)
+
+
+def _of_episodes(
+    folder: Path, info: dict[str, Any]
+) -> tuple[dict[int, float] | None, dict[int, float] | None]:
+    """The sum of the rewards of each episode, and in how many of its frames it has success; None where none are written."""
+    wanted = [key for key in (form.REWARD, form.SUCCESS) if key in info["features"]]
+    if not wanted:
+        return None, None
+    data = ds.dataset(_tables(folder / "data"), format="parquet")
+    if (frames := data.count_rows()) > MOST_FRAMES:
+        raise ValueError(f"it claims {frames:,} frames")
+    table = data.to_table(["episode_index", *wanted])
+    indices, episode = np.unique(table["episode_index"].to_numpy(), return_inverse=True)
+    sums = [
+        dict(zip(indices.tolist(), np.bincount(episode, _flat(table[key])).tolist()))
+        if key in wanted
+        else None
+        for key in (form.REWARD, form.SUCCESS)
+    ]
+    return sums[0], sums[1]
+
+
+def _flat(column: pa.ChunkedArray) -> NDArray[np.float64]:
+    """One number a frame, which some datasets keep as lists of one."""
+    array: Any = column.combine_chunks()
+    while pa.types.is_fixed_size_list(array.type) or pa.types.is_list(array.type):
+        array = array.flatten()
+    return array.to_numpy(zero_copy_only=False).astype(np.float64)
 
 
 def read_lerobot(folder: Path, index: int) -> Episode:
@@ -101,15 +136,17 @@ def read_lerobot(folder: Path, index: int) -> Episode:
 
 
 def _episode(folder: Path, info: dict[str, Any], entry: dict[str, Any], index: int) -> Episode:
-    file = info["data_path"].format(
-        chunk_index=entry["data/chunk_index"], file_index=entry["data/file_index"]
-    )
-    table = pq.read_table(_inside(folder, file), filters=[("episode_index", "=", index)])
+    numbers = {"chunk_index": entry["data/chunk_index"], "file_index": entry["data/file_index"]}
+    file = _inside(folder, _filled(info["data_path"], numbers))
+    open_regular_file(file).close()
+    table = pq.read_table(file, filters=[("episode_index", "=", index)])
     length, features = table.num_rows, info["features"]
+    if length > MOST_LENGTH:
+        raise ValueError(f"episode {index} claims {length:,} frames")
     columns = {
         key: np.array(table[key].to_pylist(), dtype=feature["dtype"]).reshape(length, -1)
         for key, feature in features.items()
-        if key in table.column_names and feature["dtype"] not in ("string", "image", "video")
+        if key in table.column_names and np.dtype(_number_type(feature["dtype"])).kind in "biuf"
     }
     action = columns.get(form.ACTION, np.zeros((length, 0))).astype(np.float32)
     names = features.get(form.ACTION, {}).get("names")
@@ -121,9 +158,9 @@ def _episode(folder: Path, info: dict[str, Any], entry: dict[str, Any], index: i
     from_ours = ours[index] if index < len(ours) else {}
     return Episode(
         info=EpisodeInfo(
-            task=", ".join(entry["tasks"]) or folder.name,
+            task=_task(entry) or folder.name,
             env_index=0,
-            seed=int(from_ours.get("seed", -1)),
+            seed=int(from_ours.get("seed", NO_SEED)),
             source_file=None,
             source_hash=str(from_ours.get("source_hash", "")),
             source={},
@@ -160,11 +197,14 @@ def _camera(folder: Path, info: dict[str, Any], entry: dict[str, Any], key: str,
     if info["features"][key]["names"][0] == "channels":  # (3, H, W), as some datasets say it
         height, width = info["features"][key]["shape"][1:]
     focal = height / 2 / math.tan(USUAL_FOVY / 2)
+    if not 0 < width * height <= MOST_PIXELS:
+        raise ValueError(f"{key} is said to have pictures of {width} x {height}")
     where = {
         "chunk_index": entry[f"videos/{key}/chunk_index"],
         "file_index": entry[f"videos/{key}/file_index"],
+        "video_key": key,
     }
-    film = _inside(folder, info["video_path"].format(video_key=key, **where))
+    film = _inside(folder, _filled(info["video_path"], where))
     pose = np.tile(np.array([0, 0, 0, 1, 0, 0, 0], np.float32), (length, 1))
     return CameraTrack(
         CameraInfo(
@@ -188,54 +228,9 @@ def _camera(folder: Path, info: dict[str, Any], entry: dict[str, Any], key: str,
     )
 
 
-class FilmPictures(Sequence[bytes]):
-    """The frames of a part of a film as JPEG; all of the part is taken out when one is first asked for."""
-
-    def __init__(self, film: Path, begin: float, count: int, fps: float) -> None:
-        self._film, self._begin, self._count, self._fps = film, begin, count, fps
-        self._blobs: list[bytes] | None = None
-        self._taking = threading.Lock()
-
-    def __len__(self) -> int:
-        return self._count
-
-    @overload
-    def __getitem__(self, index: int) -> bytes: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Sequence[bytes]: ...
-
-    def __getitem__(self, index: int | slice) -> bytes | Sequence[bytes]:
-        with self._taking:
-            if self._blobs is None:
-                self._blobs = self._take_out()
-        return self._blobs[index]
-
-    def _take_out(self) -> list[bytes]:
-        # Half a frame early, so that rounding cannot skip the first one.
-        begin = max(0.0, self._begin - 0.5 / self._fps)
-        frames = imageio_ffmpeg.read_frames(
-            str(self._film),
-            input_params=["-ss", f"{begin:.6f}"],
-            output_params=["-frames:v", str(self._count)],
-        )
-        try:
-            width, height = next(frames)["size"]
-            blobs = [
-                encode_jpeg(np.frombuffer(frame, np.uint8).reshape(height, width, 3)) for frame in frames
-            ]
-        except (OSError, RuntimeError, StopIteration, subprocess.SubprocessError) as error:
-            raise UnreadableRecording(f"The film {self._film.name} cannot be read: {error}") from error
-        if len(blobs) < self._count:
-            raise UnreadableRecording(
-                f"The film {self._film.name} ends after {len(blobs)} of the {self._count} frames of this episode."
-            )
-        return blobs
-
-
 def _info(folder: Path) -> dict[str, Any]:
     try:
-        info = json.loads((Path(folder) / form.INFO).read_text(encoding="utf-8"))
+        info = read_json(Path(folder) / form.INFO)
         version = str(info["codebase_version"])
         if not isinstance(info["features"], dict) or not float(info["fps"]) > 0:
             raise ValueError("it names no features or no rate")
@@ -250,15 +245,48 @@ def _info(folder: Path) -> dict[str, Any]:
 
 
 def _entries(folder: Path) -> list[dict[str, Any]]:
-    table = ds.dataset(Path(folder) / "meta" / "episodes", format="parquet")
-    wanted = [name for name in table.schema.names if not name.startswith("stats/")]
-    return table.to_table(wanted).to_pylist()
+    data = ds.dataset(_tables(Path(folder) / "meta" / "episodes"), format="parquet")
+    if (episodes := data.count_rows()) > MOST_EPISODES:
+        raise ValueError(f"it claims {episodes:,} episodes, and {MOST_EPISODES:,} can be listed")
+    return data.to_table([name for name in data.schema.names if not name.startswith("stats/")]).to_pylist()
+
+
+def _task(entry: dict[str, Any]) -> str:
+    return ", ".join(map(str, entry["tasks"] or ()))
+
+
+def _tables(folder: Path) -> list[str]:
+    """The parquet files below a folder; a pipe of such a name would be waited for."""
+    found = [
+        os.path.join(below, name)
+        for below, _, names in os.walk(folder)
+        for name in sorted(names)
+        if name.endswith(".parquet") and os.path.isfile(os.path.join(below, name))
+    ]
+    if not found:
+        raise FileNotFoundError(f"it has no {folder.name}/*.parquet")
+    return sorted(found)
+
+
+def _number_type(name: object) -> str:
+    """As numpy calls it; an object, which is no number, for what is none."""
+    return name if isinstance(name, str) and _NUMBER.fullmatch(name) else "O"
+
+
+def _filled(pattern: str, values: dict[str, Any]) -> str:
+    """``data/chunk-{chunk_index:03d}/...`` with these values; nothing else of Python's format can be said there."""
+
+    def value(found: re.Match[str]) -> str:
+        held = values[found["name"]]
+        return f"{int(held):0{int(found['width'] or 0)}d}" if found["name"] != "video_key" else str(held)
+
+    return _PLACE.sub(value, pattern)
 
 
 def _ours(folder: Path) -> list[dict[str, Any]]:
     """Which recordings the episodes come from, where we wrote the dataset."""
     try:
-        found = json.loads((Path(folder) / form.OURS).read_text(encoding="utf-8"))["episodes"]
+        found = read_json(Path(folder) / form.OURS)["episodes"]
     except (OSError, ValueError, KeyError, TypeError):
         return []
     return found if isinstance(found, list) and all(isinstance(one, dict) for one in found) else []

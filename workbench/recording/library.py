@@ -16,16 +16,16 @@ import hashlib
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from workbench.machine.watched_thread import watched_thread
 from workbench.recording.annotations import write_into_description, write_notes
 from workbench.recording.library_index import Kept, LibraryIndex
-from workbench.recording.library_read import DATASET_KEY, Entry, read_found
-from workbench.recording.library_row import Facts, LibraryRow, clean_note, clean_tags, text
-from workbench.recording.library_scan import NOTES, Found, Scan, found_of, key_of, scan_folder
+from workbench.recording.library_row import Entry, Facts, LibraryRow, clean_note, clean_tags, text
+from workbench.recording.library_scan import DATASET_KEY, NOTES, Found, Scan, found_of, key_of, scan_folder
+from workbench.recording.reading import read_rows
 from workbench.recording.trash import (
     Trash,
     TrashError,
@@ -195,10 +195,9 @@ class Library:
         changed.sort(key=lambda found: found.newest, reverse=True)
         unsaved: list[tuple[str, str, list[Entry]]] = []
         published = time.monotonic()
-        for done, found in enumerate(changed):
+        for done, (found, entries) in enumerate(read_rows(self.folder, changed)):
             if self._stopping.is_set():
                 break
-            entries = read_found(self.folder, found)
             with self._changing:
                 if found.key not in self._found:
                     continue  # deleted on this page since
@@ -213,19 +212,18 @@ class Library:
             self._save(unsaved, forgotten)
             self._show(reading=None, problem=scan.problem)
 
-    def _read_again(self, keys: Iterable[str]) -> None:
+    def _read_again(self, keys: Collection[str]) -> None:
         """Of what was just done here, so that whoever did it sees it at once."""
         self._found = scan_folder(self.folder).found
-        read, gone = [], []
-        for key in keys:
-            found = self._found.get(key)
-            if found is None:
-                self._kept.pop(key, None)
-                gone.append(key)
-            else:
-                entries = read_found(self.folder, found)
-                self._kept[key] = Kept(found.signature, tuple(facts for facts, _ in entries))
-                read.append((key, found.signature, entries))
+        read = []
+        gone = [key for key in keys if key not in self._found]
+        for key in gone:
+            self._kept.pop(key, None)
+        for found, entries in read_rows(
+            self.folder, [self._found[key] for key in keys if key in self._found]
+        ):
+            self._kept[found.key] = Kept(found.signature, tuple(facts for facts, _ in entries))
+            read.append((found.key, found.signature, entries))
         self._save(read, gone)
         self._show(reading=self._view.reading, problem=self._view.problem)
 

@@ -6,8 +6,9 @@ For each name it keeps the signature of its files, the rows that they gave, and 
 that bears two processes at once and being killed; each write is one short transaction. A process that finds the file
 locked for long goes on without having written.
 
-It lies in ``.workbench`` in the library's folder, so that it goes where the library goes; where that cannot be written,
-in the user's cache folder; and else in memory, for this time.
+It lies in the user's cache folder, and where that cannot be written in memory, for this time. Not in the library's folder: one that
+came from elsewhere would bring an index along, and SQLite does what a file says (it may be a link to another program's
+database, which would be given our tables, or have a journal that names files to delete).
 """
 
 from __future__ import annotations
@@ -23,15 +24,16 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from workbench.recording.library_read import Entry
-from workbench.recording.library_row import Facts, facts_as_dict, facts_from_dict
+from workbench.recording.library_row import Entry, Facts, facts_as_dict, facts_from_dict
 from workbench.recording.library_scan import found_of
 
 log = logging.getLogger(__name__)
 
-VERSION = 2
+VERSION = 3
 """Raised whenever rows are read or kept in another way: what another version left is read again."""
 LOCKED_SECONDS = 3.0
+MOST_INDICES = 200
+"""Of folders that were looked into."""
 _TABLES = (
     "CREATE TABLE IF NOT EXISTS read (key TEXT PRIMARY KEY, signature TEXT NOT NULL, rows TEXT NOT NULL)",
     "CREATE TABLE IF NOT EXISTS pictures (key TEXT, row INTEGER, jpeg BLOB NOT NULL, PRIMARY KEY (key, row))",
@@ -54,12 +56,13 @@ class LibraryIndex:
         self.path: Path | None = None
         """Where it lies; None in memory."""
         self._database: sqlite3.Connection | None = None
-        for path in (folder / ".workbench" / "library.sqlite", _in_cache(folder)):
-            self._database = _open(path)
-            if self._database is not None:
-                self.path = path
-                return
-        self._database = _connect(":memory:")
+        path = index_path(folder)
+        self._database = _open(path)
+        if self._database is None:
+            self._database = _connect(":memory:")
+            return
+        self.path = path
+        _tidy(path)
 
     def load(self) -> dict[str, Kept]:
         """All that it holds, by key."""
@@ -156,7 +159,8 @@ def _is_text(key: str) -> bool:
     return True
 
 
-def _in_cache(folder: Path) -> Path:
+def index_path(folder: Path) -> Path:
+    """Where the index of a folder lies."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     name = hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=12).hexdigest()
     return cache / "workbench" / "libraries" / f"{name}.sqlite"
@@ -179,6 +183,17 @@ def _open(path: Path) -> sqlite3.Connection | None:
         if not _remove(path):
             return None
     return None
+
+
+def _tidy(path: Path) -> None:
+    """Throw away the indices that were used least lately, where there are very many."""
+    try:
+        os.utime(path)
+        indices = sorted(path.parent.glob("*.sqlite"), key=lambda index: index.stat().st_mtime)
+    except OSError:
+        return  # another process is at it
+    for index in indices[:-MOST_INDICES]:
+        _remove(index)
 
 
 def _connect(name: str) -> sqlite3.Connection:

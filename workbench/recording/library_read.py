@@ -11,21 +11,22 @@ than find nothing. A ``.json`` that is something else (a folder of recordings ma
 from __future__ import annotations
 
 import base64
-import binascii
 import io
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from PIL import Image
 
-from workbench.recording.annotations import read_json, read_notes
+from workbench.machine.regular_file import NotARegularFile, open_regular_file
+from workbench.recording.annotations import read_notes
 from workbench.recording.checksums import wrong_size
+from workbench.recording.encoded_pictures import open_picture
 from workbench.recording.episode import acted_by_from, acted_by_in_words
-from workbench.recording.lerobot_read import lerobot_rows
+from workbench.recording.json_file import NotJson, read_json
 from workbench.recording.library_row import (
+    Entry,
     Facts,
     Kind,
     clean_note,
@@ -36,20 +37,18 @@ from workbench.recording.library_row import (
     truth,
     whole,
 )
-from workbench.recording.library_scan import NOTES, Found
-from workbench.recording.read_maniskill import UnreadableRecording
+from workbench.recording.library_scan import DATASET_KEY, NOTES, Found
+from workbench.recording.safe_h5 import H5Dataset, H5Group, RefusedH5, open_h5
+from workbench.recording.unreadable import UnreadableRecording
 
-DATASET_KEY = ["meta", "info"]
-"""How the key of a LeRobot dataset ends."""
 THUMBNAIL_PIXELS = 96
 THUMBNAIL_BYTES = 8192
 """A thumbnail as it was recorded is taken as it is up to here, and made smaller beyond."""
+MOST_EPISODES = 20_000
+"""Of one file that are listed."""
 
 _LARGEST_PICTURE = 4096
 """Pixels of a side of a picture that a thumbnail is made of."""
-
-Entry = tuple[Facts, bytes | None]
-"""A recording and its thumbnail (jpeg)."""
 
 
 def read_found(folder: Path, found: Found) -> list[Entry]:
@@ -72,7 +71,7 @@ def _read(folder: Path, found: Found) -> list[Entry]:
     if ".json" in found.sizes:
         try:
             described = read_json(found.path(folder, ".json"))
-        except ValueError as error:
+        except NotJson as error:
             return [_broken(folder, found, str(error))]
         if isinstance(described, dict) and isinstance(described.get("workbench"), dict):
             return [_ours(folder, found, described["workbench"])]
@@ -155,12 +154,12 @@ def _thumbnail(encoded: object) -> bytes | None:
         return None
     try:
         content = base64.b64decode(encoded.partition("base64,")[2] or encoded)
-        with Image.open(io.BytesIO(content)) as image:
+        with open_picture(content) as image:
             if image.format == "JPEG" and max(image.size) <= 2 * THUMBNAIL_PIXELS:
                 if len(content) <= THUMBNAIL_BYTES:
                     return content
             return _small_jpeg(image.convert("RGB"))
-    except (ValueError, OSError, SyntaxError, binascii.Error, Image.DecompressionBombError):
+    except (ValueError, OSError):
         return None
 
 
@@ -179,6 +178,8 @@ def _maniskills(folder: Path, found: Found, described: dict[str, Any]) -> list[E
     task = text(env_info.get("env_id")) if isinstance(env_info, dict) else ""
     episodes = [episode for episode in described["episodes"] if isinstance(episode, dict)]
     written = found.newest / 1e9
+    left_out = len(episodes) - MOST_EPISODES
+    episodes = episodes[:MOST_EPISODES]
     if ".h5" not in found.sizes:
         if not task:
             return []  # a .json of something else that has episodes
@@ -215,11 +216,17 @@ def _maniskills(folder: Path, found: Found, described: dict[str, Any]) -> list[E
                 pictures.get(trajectory),
             )
         )
+    if left_out > 0:
+        more = f"{name}.json names {left_out:,} episodes more than the {MOST_EPISODES:,} that are listed of a file."
+        entries.append((Facts("maniskill", task=task, written=written, problem=more), None))
     return entries
 
 
 def _lerobots(folder: Path, found: Found) -> list[Entry]:
     """One row an episode of a LeRobot dataset, which is known by its ``meta/info.json``."""
+    # Arrow's threads must not be there when a reader is forked, and most libraries hold no dataset.
+    from workbench.recording.lerobot_read import lerobot_rows
+
     written = found.newest / 1e9
     try:
         rows = lerobot_rows(found.path(folder, ".json").parents[1])
@@ -251,32 +258,35 @@ def _look_into(
     totals: dict[str, float | None] = {}
     pictures: dict[str, bytes] = {}
     try:
-        # Without a lock: a recorder that has the file open would be a reason to show nothing.
-        with h5py.File(path, "r", locking=False) as file:
+        with open_h5(path) as file:
             for name in trajectories:
-                group = file.get(name)
-                if not isinstance(group, h5py.Group):
+                group = file.group(name)
+                if group is None:
                     continue
+                totals[name] = None
                 rewards = group.get("rewards")
-                is_numbers = isinstance(rewards, h5py.Dataset) and rewards.dtype.kind in "fiu"
-                totals[name] = (
-                    number(float(np.asarray(rewards, dtype=np.float64).sum())) if is_numbers else None
-                )
+                if isinstance(rewards, H5Dataset) and rewards.is_numbers:
+                    totals[name] = number(float(rewards.read().sum(dtype=np.float64)))
                 if (picture := _last_picture(group)) is not None:
                     pictures[name] = picture
+    except RefusedH5 as error:
+        return totals, pictures, f"{path.name} {error}."
+    except NotARegularFile as error:
+        return totals, pictures, f"{path.name} {error.strerror}."
     except (OSError, RuntimeError, KeyError, ValueError):
         return totals, pictures, f"{path.name} is damaged, or still being written."
     return totals, pictures, None
 
 
-def _last_picture(group: h5py.Group) -> bytes | None:
+def _last_picture(group: H5Group) -> bytes | None:
     """A small jpeg of what the first camera saw last, in colour; None where no picture was recorded."""
-    cameras = group.get("obs/sensor_data")
-    for camera in cameras.values() if isinstance(cameras, h5py.Group) else ():
-        rgb = camera.get("rgb") if isinstance(camera, h5py.Group) else None
-        if isinstance(rgb, h5py.Dataset) and rgb.dtype == np.uint8 and rgb.ndim == 4 and len(rgb):
+    cameras = group.group("obs/sensor_data")
+    for name in cameras or ():
+        camera = None if cameras is None else cameras.group(name)
+        rgb = None if camera is None else camera.get("rgb")
+        if isinstance(rgb, H5Dataset) and rgb.dtype == np.uint8 and rgb.ndim == 4 and len(rgb):
             if rgb.shape[3] == 3 and max(rgb.shape[1:3]) <= _LARGEST_PICTURE:
-                return _small_jpeg(Image.fromarray(rgb[len(rgb) - 1]))
+                return _small_jpeg(Image.fromarray(rgb.row(len(rgb) - 1)))
     return None
 
 
@@ -286,7 +296,10 @@ def _rrd_only(folder: Path, found: Found) -> Entry:
 
     path = found.path(folder, ".rrd")
     try:
+        open_regular_file(path).close()
         said = read_properties(path)
+    except NotARegularFile as error:
+        return _broken(folder, found, str(error.strerror))
     except (OSError, ValueError, RuntimeError):
         return _broken(folder, found, "is no recording that rerun can read, or was cut short")
     episode = said.get("episode", {})

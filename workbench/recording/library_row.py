@@ -55,6 +55,10 @@ class Facts:
     """One sentence, where something is wrong with the files."""
 
 
+Entry = tuple[Facts, bytes | None]
+"""A recording and its thumbnail (jpeg)."""
+
+
 @dataclass(frozen=True)
 class LibraryRow:
     """A recording in the table."""

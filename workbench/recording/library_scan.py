@@ -21,6 +21,8 @@ SUFFIXES = (".json", ".h5", ".rrd")
 NOTES = ".notes"
 """Ending of the file with tags and notes of recordings that are not ours to write into: JSON, but a ``.json`` would be
 taken for a recording's by whoever looks for those."""
+DATASET_KEY = ["meta", "info"]
+"""How the key of a LeRobot dataset ends."""
 SETTLES = 3.0
 """Seconds in which a folder may change again within one tick of its time, and files of one recording come one by one."""
 MOST_ENTRIES = 500_000

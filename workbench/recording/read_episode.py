@@ -9,13 +9,12 @@ Pictures stay in the file until one is asked for.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,17 +22,23 @@ from workbench.core.geometry import SceneGeometry
 from workbench.core.shared_shapes import SharedShapes
 from workbench.recording.checksums import check
 from workbench.recording.columns import Column
-from workbench.recording.description import columns_from, info_from
+from workbench.recording.description import columns_from, info_from, task_file
 from workbench.recording.encoded_pictures import EncodedPictures, Modality
 from workbench.recording.episode import CameraTrack, Episode, Unread
+from workbench.recording.json_file import NotJson, parse_json, read_json
 from workbench.recording.layout import OBSERVATION, body_entities, camera_entities, evaluate_entity
 from workbench.recording.maniskill_h5 import TRAJECTORY
-from workbench.recording.read_maniskill import UnreadableRecording as UnreadableRecording
 from workbench.recording.read_maniskill import leaves
 from workbench.recording.read_maniskill import read_maniskill as read_maniskill
 from workbench.recording.read_maniskill import trajectories as trajectories
 from workbench.recording.rerun_table import RerunTable, rows_at, wxyz_from_optical
+from workbench.recording.safe_h5 import open_h5
 from workbench.recording.survey import camera_from
+from workbench.recording.unreadable import UnreadableRecording as UnreadableRecording
+
+MOST_STATES = 10_000_000
+MOST_COLUMN_BYTES = 1 << 29
+"""Of one column, as the recording describes it: the rows that say nothing new are not in the file, so its size says little."""
 
 
 def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
@@ -47,6 +52,18 @@ def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
 
     Raises:
         UnreadableRecording: what is there is no recording of ours, or all of it is broken; the message says which.
+    """
+    episode, source_path = read_inert(path, shapes)
+    found = task_file(source_path, episode.info.task, Path(path).parent)
+    if found is not None:
+        episode.info = replace(episode.info, source_file=found)
+    return episode
+
+
+def read_inert(path: Path, shapes: SharedShapes | None = None) -> tuple[Episode, str | None]:
+    """As `read_episode`, from these files alone: the task's own file is not looked for, and where it may be is said beside.
+
+    Raises as `read_episode`.
     """
     path = Path(path)
     files = {suffix: path.with_suffix(suffix) for suffix in (".rrd", ".h5", ".json")}
@@ -82,12 +99,13 @@ def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
             _add_states(episode, states)
         elif table is not None:
             episode.obs = dict(_observations(table, columns_from(said["obs"]), episode.length + 1))
-    except (OSError, RuntimeError, KeyError, TypeError, ValueError, IndexError) as error:
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         raise UnreadableRecording(
             f"{path.stem} is a recording, but a broken one ({type(error).__name__}: {error})"
         ) from error
     episode.unread = tuple(unread)
-    return episode
+    source_path = said.get("source_path")
+    return episode, source_path if isinstance(source_path, str) else None
 
 
 def _unread(file: Path, error: Exception, lost: str) -> Unread:
@@ -101,8 +119,8 @@ def _beside(file: Path | None) -> tuple[dict[str, Any], Exception | None]:
     if file is None:
         return {}, None
     try:
-        said = json.loads(file.read_bytes())
-    except (OSError, ValueError, RecursionError) as error:
+        said = read_json(file)
+    except (OSError, NotJson) as error:
         return {}, error
     ours = said.get("workbench") if isinstance(said, dict) else None
     return (ours if isinstance(ours, dict) else {}), None
@@ -122,7 +140,7 @@ def _description(
     if not isinstance(said, str):
         raise UnreadableRecording(f"{path.stem}.rrd is from another program, or from an older workbench.")
     files, texts = (_list(table.property("source", key)) for key in ("files", "texts"))
-    return {**json.loads(said), "source": dict(zip(files, texts))}
+    return {**parse_json(said), "source": dict(zip(files, texts))}
 
 
 def _list(value: Any) -> list[Any]:
@@ -131,6 +149,8 @@ def _list(value: Any) -> list[Any]:
 
 def _episode(said: dict[str, Any], table: RerunTable | None, folder: Path) -> Episode:
     states = int(said["length"]) + 1
+    if not 0 < states <= MOST_STATES:
+        raise ValueError(f"it says that it has {said['length']} steps")
     scene = said["scene"]
     names = tuple(scene["body_names"])
     geometry = poses = None
@@ -139,6 +159,7 @@ def _episode(said: dict[str, Any], table: RerunTable | None, folder: Path) -> Ep
         bare = SceneGeometry(1, names, tuple(scene["body_kinds"]), tuple(scene["body_hidden"]), ())
         entities = body_entities(bare)
         geometry = table.geometry(bare, entities)
+        _check_room("the poses", (states, len(entities), 7), np.dtype(np.float32))
         poses = table.poses(entities, states)
         cameras = list(_cameras(said["cameras"], table, states))
     evaluate = {
@@ -149,7 +170,7 @@ def _episode(said: dict[str, Any], table: RerunTable | None, folder: Path) -> Ep
     actions = Column(np.dtype(np.float32), (len(said["action_names"]),))
     number, flag = Column(np.dtype(np.float32), ()), Column(np.dtype(np.bool_), ())
     return Episode(
-        info=info_from(said, folder),
+        info=info_from({**said, "source_path": None}, folder),
         geometry=geometry,
         segmentation={int(key): name for key, name in said["segmentation"].items()},
         poses=poses,
@@ -166,6 +187,7 @@ def _episode(said: dict[str, Any], table: RerunTable | None, folder: Path) -> Ep
 def _column(table: RerunTable | None, entity: str, column: Column, first: int, states: int) -> NDArray:
     """States `first` to the last of the numbers of `entity`, as `column` says they were."""
     shape = (states - first, *column.shape)
+    _check_room(entity, shape, column.dtype)
     fill = np.nan if column.dtype.kind == "f" else 0
     out = np.full(shape, fill, dtype=column.dtype)
     if table is None or out.size == 0:
@@ -179,6 +201,14 @@ def _column(table: RerunTable | None, entity: str, column: Column, first: int, s
     at = rows_at(steps, first, states)
     flat[at >= 0] = values[at[at >= 0]].astype(column.dtype)
     return out
+
+
+def _check_room(what: str, shape: tuple[int, ...], dtype: np.dtype) -> None:
+    """Before it is allocated: what a recording says of itself may be anything. Raises ValueError."""
+    if dtype.kind not in "biuf":
+        raise ValueError(f"{what} is said to be of type {dtype}, which is no plain number")
+    if any(size < 0 for size in shape) or math.prod(shape) * dtype.itemsize > MOST_COLUMN_BYTES:
+        raise ValueError(f"{what} is said to be {shape} numbers")
 
 
 def _cameras(said: Sequence[dict[str, Any]], table: RerunTable, states: int) -> Iterator[CameraTrack]:
@@ -216,13 +246,13 @@ _FLAGS = ("success", "fail")
 
 def _read_states(path: Path) -> dict[str, Any]:
     """What the .h5 holds; where the .rrd holds it too, this is what ManiSkill reads."""
-    with h5py.File(path, "r") as file:
-        if TRAJECTORY not in file:
+    with open_h5(path) as file:
+        group = file.group(TRAJECTORY)
+        if group is None:
             raise KeyError(f"it has no {TRAJECTORY}")
-        group: Any = file[TRAJECTORY]
         held: dict[str, Any] = {name: dict(leaves(group.get(name))) for name in ("env_states", "obs")}
-        held |= {name: group[name][:] for name in ("actions", "rewards", "terminated", "truncated")}
-        return held | {name: group[name][:] for name in _FLAGS if name in group}
+        held |= {name: group.numbers(name) for name in ("actions", "rewards", "terminated", "truncated")}
+        return held | {name: group.numbers(name) for name in _FLAGS if name in group}
 
 
 def _add_states(episode: Episode, held: dict[str, Any]) -> None:

@@ -8,12 +8,10 @@ failure), and entries of ``evaluate()`` besides those two.
 from __future__ import annotations
 
 import datetime
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from numpy.typing import NDArray
 from transforms3d.quaternions import mat2quat
@@ -22,19 +20,19 @@ from workbench.core.pictures import CameraInfo
 from workbench.recording.encoded_pictures import (
     MILLIMETRES_PER_METRE,
     MODALITIES,
+    MOST_PIXELS,
     EncodedPictures,
     Modality,
     encode,
 )
 from workbench.recording.episode import NO_SEED, CameraTrack, Episode, EpisodeInfo
+from workbench.recording.json_file import read_json
+from workbench.recording.safe_h5 import H5Dataset, H5Group, RefusedH5, open_h5
+from workbench.recording.unreadable import UnreadableRecording
 
 _PICTURES = ("sensor_data", "sensor_param")
 _UNKNOWN_DT = 0.05
 """ManiSkill's default control period (20 Hz); the file does not say it."""
-
-
-class UnreadableRecording(ValueError):
-    """A file that is no recording, or a broken one; the message says what is wrong with it in a sentence."""
 
 
 def trajectories(path: Path) -> tuple[str, ...]:
@@ -44,9 +42,9 @@ def trajectories(path: Path) -> tuple[str, ...]:
         UnreadableRecording: it is no such file.
     """
     try:
-        with h5py.File(path, "r") as file:
-            return tuple(sorted((name for name in map(str, file) if name.startswith("traj_")), key=_number))
-    except (OSError, RuntimeError) as error:
+        with open_h5(path) as file:
+            return tuple(sorted((name for name in file if name.startswith("traj_")), key=_number))
+    except (OSError, RuntimeError, RefusedH5) as error:
         raise UnreadableRecording(f"{Path(path).name} is no .h5 that can be read: {error}") from error
 
 
@@ -62,22 +60,28 @@ def read_maniskill(path: Path, trajectory: str) -> Episode:
     path = Path(path)
     document, said = _said(path.with_suffix(".json"), trajectory)
     try:
-        with h5py.File(path, "r") as file:
-            if trajectory not in file:
+        with open_h5(path) as file:
+            group = file.group(trajectory)
+            if group is None:
                 raise UnreadableRecording(f"{path.name} has no {trajectory}.")
-            return _episode(file[trajectory], document, said, path, trajectory)
+            return _episode(group, document, said, path, trajectory)
     except UnreadableRecording:
         raise
+    except RefusedH5 as error:
+        raise UnreadableRecording(f"{path.name} {error}.") from error
     except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
         raise UnreadableRecording(
             f"{trajectory} of {path.name} cannot be read ({type(error).__name__}: {error})"
         ) from error
 
 
-def leaves(node: Any, prefix: str = "", skip: Sequence[str] = ()) -> Iterator[tuple[str, NDArray]]:
-    """Every dataset below `node` by its path, ``a/b``; ``""`` where `node` is one itself."""
-    if isinstance(node, h5py.Dataset):
-        yield prefix, node[:]
+def leaves(
+    node: H5Group | H5Dataset | None, prefix: str = "", skip: Sequence[str] = ()
+) -> Iterator[tuple[str, NDArray]]:
+    """Every dataset of numbers below `node` by its path, ``a/b``; ``""`` where `node` is one itself."""
+    if isinstance(node, H5Dataset):
+        if node.is_numbers:
+            yield prefix, node.read()
     elif node is not None:
         for name in node:
             if name not in skip:
@@ -91,7 +95,7 @@ def _number(name: str) -> tuple[int, str]:
 
 def _said(path: Path, trajectory: str) -> tuple[dict[str, Any], dict[str, Any]]:
     try:
-        document = json.loads(path.read_bytes())
+        document = read_json(path)
         for episode in document["episodes"]:
             if f"traj_{episode['episode_id']}" == trajectory:
                 return document, episode
@@ -103,15 +107,17 @@ def _said(path: Path, trajectory: str) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 def _episode(
-    group: Any, document: dict[str, Any], said: dict[str, Any], path: Path, trajectory: str
+    group: H5Group, document: dict[str, Any], said: dict[str, Any], path: Path, trajectory: str
 ) -> Episode:
     env_info = document.get("env_info") or {}
     kwargs = dict(env_info.get("env_kwargs") or {})
     reset = said.get("reset_kwargs") or {}
     actions, action_names = _actions(group["actions"])
     length = len(actions)
-    flags = {name: np.concatenate([[False], group[name][:]]) for name in ("success", "fail") if name in group}
-    rewards = group["rewards"][:] if "rewards" in group else np.full(length, np.nan)
+    flags = {
+        name: np.concatenate([[False], group.numbers(name)]) for name in ("success", "fail") if name in group
+    }
+    rewards = group.numbers("rewards") if "rewards" in group else np.full(length, np.nan)
     frequency = (kwargs.get("sim_config") or {}).get("control_freq") or 0
     seed: Any = said.get("episode_seed", reset.get("seed"))
     seed = seed[0] if isinstance(seed, list) and seed else seed
@@ -141,8 +147,8 @@ def _episode(
         action=actions,
         action_names=action_names,
         reward=np.asarray(rewards, dtype=np.float32),
-        terminated=group["terminated"][:].astype(np.bool_),
-        truncated=group["truncated"][:].astype(np.bool_),
+        terminated=group.numbers("terminated").astype(np.bool_),
+        truncated=group.numbers("truncated").astype(np.bool_),
         evaluate=flags,
         cameras=_cameras(obs, path),
         env_states=dict(leaves(group.get("env_states"))),
@@ -161,7 +167,7 @@ def _written(path: Path) -> str:
     return when.isoformat(timespec="seconds")
 
 
-def _actions(node: Any) -> tuple[NDArray[np.float32], tuple[str, ...]]:
+def _actions(node: H5Group | H5Dataset) -> tuple[NDArray[np.float32], tuple[str, ...]]:
     """(T, A), of several robots one behind the other, and a name for each of the A."""
     parts = [(name, array.reshape(len(array), -1)) for name, array in leaves(node)]
     names = [f"{name or 'action'}[{i}]" for name, array in parts for i in range(array.shape[1])]
@@ -187,9 +193,11 @@ class _H5Pictures(Sequence[bytes]):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(self._count))]
         number = range(self._count)[index]
-        with h5py.File(self._path, "r") as file:
-            dataset: Any = file[self._dataset]
-            picture = dataset[number]
+        with open_h5(self._path) as file:
+            dataset = file[self._dataset]
+            if not isinstance(dataset, H5Dataset):
+                raise OSError(f"{self._path.name} has changed since it was opened")
+            picture = dataset.row(number)
         if self._modality == "rgb":
             return encode("rgb", np.ascontiguousarray(picture[..., :3]))
         plain = picture.reshape(picture.shape[:2])
@@ -200,45 +208,56 @@ class _H5Pictures(Sequence[bytes]):
         return encode("segmentation", plain.astype(np.int32))
 
 
-def _cameras(obs: Any, path: Path) -> list[CameraTrack]:
-    if not isinstance(obs, h5py.Group) or "sensor_data" not in obs:
+def _cameras(obs: H5Group | H5Dataset | None, path: Path) -> list[CameraTrack]:
+    sensors = obs.group("sensor_data") if isinstance(obs, H5Group) else None
+    if sensors is None or not isinstance(obs, H5Group):
         return []
     tracks = []
-    sensors: Any = obs["sensor_data"]
     for name in sensors:
         held: dict[Modality, EncodedPictures] = {}
         size = (0, 0)
         count = 0
-        for key in sensors[name]:
+        camera = sensors.group(name)
+        for key in camera or ():
             modality: Modality | None = next((known for known in MODALITIES if known == key), None)
-            dataset = sensors[name][key]
-            if modality is None:
+            dataset = None if camera is None or modality is None else camera[key]
+            if modality is None or not isinstance(dataset, H5Dataset):
                 continue
-            count, size = len(dataset), dataset.shape[1:3]
+            if dataset.ndim != 4 or not dataset.is_numbers:
+                raise RefusedH5(
+                    f"has pictures of shape {dataset.shape} and type {dataset.dtype} (at {dataset.name})"
+                )
+            count, size = len(dataset), (dataset.shape[1], dataset.shape[2])
+            if dataset.shape[1] * dataset.shape[2] > MOST_PIXELS:
+                raise RefusedH5(
+                    f"claims pictures of {dataset.shape[2]} x {dataset.shape[1]} pixels (at {dataset.name})"
+                )
             held[modality] = EncodedPictures(modality, _H5Pictures(path, dataset.name, count, modality))
         if held:
-            parameters: Any = obs.get(f"sensor_param/{name}")
+            parameters = obs.group(f"sensor_param/{name}")
             info = _lens(name, size, tuple(held), parameters)
             pose = _poses(parameters, count)
             tracks.append(CameraTrack(info, np.arange(count), pose, **held))
     return tracks
 
 
-def _lens(name: str, size: tuple[int, int], modalities: tuple[str, ...], parameters: Any) -> CameraInfo:
+def _lens(
+    name: str, size: tuple[int, int], modalities: tuple[str, ...], parameters: H5Group | None
+) -> CameraInfo:
     height, width = size
     intrinsic = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], dtype=np.float32)
     if parameters is not None and "intrinsic_cv" in parameters:
-        intrinsic = parameters["intrinsic_cv"][0].astype(np.float32)
+        intrinsic = parameters.numbers("intrinsic_cv")[0].astype(np.float32)
     fovy = float(2 * np.arctan2(height / 2, intrinsic[1, 1]))
     return CameraInfo(name, "sensor", width, height, fovy, 0.01, 100.0, intrinsic, None, modalities)
 
 
-def _poses(parameters: Any, count: int) -> NDArray[np.float32]:
+def _poses(parameters: H5Group | None, count: int) -> NDArray[np.float32]:
     """(P, 7) in ManiSkill's camera frame, from OpenGL's (x right, y up, z backward)."""
     poses = np.tile(np.array([0, 0, 0, 1, 0, 0, 0], dtype=np.float32), (count, 1))
     if parameters is None or "cam2world_gl" not in parameters:
         return poses
-    matrices = parameters["cam2world_gl"][:]
+    matrices = parameters.numbers("cam2world_gl")
     for index, matrix in enumerate(matrices):
         if index and np.array_equal(matrix, matrices[index - 1]):
             poses[index] = poses[index - 1]

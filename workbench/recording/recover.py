@@ -7,7 +7,6 @@ process that lives is left alone.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +14,7 @@ from pathlib import Path
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.episode_writer import SCENE_SUFFIX, tidy
 from workbench.recording.journal import FOLDER, claim
+from workbench.recording.json_file import read_json
 from workbench.recording.landing import RecordingError, candidates, reason
 from workbench.recording.make_files import (
     SUFFIXES,
@@ -100,7 +100,7 @@ def _stems(folder: Path, stem: str) -> Iterator[str]:
 
 def _id_of(path: Path) -> str | None:
     try:
-        said = json.loads(path.read_bytes())
+        said = read_json(path)
         return said["workbench"]["id"]
     except (OSError, ValueError, KeyError, TypeError):
         return None

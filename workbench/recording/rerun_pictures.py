@@ -21,12 +21,15 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from workbench.machine.regular_file import open_regular_file
 from workbench.recording.encoded_pictures import Modality, encode
 from workbench.recording.rerun_chunks import STEP
 from workbench.recording.rerun_seam import IndexedChunk, decode_chunk
 
 KEPT_BYTES = 64 << 20
 """Of decompressed chunks, in the whole process; the newest is kept however large it is."""
+MOST_ROWS = 1_000_000
+"""Of a chunk: its index is believed before anything of it is read."""
 PICTURE_COMPONENTS: dict[Modality, str] = {
     "rgb": "EncodedImage:blob",
     "depth": "EncodedDepthImage:blob",
@@ -40,7 +43,8 @@ class OpenFile:
     def __init__(self, path: Path) -> None:
         """Raises OSError."""
         self.name = path.name
-        self._descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_BINARY", 0) | os.O_CLOEXEC)
+        with open_regular_file(path) as file:
+            self._descriptor = os.dup(file.fileno())
 
     def __del__(self) -> None:
         if hasattr(self, "_descriptor"):
@@ -106,6 +110,8 @@ class PicturesInFile(Sequence[bytes]):
         return np.concatenate([self._steps(place) for place in self._places])
 
     def _steps(self, place: IndexedChunk) -> NDArray[np.int64]:
+        if place.rows > MOST_ROWS:
+            raise OSError(f"{self._file.name} claims {place.rows:,} pictures in one piece")
         if place.steps is not None and place.steps[1] - place.steps[0] + 1 == place.rows:
             return np.arange(place.steps[0], place.steps[1] + 1)
         # A picture here and there: only the chunk itself says of which states.

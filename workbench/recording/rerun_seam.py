@@ -77,6 +77,8 @@ def index_of(store: LazyStore, timeline: str | None = None) -> list[IndexedChunk
 _COMPRESSION, _UNPACKED, _ENCODING, _PAYLOAD = 2, 3, 4, 5
 """Fields of ``ArrowMsg`` in rerun's ``log_msg.proto``."""
 _LZ4, _ARROW_IPC = 2, 1
+_MOST_PACKED, _SMALL = 255, 4096
+"""What a byte of LZ4 can become at most, and what need not be asked."""
 
 
 def decode_chunk(message: bytes) -> pa.RecordBatch:
@@ -95,6 +97,8 @@ def decode_chunk(message: bytes) -> pa.RecordBatch:
             raise ValueError("in another encoding")
         content = pa.py_buffer(payload)
         if fields.get(_COMPRESSION) == _LZ4 and isinstance(unpacked, int):
+            if unpacked > _MOST_PACKED * len(payload) + _SMALL:
+                raise ValueError(f"{len(payload)} bytes that claim to be {unpacked}")
             content = pa.decompress(content, decompressed_size=unpacked, codec="lz4_raw")
         return pa.ipc.open_stream(content).read_next_batch()
     except (KeyError, StopIteration, ValueError, OSError) as error:

@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
 from workbench.machine.guarded_terminal import guard_terminal
-from workbench.session.worker_start import end_with
+from workbench.session.family import begin_family
 
 if TYPE_CHECKING:
     from workbench.session.record import RecordOptions
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 def main() -> None:
     """Entry of the process."""
     connection, parent = map(int, sys.argv[1:3])
-    end_with(parent)
+    begin_family(parent)
     guard_terminal()
     try:
         _work(Connection(connection))

@@ -9,7 +9,6 @@ and the recording ends with a sentence; what it left is mended at the next start
 from __future__ import annotations
 
 import os
-import signal
 import socket
 import subprocess
 import time
@@ -22,6 +21,7 @@ from workbench.authoring.problem import Problem, TaskError
 from workbench.machine.child_python import child_environment, python_command
 from workbench.recording.landing import RecordingError
 from workbench.session.dealer import Dealer
+from workbench.session.family import end_family
 from workbench.session.message_reader import Unreadable, receive_message
 from workbench.session.process import describe_exit
 from workbench.session.record import (
@@ -136,7 +136,7 @@ class _Parent:
 
     def kill(self) -> None:
         for process in self._workers.values():
-            _kill(process)
+            end_family(process)
 
     def end(self) -> None:
         for connection in self._busy:
@@ -146,7 +146,7 @@ class _Parent:
             while process.poll() is None and connection in self._busy and time.monotonic() < deadline:
                 self._take_what_is_written(connection)
             _exit_code(process, 10.0)
-            _kill(process)
+            end_family(process)
             process.wait()
             connection.close()
 
@@ -167,7 +167,7 @@ class _Parent:
             self._busy.discard(connection)
 
     def _kill(self, connection: Connection) -> None:
-        _kill(self._workers[connection])
+        end_family(self._workers[connection])
         self._busy.discard(connection)
 
     def _hear(self, connection: Connection, word: str, value: Any) -> None:
@@ -233,11 +233,3 @@ def _exit_code(process: subprocess.Popen[bytes], patience: float) -> int | None:
         return process.wait(timeout=patience)
     except subprocess.TimeoutExpired:
         return None
-
-
-def _kill(process: subprocess.Popen[bytes]) -> None:
-    """End it with all that it started."""
-    try:
-        os.killpg(process.pid, signal.SIGKILL)
-    except ProcessLookupError:
-        pass  # it and all its children are gone already

@@ -14,6 +14,7 @@ import numpy as np
 from workbench.core.camera_settings import CameraKey
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.recording.episode import CameraTrack, Episode
+from workbench.recording.reader.processes import ReaderBusy
 from workbench.session.messages import CameraRequest
 
 MODALITIES = ("rgb", "depth", "segmentation")
@@ -59,6 +60,11 @@ class PictureReader:
             if kept is None or kept[:2] != (index, modalities) or kept[2].env != env:
                 try:
                     picture = decoded(track, index, modalities, env)
+                except ReaderBusy:
+                    # The one before stays for the moment that another recording is opened in.
+                    if kept is not None:
+                        found[track.info.key] = kept[2]
+                    continue
                 except (OSError, ValueError, EOFError, IndexError) as error:
                     self.problem = f"A picture of {track.info.name} cannot be read: {error}."
                     continue

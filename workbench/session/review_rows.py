@@ -15,8 +15,7 @@ from typing import Protocol
 
 from workbench.core.shared_shapes import SharedShapes
 from workbench.recording.episode import Episode
-from workbench.recording.lerobot_read import read_lerobot
-from workbench.recording.read_episode import read_episode, read_maniskill
+from workbench.recording.reading import read_recording
 
 
 class Row(Protocol):
@@ -52,19 +51,37 @@ class Stamp:
     """Size and time of change then; None if it was not there."""
 
 
-def read_row(row: Row, shapes: SharedShapes | None = None) -> Episode:
-    """The recording of a row, with those shapes where it looks the same. Raises as `read_episode`."""
+def read_row(row: Row, shapes: SharedShapes | None = None, folder: Path | None = None) -> Episode:
+    """The recording of a row, with those shapes where it looks the same; `folder` is the library's. Raises as `read_recording`."""
     if row.kind == "lerobot" and row.trajectory is not None:
-        return read_lerobot(row.paths[0].parents[1], int(row.trajectory))
+        return read_recording("lerobot", row.paths[0].parents[1], row.trajectory, shapes, folder)
     if row.trajectory is not None:
         # The library opens it by its .json, which is where the words are.
-        return read_maniskill(row.paths[0].with_suffix(".h5"), row.trajectory)
-    return read_episode(row.paths[0], shapes)
+        return read_recording("maniskill", row.paths[0].with_suffix(".h5"), row.trajectory, shapes, folder)
+    return read_recording("ours", row.paths[0], "", shapes, folder)
 
 
 def shared(episode: Episode, shapes: SharedShapes) -> Episode:
     """The same recording, with shapes of others where they look the same."""
     return episode if episode.geometry is None else replace(episode, geometry=shapes.share(episode.geometry))
+
+
+def size_of(episode: Episode, counted: set[int]) -> int:
+    """Bytes of its columns and meshes; pictures stay in the file.
+
+    Args:
+        counted: ids of meshes that others share with it, and that were counted there. Its own are added.
+    """
+    columns = [episode.action, episode.reward, episode.terminated, episode.truncated]
+    columns += [] if episode.poses is None else [episode.poses]
+    for held in (episode.evaluate, episode.env_states, episode.obs):
+        columns += held.values()
+    for visual in () if episode.geometry is None else episode.geometry.visuals:
+        if id(visual.mesh) not in counted:
+            counted.add(id(visual.mesh))
+            parts = (visual.mesh.vertices, visual.mesh.faces, visual.mesh.normals, visual.mesh.uvs)
+            columns += [part for part in (*parts, visual.material.texture) if part is not None]
+    return sum(column.nbytes for column in columns)
 
 
 def stamps_of(row: Row) -> dict[Path, Stamp]:

@@ -7,6 +7,7 @@ live env.
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from workbench.recording.recover import recover
 from workbench.session.record_live import recovered_in_words
 from workbench.session.recorded_scene import SceneProcess
 from workbench.session.review import Review
+from workbench.session.review_rows import read_row
 from workbench.ui.commands import Command
 from workbench.ui.pages import Pages
 from workbench.ui.review_page import ReviewOffers, ReviewPage
@@ -79,7 +81,8 @@ class Workplace:
             if self._shelf is None:
                 library = Library(self._recordings)
                 library.watch()
-                self._shelf = Shelf(library, Review(library, make_scene=SceneProcess(self._tasks)))
+                read = functools.partial(read_row, folder=library.folder)
+                self._shelf = Shelf(library, Review(library, read, SceneProcess(self._tasks)))
                 if self.session is None:
                     # A live env's recorder has done it, and is writing.
                     self._mending = threading.Thread(

@@ -31,8 +31,7 @@ from types import MappingProxyType
 
 import viser
 
-from workbench.recording.blueprint_in_file import blueprint_stream
-from workbench.recording.rerun_seam import store_id
+from workbench.recording.reading import told_rerun
 from workbench.recording.web_viewer import VIEWER_FILES, VIEWER_POLICY, is_kept, viewer_file
 from workbench.ui.changed import fill
 from workbench.ui.door import Door
@@ -162,8 +161,8 @@ class RerunPages:
 
 def _blueprint(path: Path) -> bytes | None:
     try:
-        return blueprint_stream(path)
-    except (ValueError, OSError, RuntimeError) as error:
+        return told_rerun(path)[1]
+    except (ValueError, OSError) as error:
         log.info("%s shows no blueprint of its own before it is read: %s", path.name, error)
         return None
 
@@ -176,9 +175,12 @@ def _in_script(value: object) -> str:
 def _stores(moments: Moments) -> Iterator[tuple[str, int]]:
     for path, step in moments.items():
         try:
-            yield store_id(path), step
-        except (ValueError, OSError, RuntimeError) as error:
+            store, _ = told_rerun(path)
+        except (ValueError, OSError) as error:
             log.warning("rerun cannot be told to open %s at step %d: %s", path.name, step, error)
+            continue
+        if store is not None:
+            yield store, step
 
 
 def _viewer_file(name: str) -> tuple[int, str, bytes] | FileReply:

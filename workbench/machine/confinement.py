@@ -1,0 +1,115 @@
+"""What a process that reads files of others gives up before it opens the first of them (Linux).
+
+Landlock is asked through system calls, since libc has no names for it (``include/uapi/linux/landlock.h``). A kernel
+without it, or an older one, confines to what it knows; the limits on memory and files hold everywhere.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import resource
+import signal
+import site
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+_CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
+_ASK_VERSION = 1
+_PATH_BENEATH = 1
+_EXECUTE, _WRITE_FILE, _READ_FILE, _READ_DIR = 1 << 0, 1 << 1, 1 << 2, 1 << 3
+_FILE_RIGHTS = {1: (1 << 13) - 1, 2: 1 << 13, 3: 1 << 14, 5: 1 << 15}
+"""What of files a version of Landlock knows besides those before it: all but reading is given up."""
+_OF_FILES = _EXECUTE | _WRITE_FILE | _READ_FILE
+"""Rights that make sense for what is no folder."""
+_TCP_RIGHTS = 0b11
+"""Bind and connect, from version 4 on."""
+_SCOPES = 0b11
+"""Abstract sockets of others, and signals to others, from version 6 on."""
+_PR_SET_PDEATHSIG, _PR_SET_NO_NEW_PRIVS = 1, 38
+_SYSTEM = ("/usr", "/lib", "/lib64", "/nix/store", "/gnu/store", "/etc/ld.so.cache", "/etc/localtime",
+           "/proc/self", "/proc/cpuinfo", "/proc/meminfo", "/proc/sys", "/sys/devices/system", "/dev/urandom")  # fmt: skip
+MOST_WRITTEN = 1 << 20
+"""Bytes of a file that is written all the same, where there is no Landlock."""
+MOST_OPEN_FILES = 512
+
+
+def landlock_version() -> int:
+    """Of this kernel; 0 where it has none, or it is turned off."""
+    return max(_call(_CREATE_RULESET, None, 0, _ASK_VERSION), 0)
+
+
+def confine(reads: Iterable[Path], most_memory: int) -> None:
+    """From now on this process and its children may read below `reads`, and what programs and libraries are made of.
+
+    They write no file, open no TCP connection, signal nobody outside, and get no rights by what they start.
+
+    Args:
+        most_memory: bytes that may be allocated.
+    """
+    resource.setrlimit(resource.RLIMIT_DATA, (most_memory, most_memory))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (MOST_WRITTEN, MOST_WRITTEN))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    most = min(MOST_OPEN_FILES, resource.getrlimit(resource.RLIMIT_NOFILE)[1])
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+    ctypes.CDLL(None).prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
+    if landlock_version():
+        _restrict(tuple(reads))
+
+
+def end_with_parent(parent: int) -> None:
+    """Ask the kernel to end this process with `parent`, which must be the process that made it and have one thread."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
+
+
+def _restrict(reads: tuple[Path, ...]) -> None:
+    version = landlock_version()
+    rights = sum(bits for since, bits in _FILE_RIGHTS.items() if since <= version)
+    wanted = [rights, _TCP_RIGHTS if version >= 4 else 0, _SCOPES if version >= 6 else 0]
+    asked = (ctypes.c_uint64 * 3)(*wanted)
+    # The kernel refuses a longer question than it knows.
+    size = 8 * (3 if version >= 6 else 2 if version >= 4 else 1)
+    ruleset = _call(_CREATE_RULESET, ctypes.byref(asked), size, 0)
+    if ruleset < 0:
+        raise OSError(ctypes.get_errno(), "Landlock gives no ruleset")
+    try:
+        read = _READ_FILE | _READ_DIR
+        for path in (*_SYSTEM, *_python()):
+            _allow(ruleset, path, read | _EXECUTE)
+        for path in reads:
+            _allow(ruleset, os.fspath(path), read)
+        _allow(ruleset, os.devnull, _READ_FILE | _WRITE_FILE)
+        if _call(_RESTRICT_SELF, ruleset, 0) < 0:
+            raise OSError(ctypes.get_errno(), "Landlock does not restrict this process")
+    finally:
+        os.close(ruleset)
+
+
+def _python() -> set[str]:
+    """Where this interpreter and its packages are."""
+    user = [site.getusersitepackages()]
+    return {os.path.realpath(path) for path in (sys.prefix, sys.base_prefix, *sys.path, *user) if path}
+
+
+def _allow(ruleset: int, path: str, rights: int) -> None:
+    try:
+        place = os.open(path, os.O_PATH | os.O_CLOEXEC)
+    except OSError:
+        return  # not on this system
+    try:
+        if not os.path.isdir(path):
+            rights &= _OF_FILES
+        rule = rights.to_bytes(8, sys.byteorder) + place.to_bytes(4, sys.byteorder, signed=True)
+        if _call(_ADD_RULE, ruleset, _PATH_BENEATH, rule, 0) < 0:
+            raise OSError(ctypes.get_errno(), f"Landlock takes no rule for {path}")
+    finally:
+        os.close(place)
+
+
+def _call(number: int, *arguments: object) -> int:
+    if not sys.platform.startswith("linux"):
+        return -1
+    return ctypes.CDLL(None, use_errno=True).syscall(ctypes.c_long(number), *arguments)

@@ -1,0 +1,331 @@
+"""The processes of readers, from outside: how they are started, asked one thing at a time, and ended."""
+
+from __future__ import annotations
+
+import contextlib
+import enum
+import itertools
+import os
+import select
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from workbench.machine.child_python import child_environment, python_command
+from workbench.recording.reader.nursery_messages import Ended, NewReader
+from workbench.recording.reader.requests import ANSWERS, Answer, Forget, Request
+from workbench.recording.reader.wire import (
+    ArrayReader,
+    Closed,
+    Garbled,
+    TookTooLong,
+    bytes_of,
+    receive,
+    send,
+)
+
+START_SECONDS = 60.0
+"""For a nursery to be there; it imports for half a second."""
+
+
+_ENVIRONMENT = {
+    # It forks, which takes one thread along.
+    "OPENBLAS_NUM_THREADS": "1",
+    "OMP_NUM_THREADS": "1",
+    # Nobody brings filters for HDF5 along.
+    "HDF5_PLUGIN_PRELOAD": "::",
+    # Arrow and rerun would each take 1 GB at once that they do not need, and memory is limited.
+    "MIMALLOC_ARENA_EAGER_COMMIT": "0",
+}
+
+
+class How(enum.Enum):
+    """How the reading of something ended that did not end well."""
+
+    LATE = "late"
+    DIED = "died"
+    GARBLED = "garbled"
+
+
+class ReaderEnded(OSError):
+    """What was asked for last ended the reader; the message goes on from the name of what was read."""
+
+    def __init__(self, how: How, words: str) -> None:
+        super().__init__(words)
+        self.how = how
+
+
+class ReaderBusy(OSError):
+    """The reader is at something else."""
+
+
+class NotThere(Exception):
+    """The process that was meant is not the one that reads now."""
+
+
+@dataclass(frozen=True)
+class Answered:
+    answer: Answer
+    arrays: ArrayReader
+    process: int
+    """The number of the process that it came from."""
+
+
+class _Nursery:
+    """One a process, started when it is first needed."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._control: socket.socket | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> None:
+        """Begin to start it; returns at once."""
+        with self._lock:
+            self._start()
+
+    def new_reader(self, paths: Sequence[Path], episodes: bool) -> tuple[int, socket.socket]:
+        """Its process id and its socket. Raises OSError."""
+        ours, theirs = socket.socketpair()
+        message = msgspec.msgpack.encode(NewReader([bytes_of(path) for path in paths], episodes))
+        with theirs, self._lock:
+            for _ in range(2):
+                control = self._start()
+                try:
+                    socket.send_fds(control, [message], [theirs.fileno()])
+                    return msgspec.msgpack.decode(self._answer(control), type=int), ours
+                except (OSError, msgspec.MsgspecError):
+                    self._end()  # somebody ended it: once more, with another
+        ours.close()
+        raise OSError("the process that reads recordings cannot be started")
+
+    def ended(self, pid: int) -> int | None:
+        """The exit status of a reader that has ended or was killed; None where nobody knows."""
+        with self._lock:
+            if self._control is None:
+                return None
+            try:
+                self._control.send(msgspec.msgpack.encode(Ended(pid)))
+                return msgspec.msgpack.decode(self._answer(self._control), type=int)
+            except (OSError, msgspec.MsgspecError):
+                self._end()
+                return None
+
+    def end(self) -> None:
+        with self._lock:
+            self._end()
+
+    def _start(self) -> socket.socket:
+        if self._control is None or self._process is None or self._process.poll() is not None:
+            self._end()
+            ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            with theirs:
+                self._process = subprocess.Popen(
+                    python_command("-m", "workbench.recording.reader.nursery", str(theirs.fileno())),
+                    env=child_environment(**_ENVIRONMENT),
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                    pass_fds=[theirs.fileno()],
+                    start_new_session=True,
+                )
+            ours.settimeout(START_SECONDS)
+            self._control = ours
+        return self._control
+
+    @staticmethod
+    def _answer(control: socket.socket) -> bytes:
+        if not (answer := control.recv(64)):
+            raise OSError("it has ended")
+        return answer
+
+    def _end(self) -> None:
+        if self._control is not None:
+            self._control.close()
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+        self._control = self._process = None
+
+
+_nursery = _Nursery()
+
+
+def start_nursery() -> None:
+    """Have a nursery started while something else is done. Returns at once; raises OSError."""
+    _nursery.start()
+
+
+def end_nursery() -> None:
+    """End it, and the readers that it made with it."""
+    _nursery.end()
+
+
+class Reader:
+    """A process that reads below one folder and may do little else. It is there when it is first asked.
+
+    Safe to use from several threads; who asks first is answered first.
+    """
+
+    _numbers = itertools.count(1)
+
+    def __init__(self, folder: Path, episodes: bool) -> None:
+        """
+        Args:
+            episodes: it is for whole episodes, not for rows.
+        """
+        self._folder, self._episodes = Path(folder), episodes
+        self._allowed: set[Path] = set()
+        """Further files: what links in the folder lead to."""
+        self._turns = _Turns()
+        self._pid = 0
+        self._connection: socket.socket | None = None
+        self._forgotten: deque[tuple[int, int]] = deque()
+        self._closed = False
+        self.process = 0
+        """The number of the present process; 0 where there is none."""
+
+    def ask(
+        self,
+        request: Request,
+        seconds: float,
+        patience: float | None = None,
+        process: int | None = None,
+    ) -> Answered:
+        """
+        Args:
+            seconds: that the answer may take.
+            patience: seconds to wait for its turn; None waits for as long as it takes.
+            process: which is meant, for a request that makes sense there alone.
+
+        Raises:
+            ReaderEnded: it ended the reader, or was not answered in time. Another one reads what comes next.
+            ReaderBusy, NotThere
+            OSError: no reader can be started.
+        """
+        (answer,) = self.ask_all([request], seconds, patience, process)
+        if isinstance(answer, ReaderEnded):
+            raise answer
+        return answer
+
+    def ask_all(
+        self,
+        requests: Sequence[Request],
+        seconds: float,
+        patience: float | None = None,
+        process: int | None = None,
+    ) -> list[Answered | ReaderEnded]:
+        """Several at once, of which each may take so long; one that ends the reader does not end the others."""
+        answers: list[Answered | ReaderEnded] = []
+        with self._turns.turn(patience):
+            while len(answers) < len(requests):
+                connection = self._started()
+                if process is not None and process != self.process:
+                    raise NotThere
+                begun = len(answers)
+                try:
+                    self._send_forgotten(connection)
+                    for request in requests[begun:]:
+                        send(connection, request)
+                    for _ in requests[begun:]:
+                        answer, arrays = receive(connection, ANSWERS, time.monotonic() + seconds)
+                        answers.append(Answered(answer, arrays, self.process))
+                except (Closed, TookTooLong, Garbled) as error:
+                    answers.append(self._ended(error, seconds))
+        return answers
+
+    def allow(self, paths: Sequence[Path]) -> None:
+        """Let it read these files too, wherever they are. What is open in it is not any more."""
+        with self._turns.turn(None):
+            if not self._allowed.issuperset(paths):
+                self._allowed.update(paths)
+                self._kill()
+
+    def forget(self, process: int, opened: int) -> None:
+        """That episode is of no use any more. Returns at once: it may be called by a finalizer, on any thread."""
+        self._forgotten.append((process, opened))
+
+    def close(self) -> None:
+        """End it; who asks it then has another one started."""
+        with self._turns.turn(None):
+            self._kill()
+
+    def _started(self) -> socket.socket:
+        if self._connection is not None and select.select([self._connection], [], [], 0)[0]:
+            # Nothing is asked, so this is its end: nobody's fault but of who ended it.
+            self._kill()
+        if self._connection is None:
+            paths = (self._folder, *sorted(self._allowed))
+            self._pid, self._connection = _nursery.new_reader(paths, self._episodes)
+            self.process = next(self._numbers)
+        return self._connection
+
+    def _send_forgotten(self, connection: socket.socket) -> None:
+        gone = []
+        while self._forgotten:
+            process, opened = self._forgotten.popleft()
+            if process == self.process:
+                gone.append(opened)
+        if gone:
+            send(connection, Forget(gone))
+
+    def _ended(self, error: Exception, seconds: float) -> ReaderEnded:
+        status = self._kill()
+        if isinstance(error, TookTooLong):
+            return ReaderEnded(How.LATE, f"takes longer to read than {seconds:.0f} s")
+        if isinstance(error, Garbled):
+            return ReaderEnded(How.GARBLED, f"is not what it should be: {error}")
+        with_what = "" if status is None else f" ({_in_words(status)})"
+        return ReaderEnded(How.DIED, f"ended the process that reads recordings{with_what}")
+
+    def _kill(self) -> int | None:
+        """Its exit status, where it had ended by itself or is known."""
+        if self._connection is None:
+            return None
+        self._connection.close()
+        self._connection, self.process = None, 0
+        # With what it started. Its number is its own until the nursery was told.
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._pid, signal.SIGKILL)
+        return _nursery.ended(self._pid)
+
+
+class _Turns:
+    """A lock whose turn is that of who came first: Python's own goes to who lets it go, if they want it again."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._waiting: deque[object] = deque()
+
+    @contextlib.contextmanager
+    def turn(self, patience: float | None) -> Iterator[None]:
+        """Raises ReaderBusy."""
+        me = object()
+        with self._changed:
+            self._waiting.append(me)
+            if not self._changed.wait_for(lambda: self._waiting[0] is me, patience):
+                self._waiting.remove(me)
+                raise ReaderBusy("the process that reads recordings is at another one")
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._waiting.remove(me)
+                self._changed.notify_all()
+
+
+def _in_words(status: int) -> str:
+    if status >= 0:
+        return f"exit code {status}"
+    try:
+        return signal.Signals(-status).name
+    except ValueError:
+        return f"signal {-status}"

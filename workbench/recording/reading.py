@@ -1,0 +1,264 @@
+"""Recordings are read in processes of their own, which may read their folder and do nothing else (`reader`).
+
+What a page shows and what is exported may come from anybody, and it is read by HDF5, Arrow, rerun, ffmpeg and Pillow:
+millions of lines in C, C++ and Rust. So none of them opens a recording in the process that serves the page. Whatever
+ends the process that does, or takes it too long, is a sentence about that one recording.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import weakref
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from workbench.core.shared_shapes import SharedShapes
+from workbench.recording.description import task_file
+from workbench.recording.encoded_pictures import Modality
+from workbench.recording.episode import Episode
+from workbench.recording.library_row import Entry, Facts, facts_from_dict, text
+from workbench.recording.library_scan import Found
+from workbench.recording.reader.episode_wire import KnownShapes, unpacked
+from workbench.recording.reader.processes import (
+    Answered,
+    NotThere,
+    Reader,
+    ReaderEnded,
+    end_nursery,
+    start_nursery,
+)
+from workbench.recording.reader.requests import (
+    EpisodeRead,
+    Failed,
+    ForRerun,
+    Kind,
+    Open,
+    PictureAt,
+    PictureRead,
+    Rows,
+    RowsRead,
+    Sources,
+    SourcesFound,
+    ToldRerun,
+)
+from workbench.recording.reader.wire import ArrayReader, Garbled, bytes_of, path_of
+from workbench.recording.unreadable import UnreadableRecording
+
+ROW_SECONDS = 30.0
+OPEN_SECONDS = 60.0
+PICTURE_SECONDS = 70.0
+"""A film is taken apart when its first frame is looked at."""
+PICTURE_PATIENCE = 0.2
+"""Seconds that a picture waits for another recording to be opened."""
+MOST_READERS = 4
+LARGEST_THUMBNAIL = 64 << 10
+_AT_ONCE = 8
+"""Rows that are asked for together: the reader goes on while the last ones are put into the table."""
+_JPEG = b"\xff\xd8\xff"
+
+_lock = threading.Lock()
+_readers: OrderedDict[tuple[Path, bool], Reader] = OrderedDict()
+_shapes = KnownShapes()
+
+
+def start_reading() -> None:
+    """Begin to start what reads recordings, before one is wanted. Returns at once; raises OSError."""
+    start_nursery()
+
+
+def stop_reading() -> None:
+    """End all processes that read recordings; who wants one read has them started again."""
+    with _lock:
+        readers = list(_readers.values())
+        _readers.clear()
+    for reader in readers:
+        reader.close()
+    end_nursery()
+
+
+def read_rows(folder: Path, wanted: Iterable[Found]) -> Iterator[tuple[Found, list[Entry]]]:
+    """The recordings in these files of a library's folder, with a thumbnail each. Whatever is wrong is said in a row.
+
+    Raises:
+        OSError: no process can be started to read them.
+    """
+    wanted = list(wanted)
+    reader = _reader(folder, episodes=False)
+    reader.allow(_beyond(path for found in wanted for path in found.paths(folder)))
+    where = bytes_of(folder)
+    for begin in range(0, len(wanted), _AT_ONCE):
+        some = wanted[begin : begin + _AT_ONCE]
+        answers = reader.ask_all(
+            [Rows(where, bytes_of(found.key), found.signature) for found in some], ROW_SECONDS
+        )
+        for found, answer in zip(some, answers, strict=True):
+            yield found, _entries(found, answer)
+
+
+def read_recording(
+    kind: Kind, path: Path, part: str = "", shapes: SharedShapes | None = None, folder: Path | None = None
+) -> Episode:
+    """An episode. Its pictures are read one by one when they are looked at.
+
+    Args:
+        part: which one of the file or dataset; empty for a recording of ours.
+        shapes: of other recordings, to be shared.
+        folder: below which the process that reads it may read; by default that of the file.
+
+    Raises:
+        UnreadableRecording: it cannot be read; the message says what is wrong.
+        OSError: its files cannot be got at.
+    """
+    path = Path(path).absolute()
+    folder = folder or (path if kind == "lerobot" else path.parent)
+    beside = (path,) if kind == "lerobot" else tuple(path.with_suffix(s) for s in (".json", ".h5", ".rrd"))
+    reader = _reader(folder, episodes=True)
+    reader.allow(_beyond(beside))
+    shapes = SharedShapes() if shapes is None else shapes
+    sharing, known = _shapes.of(shapes)
+    wanted = Open(kind, bytes_of(path), part, sharing)
+    read, answered = _open(reader, wanted, path.name)
+    opened = _Opened(reader, wanted, answered.process, read.opened, path.name)
+    try:
+        episode = unpacked(read, answered.arrays, opened.picture, answered.process, shapes, known)
+    except Garbled as error:
+        raise UnreadableRecording(f"{path.name} is a recording, but a broken one: {error}.") from error
+    if kind == "ours":
+        found = task_file(read.source_path, episode.info.task, path.parent)
+        if found is not None:
+            episode.info = replace(episode.info, source_file=found)
+    return episode
+
+
+def find_sources(path: Path) -> list[tuple[Path, str | None]]:
+    """Path and part of the recordings that a file is or a folder holds. Raises as `read_recording`."""
+    path = Path(path).absolute()
+    reader = _reader(path if path.is_dir() else path.parent, episodes=True)
+    reader.allow(_beyond([path]))
+    answer = _asked(reader, Sources(bytes_of(path)), path.name).answer
+    if not isinstance(answer, SourcesFound):
+        raise UnreadableRecording(f"{path.name} gave {type(answer).__name__}.")
+    return [(path_of(found), part) for found, part in answer.sources]
+
+
+def told_rerun(path: Path) -> tuple[str | None, bytes | None]:
+    """What rerun calls the recording in an ``.rrd``, and the blueprint in it. Raises as `read_recording`."""
+    path = Path(path).absolute()
+    reader = _reader(path.parent, episodes=True)
+    reader.allow(_beyond([path]))
+    answer = _asked(reader, ForRerun(bytes_of(path)), path.name).answer
+    if not isinstance(answer, ToldRerun):
+        raise UnreadableRecording(f"{path.name} gave {type(answer).__name__}.")
+    return answer.store, answer.blueprint
+
+
+def _reader(folder: Path, episodes: bool) -> Reader:
+    key = (Path(folder).absolute(), episodes)
+    gone = None
+    with _lock:
+        if key not in _readers:
+            _readers[key] = Reader(key[0], episodes)
+        _readers.move_to_end(key)
+        if len(_readers) > MOST_READERS:
+            _, gone = _readers.popitem(last=False)
+        reader = _readers[key]
+    if gone is not None:
+        gone.close()  # one that somebody still has pictures of is started again when they ask
+    return reader
+
+
+def _beyond(paths: Iterable[Path]) -> list[Path]:
+    """Where links lead that stand in place of files: out of the folder, perhaps."""
+    return [Path(os.path.realpath(path)) for path in paths if os.path.islink(path)]
+
+
+def _entries(found: Found, answered: Answered | ReaderEnded) -> list[Entry]:
+    answer = answered.answer if isinstance(answered, Answered) else answered
+    if isinstance(answer, RowsRead) and len(answer.facts) == len(answer.thumbnails):
+        try:
+            return [
+                (facts_from_dict(facts), _thumbnail(jpeg))
+                for facts, jpeg in zip(answer.facts, answer.thumbnails)
+            ]
+        except ValueError:
+            pass
+    why = "gave something that is no row"
+    if isinstance(answer, Failed):
+        why = answer.words
+    elif isinstance(answer, ReaderEnded):
+        # It is read again when it has changed, or by who opens it.
+        why = f"{answer}, and is left alone until it changes"
+    suffix = next(iter(found.sizes))
+    problem = text(f"{Path(found.key).name}{suffix} {why}.", 500)
+    kind = "rrd only" if suffix == ".rrd" else "maniskill"
+    return [(Facts(kind, written=found.newest / 1e9, problem=problem), None)]
+
+
+def _thumbnail(jpeg: bytes | None) -> bytes | None:
+    """It goes to the browser as it is."""
+    return jpeg if jpeg is not None and jpeg.startswith(_JPEG) and len(jpeg) <= LARGEST_THUMBNAIL else None
+
+
+def _asked(reader: Reader, request: Open | Sources | ForRerun, name: str) -> Answered:
+    try:
+        answered = reader.ask(request, OPEN_SECONDS)
+    except ReaderEnded as error:
+        raise UnreadableRecording(f"{name} {error}.") from error
+    if isinstance(answered.answer, Failed):
+        if answered.answer.why == "system":
+            raise OSError(answered.answer.words)
+        raise UnreadableRecording(answered.answer.words)
+    return answered
+
+
+def _open(reader: Reader, wanted: Open, name: str) -> tuple[EpisodeRead, Answered]:
+    answered = _asked(reader, wanted, name)
+    if not isinstance(answered.answer, EpisodeRead):
+        raise UnreadableRecording(f"{name} gave {type(answered.answer).__name__}.")
+    return answered.answer, answered
+
+
+class _Opened:
+    """An episode that is open in a reader for as long as somebody may look at its pictures."""
+
+    def __init__(self, reader: Reader, wanted: Open, process: int, opened: int, name: str) -> None:
+        self._reader, self._wanted, self._name = reader, wanted, name
+        self._lock = threading.Lock()
+        self._failed: OSError | None = None
+        self._is_open_in(process, opened)
+
+    def picture(
+        self, camera: int, modality: Modality, index: int, encoded: bool
+    ) -> tuple[PictureRead, ArrayReader]:
+        """Raises OSError; ReaderBusy while another recording is being opened."""
+        with self._lock:
+            if self._failed is not None:
+                raise self._failed
+            try:
+                answered = self._ask(camera, modality, index, encoded)
+            except ReaderEnded as error:
+                # It would end the next one too, thirty times a second.
+                self._failed = OSError(f"{self._name} {error}")
+                raise self._failed from error
+        answer = answered.answer
+        if isinstance(answer, PictureRead):
+            return answer, answered.arrays
+        raise OSError(answer.words if isinstance(answer, Failed) else "the reader gave no picture")
+
+    def _ask(self, camera: int, modality: Modality, index: int, encoded: bool) -> Answered:
+        for _ in range(2):
+            wanted = PictureAt(self._number, camera, modality, index, encoded)
+            try:
+                return self._reader.ask(wanted, PICTURE_SECONDS, PICTURE_PATIENCE, self._process)
+            except NotThere:
+                # Something else has ended the process since.
+                read, answered = _open(self._reader, self._wanted, self._name)
+                self._is_open_in(answered.process, read.opened)
+        raise OSError("the process that reads it is ended again and again")
+
+    def _is_open_in(self, process: int, opened: int) -> None:
+        self._process, self._number = process, opened
+        weakref.finalize(self, self._reader.forget, process, opened).atexit = False
