@@ -45,6 +45,8 @@ TITLE = "\x1b]0;owned\x07"
 CLIPBOARD = "\x1b]52;c;aGk=\x1b\\"
 LINK = "\x1b]8;;http://127.0.0.1/\x1b\\press me\x1b]8;;\x1b\\"
 EVIL = f"{TITLE}{CLIPBOARD}{LINK}\x1b[2J\x1b[H\x1b[10A\x9b2J\x90q\x9c\x1bc\x07\x08\u202eback"
+BARS = re.compile("\x1b\\[(\\?25[lh]|1A|2K)|\r")
+"""How a bar of ours moves the cursor."""
 COLOURS = re.compile("\x1b\\[[0-9;:]*m")
 
 
@@ -137,6 +139,20 @@ def test_a_task_and_a_request_full_of_escapes_do_nothing_to_the_terminal(tmp_pat
     assert "\x1b[1;32mgreen\x1b[0m and hidden" in text, "colours are kept, and nothing is hidden"
 
 
+@pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.slow)])
+def test_a_task_that_is_recorded_does_nothing_to_the_terminal(workers: str, tmp_path: Path) -> None:
+    """Its code runs in the command's own process, or in some that write to the terminal themselves."""
+    (tmp_path / "mine.py").write_text(
+        f"import sys\nprint({EVIL!r} + 'printed')\nprint({EVIL!r} + 'said', file=sys.stderr)\n"
+        f"print('\\x1b[1;32mgreen\\x1b[0m')\nraise RuntimeError({EVIL!r} + 'raised')\n"
+    )
+    with on_terminal(tmp_path, "record", "mine.py", "--workers", workers, "--num-envs", workers) as terminal:
+        terminal.process.wait(timeout=120)
+    text = BARS.sub("", terminal.text)
+    assert harmful(text) == set(), text
+    assert all(word in text for word in ("printed", "said", "green", "raised"))
+
+
 def test_a_recording_full_of_escapes_is_told_as_text(tmp_path: Path) -> None:
     info: dict[str, Any] = {"task": f"Push{EVIL}-v1", "source_file": f"{EVIL}.py"}
     first = write(tmp_path, made(3, **info), pictures=False)
@@ -144,8 +160,7 @@ def test_a_recording_full_of_escapes_is_told_as_text(tmp_path: Path) -> None:
         file.rename(file.with_name(f"a\u202e{TITLE}\nb{file.suffix}"))
     with on_terminal(tmp_path, "rescore", ".") as terminal:
         terminal.process.wait(timeout=120)
-    # Its own bar moves the cursor about.
-    text = re.sub("\x1b\\[(\\?25[lh]|1A|2K)|\r", "", terminal.text)
+    text = BARS.sub("", terminal.text)
     assert harmful(text) == set(), text
     assert "\\x1b]0;owned\\x07" in text and "\\u202e" in text
 
@@ -220,7 +235,7 @@ def test_bars_still_move_and_what_they_say_is_text() -> None:
         bar.refresh()
     text = said.getvalue()
     assert "\x1b[2K" in text or "\x1b[?25l" in text, "rich's own controls"
-    assert harmful(re.sub("\x1b\\[(\\?25[lh]|1A|2K)|\r", "", text)) == set()
+    assert harmful(BARS.sub("", text)) == set()
     assert "[/b]" in text and "\\x1b]0;owned" in text
 
 

@@ -163,6 +163,15 @@ def test_a_policy_by_its_modules_name_is_found_where_the_command_was_started(
     del sys.modules["a_policy_here"]
 
 
+def test_after_a_file_of_an_installed_package_names_are_the_libraries_as_before(write: Write) -> None:
+    installed = sys.modules["mani_skill.envs.tasks.tabletop.push_cube"].__file__
+    load_task(str(installed))
+    assert is_library("sympy") and is_library("numpy")
+    plant(write, "sympy")
+    task = load_task(str(write("push.py", TASK, task=True)))
+    assert [file.name for file in task.named_like_libraries] == ["sympy.py"]
+
+
 def test_a_folder_is_searched_first_for_a_while(write: Write, folder: Path, late: tuple[str, ...]) -> None:
     plant(write, *late)
     before, finders = list(sys.path), list(sys.meta_path)

@@ -92,7 +92,9 @@ def named_like_library(file: Path) -> str:
 def search_first(folder: Path) -> None:
     """Put an author's folder first on ``sys.path``, but for the names of libraries."""
     name = str(folder)
-    _author_folders.add(name)
+    # A file of an installed package is opened with the folder of all packages: that stays the libraries'.
+    if folder.name not in _LIBRARY_FOLDERS and is_own_file(os.path.join(name, "x.py"), folder):
+        _author_folders.add(name)
     if not _is_guarded():
         sys.meta_path.insert(0, LibraryFinder())
     sys.path[:] = [name, *(entry for entry in sys.path if entry != name)]
