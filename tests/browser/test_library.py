@@ -68,6 +68,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Itera
         browser = launch(playwright, chromium_path)
         page, errors = new_page(browser)
         page.set_default_timeout(15_000)
+        page.add_init_script(path=web_assets_folder() / "pressed.js")
         page.goto(f"http://127.0.0.1:{server.get_port()}")
         page.add_style_tag(path=web_assets_folder() / "panels" / "page.css")
         page.wait_for_selector(".wb-library tbody")

@@ -14,11 +14,14 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import msgspec
+import psutil
 import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import unix_connect
 
 from tests.ui.knocking import PROTOCOL, ask, both, client, close_code, cookie_of, token_of, until
+from tests.ui.tabs import open_deaf_tab, tabs_of
 from workbench.machine.child_python import child_environment, python_command
 from workbench.ui import listening
 from workbench.ui.door import Door, DoorError, DoorOptions, open_door
@@ -56,8 +59,6 @@ def get(door: Door, path: str = "/", host: str = "localhost:8080", **headers: st
 def test_only_its_owner_can_connect_and_no_port_is_open(door, folder):
     found = (folder / "page.sock").lstat()
     assert stat.S_ISSOCK(found.st_mode) and stat.S_IMODE(found.st_mode) == 0o600
-    import psutil
-
     own = psutil.Process().net_connections(kind="tcp")
     assert not [one for one in own if one.status == psutil.CONN_LISTEN]
 
@@ -90,8 +91,6 @@ def test_a_websocket_works_over_it(door):
         max_size=None,
         close_timeout=0.2,
     ) as connection:
-        import msgspec
-
         update = {"type": "GuiUpdateMessage", "uuid": box._impl.uuid, "updates": {"value": True}}
         connection.send(msgspec.msgpack.encode(update))
         until(lambda: box.value)
@@ -231,8 +230,6 @@ def test_an_answer_on_its_way_ends_with_the_token(on_port):
 
 
 def test_a_page_that_does_not_listen_is_closed_as_well(on_port):
-    from tests.ui.tabs import open_deaf_tab
-
     tab = open_deaf_tab(on_port.url)
     until(on_port.server.get_clients)
     on_port.renew_token()
@@ -277,6 +274,33 @@ def test_the_command_renews_at_a_signal_and_ends_at_another(tmp_path, folder):
         process.send_signal(signal.SIGINT)
         assert process.wait(60) == 0
         assert not place.exists()
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def test_the_palette_of_the_page_renews_and_the_page_is_closed(tmp_path):
+    process = subprocess.Popen(
+        [*python_command("-m", "workbench.cli"), "review", str(tmp_path), "--port", "0"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=child_environment(),
+    )
+    try:
+        first = until_line(process, lambda line: line.startswith("  page")).split()[1]
+        with tabs_of(first) as tabs:
+            tab = tabs.open()
+            until(lambda: tab.open)
+            tabs.trigger(tab, "Renew the token and close every page")
+            second = until_line(process, lambda line: line.startswith("  page")).split()[1]
+            assert second.partition("?")[0] == first.partition("?")[0] and second != first
+            until(lambda: not tab.open)
+        with tabs_of(second) as tabs:
+            tab = tabs.open()
+            until(lambda: tab.open)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 0
     finally:
         process.kill()
         process.communicate()

@@ -18,7 +18,6 @@ from workbench.session.studio_view import StudioCamera
 from workbench.session.view import SessionView
 from workbench.ui.camera_work import WorkBar
 from workbench.ui.changed import fill, show
-from workbench.ui.checked import checked_choice
 from workbench.ui.fragments import render
 from workbench.ui.inline_pictures import data_address
 
@@ -75,16 +74,14 @@ class CameraCompare:
         camera = self._chosen()
         if camera is None or camera.now is None or camera.info.settings is None:
             return
-        try:
-            choice = checked_choice(self._other.value, (FILE, KEPT), "choice")
-            if choice == KEPT and camera.key not in self._kept:
-                raise ValueError(
-                    "Nothing is kept of this camera yet: press Keep this placement as A, then move it."
-                )
-        except ValueError as error:
+        choice = self._other.value
+        if choice == KEPT and camera.key not in self._kept:
             if event.client is not None:
                 event.client.add_notification(
-                    "Not possible", str(error), color="orange", auto_close_seconds=6.0
+                    "Not possible",
+                    "Nothing is kept of this camera yet: press Keep this placement as A, then move it.",
+                    color="orange",
+                    auto_close_seconds=6.0,
                 )
             return
         other = camera.info.settings if choice == FILE else self._kept[camera.key]

@@ -18,7 +18,6 @@ from workbench.core.camera_frames import Convention, Direction
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera
 from workbench.session.view import SessionView
-from workbench.ui.checked import checked_choice
 from workbench.ui.fragments import render
 
 Form = Literal["json", "opencv", "ros"]
@@ -89,11 +88,7 @@ class CameraExport:
         self._import.on_click(self._on_import)
 
     def _choices(self) -> tuple[Convention, Direction]:
-        """Raises ValueError with a sentence."""
-        convention = checked_choice(self._convention.value, CONVENTIONS, "convention")
-        return CONVENTIONS[convention], DIRECTIONS[
-            checked_choice(self._direction.value, DIRECTIONS, "direction")
-        ]
+        return CONVENTIONS[self._convention.value], DIRECTIONS[self._direction.value]
 
     def _on_download(self, event: viser.GuiEvent) -> None:
         view = self._session.view()
@@ -101,8 +96,8 @@ class CameraExport:
         if event.client is None or camera is None:
             return
         try:
-            form, suffix = FORMS[checked_choice(self._form.value, FORMS, "kind of file")]
-            every = checked_choice(self._which.value, (THIS, ALL), "choice") == ALL
+            form, suffix = FORMS[self._form.value]
+            every = self._which.value == ALL
             keys = tuple(c.key for c in view.studio.cameras) if every else (camera.key,)
             text = self._session.studio.export(keys, form)
         except ValueError as error:
@@ -126,7 +121,7 @@ class CameraExport:
                     "Paste a calibration into the field first: a matrix, our JSON, or an OpenCV YAML."
                 )
             convention, direction = self._choices()
-            metres = UNITS[checked_choice(self._unit.value, UNITS, "unit")]
+            metres = UNITS[self._unit.value]
             self._session.studio.import_pose(camera.key, text, direction, convention, metres)
         except ValueError as error:
             event.client.add_notification("Not placed", str(error), color="orange", auto_close_seconds=12.0)

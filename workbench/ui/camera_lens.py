@@ -23,7 +23,7 @@ from workbench.core.camera_settings import CameraSettings
 from workbench.session.studio_view import StudioCamera
 from workbench.ui.camera_moves import kept_where_equal
 from workbench.ui.changed import show
-from workbench.ui.checked import checked_choice, checked_int
+from workbench.ui.checked import checked_int
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
 from workbench.ui.number_fields import number_field, pair_field
@@ -56,7 +56,7 @@ class CameraLens:
     def _build_lens(self, gui: viser.GuiApi) -> None:
         self._lens = Control(
             gui.add_dropdown("Lens as", LENSES, initial_value=FOV),
-            read=lambda value: checked_choice(value, LENSES, "way to say a lens"),
+            read=str,
             send=self._set_lens,
         )
         self._degrees = number_field(
@@ -103,7 +103,7 @@ class CameraLens:
                 initial_value="minimal",
                 hint="minimal is what ManiSkill trains with; the rt ones trace rays, slowly.",
             ),
-            read=lambda value: checked_choice(value, self._shader.handle.options, "shader"),
+            read=str,
             send=lambda name: self._change("shader", lambda s: replace(s, shader_pack=name)),
         )
 

@@ -23,7 +23,7 @@ from workbench.session.view import SessionView
 from workbench.ui.arrival import Arrival
 from workbench.ui.camera_work import WorkBar
 from workbench.ui.changed import fill, show
-from workbench.ui.checked import checked_int, checked_number
+from workbench.ui.checked import checked_number
 from workbench.ui.fragments import render
 from workbench.ui.inline_pictures import data_address
 from workbench.ui.presses import Presses
@@ -120,8 +120,6 @@ class CameraSuggest:
         """Raises ValueError with a sentence."""
         corners = []
         for handle, name in ((self._low, "eye's first corner"), (self._high, "eye's second corner")):
-            if not isinstance(handle.value, tuple) or len(handle.value) != 3:
-                raise ValueError(f"The {name} is not three numbers.")
             corners.append([checked_number(number, -FARTHEST, FARTHEST, name) for number in handle.value])
         low, high = np.minimum(*corners), np.maximum(*corners)
         return (float(low[0]), float(low[1]), float(low[2])), (float(high[0]), float(high[1]), float(high[2]))
@@ -136,7 +134,6 @@ class CameraSuggest:
             if not wanted:
                 raise ValueError("Choose at least one object that must be seen.")
             low, high = self._bounds()
-            resets = checked_int(self._resets.value, 1, MOST_RESETS, "number of resets")
         except ValueError as error:
             if event.client is not None:
                 event.client.add_notification(
@@ -145,7 +142,7 @@ class CameraSuggest:
             return
         self._bar.asked()
         self._arrival.asked(self._session.view().studio.suggestions)
-        self._session.studio.suggest(key, wanted, low, high, resets)
+        self._session.studio.suggest(key, wanted, low, high, self._resets.value)
 
     # --- drawn ---------------------------------------------------------------------------------------
 

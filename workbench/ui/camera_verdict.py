@@ -23,7 +23,6 @@ from workbench.ui import camera_report_words as words
 from workbench.ui.arrival import Arrival
 from workbench.ui.camera_work import WorkBar
 from workbench.ui.changed import fill, show
-from workbench.ui.checked import checked_choice, checked_int
 from workbench.ui.fragments import render
 from workbench.ui.inline_pictures import data_address
 from workbench.ui.presses import Presses
@@ -91,33 +90,22 @@ class CameraVerdict:
             self._sheet_bar = WorkBar(server, session)
             self._pictures = server.gui.add_html("", visible=False)
             self._presses = Presses(server)
-        self._judge.on_click(self._ask)
+        self._judge.on_click(lambda _: self._ask())
         self._sheet.on_click(lambda _: self._ask_for_sheet())
 
     # --- asked ---------------------------------------------------------------------------------------
 
-    def _ask(self, event: viser.GuiEvent) -> None:
+    def _ask(self) -> None:
         key = self._session.view().studio.selected
         if key is None:
             return
-        try:
-            over = checked_choice(self._over.value, OVERS, "choice")
-            seeds = (
-                checked_int(self._resets.value, 1, MOST_RESETS, "number of resets") if over == FRESH else 0
-            )
-            steps = checked_int(self._steps.value, 1, MOST_STEPS, "number of steps")
-        except ValueError as error:
-            if event.client is not None:
-                event.client.add_notification(
-                    "Not possible", str(error), color="orange", auto_close_seconds=6.0
-                )
-            return
         self._bar.asked()
         self._report_arrival.asked(self._session.view().studio.report)
+        over = self._over.value
         if over == STEPS:
-            self._session.studio.judge_steps(key, steps)
+            self._session.studio.judge_steps(key, self._steps.value)
         else:
-            self._session.studio.judge(key, seeds)
+            self._session.studio.judge(key, self._resets.value if over == FRESH else 0)
 
     def _ask_for_sheet(self) -> None:
         key = self._session.view().studio.selected

@@ -1,6 +1,7 @@
 """Fields of several numbers on one camera, each shown in so many digits, sent when they were left to settle.
 
-What a page sends may be anything: a field takes as many numbers as it has, between its bounds, or says why not.
+A field takes numbers between its bounds, or says why not; that they are numbers, and as many as it has, is known by then
+(`workbench.ui.control_values`).
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ def vector_field(
 ) -> Control[Any, Any]:
     """Three numbers, metres or parts of a unit vector."""
     handle = gui.add_vector3(label, (0.0, 0.0, 0.0), step=step, hint=hint)
-    return _field(handle, label, digits, 3, -FARTHEST, FARTHEST, send)
+    return _field(handle, label, digits, -FARTHEST, FARTHEST, send)
 
 
 def pair_field(
@@ -41,7 +42,7 @@ def pair_field(
 ) -> Control[Any, Any]:
     """Two numbers."""
     handle = gui.add_vector2(label, (0.0, 0.0), step=step, hint=hint)
-    return _field(handle, label, digits, 2, low, high, send)
+    return _field(handle, label, digits, low, high, send)
 
 
 def number_field(
@@ -66,23 +67,13 @@ def number_field(
     )
 
 
-def _field(
-    handle: Any, label: str, digits: int, length: int, low: float, high: float, send: Send
-) -> Control[Any, Any]:
+def _field(handle: Any, label: str, digits: int, low: float, high: float, send: Send) -> Control[Any, Any]:
     # Digits that are shown and can be typed; viser takes them from the step.
     handle.precision = digits
     return Control(
         handle,
-        read=lambda value: tuple(
-            checked_number(n, low, high, label) for n in _of_length(value, length, label)
-        ),
+        read=lambda value: tuple(checked_number(n, low, high, label) for n in value),
         send=send,
         shown=lambda numbers: rounded(numbers, digits),
         settle=TYPED,
     )
-
-
-def _of_length(value: object, length: int, name: str) -> tuple[object, ...]:
-    if not isinstance(value, (tuple, list)) or len(value) != length:
-        raise ValueError(f"{name} has {length} numbers.")
-    return tuple(value)

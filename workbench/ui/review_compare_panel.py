@@ -19,7 +19,6 @@ from workbench.session.review_compare import (
 from workbench.session.review_view import Opened, ReviewView
 from workbench.session.reward_terms import PREFIX
 from workbench.ui.changed import fill, show
-from workbench.ui.checked import checked_choice
 from workbench.ui.fragments import render
 from workbench.ui.presses import Presses
 from workbench.ui.review_scene import COLOURS, letter
@@ -73,8 +72,8 @@ class ReviewComparePanel:
             self._drawn = None
             fill(self._html, render("note", text="Open two recordings, and this says where they part."))
             return
-        other = 1 + letters.index(checked_choice(self._other.value, letters, "recording"))
-        tolerance = TOLERANCE_NAMES[checked_choice(self._tolerance.value, TOLERANCE_NAMES, "distance")]
+        other = 1 + letters.index(self._other.value)
+        tolerance = TOLERANCE_NAMES[self._tolerance.value]
         wanted = (view.opened_serial, view.anchors, other, tolerance)
         if wanted == self._drawn:
             return

@@ -19,7 +19,6 @@ from workbench.session.review import MOST_COMPARED
 from workbench.session.review_events import ACTION, REWARD, TERMS, curves
 from workbench.session.review_view import ReviewView, column_at
 from workbench.ui.changed import fill, show
-from workbench.ui.checked import checked_choice
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import CURSOR, LONGEST, STEP, LineChart, Span, line, value_span
 from workbench.ui.numbers_table import NumberRow, number_rows
@@ -131,7 +130,7 @@ class ReviewCurves:
         if options and options != self._entry.options:
             wish = self._wish if self._wish in options else "success" if "success" in options else options[0]
             self._entry.options = options
-            self._entry.value = checked_choice(wish, options, "entry")
+            self._entry.value = wish
 
     def _draw_entry(self, chart: str, entry: str, view: ReviewView, shown: Sequence[int]) -> None:
         """One entry of all that are compared."""

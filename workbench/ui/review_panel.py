@@ -55,13 +55,13 @@ class ReviewPanel:
         self._live.on_click(lambda _: self.step_back())
         self._speed = Control(
             gui.add_dropdown("Speed", tuple(SPEED_NAMES), initial_value="1 ×", visible=False),
-            read=lambda value: SPEED_NAMES[checked_choice(value, SPEED_NAMES, "speed")],
+            read=lambda value: SPEED_NAMES[value],
             send=review.set_speed,
             shown=lambda speed: next((n for n, known in SPEED_NAMES.items() if known == speed), "1 ×"),
         )
         self._loop = Control(
             gui.add_checkbox("Loop", False, visible=False),
-            read=lambda value: checked_choice(value, (True, False), "choice"),
+            read=bool,
             send=review.set_loop,
         )
         self._problems = gui.add_html("")

@@ -15,7 +15,7 @@ from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.action_sliders import ActionSliders
 from workbench.ui.changed import show
-from workbench.ui.checked import checked_choice, checked_int, checked_text
+from workbench.ui.checked import checked_int, checked_text
 from workbench.ui.controls import Control
 
 SPEEDS: dict[str, float] = {
@@ -73,7 +73,7 @@ class RunPanel:
                 gui.add_dropdown(
                     "Speed", tuple(SPEEDS), initial_value="1 ×", hint="Simulated seconds in one second."
                 ),
-                read=lambda value: SPEEDS[checked_choice(value, SPEEDS, "speed")],
+                read=lambda value: SPEEDS[value],
                 send=session.set_speed,
                 shown=self._speed_shown,
             )
@@ -81,13 +81,13 @@ class RunPanel:
                 gui.add_number(
                     "Seed", 0, min=0, max=LARGEST_SEED, step=1, hint="A new seed resets every env with it."
                 ),
-                read=lambda value: checked_int(value, 0, LARGEST_SEED, "seed"),
+                read=int,
                 send=session.set_seed,
                 settle=0.6,
             )
             self._end = Control(
                 gui.add_dropdown("At its end", tuple(EPISODE_ENDS), initial_value="reset that env"),
-                read=lambda value: EPISODE_ENDS[checked_choice(value, EPISODE_ENDS, "rule")],
+                read=lambda value: EPISODE_ENDS[value],
                 send=session.set_episode_end,
                 shown=lambda rule: _name_of(EPISODE_ENDS, rule),
             )
@@ -95,7 +95,7 @@ class RunPanel:
         with gui.add_folder("Actions"):
             self._source = Control(
                 gui.add_dropdown("Source", tuple(SOURCES), initial_value="hold still"),
-                read=lambda value: SOURCES[checked_choice(value, SOURCES, "source of actions")],
+                read=lambda value: SOURCES[value],
                 send=self._choose_source,
                 shown=lambda source: _name_of(SOURCES, source),
             )

@@ -72,8 +72,8 @@ class VersionPanel:
             self._drawn = wanted
             self._html.content = version_html(view.reload, loaded=task is not None, notices=notices)
 
-    def _load(self, value: object) -> None:
-        self._session.reload(LEVELS[checked_choice(value, LEVELS, "way to load")])
+    def _load(self, value: str) -> None:
+        self._session.reload(LEVELS[value])
 
 
 def version_html(report: ReloadReport | None, loaded: bool, notices: tuple[str, ...] = ()) -> str:
