@@ -1,16 +1,21 @@
-"""What every test relies on: rerun strict, a real Chromium by name, no processes left behind."""
+"""What every test relies on: rerun strict, a configuration folder of its own, a real Chromium by name, no processes left behind."""
 
 from __future__ import annotations
 
+import atexit
 import gc
 import os
 import shutil
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 # Before anything imports rerun, which reads it once: a wrong argument raises instead of printing a warning.
 os.environ["RERUN_STRICT"] = "1"
+# For this process and all that it starts: what tests trust and seal must not get into the developer's own folder.
+os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="workbench-test-config-")
+atexit.register(shutil.rmtree, os.environ["XDG_CONFIG_HOME"], ignore_errors=True)
 
 import psutil
 import pytest

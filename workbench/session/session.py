@@ -17,6 +17,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import get_args
 
+from workbench.authoring.reference import TaskName
 from workbench.core.inspection import Section
 from workbench.core.recorded_run import RecordedRun
 from workbench.session.camera_messages import CameraAnswer
@@ -68,7 +69,7 @@ class Session:
 
     def __init__(
         self,
-        task: str,
+        task: TaskName,
         options: TaskOptions,
         *,
         recordings: Path,
@@ -79,7 +80,7 @@ class Session:
     ) -> None:
         """
         Args:
-            task: a file, ``file.py:ClassName``, or a registered env id.
+            task: a file, ``file.py:ClassName``, or a registered env id; or what a recording names, cleared.
             recordings: folder that recorded episodes go to; made when the first is written.
             history_bytes: memory that the past may take.
             worker: limits of the worker process, and whether there is a spare one.

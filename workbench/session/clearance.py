@@ -1,0 +1,209 @@
+"""Whether code that a recording names or holds may run: every way to it goes through `Clearances`, and is asked once.
+
+A recording is somebody else's file until its seal says that it was made here. What it names is opened without a question
+if it is an id of an installed package, a file that a person named (on the command line, or that is open live), or the file
+that this installation had open when it recorded. Of anything else the texts are read, not run, and a person is asked about
+these very texts; the answer is kept by what they say. What was agreed to is what runs, whatever becomes of the file.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from pathlib import Path
+
+from workbench.authoring.reference import RecordedTask, TaskName
+from workbench.authoring.task_content import CannotRead, TaskContent, content_of_texts, read_content
+from workbench.authoring.trust import TrustStore
+from workbench.recording.episode import EpisodeInfo
+from workbench.recording.made_here import MadeHere, made_here
+from workbench.session.recorded_text import NoText, below_one_folder
+
+SHORT_HASH = 12
+
+
+class Answer(Enum):
+    NO = "no"
+    NONE = "none"
+    """Neither this nor any other of those that are asked about together."""
+    ONCE = "once"
+    """Until the program ends."""
+    ALWAYS = "always"
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a person is to be asked. All texts may be anything: a recording holds them."""
+
+    file: str
+    """What would run: a path, or the name of a file that a recording holds."""
+    held_by: str
+    """The task whose recordings hold the text; empty for a file on the disk."""
+    hash: str
+    """The first digits."""
+    modules: tuple[str, ...]
+    """Further files that would run."""
+    unseen: tuple[str, ...]
+    changed: bool
+    """Another text of this file was trusted before."""
+    more: int = 0
+    """Questions that follow this one."""
+
+
+class NotCleared(Exception):
+    """Code is not to run; the message is a sentence that names it, `question` what would have to be agreed to."""
+
+    def __init__(self, why: str, question: Question | None = None) -> None:
+        super().__init__(why)
+        self.question = question
+
+
+Ask = Callable[[Question, Callable[[], bool]], Answer]
+"""Puts a question to a person and waits for the answer; gives up, which is a no, when its second argument says so."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """Something that would run."""
+
+    reference: TaskName
+    """What is opened; not looked at where it is the recorded text."""
+    info: EpisodeInfo
+    """Of the recording that wants it."""
+    recorded_text: bool = False
+
+
+class Clearances:
+    """
+    Args:
+        named: The files that a person named: on the command line, or by having them open live.
+        ask: Puts a question to a person; None where there is nobody: the answer is no then.
+        all_trusted: Every answer is yes, for this run (``--trust``).
+    """
+
+    def __init__(
+        self,
+        named: Callable[[], Iterable[Path]] = tuple,
+        ask: Ask | None = None,
+        all_trusted: bool = False,
+    ) -> None:
+        self._named, self._ask, self._all_trusted = named, ask, all_trusted
+        self._store = TrustStore()
+
+    def clear(self, wanted: Wanted, stopped: Callable[[], bool] = lambda: False) -> TaskName:
+        """What may be opened for it; asks if need be, and waits for the answer.
+
+        Raises:
+            NotCleared: nothing may, and why.
+        """
+        (cleared,) = self.clear_all([wanted], stopped)
+        if isinstance(cleared, NotCleared):
+            raise cleared
+        return cleared
+
+    def clear_all(
+        self, wanted: Sequence[Wanted], stopped: Callable[[], bool] = lambda: False
+    ) -> list[TaskName | NotCleared]:
+        """The same for several; each text is asked about once."""
+        found = [self._without_asking(one) for one in wanted]
+        open_ones = {one.hash: one for one in found if isinstance(one, TaskContent)}
+        refused: dict[str, NotCleared] = {}
+        none_of_them = False
+        for place, (hash, content) in enumerate(open_ones.items()):
+            about = next(
+                one for one, its in zip(wanted, found) if isinstance(its, TaskContent) and its.hash == hash
+            )
+            question = replace(self._question(about, content), more=len(open_ones) - place - 1)
+            answer = (
+                Answer.NO if none_of_them or self._ask is None or stopped() else self._ask(question, stopped)
+            )
+            none_of_them = none_of_them or answer is Answer.NONE
+            if answer in (Answer.NO, Answer.NONE):
+                refused[hash] = NotCleared(f"{_named_in(question)} is not trusted", question)
+            elif answer is Answer.ALWAYS:
+                self._store.trust(content)
+            else:
+                self._store.trust_once(content)
+        cleared: list[TaskName | NotCleared] = []
+        for one, its in zip(wanted, found):
+            if not isinstance(its, TaskContent):
+                cleared.append(its)
+            elif its.hash in refused:
+                cleared.append(refused[its.hash])
+            else:
+                cleared.append(_approved(one, its))
+        return cleared
+
+    def _without_asking(self, wanted: Wanted) -> TaskName | NotCleared | TaskContent:
+        """What may be opened; or the texts that have to be asked about."""
+        made = made_here(wanted.info)
+        if wanted.recorded_text:
+            try:
+                content = recorded_content(wanted.info)
+            except NoText as error:
+                return NotCleared(str(error))
+            trusted = made is not MadeHere.NO
+        else:
+            reference = wanted.reference
+            if isinstance(reference, str) or reference.file is None:
+                return reference
+            if made is MadeHere.CONTENT_AND_PLACE and reference.file == wanted.info.source_file:
+                return str(reference)
+            if _is_one_of(reference.file, self._named()):
+                return str(reference)
+            try:
+                content = read_content(Path(reference.file))
+            except CannotRead as error:
+                return NotCleared(str(error))
+            trusted = made is not MadeHere.NO and _as_recorded(content, wanted.info)
+        if trusted or self._all_trusted or self._store.trusts(content):
+            return _approved(wanted, content)
+        return content
+
+    def _question(self, wanted: Wanted, content: TaskContent) -> Question:
+        return Question(
+            content.main,
+            wanted.info.task if wanted.recorded_text else "",
+            content.hash[:SHORT_HASH],
+            content.modules,
+            content.unseen,
+            not wanted.recorded_text and self._store.trusted_before(content),
+        )
+
+
+def recorded_content(info: EpisodeInfo) -> TaskContent:
+    """The text that a recording holds.
+
+    Raises:
+        NoText: it holds none.
+    """
+    if not info.source or info.source_file is None:
+        raise NoText("this recording does not hold the text of its task")
+    return content_of_texts(*below_one_folder(info.source_file, info.source))
+
+
+def _approved(wanted: Wanted, content: TaskContent) -> TaskName:
+    if wanted.recorded_text or isinstance(wanted.reference, str):
+        return wanted.reference
+    return replace(wanted.reference, file=content.main, approved=content.texts)
+
+
+def _as_recorded(content: TaskContent, info: EpisodeInfo) -> bool:
+    """Whether a file says what the recording holds: then the seal speaks for it, wherever it lies."""
+    try:
+        return content.hash == recorded_content(info).hash
+    except NoText:
+        return False
+
+
+def _is_one_of(file: str, named: Iterable[Path]) -> bool:
+    real = os.path.realpath(file)
+    return any(os.path.realpath(one) == real for one in named)
+
+
+def _named_in(question: Question) -> str:
+    if question.held_by:
+        return f"The text that recordings of {question.held_by} hold ({question.hash})"
+    return f"{question.file} ({question.hash})"
