@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 import gc
 import os
 import shutil
@@ -15,7 +14,6 @@ from pathlib import Path
 os.environ["RERUN_STRICT"] = "1"
 # For this process and all that it starts: what tests trust and seal must not get into the developer's own folder.
 os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="workbench-test-config-")
-atexit.register(shutil.rmtree, os.environ["XDG_CONFIG_HOME"], ignore_errors=True)
 
 import psutil
 import pytest
@@ -55,6 +53,13 @@ def imported_modules_are_not_searched_for_garbage() -> None:
     """BaseEnv calls ``gc.collect()`` whenever it builds or closes: 0.25 s each over torch's own objects."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def configuration_folder_is_removed() -> Iterator[None]:
+    folder = os.environ["XDG_CONFIG_HOME"]
+    yield
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -17,7 +17,7 @@ from typing import NoReturn
 from rich.markup import escape
 
 import workbench
-from workbench.authoring.reference import named_file
+from workbench.authoring.reference import TaskName, named_file
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.session.kept_worker import WorkerOptions
 from workbench.session.messages import Event, Failed, TaskOptions
@@ -37,8 +37,13 @@ def open_in_terminal(
     worker: WorkerOptions,
     recordings: Path,
     history_bytes: int,
+    trust: bool = False,
 ) -> int:
-    """Serve the page of a task; returns only where the door cannot be opened."""
+    """Serve the page of a task; returns only where the door cannot be opened.
+
+    Args:
+        trust: Run what recordings name without asking.
+    """
     door = _opened(at, "Workbench")
     if isinstance(door, int):
         return door
@@ -62,20 +67,25 @@ def open_in_terminal(
     )
     place = Workplace(door.server, recordings, session)
     what = f"{task}, {options.num_envs} envs"
-    _serve(door, place, "live", what, recordings, WorkerOptions(worker.memory_limit), end, session.close)
+    _serve(
+        door, place, "live", what, recordings, WorkerOptions(worker.memory_limit), end, session.close, trust
+    )
 
 
-def review_in_terminal(folder: Path, tasks: tuple[Path, ...], at: DoorOptions, worker: WorkerOptions) -> int:
+def review_in_terminal(
+    folder: Path, tasks: tuple[Path, ...], at: DoorOptions, worker: WorkerOptions, trust: bool = False
+) -> int:
     """Serve the page of a folder of recordings; returns only where the door cannot be opened.
 
     Args:
         worker: Of tasks that are opened from there.
+        trust: Run what recordings name without asking.
     """
     door = _opened(at, "Recordings")
     if isinstance(door, int):
         return door
     place = Workplace(door.server, folder, tasks=tasks)
-    _serve(door, place, "review", f"recordings in {folder}", folder, worker, _End(), lambda: None)
+    _serve(door, place, "review", f"recordings in {folder}", folder, worker, _End(), lambda: None, trust)
 
 
 def _opened(at: DoorOptions, label: str) -> Door | int:
@@ -100,15 +110,16 @@ def _serve(
     worker: WorkerOptions,
     end: _End,
     close_session: Callable[[], None],
+    trust: bool,
 ) -> NoReturn:
-    def open_task(task: str, options: TaskOptions) -> Session:
+    def open_task(task: TaskName, options: TaskOptions) -> Session:
         return Session(
             task, options, recordings=recordings, worker=worker, on_event=print_event, on_line=print_line
         )
 
     sharing = Sharing(door)
     place.offer(sharing.offer)
-    close_others = offer_going_back_in(place, open_task)
+    close_others = offer_going_back_in(place, open_task, trust)
     end.at_signals()
     try:
         place.pages.start(first)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from rich.console import Console
@@ -12,12 +14,17 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsed
 from rich.progress import Progress as Bar
 from rich.table import Table
 
+from workbench.exit_codes import Exit
 from workbench.session import rescore_words as words
+from workbench.session.clearance import Clearances
 from workbench.session.rescore_all import Progress, RescoreOptions, rescore_all
 from workbench.session.rescore_messages import Verdict
+from workbench.trust_prompt import TerminalPrompt, can_ask
 
 
-def run_rescore(what: RescoreOptions, out: Console, err: Console, csv: Path | None, json: Path | None) -> int:
+def run_rescore(
+    what: RescoreOptions, out: Console, err: Console, csv: Path | None, json: Path | None, trust: bool = False
+) -> int:
     """Judge, print, write the tables that are asked for; raises as `rescore_all`, and OSError for a table."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Bar(*columns, console=err) as bar:
@@ -28,7 +35,19 @@ def run_rescore(what: RescoreOptions, out: Console, err: Console, csv: Path | No
                 row, total=now.total, completed=now.episodes, description=f"judging, {now.steps} steps"
             )
 
-        verdicts, notes = rescore_all(what, lambda activity: bar.update(row, description=activity), tell)
+        @contextmanager
+        def without_bar() -> Iterator[None]:
+            bar.stop()
+            yield
+            bar.start()
+
+        ask = TerminalPrompt(out, without_bar).ask if can_ask() else None
+        verdicts, notes = rescore_all(
+            what,
+            lambda activity: bar.update(row, description=activity),
+            tell,
+            Clearances(ask=ask, all_trusted=trust),
+        )
         bar.update(row, total=len(verdicts), completed=len(verdicts), description="judged")
     for path, text in ((csv, words.as_csv), (json, words.as_json)):
         if path is not None:
@@ -38,7 +57,7 @@ def run_rescore(what: RescoreOptions, out: Console, err: Console, csv: Path | No
         err.print(f"[yellow]{escape(note)}[/]", soft_wrap=True)
     if doubt := words.doubts(verdicts):
         err.print(f"[yellow]{escape(doubt)}[/]", soft_wrap=True)
-    return 0
+    return Exit.DONE
 
 
 def print_verdicts(verdicts: list[Verdict], out: Console) -> None:

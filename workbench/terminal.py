@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.markup import escape
 
+from workbench.exit_codes import Exit
+
 if TYPE_CHECKING:
     from workbench.authoring.problem import Problem
     from workbench.session.messages import Event
@@ -18,7 +20,7 @@ err = Console(stderr=True, highlight=False)
 def refuse(message: str) -> int:
     """Say in a sentence why nothing is done; returns the exit code."""
     err.print(f"[red]{escape(message)}[/]", soft_wrap=True)
-    return 2
+    return Exit.REFUSED
 
 
 def warn(message: str) -> None:

@@ -14,7 +14,6 @@ import logging
 import os
 import secrets
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from enum import Enum
 from hashlib import sha256
 from typing import Any
@@ -74,8 +73,7 @@ def made_here(info: EpisodeInfo) -> MadeHere:
         return MadeHere.NO
     try:
         key = _key()
-        held = asdict(info)
-        values = {name: held[name] for name in _COVERED}
+        values = {name: getattr(info, name) for name in _COVERED}
         values["seed"] = info.seed if info.seed >= 0 else None
         content = _content(values, found.main, found.files, info.acted_by)
     except OSError as error:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 
-from workbench.authoring.reference import RecordedTask, TaskName
+from workbench.authoring.reference import TaskName
 from workbench.authoring.task_content import CannotRead, TaskContent, content_of_texts, read_content
 from workbench.authoring.trust import TrustStore
 from workbench.recording.episode import EpisodeInfo
@@ -22,6 +22,8 @@ from workbench.recording.made_here import MadeHere, made_here
 from workbench.session.recorded_text import NoText, below_one_folder
 
 SHORT_HASH = 12
+LONGEST = 400
+"""Characters of a name that is shown."""
 
 
 class Answer(Enum):
@@ -35,7 +37,7 @@ class Answer(Enum):
 
 @dataclass(frozen=True)
 class Question:
-    """What a person is to be asked. All texts may be anything: a recording holds them."""
+    """What a person is to be asked. Texts out of recordings are printable, and not escaped."""
 
     file: str
     """What would run: a path, or the name of a file that a recording holds."""
@@ -53,11 +55,19 @@ class Question:
 
 
 class NotCleared(Exception):
-    """Code is not to run; the message is a sentence that names it, `question` what would have to be agreed to."""
+    """Code is not to run; the message is the reason, `question` what would have to be agreed to, if that would help."""
 
     def __init__(self, why: str, question: Question | None = None) -> None:
         super().__init__(why)
         self.question = question
+
+
+class NotTrusted(Exception):
+    """Nothing was run, because there is code that nobody agreed to."""
+
+    def __init__(self, questions: Sequence[Question]) -> None:
+        super().__init__("; ".join(map(in_words, questions)))
+        self.questions = tuple(questions)
 
 
 Ask = Callable[[Question, Callable[[], bool]], Answer]
@@ -92,6 +102,11 @@ class Clearances:
         self._named, self._ask, self._all_trusted = named, ask, all_trusted
         self._store = TrustStore()
 
+    @property
+    def asks(self) -> bool:
+        """Whether there is a person to ask."""
+        return self._ask is not None
+
     def clear(self, wanted: Wanted, stopped: Callable[[], bool] = lambda: False) -> TaskName:
         """What may be opened for it; asks if need be, and waits for the answer.
 
@@ -121,7 +136,7 @@ class Clearances:
             )
             none_of_them = none_of_them or answer is Answer.NONE
             if answer in (Answer.NO, Answer.NONE):
-                refused[hash] = NotCleared(f"{_named_in(question)} is not trusted", question)
+                refused[hash] = NotCleared(f"{in_words(question)} is not trusted", question)
             elif answer is Answer.ALWAYS:
                 self._store.trust(content)
             else:
@@ -164,11 +179,11 @@ class Clearances:
 
     def _question(self, wanted: Wanted, content: TaskContent) -> Question:
         return Question(
-            content.main,
-            wanted.info.task if wanted.recorded_text else "",
+            _printable(content.main),
+            _printable(wanted.info.task) if wanted.recorded_text else "",
             content.hash[:SHORT_HASH],
-            content.modules,
-            content.unseen,
+            tuple(map(_printable, content.modules)),
+            tuple(map(_printable, content.unseen)),
             not wanted.recorded_text and self._store.trusted_before(content),
         )
 
@@ -198,12 +213,19 @@ def _as_recorded(content: TaskContent, info: EpisodeInfo) -> bool:
         return False
 
 
+def _printable(text: str) -> str:
+    """On one line, with nothing that moves the cursor or turns the direction of writing."""
+    plain = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return plain if len(plain) <= LONGEST else f"{plain[: LONGEST // 2]} ... {plain[-LONGEST // 2 :]}"
+
+
 def _is_one_of(file: str, named: Iterable[Path]) -> bool:
     real = os.path.realpath(file)
     return any(os.path.realpath(one) == real for one in named)
 
 
-def _named_in(question: Question) -> str:
+def in_words(question: Question) -> str:
+    """The code that a question is about, with its hash."""
     if question.held_by:
-        return f"The text that recordings of {question.held_by} hold ({question.hash})"
+        return f"the text of {question.file} in recordings of {question.held_by} ({question.hash})"
     return f"{question.file} ({question.hash})"

@@ -27,7 +27,6 @@ from workbench.recording.side_files import folder_of, place_of
 from workbench.session.messages import TaskDescription, TaskOptions
 from workbench.session.recorded_text import NoText, below_one_folder
 
-
 _IMPORTED = (".py", ".pyc", ".pyo", ".so", ".pyd", ".pth", ".zip", ".egg")
 """Ends of the names of files that Python imports or reads at an import."""
 

@@ -66,4 +66,4 @@ def _in_words(reference: RecordedTask) -> str:
 def _recorded(infos: Sequence[EpisodeInfo]) -> str:
     hashes = list(dict.fromkeys(info.source_hash for info in infos if info.source_hash))
     version = f" (version {', '.join(hashes[:MOST_NAMED])})" if hashes else ""
-    return f"With the text that each recording holds{version}. It runs here: only where it is trusted."
+    return f"With the text that each recording holds{version}. It runs here; you are asked first where it was not recorded here."

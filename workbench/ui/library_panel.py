@@ -152,6 +152,10 @@ class LibraryPanel:
         with self._lock:
             self._actions.append(action)
 
+    def leave_keys(self, asking: bool) -> None:
+        """Take no keys while another part of the page asks something."""
+        self._on_asking(asking)
+
     def close(self) -> None:
         """Close the window with a question, if there is one. For when the page goes."""
         self._edits.close()
