@@ -26,6 +26,7 @@ def run_rescore(
     what: RescoreOptions, out: Console, err: Console, csv: Path | None, json: Path | None, trust: bool = False
 ) -> int:
     """Judge, print, write the tables that are asked for; raises as `rescore_all`, and OSError for a table."""
+    asks = can_ask()  # before the bar takes the terminal
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Bar(*columns, console=err) as bar:
         row = bar.add_task("reading the recordings", total=None)
@@ -41,7 +42,7 @@ def run_rescore(
             yield
             bar.start()
 
-        ask = TerminalPrompt(out, without_bar).ask if can_ask() else None
+        ask = TerminalPrompt(out, without_bar).ask if asks else None
         verdicts, notes = rescore_all(
             what,
             lambda activity: bar.update(row, description=activity),

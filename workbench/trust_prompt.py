@@ -72,6 +72,8 @@ def print_question(question: Question, out: Console) -> None:
 
 def not_trusted(questions: tuple[Question, ...]) -> str:
     """Why nothing was run, and what to do."""
+    if can_ask():
+        return "Nothing was run: you agreed to none of it."
     named = "\n".join(f"    {in_words(question)}" for question in questions[:MOST_NAMED])
     if len(questions) > MOST_NAMED:
         named += f"\n    and {len(questions) - MOST_NAMED} more"

@@ -25,10 +25,13 @@ def user_folder() -> Path:
     Raises:
         NoUserFolder: this user has no home folder.
     """
-    folder = platformdirs.user_config_path("workbench", appauthor=False)
+    try:
+        folder = platformdirs.user_config_path("workbench", appauthor=False)
+    except RuntimeError as error:
+        raise NoUserFolder(f"this user has no home folder ({error})") from error
     if not folder.is_absolute():
-        # Without a home the answer is "~/.config/workbench", below the current folder, which may be a downloaded one.
-        raise NoUserFolder(f"this user has no home folder ({folder})")
+        # Below the current folder, which may be a downloaded one: earlier versions of platformdirs answer so.
+        raise NoUserFolder(f"the configuration folder has no absolute path ({folder})")
     return folder
 
 
