@@ -39,8 +39,8 @@ class TerminalPrompt:
     def ask(self, question: Question, stopped: Callable[[], bool]) -> Answer:
         with self._quiet():
             print_question(question, self._out)
-            choices = "y: run it this once, a: trust this text from now on, n: do not run it"
-            choices += f", q: nor the {question.more} more" if question.more else ""
+            choices = "y: run it, and ask again next time; a: run it, and trust this text from now on; n: do not run it"
+            choices += f"; q: nor the {question.more} more" if question.more else ""
             self._out.print(f"[bold]Run it?[/] ({choices}) \\[n] ", end="", soft_wrap=True)
             try:
                 typed = input()
@@ -51,13 +51,16 @@ class TerminalPrompt:
 
 def print_question(question: Question, out: Console) -> None:
     """What would run."""
-    if question.held_by:
+    if question.recorded_text:
         out.print(
-            f"Recordings of {escape(question.held_by)} that were not made by this installation hold this text:",
+            f"Recordings of {escape(question.task)} that were not made by this installation hold this text:",
             soft_wrap=True,
         )
     else:
-        out.print("A recording that was not made by this installation names this file:", soft_wrap=True)
+        out.print(
+            f"Recordings of {escape(question.task)} that were not made by this installation name this file:",
+            soft_wrap=True,
+        )
     out.print(f"    [bold]{escape(question.file)}[/]  {question.hash}", soft_wrap=True)
     for name in question.modules[:MOST_NAMED]:
         out.print(f"    and beside it {escape(name)}", soft_wrap=True)

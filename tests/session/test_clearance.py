@@ -118,7 +118,7 @@ def test_what_was_recorded_elsewhere_is_asked_about_with_file_hash_and_modules(f
     assert question.file == str(file) and question.modules == ("helper.py",) and not question.changed
     assert read_content(file).hash.startswith(question.hash) and len(question.hash) == 12
     (question,) = asked(as_recorded(foreign))
-    assert (question.file, question.held_by) == ("push.py", "Push-v1")
+    assert (question.file, question.task, question.recorded_text) == ("push.py", "Push-v1", True)
 
 
 def test_without_anybody_to_ask_the_answer_is_no(foreign: Path) -> None:
@@ -185,7 +185,7 @@ def test_names_out_of_a_recording_cannot_write_to_a_terminal(foreign: Path) -> N
         source={"push\n.py": "x"},
     )
     (question,) = asked(as_recorded(foreign))
-    assert (question.file, question.held_by) == (r"push\n.py", r"Push\x1b[2J\u202e-v1")
+    assert (question.file, question.task) == (r"push\n.py", r"Push\x1b[2J\u202e-v1")
 
 
 # --- the seal ----------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ import shutil
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import mani_skill.envs  # noqa: F401  registers the ids
@@ -75,7 +76,7 @@ def ran(folder: Path) -> bool:
 
 
 def test_a_path_in_place_of_an_id_is_not_loaded_when_its_row_is_opened(tmp_path: Path) -> None:
-    env = gym.make("PickCube-v1", obs_mode="state", render_backend="none")
+    env: Any = gym.make("PickCube-v1", obs_mode="state", render_backend="none")
     env = RecordEpisode(env, str(tmp_path), save_video=False, trajectory_name="demos", source_type="test")
     env.reset(seed=1)
     for _ in range(2):

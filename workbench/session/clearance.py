@@ -41,8 +41,10 @@ class Question:
 
     file: str
     """What would run: a path, or the name of a file that a recording holds."""
-    held_by: str
-    """The task whose recordings hold the text; empty for a file on the disk."""
+    task: str
+    """Of the recording that wants it."""
+    recorded_text: bool
+    """The text is the one that the recording holds, and not a file on the disk."""
     hash: str
     """The first digits."""
     modules: tuple[str, ...]
@@ -180,7 +182,8 @@ class Clearances:
     def _question(self, wanted: Wanted, content: TaskContent) -> Question:
         return Question(
             _printable(content.main),
-            _printable(wanted.info.task) if wanted.recorded_text else "",
+            _printable(wanted.info.task),
+            wanted.recorded_text,
             content.hash[:SHORT_HASH],
             tuple(map(_printable, content.modules)),
             tuple(map(_printable, content.unseen)),
@@ -226,6 +229,6 @@ def _is_one_of(file: str, named: Iterable[Path]) -> bool:
 
 def in_words(question: Question) -> str:
     """The code that a question is about, with its hash."""
-    if question.held_by:
-        return f"the text of {question.file} in recordings of {question.held_by} ({question.hash})"
+    if question.recorded_text:
+        return f"the text of {question.file} in recordings of {question.task} ({question.hash})"
     return f"{question.file} ({question.hash})"

@@ -19,6 +19,11 @@ from workbench.ui.library_forms import Question as Window
 from workbench.ui.review_page import Places
 
 TITLE = "Run this code?"
+DO_NOT, ONCE, ALWAYS = (
+    "Don't run it",
+    "Run it, and ask again next time",
+    "Run it, and trust this text from now on",
+)
 MOST_NAMED = 8
 """Files that are named; the rest is counted."""
 _LOOK = 0.1
@@ -97,17 +102,13 @@ class TrustDialog:
                 with self._window.modal:
                     gui.add_html(question_html(question))
                     # The first has the focus: Enter must not run anything.
-                    self._add_button("Don't run it", "gray", viser.Icon.X, pending, Answer.NO)
+                    self._add_button(DO_NOT, None, viser.Icon.X, pending, Answer.NO)
                     if question.more:
-                        label = f"Don't run it, nor the {question.more} more that are asked about"
+                        label = f"Nor the {question.more} more that are asked about"
                         self._add_button(label, "gray", viser.Icon.X, pending, Answer.NONE)
-                    self._add_button(
-                        "Run it until the workbench ends", None, viser.Icon.PLAYER_PLAY, pending, Answer.ONCE
-                    )
-                    self._add_button(
-                        "Trust this text from now on", None, viser.Icon.SHIELD_CHECK, pending, Answer.ALWAYS
-                    )
-                self._escape = gui.add_command("Don't run it", hotkey="escape")
+                    self._add_button(ONCE, "gray", viser.Icon.PLAYER_PLAY, pending, Answer.ONCE)
+                    self._add_button(ALWAYS, "gray", viser.Icon.SHIELD_CHECK, pending, Answer.ALWAYS)
+                self._escape = gui.add_command(DO_NOT, hotkey="escape")
                 self._escape.on_trigger(lambda _: pending.take(Answer.NO))
             self._asking(True)
 
@@ -135,7 +136,8 @@ def question_html(question: Question) -> str:
     return render(
         "trust_question",
         file=question.file,
-        held_by=question.held_by,
+        task=question.task,
+        recorded_text=question.recorded_text,
         hash=question.hash,
         modules=question.modules[:MOST_NAMED],
         more_modules=max(0, len(question.modules) - MOST_NAMED),
