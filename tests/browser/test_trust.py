@@ -63,7 +63,7 @@ def test_code_of_a_recording_from_elsewhere_runs_when_a_person_says_so(
 
         live.click()
         other.get_by_role("button", name="Run it, and ask again next time").click()
-        expect(page.get_by_text("its actions were made again")).to_be_visible(timeout=PATIENT)
+        expect(page.get_by_text("every body is where it was")).to_be_visible(timeout=PATIENT)
         assert mark.exists()
         assert not [error for error in errors if "non-existent component" not in error]
         browser.close()

@@ -26,6 +26,7 @@ from workbench.recording.made_here import KEY_FILE, MadeHere, made_here
 from workbench.recording.read_episode import read_episode
 from workbench.recording.recover import recover
 from workbench.session.clearance import Answer, Clearances, NotCleared, Question, Wanted
+from workbench.session.recorded_scene import SceneError, SceneProcess
 from workbench.session.step_back import recorded_source, reference_of
 
 TEXT = "import helper\nclass Push: ...\n"
@@ -158,6 +159,31 @@ def test_an_answer_is_kept_by_what_the_texts_say(foreign: Path, tmp_path: Path) 
     assert [question.changed for question in asked(todays(foreign))] == [True]
     file.write_text(TEXT)
     assert asked(todays(foreign)) == []
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"env_kwargs": {"episode_json": "/etc/passwd"}},
+        {"env_kwargs": {"sensor_configs": {"shaders": ["../evil"]}}},
+        {"reset_options": {"~/model": 1}},
+        {"env_kwargs": {"model": "evil.urdf"}},
+        {"control_mode": "a\\b"},
+    ],
+)
+def test_arguments_from_elsewhere_name_no_files(
+    foreign: Path, values: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(foreign.parent)
+    (foreign.parent / "evil.urdf").write_text("")
+    file = foreign.parents[1] / "push.py"
+    edit(foreign, **values)
+    for wanted in (todays(foreign), as_recorded(foreign), Wanted(str(file), info_of(foreign))):
+        with pytest.raises(NotCleared, match="names files for its env to read"):
+            Clearances(ask=Person(Answer.ALWAYS)).clear(wanted)
+        Clearances(all_trusted=True).clear(wanted)
+    with pytest.raises(SceneError, match="numbers and curves only"):
+        SceneProcess()._one(None, None, read_episode(foreign), lambda: False, print)  # type: ignore[arg-type]
 
 
 def test_each_text_is_asked_about_once_and_all_can_be_refused_at_once(foreign: Path) -> None:

@@ -35,7 +35,7 @@ def buttons(server: viser.ViserServer) -> dict[str, Any]:
 
 def window_with(server: viser.ViserServer, text: str) -> dict[str, Any]:
     deadline = time.monotonic() + 20
-    while text not in shown(server) or DO_NOT not in buttons(server):
+    while text not in shown(server) or ALWAYS not in buttons(server):
         assert time.monotonic() < deadline, f"no window with {text}"
         time.sleep(0.01)
     return buttons(server)

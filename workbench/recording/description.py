@@ -40,6 +40,9 @@ from workbench.recording.survey import Survey, camera_words
 
 FORMAT = 1
 THUMBNAIL_WIDTH = 160
+MOST_PARTS = 40
+"""Folders in the place of a task that are looked for: the place is what a recording says."""
+MOST_TASK_BYTES = 8 << 20
 
 
 def describe(survey: Survey) -> dict[str, Any]:
@@ -146,11 +149,17 @@ def _source_where(path: str, task: str, folder: Path) -> Path | None:
     if (there := folder / path).is_file():
         return there
     parts = [part for part in Path(path).parts if part not in ("..", os.sep)] if path.endswith(".py") else []
+    if len(parts) > MOST_PARTS:
+        return None
     for place in (Path.cwd(), *folder.resolve().parents):
         for begin in range(len(parts)):
             candidate = place.joinpath(*parts[begin:])
             try:
-                if candidate.is_file() and task in candidate.read_text(encoding="utf-8"):
+                if (
+                    candidate.is_file()
+                    and candidate.stat().st_size <= MOST_TASK_BYTES
+                    and task in candidate.read_text(encoding="utf-8")
+                ):
                     return candidate
             except (OSError, UnicodeDecodeError):
                 continue

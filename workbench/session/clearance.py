@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
+from typing import Any
 
 from workbench.authoring.reference import TaskName
 from workbench.authoring.task_content import CannotRead, TaskContent, content_of_texts, read_content
@@ -153,9 +154,20 @@ class Clearances:
                 cleared.append(_approved(one, its))
         return cleared
 
+    def why_not_its_arguments(self, info: EpisodeInfo, made: MadeHere | None = None) -> str | None:
+        """Why an env cannot be made as this recording was; None where it can: arguments from elsewhere name no files."""
+        if self._all_trusted or (made or made_here(info)) is not MadeHere.NO:
+            return None
+        named = [_printable(text) for text in files_named(info)]
+        if not named:
+            return None
+        return f"a recording of {_printable(info.task)} that was not made here names files for its env to read ({', '.join(named[:3])})"
+
     def _without_asking(self, wanted: Wanted) -> TaskName | NotCleared | TaskContent:
         """What may be opened; or the texts that have to be asked about."""
         made = made_here(wanted.info)
+        if (why := self.why_not_its_arguments(wanted.info, made)) is not None:
+            return NotCleared(why)
         if wanted.recorded_text:
             try:
                 content = recorded_content(wanted.info)
@@ -189,6 +201,30 @@ class Clearances:
             tuple(map(_printable, content.unseen)),
             not wanted.recorded_text and self._store.trusted_before(content),
         )
+
+
+def files_named(info: EpisodeInfo) -> list[str]:
+    """What in the arguments of a recording's env looks like a path: a task may open it, whatever it is."""
+    found: list[str] = []
+    waiting: list[Any] = [info.env_kwargs, info.reset_options, info.control_mode]
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, dict):
+            waiting += [*value.keys(), *value.values()]
+        elif isinstance(value, (list, tuple)):
+            waiting += value
+        elif isinstance(value, str) and _is_like_a_path(value):
+            found.append(value)
+    return found
+
+
+def _is_like_a_path(text: str) -> bool:
+    if "/" in text or "\\" in text or text.startswith("~"):
+        return True
+    try:
+        return "." in text and os.path.lexists(text)
+    except ValueError:  # a null byte
+        return True
 
 
 def recorded_content(info: EpisodeInfo) -> TaskContent:

@@ -157,8 +157,9 @@ class LibraryPanel:
         self._on_asking(asking)
 
     def close(self) -> None:
-        """Close the window with a question, if there is one. For when the page goes."""
+        """Close the window with a question, if there is one. For when the page goes, and its keys with it."""
         self._edits.close()
+        self._keys, self._escapes = [], []
 
     def commands(self) -> list[Command]:
         """Keys of the table, for the page to register after the last action was added."""

@@ -97,6 +97,9 @@ class StepIn:
             self._say(str(error))
             return
         info = one.episode.info
+        if (why := self._clearances.why_not_its_arguments(info)) is not None:
+            self._say(_sentence(why))
+            return
         there = None if self.recorded_source else self._open_already(info)
         if there is not None:
             self._enter(there, run, info, state)
@@ -137,7 +140,7 @@ class StepIn:
                 folder, reference = write_source(wanted.info)
         except (CannotStepIn, NotCleared) as error:
             if not clearing.stop.is_set():
-                self._say(f"{str(error)[:1].upper()}{str(error)[1:]}.".replace("..", "."))
+                self._say(_sentence(str(error)))
             self._cleared(clearing)
             return
         with self._lock:
@@ -340,6 +343,10 @@ def episode_files(library: Library, ids: Sequence[str]) -> list[EpisodeFile]:
         for row in (rows[id] for id in dict.fromkeys(ids) if id in rows)
         if row.paths
     ]
+
+
+def _sentence(why: str) -> str:
+    return f"{why[:1].upper()}{why[1:].removesuffix('.')}."
 
 
 def offer_going_back_in(
