@@ -1,4 +1,4 @@
-"""What every test relies on: rerun strict, a real Chromium by name, no processes left behind."""
+"""What every test relies on: rerun strict, a configuration folder of its own, a real Chromium by name, no processes left behind."""
 
 from __future__ import annotations
 
@@ -6,12 +6,15 @@ import gc
 import os
 import shutil
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 # Before anything imports rerun, which reads it once: a wrong argument raises instead of printing a warning.
 os.environ["RERUN_STRICT"] = "1"
+# For this process and all that it starts: what tests trust and seal must not get into the developer's own folder.
+os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="workbench-test-config-")
 
 import psutil
 import pytest
@@ -51,6 +54,13 @@ def imported_modules_are_not_searched_for_garbage() -> None:
     """BaseEnv calls ``gc.collect()`` whenever it builds or closes: 0.25 s each over torch's own objects."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def configuration_folder_is_removed() -> Iterator[None]:
+    folder = os.environ["XDG_CONFIG_HOME"]
+    yield
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -17,6 +17,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from workbench.exit_codes import Exit
 from workbench.machine.guarded_terminal import guard_terminal
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.task_arguments import Backend, history_bytes, task_options
@@ -44,6 +45,7 @@ def open_page(
     history: str = "256MB",
     memory_limit: str = "auto",
     spare: bool = True,
+    trust: bool = False,
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
 ) -> int:
     """Open a task in a browser page that follows its file.
@@ -64,6 +66,7 @@ def open_page(
             sets no limit. A process that uses more is ended and replaced.
         spare: keep a second process ready to take over when the task's dies (--no-spare: it then takes some
             seconds more, and about 0.8 GB of memory less).
+        trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it.
         env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
     """
     from workbench.authoring.reference import named_file
@@ -83,7 +86,7 @@ def open_page(
         at = DoorOptions(host=host, port=port, socket=socket, token=token)
     except ValueError as error:
         return refuse(str(error))
-    return open_in_terminal(task, options, at, worker, recordings, past)
+    return open_in_terminal(task, options, at, worker, recordings, past, trust)
 
 
 @app.command
@@ -146,6 +149,7 @@ def review(
     socket: Path | None = None,
     token: bool = True,
     task: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = (),
+    trust: bool = False,
 ) -> int:
     """Look through a folder of recordings in a browser page: play, compare, share. No task file is needed.
 
@@ -159,6 +163,7 @@ def review(
         token: ask for the token of the printed address (--no-token: this machine only).
         task: a task file in which the envs of ManiSkill's recordings may be found; repeatable. Envs that ManiSkill
             itself has need none.
+        trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it.
     """
     if not folder.is_dir():
         return refuse(f"there is no folder {folder}; workbench record and the page's Episodes tab make one")
@@ -178,7 +183,7 @@ def review(
         at = DoorOptions(host=host, port=port, socket=socket, token=token)
     except ValueError as error:
         return refuse(str(error))
-    return review_in_terminal(folder, task, at, WorkerOptions(parse_memory("auto")))
+    return review_in_terminal(folder, task, at, WorkerOptions(parse_memory("auto")), trust)
 
 
 @app.command
@@ -192,6 +197,7 @@ def rescore(
     backend: Backend = "auto",
     csv: Path | None = None,
     json: Path | None = None,
+    trust: bool = False,
 ) -> int:
     """Judge recorded episodes again with today's reward and evaluate, and say what is otherwise (on the page: Judge again).
 
@@ -204,6 +210,8 @@ def rescore(
         backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (gpu if it works).
         csv: also write the table to this file, as CSV.
         json: also write the table to this file, as JSON.
+        trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it. Without
+            it, and without a terminal to ask in, nothing is run and the exit code is 4.
     """
     from workbench.rescore_command import run_rescore
 
@@ -218,14 +226,19 @@ def rescore(
         return refuse(str(error))
     use_private_driver()
     from workbench.authoring.problem import TaskError
+    from workbench.session.clearance import NotTrusted
     from workbench.session.rescore_all import RescoreOptions
+    from workbench.trust_prompt import not_trusted
 
     what = RescoreOptions(places, task, recorded_source, use_env_states, num_envs, base)
     try:
-        return run_rescore(what, terminal, err, csv, json)
+        return run_rescore(what, terminal, err, csv, json, trust)
+    except NotTrusted as error:
+        refuse(not_trusted(error.questions))
+        return Exit.NOT_TRUSTED
     except TaskError as error:
         print_problem(error.problem)
-        return 1
+        return Exit.FAILED
     except (OSError, ValueError) as error:
         return refuse(str(error))
     except KeyboardInterrupt:

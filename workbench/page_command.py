@@ -16,7 +16,7 @@ from typing import Literal, NoReturn
 from rich.markup import escape
 
 import workbench
-from workbench.authoring.reference import named_file
+from workbench.authoring.reference import TaskName, named_file
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.recording.reading import start_reading
 from workbench.session.kept_worker import WorkerOptions
@@ -38,8 +38,13 @@ def open_in_terminal(
     worker: WorkerOptions,
     recordings: Path,
     history_bytes: int,
+    trust: bool = False,
 ) -> int:
-    """Serve the page of a task; returns only where the door cannot be opened."""
+    """Serve the page of a task; returns only where the door cannot be opened.
+
+    Args:
+        trust: Run what recordings name without asking.
+    """
     door = _opened(at, "Workbench")
     if isinstance(door, int):
         return door
@@ -67,20 +72,25 @@ def open_in_terminal(
     )
     place = Workplace(door.server, recordings, session, on_notice=warn)
     what = f"{task}, {options.num_envs} envs"
-    _serve(door, place, "live", what, recordings, WorkerOptions(worker.memory_limit), end, session.close)
+    _serve(
+        door, place, "live", what, recordings, WorkerOptions(worker.memory_limit), end, session.close, trust
+    )
 
 
-def review_in_terminal(folder: Path, tasks: tuple[Path, ...], at: DoorOptions, worker: WorkerOptions) -> int:
+def review_in_terminal(
+    folder: Path, tasks: tuple[Path, ...], at: DoorOptions, worker: WorkerOptions, trust: bool = False
+) -> int:
     """Serve the page of a folder of recordings; returns only where the door cannot be opened.
 
     Args:
         worker: Of tasks that are opened from there.
+        trust: Run what recordings name without asking.
     """
     door = _opened(at, "Recordings")
     if isinstance(door, int):
         return door
     place = Workplace(door.server, folder, tasks=tasks, on_notice=warn)
-    _serve(door, place, "review", f"recordings in {folder}", folder, worker, _End(), lambda: None)
+    _serve(door, place, "review", f"recordings in {folder}", folder, worker, _End(), lambda: None, trust)
 
 
 def _opened(at: DoorOptions, label: str) -> Door | int:
@@ -105,8 +115,9 @@ def _serve(
     worker: WorkerOptions,
     end: _End,
     close_session: Callable[[], None],
+    trust: bool,
 ) -> NoReturn:
-    def open_task(task: str, options: TaskOptions) -> Session:
+    def open_task(task: TaskName, options: TaskOptions) -> Session:
         return Session(
             task,
             options,
@@ -121,7 +132,7 @@ def _serve(
     place.offer(sharing.offer)
     if door.options.token:
         place.commands = (Command("Renew the token and close every page", end.renew),)
-    close_others = offer_going_back_in(place, open_task)
+    close_others = offer_going_back_in(place, open_task, trust)
     end.at_signals()
     try:
         place.pages.start(first)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from rich.console import Console
@@ -12,15 +14,21 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsed
 from rich.progress import Progress as Bar
 from rich.table import Table
 
+from workbench.exit_codes import Exit
 from workbench.machine.start_folder import in_start_folder
 from workbench.machine.terminal_text import plain_text
 from workbench.session import rescore_words as words
+from workbench.session.clearance import Clearances
 from workbench.session.rescore_all import Progress, RescoreOptions, rescore_all
 from workbench.session.rescore_messages import Verdict
+from workbench.trust_prompt import TerminalPrompt, can_ask
 
 
-def run_rescore(what: RescoreOptions, out: Console, err: Console, csv: Path | None, json: Path | None) -> int:
+def run_rescore(
+    what: RescoreOptions, out: Console, err: Console, csv: Path | None, json: Path | None, trust: bool = False
+) -> int:
     """Judge, print, write the tables that are asked for; raises as `rescore_all`, and OSError for a table."""
+    asks = can_ask()  # before the bar takes the terminal
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -35,7 +43,19 @@ def run_rescore(what: RescoreOptions, out: Console, err: Console, csv: Path | No
                 row, total=now.total, completed=now.episodes, description=f"judging, {now.steps} steps"
             )
 
-        verdicts, notes = rescore_all(what, lambda activity: bar.update(row, description=activity), tell)
+        @contextmanager
+        def without_bar() -> Iterator[None]:
+            bar.stop()
+            yield
+            bar.start()
+
+        ask = TerminalPrompt(out, without_bar).ask if asks else None
+        verdicts, notes = rescore_all(
+            what,
+            lambda activity: bar.update(row, description=activity),
+            tell,
+            Clearances(ask=ask, all_trusted=trust),
+        )
         bar.update(row, total=len(verdicts), completed=len(verdicts), description="judged")
     for path, text in ((csv, words.as_csv), (json, words.as_json)):
         if path is not None:
@@ -46,7 +66,7 @@ def run_rescore(what: RescoreOptions, out: Console, err: Console, csv: Path | No
         err.print(f"[yellow]{escape(plain_text(note))}[/]", soft_wrap=True)
     if doubt := words.doubts(verdicts):
         err.print(f"[yellow]{escape(plain_text(doubt))}[/]", soft_wrap=True)
-    return 0
+    return Exit.DONE
 
 
 def print_verdicts(verdicts: list[Verdict], out: Console) -> None:

@@ -14,6 +14,7 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
 from rich.segment import Segment
 
+from workbench.exit_codes import Exit
 from workbench.machine.guarded_terminal import SafeStream
 from workbench.machine.terminal_text import for_terminal, plain_text
 
@@ -63,7 +64,7 @@ def say(text: object) -> None:
 def refuse(message: str) -> int:
     """Say in a sentence why nothing is done; returns the exit code."""
     err.print(f"[red]{escape(plain_text(message))}[/]", soft_wrap=True)
-    return 2
+    return Exit.REFUSED
 
 
 def warn(message: str) -> None:

@@ -38,6 +38,7 @@ from workbench.authoring.modules import (
     set_aside,
 )
 from workbench.authoring.problem import Problem, TaskError, problem_from_exception, shorten
+from workbench.authoring.reference import RecordedTask, TaskName
 
 if TYPE_CHECKING:
     from mani_skill.envs.sapien_env import BaseEnv
@@ -99,13 +100,18 @@ _loads: dict[Path, _Load] = {}
 """The last good load of each file. ``sys.modules`` and the registries are of the process, so this is."""
 
 
-def load_task(reference: str, source: Mapping[str, str] | None = None) -> LoadedTask:
+def load_task(reference: TaskName, source: Mapping[str, str] | None = None) -> LoadedTask:
     """Import the task that `reference` names: ``file.py``, ``file.py:ClassName`` or a registered id.
+
+    What a recording names (`RecordedTask`) is a registered id, or texts that a person agreed to; no path out of a
+    recording is followed.
 
     `source` gives, by path, texts to use in place of what is on disk, for the task's file and for
     modules beside it; files in it need not exist. Raises `TaskError`, and lets KeyboardInterrupt
     through; in either case all is as it was before.
     """
+    if isinstance(reference, RecordedTask):
+        return _load_recorded(reference, source or {})
     file, class_name = _parse(reference)
     if file is None:
         return _registered(reference)
@@ -145,8 +151,23 @@ def source_hash(source: Mapping[str, str], folder: Path) -> str:
     return digest.hexdigest()[:12]
 
 
-def _load_file(file: Path, class_name: str | None, given: dict[str, str]) -> LoadedTask:
-    finder = AuthorFinder(file, given)
+def _load_recorded(task: RecordedTask, source: Mapping[str, str]) -> LoadedTask:
+    if task.approved is None:
+        # A file that was asked about and not approved is not here; `env_id` may look like a path, and is none.
+        if registry.environment(task.env_id) is None:
+            raise _refused(
+                f"a recording names the task {task.env_id!r}, and no installed package registers one of that id"
+            )
+        return _registered(task.env_id)
+    if task.file is None or task.file not in task.approved:
+        raise _refused(f"the texts that were agreed to do not hold the file of {task.env_id}")
+    return _load_file(Path(task.file), task.class_name, {**task.approved, **source}, only_given=True)
+
+
+def _load_file(
+    file: Path, class_name: str | None, given: dict[str, str], only_given: bool = False
+) -> LoadedTask:
+    finder = AuthorFinder(file, given, only_given)
     others = {load.finder.main for path, load in _loads.items() if path != file}
     load = _begin(finder, set_aside(finder, others.__contains__))
     with registry.registering(finder.texts.__contains__, load.registrations):
@@ -174,7 +195,8 @@ def _begin(finder: AuthorFinder, aside: SetAside) -> _Load:
     if before is not None:
         before.registrations.undo()
         sys.meta_path.remove(before.finder)
-    search_first(finder.search_folder)
+    if not finder.only_given:
+        search_first(finder.search_folder)
     sys.meta_path.insert(0, finder)
     # A helper that was created a moment ago is not in the listing of its folder that Python keeps.
     importlib.invalidate_caches()
@@ -454,6 +476,11 @@ def _module_hint(name: str, finder: AuthorFinder) -> str:
             "file, or name its folder in PYTHONPATH"
         )
     beside = [path.stem for path in finder.file.parent.glob("*.py") if path != finder.file]
+    if finder.only_given and name.rpartition(".")[2] in beside:
+        return (
+            f"{name} lies beside the file, but was not among what you were asked about; open {finder.file} by its name "
+            "to run it with all that lies beside it"
+        )
     close = difflib.get_close_matches(name, beside, n=1)
     if close:
         return f"there is {close[0]}.py beside the file"

@@ -72,11 +72,13 @@ def hidden_by_libraries(file: Path) -> tuple[Path, ...]:
 class AuthorFinder(MetaPathFinder):
     """Finds and executes the modules of one task: its file, and what lies in the folder beside it."""
 
-    def __init__(self, file: Path, given: Mapping[str, str]) -> None:
+    def __init__(self, file: Path, given: Mapping[str, str], only_given: bool = False) -> None:
         self.file = file
         self.main, self.search_folder = module_name(file).name, module_name(file).search_folder
         self.given = given
         """Path to text that is used in place of what is on disk."""
+        self.only_given = only_given
+        """Nothing else in the folder is executed: a recording named the file, and a person agreed to these texts."""
         self.texts: dict[str, str] = {}
         """Path to text of everything read so far, in order; the task's own file first."""
         self.names: list[str] = []
@@ -101,6 +103,8 @@ class AuthorFinder(MetaPathFinder):
                 candidate = os.path.join(folder, name)
                 if candidate in self.given:
                     return self._spec(fullname, candidate, is_package)
+        if self.only_given:
+            return self._given_folder(fullname, last, path)
         found = importlib.machinery.PathFinder.find_spec(fullname, path, target)
         if (
             found is None
@@ -111,6 +115,35 @@ class AuthorFinder(MetaPathFinder):
         if not is_own_file(found.origin, self.file.parent):
             return None
         return self._spec(fullname, found.origin, found.submodule_search_locations is not None)
+
+    def _given_folder(
+        self, fullname: str, last: str, path: Sequence[str] | None
+    ) -> importlib.machinery.ModuleSpec | None:
+        """For a name that is no given text: what is installed, else a folder of given texts without an ``__init__.py``.
+
+        Raises ModuleNotFoundError for what is neither: Python would go on to `PathFinder`, and that to this folder, where
+        an earlier task, or the code itself, has put it on ``sys.path``.
+        """
+        for finder in sys.meta_path:
+            if not isinstance(finder, AuthorFinder) and finder is not importlib.machinery.PathFinder:
+                spec = finder.find_spec(fullname, path)
+                if spec is not None:
+                    return spec
+        root = str(self.file.parent)
+        places = [place for place in (sys.path if path is None else path) if not _is_in(place, root)]
+        found = importlib.machinery.PathFinder.find_spec(fullname, places) if places else None
+        if found is not None:
+            return found
+        folders = [
+            os.path.join(folder, last)
+            for folder in ([str(self.search_folder)] if path is None else path)
+            if any(given.startswith(os.path.join(folder, last) + os.sep) for given in self.given)
+        ]
+        if folders:
+            spec = importlib.machinery.ModuleSpec(fullname, None, is_package=True)
+            spec.submodule_search_locations = folders
+            return spec
+        raise ModuleNotFoundError(f"No module named {fullname!r}", name=fullname)
 
     def text(self, path: str) -> str:
         """What is executed for `path`. Raises OSError, or SyntaxError for what is no text."""
@@ -197,6 +230,13 @@ def decode(path: str, raw: bytes) -> str:
             message = f"{wrong}; save the file as UTF-8"
             line = raw[: wrong.start].count(b"\n") + 1
         raise SyntaxError(message, (path, line, 1, None)) from None
+
+
+def _is_in(path: str, root: str) -> bool:
+    """Whether `path` is the folder `root`, or below it and the author's own."""
+    real = os.path.realpath(path or os.curdir)
+    root = os.path.realpath(root)
+    return real == root or is_own_file(os.path.join(real, "x.py"), Path(root))
 
 
 @dataclass(frozen=True)

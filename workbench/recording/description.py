@@ -14,6 +14,7 @@ neither of the two formats keeps: the types of the entries of ``evaluate()``, th
     length, return, success, success_once, fail, fail_once       the last four null where the task has no such entry
     action_names, cameras, segmentation, scene, evaluate, obs    what the columns are
     files           suffix of each of the other two files, to how many bytes it has and what they hash to; may lack; in the .json alone
+    made_here       the seal of the installation that recorded it (`made_here`), null where it could not make one; may lack; in the .json alone
     thumbnail       base64 of a JPEG at most 160 pixels wide; null without cameras; in the .json alone
 """
 
@@ -35,10 +36,13 @@ from workbench.machine.regular_file import read_regular_file
 from workbench.recording.checksums import checksum
 from workbench.recording.columns import Column
 from workbench.recording.episode import EpisodeInfo, acted_by_from
+from workbench.recording.made_here import seal, seal_from
 from workbench.recording.survey import Survey, camera_words
 
 FORMAT = 1
 THUMBNAIL_WIDTH = 160
+MOST_PARTS = 40
+"""Folders in the place of a task that are looked for: the place is what a recording says."""
 MOST_SOURCE_BYTES = 4 << 20
 """Of a task's file that is looked for by what it names."""
 
@@ -87,11 +91,12 @@ def describe_beside(survey: Survey, folder: Path, files: Sequence[Path]) -> dict
     """`describe`, with what is only worth saying in `folder`, where the recording lies; of which these are the other `files`."""
     info = survey.info
     source = info.source_file if info.source_file and os.path.isabs(info.source_file) else None
+    said = {**describe(survey), "files": {path.suffix: checksum(path) for path in files}}
     return {
-        **describe(survey),
+        **said,
         "source_path": None if source is None else _relative(source, os.fspath(folder.resolve())),
-        "files": {path.suffix: checksum(path) for path in files},
         "thumbnail": thumbnail(survey.sample),
+        "made_here": seal(said, source) if survey.header.made_here else None,
     }
 
 
@@ -129,6 +134,7 @@ def info_from(said: dict[str, Any], folder: Path) -> EpisodeInfo:
         recovered=said["recovered"],
         acted_by=acted_by_from(said.get("acted_by")),
         side_files={str(name): str(hashed) for name, hashed in dict(said.get("side_files") or {}).items()},
+        seal=seal_from(said),
     )
 
 
@@ -147,6 +153,8 @@ def _source_where(path: str, task: str, folder: Path) -> Path | None:
     if (there := folder / path).is_file():
         return there
     parts = [part for part in Path(path).parts if part not in ("..", os.sep)] if path.endswith(".py") else []
+    if len(parts) > MOST_PARTS:
+        return None
     for place in (Path.cwd(), *folder.resolve().parents):
         for begin in range(len(parts)):
             candidate = place.joinpath(*parts[begin:])

@@ -31,6 +31,18 @@ NO_SEED = -1
 
 
 @dataclass(frozen=True)
+class Seal:
+    """What a recording that was read says of who made it; only `made_here` knows whether it is true."""
+
+    content: str
+    place: str
+    main: Any
+    """The name of the task's file as it was described."""
+    files: Any
+    """What the other files hash to."""
+
+
+@dataclass(frozen=True)
 class EpisodeInfo:
     """What is needed to know an episode again, and to make it again."""
 
@@ -66,6 +78,8 @@ class EpisodeInfo:
     acted_by: tuple[tuple[int, str], ...] = ()
     """What chose the actions: number of an action, and what it was from that one on (``random``, ``policy act.py:act``).
     Empty where it is not known."""
+    seal: Seal | None = field(default=None, compare=False)
+    """Of a recording that was read."""
 
 
 @dataclass

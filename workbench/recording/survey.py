@@ -23,6 +23,7 @@ from workbench.recording.columns import EVALUATE, Column, assemble, layout_type,
 from workbench.recording.encoded_pictures import MODALITIES, Modality
 from workbench.recording.episode import EpisodeInfo, acted_by_from
 from workbench.recording.journal import Entry, read_journal
+from workbench.recording.made_here import is_sealed, seal_text
 
 _PIECE_STATES = 1024
 _PIECE_BYTES = 8 << 20
@@ -37,6 +38,8 @@ class Header:
     segmentation: dict[int, str]
     action_names: tuple[str, ...]
     cameras: tuple[CameraInfo, ...]
+    made_here: bool = True
+    """Its episode was recorded by this installation: not so of a journal that came with a folder from elsewhere."""
 
     @property
     def bodies(self) -> int:
@@ -46,9 +49,11 @@ class Header:
 def header_text(header: Header) -> str:
     """`header` without its meshes, as JSON."""
     geometry = header.geometry
+    info = json.dumps(asdict(header.info), default=str)
     return json.dumps(
         {
-            "info": asdict(header.info),
+            "info": info,
+            "made_here": seal_text(info),
             "bodies": [geometry.num_envs, geometry.body_names, geometry.body_kinds, geometry.body_hidden],
             "segmentation": {str(key): name for key, name in header.segmentation.items()},
             "action_names": header.action_names,
@@ -64,17 +69,20 @@ def header_from(text: str, geometry: SceneGeometry | None) -> Header:
     if geometry is None:
         num_envs, names, kinds, hidden = said["bodies"]
         geometry = SceneGeometry(num_envs, tuple(names), tuple(kinds), tuple(hidden), ())
+    # A journal of an earlier version holds it as an object, without a seal.
+    info = said["info"] if isinstance(said["info"], str) else json.dumps(said["info"])
     return Header(
-        info=_info_from(said["info"]),
+        info=_info_from(json.loads(info)),
         geometry=geometry,
         segmentation={int(key): name for key, name in said["segmentation"].items()},
         action_names=tuple(said["action_names"]),
         cameras=tuple(camera_from(words) for words in said["cameras"]),
+        made_here=is_sealed(info, said.get("made_here")),
     )
 
 
 def _info_from(said: Mapping[str, Any]) -> EpisodeInfo:
-    return EpisodeInfo(**{**said, "acted_by": acted_by_from(said.get("acted_by"))})
+    return EpisodeInfo(**{**said, "acted_by": acted_by_from(said.get("acted_by")), "seal": None})
 
 
 def camera_words(camera: CameraInfo) -> dict[str, Any]:

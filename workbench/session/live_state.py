@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from workbench.authoring.problem import Problem
-from workbench.authoring.reference import named_file
+from workbench.authoring.reference import RecordedTask, TaskName, named_file
 from workbench.core.inspection import Inspection
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.snapshot_bytes import WholeSnapshot
@@ -59,8 +59,8 @@ from workbench.session.view import RecordingStatus, SessionView, State
 class LiveState:
     """See the module's text. Not thread-safe: the session locks."""
 
-    reference: str
-    """The task that was asked for: a file, ``file.py:ClassName``, or a registered env id."""
+    reference: TaskName
+    """The task that was asked for: a file, ``file.py:ClassName``, or a registered env id; or what a recording names."""
     options: TaskOptions
     """How it is made, but for the seed."""
     history_bytes: int
@@ -272,12 +272,20 @@ class LiveState:
         """Ask for another task class of the same file. False if the file has no such class."""
         if self.task is None or self.own_file is None or name not in self.task.others:
             return False
-        self.reference = f"{self.own_file}:{name}"
+        if isinstance(self.reference, RecordedTask):
+            self.reference = replace(self.reference, class_name=name)
+        else:
+            self.reference = f"{self.own_file}:{name}"
         return True
 
     def open_file(self, file: Path, class_name: str) -> None:
         """Ask for a class of another file."""
         self.reference, self.own_file = f"{file}:{class_name}", file
+
+    def file_is_edited(self) -> None:
+        """A file that a recording named is open live and is saved: from now on it is what is on disk that is open."""
+        if isinstance(self.reference, RecordedTask) and self.reference.approved is not None:
+            self.reference = str(self.reference)
 
     def seek(self, seek: Callable[[Timeline], None]) -> bool:
         """Show another moment. False if it was shown."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.authoring.problem import Problem
+from workbench.authoring.reference import TaskName
 from workbench.core.camera_report import ObjectToSee
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.geometry import SceneGeometry
@@ -111,8 +112,8 @@ class TaskDescription:
 class Load:
     """Import and build the task, replacing the one that runs if (and only if) all goes well."""
 
-    task: str
-    """A path, ``path:ClassName``, or a registered env id."""
+    task: TaskName
+    """A path, ``path:ClassName``, or a registered env id, as a person named it; or what a recording names."""
     options: TaskOptions
     source: dict[str, str] | None = None
     """Text to use in place of what is on disk: how the last good version comes back."""

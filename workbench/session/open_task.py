@@ -18,6 +18,7 @@ from typing import Any
 from workbench.authoring import registry
 from workbench.authoring.load import LoadedTask, load_task, take_back, with_late_imports
 from workbench.authoring.problem import Problem, TaskError, problem_from_exception
+from workbench.authoring.reference import TaskName
 from workbench.authoring.returns import check_step_returns, problem_from_return
 from workbench.core import actions
 from workbench.core.backends import find_renderer
@@ -45,7 +46,7 @@ class OpenedTask:
 
 
 def open_task(
-    reference: str,
+    reference: TaskName,
     options: TaskOptions,
     *,
     on_activity: Callable[[str], None] = lambda activity: None,
@@ -56,7 +57,7 @@ def open_task(
         TaskError: with the author's file and line; nothing of the task stays behind.
     """
     clock = Clock()
-    on_activity(f"importing {reference.rsplit('/', 1)[-1]}")
+    on_activity(f"importing {str(reference).rsplit('/', 1)[-1]}")
     loaded = load_task(reference)
     clock.lap("import")
 

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from workbench.core.geometry import SceneGeometry
 from workbench.machine.child_python import child_environment, python_command
 from workbench.recording.episode import Episode
+from workbench.session.clearance import files_named
 from workbench.session.family import end_family
 from workbench.session.message_reader import MessageReader, Unreadable
 
@@ -148,6 +149,12 @@ class SceneProcess:
     ) -> SceneMade | None:
         """None if it was stopped."""
         info = episode.info
+        if named := files_named(info):
+            # This is done when a row is opened; an env would read them, and may do so in native code.
+            raise SceneError(
+                f"It names files for {info.task} to read ({', '.join(named[:3])}), which is not done for looking at it, so "
+                "there are numbers and curves only."
+            )
         kwargs = {name: value for name, value in info.env_kwargs.items() if name not in _NOT_PASSED_ON}
         wanted = SceneWanted(
             info.task, self._files, kwargs, info.seed, dict(info.reset_options), dict(episode.env_states)

@@ -62,6 +62,7 @@ def make(wanted: SceneWanted) -> TaskEnv:
     """One env of the recorded task, as it was made for the recording."""
     from workbench.authoring.load import load_task
     from workbench.authoring.problem import TaskError
+    from workbench.authoring.reference import RecordedTask
     from workbench.core.task_env import EnvOptions, TaskEnv, make_env
 
     loaded = None
@@ -75,7 +76,7 @@ def make(wanted: SceneWanted) -> TaskEnv:
             raise _CannotMake(f"{Path(file).name} cannot be loaded: {error.problem.message}") from error
     if loaded is None or loaded.env_id != wanted.task:
         try:
-            loaded = load_task(wanted.task)
+            loaded = load_task(RecordedTask(wanted.task))  # an id that is registered, never a path
         except TaskError as error:
             raise _CannotMake(
                 f"There is no env {wanted.task} here to make the scene with, so there are numbers and curves only. If it "

@@ -73,7 +73,7 @@ def load_version(
     """
     began, clock = perf_counter(), Clock()
     before = None if running is None else with_late_imports(running.opened.loaded)
-    on_activity(f"importing {request.task.rsplit('/', 1)[-1]}")
+    on_activity(f"importing {str(request.task).rsplit('/', 1)[-1]}")
     loaded = load_task(request.task, source=request.source)
     clock.lap("import")
     try:

@@ -20,13 +20,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.authoring.reference import TaskName
 from workbench.core.recorded_run import RecordedRun
 from workbench.recording.description import info_from
 from workbench.recording.episode import EpisodeInfo
+from workbench.recording.made_here import made_here
 from workbench.recording.read_episode import UnreadableRecording, trajectories
 from workbench.recording.side_files import side_files_in_words
+from workbench.session.clearance import Wanted, recorded_content
 from workbench.session.judgement import SAME_REWARD
 from workbench.session.messages import TaskOptions
+from workbench.session.recorded_text import NoText
 from workbench.session.rescore_messages import EpisodeFile, Verdict
 from workbench.session.step_back import class_in, options_of, reference_of
 
@@ -35,14 +39,20 @@ from workbench.session.step_back import class_in, options_of, reference_of
 class Group:
     """Episodes that are judged in one env."""
 
-    reference: str
-    """What is opened, unless it is `info`'s recorded text."""
+    reference: TaskName
+    """What is opened when it is cleared, unless it is `info`'s recorded text."""
     options: TaskOptions
     info: EpisodeInfo
     """Of the first of them."""
     files: tuple[EpisodeFile, ...]
     note: str = ""
     """What is not as it was recorded, on purpose."""
+    recorded_source: bool = False
+
+    @property
+    def wanted(self) -> Wanted:
+        """What has to be cleared before it is judged."""
+        return Wanted(self.reference, self.info, self.recorded_source)
 
 
 @dataclass
@@ -154,16 +164,19 @@ def group_episodes(
         except (UnreadableRecording, OSError) as error:
             unread.append(Verdict(episode, why_not=str(error)))
             continue
-        if recorded_source and not info.source:
-            unread.append(Verdict(episode, task=info.task, why_not="it does not hold the text of its task"))
+        try:
+            text = recorded_content(info).hash if recorded_source else ""
+        except NoText as error:
+            unread.append(Verdict(episode, task=info.task, why_not=str(error)))
             continue
         options, note = judging_options(options_of(info, 1, base))
         if recorded_source and (besides := side_files_in_words(info.source_file, info.side_files)):
             note = f"{note}. {besides}" if note else besides
         reference = task or (file and class_in(file, info.task)) or reference_of(info)
-        about = [reference, info.task, options.env_kwargs, info.source_hash if recorded_source else ""]
+        # One that was made here must not vouch for one that was not.
+        about = [str(reference), info.task, options.env_kwargs, text, made_here(info).value]
         key = json.dumps(about, sort_keys=True, default=str)
-        group = groups.get(key) or Group(reference, options, info, (), note)
+        group = groups.get(key) or Group(reference, options, info, (), note, recorded_source)
         groups[key] = replace(group, files=(*group.files, episode))
     return [
         replace(g, options=replace(g.options, num_envs=max(1, min(num_envs, len(g.files)))))

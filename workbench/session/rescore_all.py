@@ -10,10 +10,12 @@ from pathlib import Path
 import torch
 
 from workbench.authoring.problem import TaskError
+from workbench.authoring.reference import TaskName
 from workbench.machine.start_folder import in_start_folder
+from workbench.session.clearance import Clearances, NotCleared, NotTrusted
 from workbench.session.messages import TaskOptions
 from workbench.session.open_task import OpenedTask, open_task
-from workbench.session.rescore import find_episodes, group_episodes, not_judged, with_renderer
+from workbench.session.rescore import Group, find_episodes, group_episodes, not_judged, with_renderer
 from workbench.session.rescore_messages import Verdict
 from workbench.session.rescore_run import rescore
 from workbench.session.step_back import CannotStepIn, write_source
@@ -43,10 +45,15 @@ def rescore_all(
     what: RescoreOptions,
     on_activity: Callable[[str], None] = lambda activity: None,
     on_progress: Callable[[Progress], None] = lambda progress: None,
+    clearances: Clearances | None = None,
 ) -> tuple[list[Verdict], tuple[str, ...]]:
     """The verdicts, in the order of the files; and what is not as it was recorded on purpose, in words.
 
+    Args:
+        clearances: says what of the code that the recordings name may run; None asks nobody.
+
     Raises:
+        NotTrusted: a recording names code that nobody agreed to, and there is nobody to ask; or the answer to all was no.
         UnreadableRecording: there is nothing to judge.
         TaskError: no task can be opened, or each raises; where others can be judged, it is said of its episodes.
         CannotStepIn: as TaskError, where a recorded text cannot be opened.
@@ -56,12 +63,14 @@ def rescore_all(
     groups, verdicts = group_episodes(
         files, what.num_envs, what.base, task=what.task, recorded_source=what.recorded_source
     )
+    cleared = _cleared(groups, clearances or Clearances())
     steps = 0
     failed: list[TaskError | CannotStepIn] = []
-    for group in groups:
+    for group, reference in zip(groups, cleared):
         folder: Path | None = None
-        reference = group.reference
         try:
+            if isinstance(reference, NotCleared):
+                raise CannotStepIn(str(reference)) from reference
             if what.recorded_source:
                 folder, reference = write_source(group.info)
             opened = _open(reference, group.options, on_activity)
@@ -93,7 +102,16 @@ def rescore_all(
     return verdicts, tuple(dict.fromkeys(group.note for group in groups if group.note))
 
 
-def _open(reference: str, options: TaskOptions, on_activity: Callable[[str], None]) -> OpenedTask:
+def _cleared(groups: list[Group], clearances: Clearances) -> list[TaskName | NotCleared]:
+    """What may be opened for each of the groups. Before any of them runs: who is not there to be asked gets all or nothing."""
+    cleared = clearances.clear_all([group.wanted for group in groups])
+    refused = [one.question for one in cleared if isinstance(one, NotCleared) and one.question is not None]
+    if refused and (not clearances.asks or len(refused) == len(groups)):
+        raise NotTrusted(list(dict.fromkeys(refused)))
+    return cleared
+
+
+def _open(reference: TaskName, options: TaskOptions, on_activity: Callable[[str], None]) -> OpenedTask:
     with in_start_folder(stay=True):  # the task before may have gone to another one
         try:
             return open_task(reference, options, on_activity=on_activity)

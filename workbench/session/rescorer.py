@@ -16,12 +16,14 @@ from pathlib import Path
 from typing import Literal
 
 from workbench.authoring.problem import Problem
+from workbench.authoring.reference import TaskName, named_file
 from workbench.session.background import BackgroundProcess
+from workbench.session.clearance import Clearances, NotCleared
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
 from workbench.session.messages import Failed, Load, Loaded
 from workbench.session.rescore import Group, group_episodes, not_judged, with_renderer
 from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored, Verdict
-from workbench.session.step_back import CannotStepIn, file_of, write_source
+from workbench.session.step_back import CannotStepIn, write_source
 
 MOST_AT_ONCE = 16
 """Envs."""
@@ -30,7 +32,7 @@ IDLE_SECONDS = 300.0
 MOST_NAMED = 3
 """Of the versions that are judged with, where there are many."""
 
-RescoreState = Literal["none", "loading", "judging", "done", "stopped", "failed"]
+RescoreState = Literal["none", "asking", "loading", "judging", "done", "stopped", "failed"]
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,12 @@ class _Asked:
 class Rescorer:
     """One judgement at a time; a new one takes the place of the one before. All methods return at once."""
 
-    def __init__(self) -> None:
+    def __init__(self, clearances: Clearances | None = None) -> None:
+        """
+        Args:
+            clearances: says what of the code that recordings name may run; None asks nobody.
+        """
+        self._clearances = clearances or Clearances()
         self._lock = threading.Lock()
         """Of `view`: what a job that was stopped still has to say is not heard."""
         self._view = RescoreView()
@@ -109,7 +116,7 @@ class Rescorer:
         """Go no further; what is known by now stays to be seen."""
         with self._lock:
             self._lane.stop()
-            if self._view.state in ("loading", "judging"):
+            if self._view.state in ("asking", "loading", "judging"):
                 self._view = replace(self._view, state="stopped", serial=self._view.serial + 1)
 
     def close(self) -> None:
@@ -129,11 +136,15 @@ class Rescorer:
             notes = [f"with {_judged_with(group, asked)}" for group in groups[:MOST_NAMED]]
             notes += [f"and {len(groups) - MOST_NAMED} more"] if len(groups) > MOST_NAMED else []
             notes += dict.fromkeys(g.note for g in groups if g.note)
-            self._tell(job, verdicts=tuple(unread), notes=tuple(notes))
+            self._tell(job, state="asking", verdicts=tuple(unread), notes=tuple(notes))
+            cleared = self._clearances.clear_all([group.wanted for group in groups], lambda: job.stopped)
+            job.check()
             failed = 0
-            for group in groups:
+            for group, reference in zip(groups, cleared):
                 try:
-                    self._judge(job, asked, group)
+                    if isinstance(reference, NotCleared):
+                        raise JobFailed(str(reference)) from reference
+                    self._judge(job, asked, group, reference)
                 except JobFailed as failure:
                     failed += 1
                     if failed == len(groups):
@@ -156,11 +167,10 @@ class Rescorer:
             self._process.end()  # what it was asked for last belongs to nobody
             raise
 
-    def _judge(self, job: Job, asked: _Asked, group: Group) -> None:
+    def _judge(self, job: Job, asked: _Asked, group: Group, reference: TaskName) -> None:
         process = self._process
         process.start()
         folder: Path | None = None
-        reference = group.reference
         try:
             if asked.recorded_source:
                 folder, reference = write_source(group.info)
@@ -207,5 +217,5 @@ def _judged_with(group: Group, asked: _Asked) -> str:
     """What is opened, in words."""
     if asked.recorded_source:
         return f"{group.info.task} as it was recorded"
-    file = file_of(group.reference)
+    file = named_file(group.reference)
     return f"{group.info.task} as it is installed" if file is None else f"{group.info.task} of {file}"

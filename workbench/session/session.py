@@ -17,6 +17,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import get_args
 
+from workbench.authoring.reference import TaskName
 from workbench.core.inspection import Section
 from workbench.core.recorded_run import RecordedRun
 from workbench.machine.watched_thread import listen, stop_listening
@@ -69,7 +70,7 @@ class Session:
 
     def __init__(
         self,
-        task: str,
+        task: TaskName,
         options: TaskOptions,
         *,
         recordings: Path,
@@ -81,7 +82,7 @@ class Session:
     ) -> None:
         """
         Args:
-            task: a file, ``file.py:ClassName``, or a registered env id.
+            task: a file, ``file.py:ClassName``, or a registered env id; or what a recording names, cleared.
             recordings: folder that recorded episodes go to; made when the first is written.
             history_bytes: memory that the past may take.
             worker: limits of the worker process, and whether there is a spare one.

@@ -19,12 +19,16 @@ from pathlib import Path
 
 import numpy as np
 
-from workbench.authoring.modules import read_source
+from workbench.authoring.reference import RecordedTask
+from workbench.authoring.task_content import CannotRead, read_text
 from workbench.core.recorded_run import RecordedRun
 from workbench.recording.episode import Episode, EpisodeInfo
 from workbench.recording.side_files import folder_of, place_of
 from workbench.session.messages import TaskDescription, TaskOptions
 from workbench.session.recorded_text import NoText, below_one_folder
+
+_IMPORTED = (".py", ".pyc", ".pyo", ".so", ".pyd", ".pth", ".zip", ".egg")
+"""Ends of the names of files that Python imports or reads at an import."""
 
 
 class CannotStepIn(ValueError):
@@ -64,36 +68,34 @@ def why_not_into(task: TaskDescription, info: EpisodeInfo) -> str:
     return f"it is an episode of {info.task}, and {task.env_id} is open"
 
 
-def reference_of(info: EpisodeInfo) -> str:
-    """What `workbench open` would be given for today's code of a recording's task.
+def reference_of(info: EpisodeInfo) -> RecordedTask:
+    """Today's code of a recording's task. What of it may be opened is for `Clearances` to say.
 
     Its file where that is still there, with the class where the file has several; else the id, which may be one of
     ManiSkill's own.
     """
     file = None if info.source_file is None else Path(info.source_file)
-    if file is None or not file.is_absolute() or not file.is_file() or _is_installed(file):
-        return info.task
+    if (
+        file is None
+        or not file.is_absolute()
+        or file.suffix != ".py"
+        or not file.is_file()
+        or _is_installed(file)
+    ):
+        return RecordedTask(info.task)
     try:
-        text = read_source(file)
-    except (OSError, SyntaxError):
-        return str(file)
-    return _with_class(str(file), text, info.task)
+        return RecordedTask(info.task, str(file), _class_of(read_text(file), info.task))
+    except CannotRead:
+        return RecordedTask(info.task, str(file))
 
 
 def class_in(file: Path, env_id: str) -> str | None:
     """What would be opened for this task of this file; None if the file has no such task, or cannot be read."""
     try:
-        reference = _with_class(str(file), read_source(file), env_id)
-    except (OSError, SyntaxError):
+        name = _class_of(read_text(file), env_id)
+    except CannotRead:
         return None
-    return None if reference == str(file) else reference
-
-
-def file_of(reference: str) -> Path | None:
-    """The file of what is opened; None where that is an id."""
-    file, colon, _ = reference.rpartition(":")
-    name = file if colon and file.endswith(".py") else reference
-    return Path(name) if name.endswith(".py") else None
+    return None if name is None else f"{file}:{name}"
 
 
 def options_of(info: EpisodeInfo, num_envs: int, base: TaskOptions | None = None) -> TaskOptions:
@@ -143,29 +145,32 @@ def write_source(info: EpisodeInfo) -> tuple[Path, str]:
     except OSError as error:
         shutil.rmtree(folder, ignore_errors=True)
         raise CannotStepIn(f"the recorded text cannot be written: {error}") from error
-    return folder, _with_class(str(folder / main), texts[main], info.task)
+    name = _class_of(texts[main], info.task)
+    return folder, str(folder / main) if name is None else f"{folder / main}:{name}"
 
 
 def _link_side_files(info: EpisodeInfo, folder: Path) -> None:
     """Those that are there; that one is not, or is another now, is said where the recorded text is offered."""
     for name in info.side_files:
+        if name.endswith(_IMPORTED):
+            continue  # it could be imported, and is none of the texts that were agreed to
         there, here = place_of(folder_of(info.source_file), name), place_of(folder, name)
         if there is not None and here is not None and there.is_file() and not here.exists():
             here.parent.mkdir(parents=True, exist_ok=True)
             here.symlink_to(there)
 
 
-def _with_class(file: str, text: str, env_id: str) -> str:
-    """``file.py:Class`` of the class that is registered under, or has, this name; the file alone if none is found."""
+def _class_of(text: str, env_id: str) -> str | None:
+    """The class that is registered under, or has, this name; None if there is none."""
     try:
         tree = ast.parse(text)
-    except (SyntaxError, ValueError):
-        return file
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return None
     classes = [node for node in tree.body if isinstance(node, ast.ClassDef)]
     for node in classes:
         if any(_registers(decorator, env_id) for decorator in node.decorator_list):
-            return f"{file}:{node.name}"
-    return f"{file}:{env_id}" if any(node.name == env_id for node in classes) else file
+            return node.name
+    return env_id if any(node.name == env_id for node in classes) else None
 
 
 def _registers(decorator: ast.expr, env_id: str) -> bool:

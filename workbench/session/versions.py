@@ -76,6 +76,8 @@ class Versions:
     def _on_files_changed(self, paths: set[Path]) -> None:
         self._on_save()
         self._shared.set(stale=True)
+        with self._shared.lock:
+            self._shared.state.file_is_edited()
         self.reload()
 
     # --- what a worker needs to know -----------------------------------------------------------------

@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from workbench.authoring.reference import RecordedTask, named_file
 from workbench.recording.episode import EpisodeInfo
-from workbench.session.step_back import class_in, file_of, reference_of
+from workbench.session.step_back import class_in, reference_of
 
 TODAYS, RECORDED = "today's", "as recorded"
 MOST_NAMED = 3
@@ -36,8 +37,8 @@ def codes_for(infos: Sequence[EpisodeInfo], known: Sequence[Path]) -> tuple[Code
         infos: Of the recordings that are open; of others nothing is known before they are judged.
         known: Task files besides those that the recordings name.
     """
-    named = list(dict.fromkeys(reference_of(info) for info in infos))
-    own = {file for file in map(file_of, named) if file is not None}
+    named = list({str(reference): reference for reference in map(reference_of, infos)}.values())
+    own = {file for file in map(named_file, named) if file is not None}
     codes = [Code(TODAYS, _todays(infos, named)), Code(RECORDED, _recorded(infos), recorded=True)]
     for file in dict.fromkeys(known):
         # Of recordings that are not open it is not known whether it has their task; those of another are left alone.
@@ -49,7 +50,7 @@ def codes_for(infos: Sequence[EpisodeInfo], known: Sequence[Path]) -> tuple[Code
     return tuple(codes)
 
 
-def _todays(infos: Sequence[EpisodeInfo], named: Sequence[str]) -> str:
+def _todays(infos: Sequence[EpisodeInfo], named: Sequence[RecordedTask]) -> str:
     if not infos:
         return "Each recording with the file that it names, as that is now."
     told = [_in_words(reference) for reference in named[:MOST_NAMED]]
@@ -57,12 +58,12 @@ def _todays(infos: Sequence[EpisodeInfo], named: Sequence[str]) -> str:
     return f"With {', '.join(told)}{more}."
 
 
-def _in_words(reference: str) -> str:
-    file = file_of(reference)
+def _in_words(reference: RecordedTask) -> str:
+    file = named_file(reference)
     return f"{reference} as it is installed" if file is None else f"{file} as it is now"
 
 
 def _recorded(infos: Sequence[EpisodeInfo]) -> str:
     hashes = list(dict.fromkeys(info.source_hash for info in infos if info.source_hash))
     version = f" (version {', '.join(hashes[:MOST_NAMED])})" if hashes else ""
-    return f"With the text that each recording holds{version}. It runs here: only where it is trusted."
+    return f"With the text that each recording holds{version}. It runs here; you are asked first where it was not recorded here."

@@ -152,9 +152,14 @@ class LibraryPanel:
         with self._lock:
             self._actions.append(action)
 
+    def leave_keys(self, asking: bool) -> None:
+        """Take no keys while another part of the page asks something."""
+        self._on_asking(asking)
+
     def close(self) -> None:
-        """Close the window with a question, if there is one. For when the page goes."""
+        """Close the window with a question, if there is one. For when the page goes, and its keys with it."""
         self._edits.close()
+        self._keys, self._escapes = [], []
 
     def commands(self) -> list[Command]:
         """Keys of the table, for the page to register after the last action was added."""

@@ -75,6 +75,10 @@ class Workplace:
             self.go_live_with(session)
 
     @property
+    def server(self) -> viser.ViserServer:
+        return self._server
+
+    @property
     def shelf(self) -> Shelf:
         """Looks into the folder when it is first asked for."""
         with self._lock:

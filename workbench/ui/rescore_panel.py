@@ -30,7 +30,7 @@ from workbench.ui.then_and_now import ThenAndNow
 REDRAW_EVERY = 0.2
 MOST_ROWS = 10
 """Of the list, at a time."""
-RUNNING = ("loading", "judging")
+RUNNING = ("asking", "loading", "judging")
 
 
 @dataclass

@@ -10,14 +10,19 @@ from __future__ import annotations
 import shutil
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import viser
 
+from workbench.authoring.reference import RecordedTask, TaskName
+from workbench.core.recorded_run import RecordedRun
+from workbench.recording.episode import EpisodeInfo
 from workbench.recording.library import Library
 from workbench.recording.side_files import side_files_in_words
+from workbench.session.clearance import Clearances, NotCleared, Wanted
 from workbench.session.messages import TaskOptions
+from workbench.session.recovery import is_on_disk
 from workbench.session.rescore_messages import EpisodeFile
 from workbench.session.rescorer import Rescorer
 from workbench.session.review_view import ReviewView
@@ -36,11 +41,26 @@ from workbench.ui.going_live import GoingLive, begin_to_go
 from workbench.ui.put_together import Workplace
 from workbench.ui.rescore_panel import RescoreChoices, RescorePanel
 from workbench.ui.review_page import Places, ReviewOffers
+from workbench.ui.trust_dialog import TrustDialog
 
 TODAYS, RECORDED = "today's", "as recorded"
 ONE, ALL = "the selected env", "all envs"
 NEW_ENVS = 4
 """Envs of a session that is opened for all of them."""
+
+
+MakeSession = Callable[[TaskName, TaskOptions], Session]
+
+
+@dataclass
+class _Clearing:
+    """A way to a live env that waits for somebody to say that its code may run."""
+
+    wanted: Wanted
+    run: RecordedRun
+    state: int
+    stop: threading.Event = field(default_factory=threading.Event)
+    thread: threading.Thread | None = None
 
 
 class StepIn:
@@ -49,21 +69,23 @@ class StepIn:
     Args:
         place: The pages, and the session that is open, if one is.
         make_session: Opens a task; gets what `Session` gets.
+        clearances: Say what of the code that recordings name may run.
     """
 
-    def __init__(self, place: Workplace, make_session: Callable[[str, TaskOptions], Session]) -> None:
-        self._place, self._make = place, make_session
+    def __init__(self, place: Workplace, make_session: MakeSession, clearances: Clearances) -> None:
+        self._place, self._make, self._clearances = place, make_session, clearances
         self._first = place.session
         self._lock = threading.Lock()
         self._own: tuple[Session, Path | None] | None = None
         self.recorded_source, self.everywhere = False, False
         self._server: viser.ViserServer | None = None
         self._going: GoingLive | None = None
+        self._clearing: _Clearing | None = None
 
     def go(self, id: str, state: int) -> None:
         """Go on live from a state of an opened recording; on the way there, stay in the review after all."""
-        if self._going is not None:
-            self._going = None
+        if self._going is not None or self._clearing is not None:
+            self._give_up()
             return
         review = self._place.shelf.review.view()
         one = next((one for one in review.opened if one.id == id), None)
@@ -71,32 +93,85 @@ class StepIn:
             return
         try:
             run = run_of(one.episode, state)
-            info = one.episode.info
-            with self._lock:
-                session = self._place.session
-                task = None if session is None else session.view().task
-                fits = session is not None and (task is None or not why_not_into(task, info))
-                if self.recorded_source:
-                    run = replace(run, name=f"{run.name} as it was recorded")
-                    folder, reference = write_source(info)
-                    session = self._open(reference, options_of(info, self._count()), folder)
-                elif not fits or session is None or (self._own is not None and self._own[1] is not None):
-                    known = self._first if self._first is not session else None
-                    task = None if known is None else known.view().task
-                    if known is not None and task is not None and not why_not_into(task, info):
-                        session = known
-                    else:
-                        session = self._open(reference_of(info), options_of(info, self._count()), None)
         except CannotStepIn as error:
             self._say(str(error))
             return
+        info = one.episode.info
+        if (why := self._clearances.why_not_its_arguments(info)) is not None:
+            self._say(_sentence(why))
+            return
+        there = None if self.recorded_source else self._open_already(info)
+        if there is not None:
+            self._enter(there, run, info, state)
+            return
+        wanted = Wanted(reference_of(info), info, self.recorded_source)
+        if self.recorded_source:
+            run = replace(run, name=f"{run.name} as it was recorded")
+        self._clearing = clearing = _Clearing(wanted, run, state)
+        # An answer may take long, and this is one of the few threads that the page's buttons have.
+        clearing.thread = threading.Thread(
+            target=self._clear_and_go, args=(clearing,), name="clear", daemon=True
+        )
+        clearing.thread.start()
+
+    def _open_already(self, info: EpisodeInfo) -> Session | None:
+        """A session that has this task open, in today's code."""
+        with self._lock:
+            session = self._place.session
+            if session is not None and (self._own is None or self._own[1] is None):
+                task = session.view().task
+                if task is None or not why_not_into(task, info):
+                    return session
+            known = self._first if self._first is not session else None
+            task = None if known is None else known.view().task
+            return known if task is not None and not why_not_into(task, info) else None
+
+    def _clear_and_go(self, clearing: _Clearing) -> None:
+        wanted = clearing.wanted
+        folder: Path | None = None
+        try:
+            reference = self._clearances.clear(wanted, clearing.stop.is_set)
+            if isinstance(reference, RecordedTask) and not is_on_disk(reference.approved or {}):
+                # It would be followed from now on.
+                raise CannotStepIn(
+                    f"{reference.file} was changed while you were asked about it; try it again"
+                )
+            if wanted.recorded_text:
+                folder, reference = write_source(wanted.info)
+        except (CannotStepIn, NotCleared) as error:
+            if not clearing.stop.is_set():
+                self._say(_sentence(str(error)))
+            self._cleared(clearing)
+            return
+        with self._lock:
+            if clearing.stop.is_set():
+                if folder is not None:
+                    shutil.rmtree(folder, ignore_errors=True)
+                return
+            session = self._open(reference, options_of(wanted.info, self._count()), folder)
+        self._enter(session, clearing.run, wanted.info, clearing.state)
+        self._cleared(clearing)
+
+    def _enter(self, session: Session, run: RecordedRun, info: EpisodeInfo, state: int) -> None:
         self._place.go_live_with(session)
         self._going = begin_to_go(session, run, self.everywhere, info, state)
 
+    def _cleared(self, clearing: _Clearing) -> None:
+        if self._clearing is clearing:
+            self._clearing = None
+
+    def _give_up(self) -> None:
+        self._going = None
+        clearing, self._clearing = self._clearing, None
+        if clearing is not None:
+            clearing.stop.set()
+
     def going(self) -> str:
         """What is waited for on the way to the live env; empty while nobody is on it."""
-        going = self._going
-        return "" if going is None else going.words(going.session.view())
+        going, clearing = self._going, self._clearing
+        if going is not None:
+            return going.words(going.session.view())
+        return "" if clearing is None else f"asking whether the code of {clearing.wanted.info.task} may run"
 
     def change_pages_when_there(self) -> None:
         going = self._going
@@ -127,13 +202,17 @@ class StepIn:
 
     def close(self) -> None:
         """End what was opened here; the pages must be stopped."""
+        clearing = self._clearing
+        self._give_up()
+        if clearing is not None and clearing.thread is not None:
+            clearing.thread.join()
         with self._lock:
             self._end_own()
 
     def _count(self) -> int:
         return NEW_ENVS if self.everywhere else 1
 
-    def _open(self, reference: str, options: TaskOptions, folder: Path | None) -> Session:
+    def _open(self, reference: TaskName, options: TaskOptions, folder: Path | None) -> Session:
         if self._first is not None:
             self._first.pause()
         before, self._own = self._own, None
@@ -209,11 +288,12 @@ class Judging:
 
     Args:
         place: The pages.
+        clearances: Say what of the code that recordings name may run.
     """
 
-    def __init__(self, place: Workplace) -> None:
+    def __init__(self, place: Workplace, clearances: Clearances) -> None:
         self._place = place
-        self.rescorer = Rescorer()
+        self.rescorer = Rescorer(clearances)
         self._choices = RescoreChoices()
         self._panel: RescorePanel | None = None
         self._server: viser.ViserServer | None = None
@@ -265,15 +345,24 @@ def episode_files(library: Library, ids: Sequence[str]) -> list[EpisodeFile]:
     ]
 
 
+def _sentence(why: str) -> str:
+    return f"{why[:1].upper()}{why[1:].removesuffix('.')}."
+
+
 def offer_going_back_in(
-    place: Workplace, make_session: Callable[[str, TaskOptions], Session]
+    place: Workplace, make_session: MakeSession, trust: bool = False
 ) -> Callable[[], None]:
     """Put both into what the review page offers.
+
+    Args:
+        trust: Run what recordings name without asking.
 
     Returns:
         what ends them, to be called after the pages were stopped.
     """
-    step_in, judging = StepIn(place, make_session), Judging(place)
+    dialog = TrustDialog(place.server)
+    clearances = Clearances(place.task_files, dialog.ask, all_trusted=trust)
+    step_in, judging = StepIn(place, make_session, clearances), Judging(place, clearances)
 
     def add(_: Workplace, offers: ReviewOffers) -> ReviewOffers:
         return replace(
@@ -281,12 +370,13 @@ def offer_going_back_in(
             on_step_back=step_in.go,
             going=step_in.going,
             on_rescore=judging.judge,
-            parts=(*offers.parts, step_in.part, judging.part),
+            parts=(*offers.parts, step_in.part, judging.part, dialog.part),
         )
 
     place.offer(add)
 
     def close() -> None:
+        dialog.close()
         judging.close()
         step_in.close()
 

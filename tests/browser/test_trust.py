@@ -1,0 +1,69 @@
+"""A folder of recordings from elsewhere in a real Chromium: it is looked at freely, and asks before its code runs."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import expect, sync_playwright
+
+from tests.browser.opened import TASK, launch, new_page, open_workbench
+from workbench.session.messages import TaskOptions
+from workbench.session.record import RecordOptions, record
+
+pytestmark = pytest.mark.browser
+PATIENT = 120_000
+
+
+def test_code_of_a_recording_from_elsewhere_runs_when_a_person_says_so(
+    tmp_path: Path, chromium_path: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = Path(shutil.copy(TASK, tmp_path))
+    (tmp_path / "marks.py").write_text("open(__file__ + '.ran', 'w').close()\n")
+    file.write_text(file.read_text().replace("import torch\n", "import torch\nimport marks\n", 1))
+    options = TaskOptions(1, "cpu", 5, {"render_backend": "none"})
+    record(RecordOptions(str(file), tmp_path / "r", episodes=1, pictures=False, max_steps=5, options=options))
+    mark = tmp_path / "marks.py.ran"
+    mark.unlink()
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "another user"))
+    with open_workbench("r", cwd=tmp_path, what="review") as opened, sync_playwright() as playwright:
+        browser = launch(playwright, chromium_path)
+        page, errors = new_page(browser)
+        page.goto(opened.url)
+        page.locator("tr", has_text="WorkbenchPushCube").first.click()
+        page.keyboard.press("Enter")
+        live = page.get_by_role("button", name="Go on live from here")
+        expect(live).to_be_visible(timeout=PATIENT)
+        page.get_by_role("tab", name="Judge").click()
+        judge = page.get_by_role("button", name="Judge what is open")
+        judge.click()
+        window = page.get_by_role("dialog")
+        expect(window).to_contain_text(str(file), timeout=PATIENT)
+        expect(window).to_contain_text("marks.py")
+        if screenshot := os.environ.get("TRUST_SCREENSHOT"):
+            page.screenshot(path=screenshot)
+        # Enter is pressed on what has the focus, and opens nothing behind the window.
+        page.keyboard.press("Enter")
+        expect(window).to_be_hidden(timeout=PATIENT)
+        expect(page.get_by_text("is not trusted")).to_be_visible(timeout=PATIENT)
+
+        page.get_by_role("tab", name="Review").click()
+        live.click()
+        other, _ = new_page(browser)
+        other.goto(opened.url)
+        expect(window).to_be_visible(timeout=PATIENT)
+        expect(other.get_by_role("dialog")).to_contain_text(str(file), timeout=PATIENT)
+        page.keyboard.press("Escape")
+        expect(window).to_be_hidden(timeout=PATIENT)
+        expect(other.get_by_role("dialog")).to_be_hidden(timeout=PATIENT)
+        expect(page.get_by_text("cannot be gone into").first).to_be_visible(timeout=PATIENT)
+        assert not mark.exists()
+
+        live.click()
+        other.get_by_role("button", name="Run it, and ask again next time").click()
+        expect(page.get_by_text("every body is where it was")).to_be_visible(timeout=PATIENT)
+        assert mark.exists()
+        assert not [error for error in errors if "non-existent component" not in error]
+        browser.close()

@@ -1,0 +1,402 @@
+"""Which code of a recording may run, who is asked, and where the answers are kept: on real recordings, running nothing."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.session.recordings import begin, made, write
+from workbench.authoring.reference import RecordedTask
+from workbench.authoring.task_content import TaskContent, read_content
+from workbench.authoring.trust import STORE_FILE, TrustStore
+from workbench.machine.child_python import child_environment, python_command
+from workbench.machine.user_folder import user_folder
+from workbench.recording.annotations import write_into_description
+from workbench.recording.episode import EpisodeInfo
+from workbench.recording.made_here import KEY_FILE, MadeHere, made_here
+from workbench.recording.read_episode import read_episode
+from workbench.recording.recover import recover
+from workbench.session.clearance import Answer, Clearances, NotCleared, Question, Wanted
+from workbench.session.recorded_scene import SceneError, SceneProcess
+from workbench.session.step_back import recorded_source, reference_of
+
+TEXT = "import helper\nclass Push: ...\n"
+
+
+class Person:
+    """Answers as it is told, and keeps what it was asked."""
+
+    def __init__(self, answer: Answer = Answer.NO) -> None:
+        self.answer, self.asked = answer, list[Question]()
+
+    def __call__(self, question: Question, stopped: Callable[[], bool]) -> Answer:
+        self.asked.append(question)
+        return self.answer
+
+
+@pytest.fixture(autouse=True)
+def own_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    another_user(tmp_path / "config", monkeypatch)
+
+
+def another_user(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From now on this is an installation that made none of the recordings."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(folder))
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """The .json of a recording, with its task file and a module beside it."""
+    folder = tmp_path / "work"
+    folder.mkdir()
+    (folder / "push.py").write_text(TEXT)
+    (folder / "helper.py").write_text("A = 1\n")
+    texts = {str(folder / name): (folder / name).read_text() for name in ("push.py", "helper.py")}
+    episode = made(2, source_file=str(folder / "push.py"), source=texts, env_kwargs={"robot_uids": "panda"})
+    return write(folder / "recordings", episode, pictures=False)
+
+
+@pytest.fixture
+def foreign(recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    another_user(tmp_path / "another", monkeypatch)
+    return recording
+
+
+def info_of(recording: Path) -> EpisodeInfo:
+    return read_episode(recording).info
+
+
+def todays(recording: Path) -> Wanted:
+    info = info_of(recording)
+    return Wanted(reference_of(info), info)
+
+
+def as_recorded(recording: Path) -> Wanted:
+    info = info_of(recording)
+    return Wanted(reference_of(info), info, recorded_text=True)
+
+
+def asked(wanted: Wanted, answer: Answer = Answer.NO) -> list[Question]:
+    person = Person(answer)
+    try:
+        Clearances(ask=person).clear(wanted)
+    except NotCleared:
+        assert answer is Answer.NO
+    return person.asked
+
+
+def edit(recording: Path, **values: Any) -> None:
+    document = json.loads(recording.read_bytes())
+    document["workbench"].update(values)
+    recording.write_text(json.dumps(document))
+
+
+# --- who is asked ------------------------------------------------------------------------------------
+
+
+def test_what_was_recorded_here_is_not_asked_about_also_with_another_text_today(recording: Path) -> None:
+    assert made_here(info_of(recording)) is MadeHere.CONTENT_AND_PLACE
+    file = recording.parents[1] / "push.py"
+    file.write_text(f"{TEXT}# edited since\n")
+    assert Clearances().clear(todays(recording)) == str(file)
+    assert asked(as_recorded(recording)) == []
+    write_into_description(recording, ("good",), "a note")
+    assert asked(todays(recording)) == [] and asked(as_recorded(recording)) == []
+
+
+def test_what_was_recorded_elsewhere_is_asked_about_with_file_hash_and_modules(foreign: Path) -> None:
+    file = foreign.parents[1] / "push.py"
+    (question,) = asked(todays(foreign))
+    assert question.file == str(file) and question.modules == ("helper.py",) and not question.changed
+    assert read_content(file).hash.startswith(question.hash) and len(question.hash) == 12
+    (question,) = asked(as_recorded(foreign))
+    assert (question.file, question.task, question.recorded_text) == ("push.py", "Push-v1", True)
+
+
+def test_without_anybody_to_ask_the_answer_is_no(foreign: Path) -> None:
+    for wanted in (todays(foreign), as_recorded(foreign)):
+        with pytest.raises(NotCleared, match=r"push\.py .* is not trusted") as refused:
+            Clearances().clear(wanted)
+        assert refused.value.question is not None
+        assert Clearances(all_trusted=True).clear(wanted)
+    assert TrustStore().trusts(read_content(foreign.parents[1] / "push.py")) is False, "--trust keeps nothing"
+
+
+def test_a_file_that_a_person_named_is_not_asked_about(foreign: Path) -> None:
+    file = foreign.parents[1] / "push.py"
+    assert Clearances(lambda: [file]).clear(todays(foreign)) == str(file)
+    assert Clearances().clear(Wanted("any_file.py", info_of(foreign))) == "any_file.py"
+    assert Clearances().clear(Wanted(RecordedTask("PickCube-v1"), info_of(foreign))) == RecordedTask(
+        "PickCube-v1"
+    )
+
+
+def test_an_answer_is_kept_by_what_the_texts_say(foreign: Path, tmp_path: Path) -> None:
+    file, helper = foreign.parents[1] / "push.py", foreign.parents[1] / "helper.py"
+    clearances = Clearances(ask=Person(Answer.ONCE))
+    cleared = clearances.clear(todays(foreign))
+    assert isinstance(cleared, RecordedTask) and cleared.approved == {str(file): TEXT, str(helper): "A = 1\n"}
+    clearances.clear(todays(foreign))
+    assert len(asked(todays(foreign))) == 1, "another run asks again"
+    assert len(asked(todays(foreign), Answer.ALWAYS)) == 1
+    assert asked(todays(foreign)) == [] and asked(as_recorded(foreign)) == [], "the same texts"
+    copy = tmp_path / "copy"
+    shutil.copytree(file.parent, copy)
+    assert asked(todays(copy / "recordings" / foreign.name)) == [], "the same texts elsewhere"
+    helper.write_text("A = 2\n")
+    assert [question.changed for question in asked(todays(foreign))] == [True]
+    helper.write_text("A = 1\n")
+    file.write_text(f"{TEXT}import further\n")
+    assert [question.changed for question in asked(todays(foreign))] == [True]
+    file.write_text(TEXT)
+    assert asked(todays(foreign)) == []
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"env_kwargs": {"episode_json": "/etc/passwd"}},
+        {"env_kwargs": {"sensor_configs": {"shaders": ["../evil"]}}},
+        {"reset_options": {"~/model": 1}},
+        {"env_kwargs": {"model": "evil.urdf"}},
+        {"control_mode": "a\\b"},
+    ],
+)
+def test_arguments_from_elsewhere_name_no_files(
+    foreign: Path, values: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(foreign.parent)
+    (foreign.parent / "evil.urdf").write_text("")
+    file = foreign.parents[1] / "push.py"
+    edit(foreign, **values)
+    for wanted in (todays(foreign), as_recorded(foreign), Wanted(str(file), info_of(foreign))):
+        with pytest.raises(NotCleared, match="names files for its env to read"):
+            Clearances(ask=Person(Answer.ALWAYS)).clear(wanted)
+        Clearances(all_trusted=True).clear(wanted)
+    with pytest.raises(SceneError, match="numbers and curves only"):
+        SceneProcess()._one(None, None, read_episode(foreign), lambda: False, print)  # type: ignore[arg-type]
+
+
+def test_each_text_is_asked_about_once_and_all_can_be_refused_at_once(foreign: Path) -> None:
+    file = foreign.parents[1] / "push.py"
+    wanted = [todays(foreign), todays(foreign)]
+    for name in ("a", "b"):
+        other = file.with_name(f"{name}.py")
+        other.write_text(f"# {name}\n")
+        wanted.append(replace(wanted[0], reference=RecordedTask("Push-v1", str(other))))
+    person = Person(Answer.NONE)
+    cleared = Clearances(ask=person).clear_all(wanted)
+    assert [question.more for question in person.asked] == [2]
+    assert all(isinstance(one, NotCleared) for one in cleared) and len(cleared) == 4
+    person = Person(Answer.NO)
+    Clearances(ask=person).clear_all(wanted)
+    assert [Path(question.file).name for question in person.asked] == ["push.py", "a.py", "b.py"]
+
+
+def test_names_out_of_a_recording_cannot_write_to_a_terminal(foreign: Path) -> None:
+    edit(
+        foreign,
+        source_path=None,
+        task="Push\x1b[2J\u202e-v1",
+        source_file="push\n.py",
+        source={"push\n.py": "x"},
+    )
+    (question,) = asked(as_recorded(foreign))
+    assert (question.file, question.task) == (r"push\n.py", r"Push\x1b[2J\u202e-v1")
+
+
+# --- the seal ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"task": "Other-v1"},
+        {"source": {"push.py": "evil", "helper.py": "A = 1\n"}},
+        {"source_file": "helper.py"},
+        {"env_kwargs": {"robot_uids": "evil"}},
+        {"reset_options": {"reconfigure": True}},
+        {"control_mode": "other"},
+        {"side_files": {"mesh.obj": "0" * 12}},
+        {"files": {}},
+        {"id": "another"},
+        {"made_here": None},
+        {"made_here": {"content": "0" * 64, "place": "0" * 64}},
+        {"made_here": {"content": "\ud800", "place": 3}},
+        {"made_here": [1]},
+    ],
+)
+def test_an_edited_recording_has_lost_its_seal(recording: Path, values: dict[str, Any]) -> None:
+    assert json.loads(recording.read_bytes())["workbench"]["made_here"]["content"]
+    edit(recording, **values)
+    assert made_here(info_of(recording)) is MadeHere.NO
+    if "source" in values:
+        assert len(asked(as_recorded(recording))) == 1
+
+
+def test_one_that_comes_back_with_another_file_beside_it_is_asked_about(
+    recording: Path, tmp_path: Path
+) -> None:
+    back = tmp_path / "back"
+    shutil.copytree(recording.parents[1], back)
+    returned = back / "recordings" / recording.name
+    shutil.rmtree(recording.parents[1])
+    assert made_here(info_of(returned)) is MadeHere.CONTENT
+    cleared = Clearances().clear(todays(returned))
+    assert isinstance(cleared, RecordedTask) and cleared.file == str(back / "push.py"), (
+        "it says what was recorded here"
+    )
+    (back / "helper.py").write_text("evil\n")
+    assert len(asked(todays(returned))) == 1
+    assert asked(as_recorded(returned)) == []
+
+
+def test_a_journal_that_came_with_a_folder_from_elsewhere_is_recovered_without_a_seal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for who, is_ours in (("config", True), ("another", False)):
+        begin(
+            tmp_path / who,
+            made(3, source_file=str(tmp_path / "push.py"), source={str(tmp_path / "push.py"): "x"}),
+        )
+        if not is_ours:
+            another_user(tmp_path / "third", monkeypatch)
+        (files,) = recover(tmp_path / who)
+        assert (made_here(info_of(files.json)) is not MadeHere.NO) is is_ours
+
+
+def test_a_side_file_that_could_be_imported_does_not_get_beside_the_recorded_text(recording: Path) -> None:
+    folder = recording.parents[1]
+    for name in ("mesh.obj", "numpy.py", "json.cpython-311-x86_64-linux-gnu.so"):
+        (folder / name).write_text("")
+    names = ("mesh.obj", "numpy.py", "json.cpython-311-x86_64-linux-gnu.so")
+    info = replace(info_of(recording), side_files=dict.fromkeys(names, "0" * 12))
+    with recorded_source(info) as reference:
+        beside = {path.name for path in Path(reference.split(":")[0]).parent.iterdir()}
+    assert beside == {"push.py", "helper.py", "mesh.obj"}
+
+
+# --- where it is kept --------------------------------------------------------------------------------
+
+
+def test_key_and_store_are_for_this_user_alone(recording: Path) -> None:
+    TrustStore().trust(read_content(recording.parents[1] / "push.py"))
+    assert user_folder().stat().st_mode & 0o777 == 0o700
+    for name in (KEY_FILE, STORE_FILE):
+        assert (user_folder() / name).stat().st_mode & 0o777 == 0o600
+    key = (user_folder() / KEY_FILE).read_text()
+    assert len(key) == 64 and key not in recording.read_text()
+
+
+@pytest.mark.parametrize("key", ["", "00", "no key\n", None])
+def test_without_its_key_a_recording_is_anybodys_and_the_next_has_a_new_one(
+    recording: Path, key: str | None, tmp_path: Path
+) -> None:
+    path = user_folder() / KEY_FILE
+    path.unlink() if key is None else path.write_text(key)
+    assert len(asked(todays(recording))) == 1
+    again = write(tmp_path / "again", made(2), pictures=False)
+    assert made_here(info_of(again)) is not MadeHere.NO and len(path.read_text()) == 64
+    assert path.with_name(f"{KEY_FILE}.broken").exists() is (key is not None)
+
+
+@pytest.mark.parametrize(
+    "store", ["", "{", "[]", '{"trusted": [1]}', '{"trusted": [{"hash": 1}]}', "[" * 100_000]
+)
+def test_a_broken_store_trusts_nothing_is_told_once_and_is_kept_aside(
+    foreign: Path, store: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    content = read_content(foreign.parents[1] / "push.py")
+    user_folder().mkdir(parents=True)
+    (user_folder() / STORE_FILE).write_text(store)
+    kept = TrustStore()
+    assert not kept.trusts(content) and not kept.trusts(content)
+    assert len([record for record in caplog.records if "broken" in record.message]) == 1
+    kept.trust(content)
+    assert TrustStore().trusts(content)
+    assert (user_folder() / f"{STORE_FILE}.broken").read_text() == store
+
+
+def test_a_store_that_others_may_write_to_trusts_nothing(
+    foreign: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    content = read_content(foreign.parents[1] / "push.py")
+    TrustStore().trust(content)
+    (user_folder() / STORE_FILE).chmod(0o666)
+    assert not TrustStore().trusts(content) and "chmod go-w" in caplog.text
+    (user_folder() / STORE_FILE).chmod(0o600)
+    user_folder().chmod(0o777)
+    assert not TrustStore().trusts(content)
+
+
+def test_without_a_folder_to_keep_it_in_it_is_asked_every_run_and_recording_goes_on(
+    foreign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "file").write_text("")
+    another_user(tmp_path / "file" / "below", monkeypatch)
+    person = Person(Answer.ALWAYS)
+    clearances = Clearances(ask=person)
+    clearances.clear(todays(foreign))
+    clearances.clear(todays(foreign))
+    assert len(person.asked) == 1 and len(asked(todays(foreign))) == 1
+    told = [record.message for record in caplog.records]
+    assert len([message for message in told if "cannot be kept" in message]) == 1
+    again = write(foreign.parents[1] / "recordings", made(2), pictures=False)
+    assert made_here(info_of(again)) is MadeHere.NO
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become a user without a home")
+def test_a_user_without_a_home_has_no_folder_and_nothing_is_made_in_the_current_one(tmp_path: Path) -> None:
+    tmp_path.chmod(0o777)
+    program = (
+        "import os, workbench.authoring.trust as trust, workbench.authoring.task_content as content\n"
+        "os.setgid(54321); os.setuid(54321)\n"
+        "store, one = trust.TrustStore(), content.TaskContent('a.py', {'a.py': ''})\n"
+        "store.trust(one)\n"
+        "print(store.trusts(one), trust.TrustStore().trusts(one))"
+    )
+    environment = {
+        name: value for name, value in child_environment().items() if name not in ("HOME", "XDG_CONFIG_HOME")
+    }
+    ended = subprocess.run(
+        python_command("-c", program),
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert ended.stdout == "True False\n" and "no home folder" in ended.stderr, ended
+    assert not (tmp_path / "~").exists()
+
+
+def test_answers_of_several_processes_are_all_kept(tmp_path: Path) -> None:
+    context = multiprocessing.get_context("fork")
+    processes = [context.Process(target=_trust_many, args=(k,)) for k in range(3)]
+    for process in processes:
+        process.start()
+    for process in processes:
+        process.join(timeout=60)
+        assert process.exitcode == 0
+    store = TrustStore()
+    assert all(store.trusts(_content(k, i)) for k in range(3) for i in range(8))
+    assert [path.name for path in user_folder().glob("*.part")] == []
+
+
+def _content(process: int, number: int) -> TaskContent:
+    return TaskContent("task.py", {"task.py": f"# {process} {number}"})
+
+
+def _trust_many(process: int) -> None:
+    store = TrustStore()
+    for number in range(8):
+        store.trust(_content(process, number))

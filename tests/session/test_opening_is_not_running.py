@@ -1,0 +1,243 @@
+"""A folder of recordings from elsewhere: nothing of the code that it names or holds runs before a person says so."""
+
+# pyright: reportOptionalMemberAccess=false
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import select
+import shutil
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import mani_skill.envs  # noqa: F401  registers the ids
+import numpy as np
+import pytest
+from mani_skill.utils.wrappers.record import RecordEpisode
+
+from workbench.cli import main
+from workbench.exit_codes import Exit
+from workbench.recording.library import Library
+from workbench.session.clearance import Answer, Clearances, NotTrusted, Question
+from workbench.session.messages import TaskOptions
+from workbench.session.record import RecordOptions, record
+from workbench.session.recorded_scene import SceneProcess, SceneWanted
+from workbench.session.recorded_scene_worker import make
+from workbench.session.rescore import find_episodes
+from workbench.session.rescore_all import RescoreOptions, rescore_all
+from workbench.session.rescorer import Rescorer, RescoreView
+from workbench.session.review import Review
+
+PATIENCE = 120.0
+TEXT = (Path(__file__).parents[2] / "tasks" / "push_cube.py").read_text()
+HELPER = "OPENED = open(__file__ + '.ran', 'a').write('x')\n"
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a task, a module that leaves a mark when it is imported, and two episodes of it."""
+    folder = tmp_path_factory.mktemp("elsewhere")
+    (folder / "push_cube.py").write_text(TEXT.replace("import torch\n", "import torch\nimport marks\n", 1))
+    (folder / "marks.py").write_text(HELPER)
+    options = TaskOptions(2, "cpu", 20, {"render_backend": "none"})
+    task, out = str(folder / "push_cube.py"), folder / "recordings"
+    record(RecordOptions(task, out, episodes=2, pictures=False, max_steps=3, options=options))
+    assert (folder / "marks.py.ran").exists()
+    return folder
+
+
+@pytest.fixture
+def foreign(recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The same in the hands of an installation that recorded none of it."""
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    folder = tmp_path / "foreign"
+    shutil.copytree(recorded, folder)
+    (folder / "marks.py.ran").unlink()
+    return folder
+
+
+def ran(folder: Path) -> bool:
+    """Whether the task was imported since this was asked last, here or as its recordings hold it."""
+    marks = [
+        *folder.glob("*.ran"),
+        *(Path(os.environ.get("TMPDIR", "/tmp")).glob("workbench-recorded-*/*.ran")),
+    ]
+    for mark in marks:
+        mark.unlink()
+    return bool(marks)
+
+
+# --- opening a row -----------------------------------------------------------------------------------
+
+
+def test_a_path_in_place_of_an_id_is_not_loaded_when_its_row_is_opened(tmp_path: Path) -> None:
+    env: Any = gym.make("PickCube-v1", obs_mode="state", render_backend="none")
+    env = RecordEpisode(env, str(tmp_path), save_video=False, trajectory_name="demos", source_type="test")
+    env.reset(seed=1)
+    for _ in range(2):
+        env.step(np.zeros(8, np.float32))
+    env.close()
+    mark = tmp_path / "evil_ran"
+    (tmp_path / "evil.py").write_text(f"open({str(mark)!r}, 'w').write('ran')\n")
+    document = json.loads((tmp_path / "demos.json").read_text())
+    document["env_info"]["env_id"] = str(tmp_path / "evil.py")
+    (tmp_path / "demos.json").write_text(json.dumps(document))
+    library = Library(tmp_path)
+    review = Review(library, make_scene=SceneProcess())
+    try:
+        library.watch()
+        deadline = time.monotonic() + PATIENCE
+        while not library.rows() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        (row,) = library.rows()
+        review.open((row.id,))
+        while "no env" not in "".join(one.scene for one in review.view().opened):
+            assert time.monotonic() < deadline, review.view().opened
+            time.sleep(0.05)
+    finally:
+        review.close()
+        library.close()
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize(
+    "named", ["{file}", "{file}:Evil", "./evil.py", "evil.py", "evil:Evil-v0", "~/evil.py"]
+)
+def test_no_form_of_a_name_in_a_recording_is_a_file(
+    tmp_path: Path, named: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mark = tmp_path / "evil_ran"
+    (tmp_path / "evil.py").write_text(f"open({str(mark)!r}, 'w').write('ran')\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    wanted = SceneWanted(named.format(file=tmp_path / "evil.py"), (), {}, 0, {}, {})
+    with pytest.raises(Exception, match="There is no env"):
+        make(wanted)
+    assert not mark.exists()
+
+
+# --- judging -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("recorded_source", [False, True])
+def test_judging_in_a_program_runs_nothing_that_nobody_agreed_to(
+    foreign: Path, recorded_source: bool
+) -> None:
+    what = RescoreOptions((foreign / "recordings",), recorded_source=recorded_source)
+    with pytest.raises(NotTrusted) as refused:
+        rescore_all(what)
+    assert len(refused.value.questions) == 1 and not ran(foreign)
+    verdicts, _ = rescore_all(what, clearances=Clearances(all_trusted=True))
+    assert [verdict.differs for verdict in verdicts] == [False, False]
+
+
+def run(arguments: list[str], capfd: pytest.CaptureFixture[str]) -> tuple[int, str]:
+    with pytest.raises(SystemExit) as ended:
+        main(["rescore", *arguments])
+    told = capfd.readouterr()
+    return int(ended.value.code or 0), told.out + told.err
+
+
+def test_without_a_terminal_it_is_refused_with_an_exit_code_that_is_its_own(
+    foreign: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    recordings = str(foreign / "recordings")
+    for more in ([], ["--recorded-source"]):
+        code, told = run([recordings, *more], capfd)
+        assert code == Exit.NOT_TRUSTED == 4 and not ran(foreign)
+        assert "--trust" in told and "push_cube.py" in told
+    assert run([recordings, "--trust"], capfd)[0] == 0 and ran(foreign)
+    assert run([recordings], capfd)[0] == Exit.NOT_TRUSTED, "--trust is for one run"
+    assert run([recordings, "--task", str(foreign / "push_cube.py")], capfd)[0] == 0 and ran(foreign)
+
+
+def test_in_a_terminal_it_is_asked_and_the_answer_is_kept(
+    foreign: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keyboard, terminal = pty.openpty()
+
+    def judged(typed: str) -> tuple[int, str]:
+        os.write(keyboard, f"{typed}\n".encode())
+        with open(terminal, closefd=False) as read, open(terminal, "w", closefd=False) as written:
+            monkeypatch.setattr(sys, "stdin", read)
+            monkeypatch.setattr(sys, "stdout", written)
+            with pytest.raises(SystemExit) as ended:
+                main(["rescore", str(foreign / "recordings")])
+            monkeypatch.undo()
+            monkeypatch.setenv("XDG_CONFIG_HOME", str(foreign.parent / "config"))
+        told = b""
+        while select.select([keyboard], [], [], 0.2)[0]:
+            told += os.read(keyboard, 100_000)
+        return int(ended.value.code or 0), told.decode()
+
+    for no in ("n", "", "perhaps"):
+        code, told = judged(no)
+        assert code == Exit.NOT_TRUSTED and not ran(foreign)
+    assert "marks.py" in told and str(foreign / "push_cube.py") in told and "Run it?" in told
+    code, told = judged("a")
+    assert code == 0 and ran(foreign) and "Run it?" in told
+    code, told = judged("n")
+    assert code == 0 and ran(foreign) and "Run it?" not in told
+    (foreign / "marks.py").write_text(HELPER + "# changed\n")
+    code, told = judged("n")
+    assert code == Exit.NOT_TRUSTED and not ran(foreign) and "has changed since" in told
+    os.close(keyboard)
+    os.close(terminal)
+
+
+def test_on_a_page_it_is_asked_and_a_no_leaves_the_others(foreign: Path, recorded: Path) -> None:
+    asked: list[Question] = []
+    answers = iter([Answer.NO, Answer.ONCE])
+
+    def ask(question: Question, stopped: object) -> Answer:
+        asked.append(question)
+        return next(answers)
+
+    rescorer = Rescorer(Clearances(ask=ask))
+    try:
+        rescorer.start(find_episodes((foreign / "recordings",)))
+        view = until(rescorer, "failed")
+        assert "is not trusted" in view.why and not ran(foreign)
+        rescorer.start(find_episodes((foreign / "recordings",)))
+        view = until(rescorer, "done", "failed")
+        assert view.state == "done" and len(view.verdicts) == 2, view
+        assert ran(foreign) and [question.modules for question in asked] == [("marks.py",)] * 2
+    finally:
+        rescorer.close()
+
+
+def test_a_question_on_a_page_can_be_withdrawn(foreign: Path) -> None:
+    asking = []
+
+    def ask(question: Question, stopped) -> Answer:
+        asking.append(question)
+        while not stopped():
+            time.sleep(0.01)
+        return Answer.NO
+
+    rescorer = Rescorer(Clearances(ask=ask))
+    try:
+        rescorer.start(find_episodes((foreign / "recordings",)))
+        deadline = time.monotonic() + PATIENCE
+        while not asking:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        assert rescorer.view.state == "asking"
+        rescorer.stop()
+        until(rescorer, "stopped")
+    finally:
+        rescorer.close()
+    assert len(asking) == 1 and not ran(foreign)
+
+
+def until(rescorer: Rescorer, *states: str) -> RescoreView:
+    deadline = time.monotonic() + PATIENCE
+    while rescorer.view.state not in states:
+        assert time.monotonic() < deadline, rescorer.view
+        time.sleep(0.02)
+    return rescorer.view

@@ -1,0 +1,149 @@
+"""The seal of a recording: by it this installation knows what it recorded itself, also after others had it in hand.
+
+A keyed hash (HMAC-SHA256) with a key that is made once, at random, and that only this user can read. It covers what
+decides which code runs when the recording is judged or gone into (task, text, keywords), and what its files hash to
+(`checksums`). Tags and notes may change; a moved recording keeps it. Where the task's file lay has a hash of its own: a
+recording that comes back from elsewhere with another file beside it must not pass for the one that was open here.
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+import logging
+import os
+import secrets
+from collections.abc import Mapping, Sequence
+from enum import Enum
+from hashlib import sha256
+from typing import Any
+
+from workbench.machine.user_folder import create_private, read_private, set_aside
+from workbench.recording.episode import EpisodeInfo, Seal
+
+log = logging.getLogger(__name__)
+
+KEY_FILE = "recordings.key"
+_KEY_BYTES = 32
+_COVERED = (
+    "id", "task", "env_index", "seed", "control_dt", "control_mode", "backend", "versions", "env_kwargs",
+    "reset_options", "max_episode_steps", "written_at", "source_hash", "source", "side_files", "recovered",
+)  # fmt: skip
+"""Names that `EpisodeInfo` and a recording's description share."""
+_told: set[str] = set()
+
+
+class MadeHere(Enum):
+    NO = "no"
+    """It came from elsewhere, or was changed, or the key is gone."""
+    CONTENT = "content"
+    """This installation recorded it; but its task's file lay elsewhere, or is gone."""
+    CONTENT_AND_PLACE = "content and place"
+    """And the file that it names now is the one that was open then (with another text, perhaps)."""
+
+
+def seal(said: Mapping[str, Any], source_file: str | None) -> dict[str, Any] | None:
+    """For the description `said` of a recording that is being made; None, which is told once, where there can be no key.
+
+    Args:
+        source_file: the absolute path of the task's file.
+    """
+    try:
+        key = _key() or _new_key()
+    except OSError as error:
+        _tell_once(f"What is recorded is not known as recorded here when it is judged again: {error}")
+        return None
+    values = {name: said.get(name) for name in _COVERED}
+    content = _content(values, said.get("source_file"), said.get("files"), said.get("acted_by") or ())
+    return {"content": _mac(key, "content", content), "place": _mac(key, "place", source_file or "")}
+
+
+def seal_from(said: Mapping[str, Any]) -> Seal | None:
+    """What a description holds of a seal, to be checked by `made_here`."""
+    held = said.get("made_here")
+    if not isinstance(held, dict):
+        return None
+    return Seal(str(held.get("content")), str(held.get("place")), said.get("source_file"), said.get("files"))
+
+
+def made_here(info: EpisodeInfo) -> MadeHere:
+    """Whether this installation made the recording that `info` was read from."""
+    found = info.seal
+    if found is None:
+        return MadeHere.NO
+    try:
+        key = _key()
+        values = {name: getattr(info, name) for name in _COVERED}
+        values["seed"] = info.seed if info.seed >= 0 else None
+        content = _content(values, found.main, found.files, info.acted_by)
+    except OSError as error:
+        _tell_once(f"Recordings that were made here cannot be told from others: {error}")
+        return MadeHere.NO
+    except (TypeError, ValueError, RecursionError):
+        return MadeHere.NO
+    if key is None or not _same(found.content, _mac(key, "content", content)):
+        return MadeHere.NO
+    place = _mac(key, "place", info.source_file or "")
+    there = info.source_file is not None and os.path.isabs(info.source_file) and _same(found.place, place)
+    return MadeHere.CONTENT_AND_PLACE if there else MadeHere.CONTENT
+
+
+def seal_text(text: str) -> str | None:
+    """A seal of any other text that this installation writes and reads back, such as the head of a journal; None as `seal`."""
+    try:
+        return _mac(_key() or _new_key(), "text", text)
+    except OSError as error:
+        _tell_once(f"What is recorded is not known as recorded here when it is judged again: {error}")
+        return None
+
+
+def is_sealed(text: str, found: object) -> bool:
+    """Whether `found` is what `seal_text` gave for `text` here."""
+    try:
+        key = _key()
+    except OSError:
+        return False
+    return key is not None and isinstance(found, str) and _same(found, _mac(key, "text", text))
+
+
+def _content(values: Mapping[str, Any], main: Any, files: Any, acted_by: Sequence[Sequence[Any]]) -> str:
+    """One text for what JSON reads back as the same."""
+    whole = [values, main, files, [list(pair) for pair in acted_by]]
+    return json.dumps(json.loads(json.dumps(whole, default=str)), sort_keys=True)
+
+
+def _mac(key: bytes, what: str, text: str) -> str:
+    return hmac.new(key, f"{what}\0{text}".encode("utf-8", "surrogatepass"), sha256).hexdigest()
+
+
+def _same(left: str, right: str) -> bool:
+    return hmac.compare_digest(left.encode("utf-8", "surrogatepass"), right.encode())
+
+
+def _key() -> bytes | None:
+    """None where there is none, or what is there is none."""
+    written = read_private(KEY_FILE)
+    try:
+        key = None if written is None else bytes.fromhex(written.decode("ascii"))
+    except ValueError:
+        return None
+    return key if key is not None and len(key) == _KEY_BYTES else None
+
+
+def _new_key() -> bytes:
+    if read_private(KEY_FILE) is not None:
+        broken = set_aside(KEY_FILE)
+        _tell_once(
+            f"The key of this installation's recordings was broken, and is {broken} now: there is a new one."
+        )
+    create_private(KEY_FILE, secrets.token_hex(_KEY_BYTES).encode())  # or another process did, a moment ago
+    key = _key()
+    if key is None:
+        raise OSError("the key that was written cannot be read back")
+    return key
+
+
+def _tell_once(what: str) -> None:
+    if what not in _told:
+        _told.add(what)
+        log.warning("%s", what)

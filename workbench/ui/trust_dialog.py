@@ -1,0 +1,147 @@
+"""The window that asks whether code that a recording names may run.
+
+One window at a time, on every open page; whoever answers first has answered. Only a press of one of its buttons is a yes:
+Escape, a page that is closed, and the end of what wanted to run it are a no.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import viser
+
+from workbench.session.clearance import Answer, Question
+from workbench.ui.fragments import render
+from workbench.ui.library_forms import Question as Window
+from workbench.ui.review_page import Places
+
+TITLE = "Run this code?"
+DO_NOT, ONCE, ALWAYS = (
+    "Don't run it",
+    "Run it, and ask again next time",
+    "Run it, and trust this text from now on",
+)
+MOST_NAMED = 8
+"""Files that are named; the rest is counted."""
+_LOOK = 0.1
+"""Seconds between two looks at whether the answer is still wanted."""
+
+
+@dataclass
+class _Pending:
+    question: Question
+    answered: threading.Event = field(default_factory=threading.Event)
+    answer: Answer = Answer.NO
+
+    def take(self, answer: Answer) -> None:
+        """The first answer counts."""
+        if not self.answered.is_set():
+            self.answer = answer
+            self.answered.set()
+
+
+class TrustDialog:
+    """See the module's text."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._lock = threading.RLock()
+        self._waiting: list[_Pending] = []
+        """The first is shown."""
+        self._window: Window | None = None
+        self._escape: viser.CommandHandle | None = None
+        self._closed = False
+        self._asking: Callable[[bool], None] = lambda asking: None
+
+    def part(self, server: viser.ViserServer, places: Places) -> None:
+        """For the review page, whose table of recordings takes no keys while something is asked."""
+        if places.library is not None:
+            self._asking = places.library.leave_keys
+        with self._lock:
+            self._asking(bool(self._waiting))
+
+    def ask(self, question: Question, stopped: Callable[[], bool]) -> Answer:
+        """Show the question, and wait for the answer. Not to be called on viser's own threads.
+
+        Args:
+            stopped: asked often; True withdraws the question.
+        """
+        pending = _Pending(question)
+        with self._lock:
+            self._waiting.append(pending)
+        try:
+            while not self._closed and not stopped():
+                self._keep_shown()
+                if pending.answered.wait(_LOOK):
+                    return pending.answer
+            return Answer.NO
+        finally:
+            with self._lock:
+                if self._waiting[0] is pending:
+                    self._take_down()
+                self._waiting.remove(pending)
+                self._asking(bool(self._waiting))
+
+    def close(self) -> None:
+        """Take every question back."""
+        self._closed = True
+
+    def _keep_shown(self) -> None:
+        """The window of the first question; a page that went has taken it along."""
+        with self._lock:
+            if self._window is not None and not self._window.modal.closed:
+                return
+            pending = self._waiting[0]
+            question = pending.question
+            gui = self._server.gui
+            with self._server.atomic():
+                self._window = Window(self._server, TITLE, lambda: None)
+                with self._window.modal:
+                    gui.add_html(question_html(question))
+                    # The first has the focus: Enter must not run anything.
+                    self._add_button(DO_NOT, None, viser.Icon.X, pending, Answer.NO)
+                    if question.more:
+                        label = f"Nor the {question.more} more that are asked about"
+                        self._add_button(label, "gray", viser.Icon.X, pending, Answer.NONE)
+                    self._add_button(ONCE, "gray", viser.Icon.PLAYER_PLAY, pending, Answer.ONCE)
+                    self._add_button(ALWAYS, "gray", viser.Icon.SHIELD_CHECK, pending, Answer.ALWAYS)
+                self._escape = gui.add_command(DO_NOT, hotkey="escape")
+                self._escape.on_trigger(lambda _: pending.take(Answer.NO))
+            self._asking(True)
+
+    def _add_button(
+        self,
+        label: str,
+        color: Literal["gray"] | None,
+        icon: viser.IconName,
+        pending: _Pending,
+        answer: Answer,
+    ) -> None:
+        button = self._server.gui.add_button(label, color=color, icon=icon)
+        button.on_click(lambda _: pending.take(answer))
+
+    def _take_down(self) -> None:
+        window, escape = self._window, self._escape
+        self._window = self._escape = None
+        # False where the page went, and with it the window and the key.
+        if window is not None and window.close() and escape is not None:
+            escape.remove()
+
+
+def question_html(question: Question) -> str:
+    """What would run; every value escaped."""
+    return render(
+        "trust_question",
+        file=question.file,
+        task=question.task,
+        recorded_text=question.recorded_text,
+        hash=question.hash,
+        modules=question.modules[:MOST_NAMED],
+        more_modules=max(0, len(question.modules) - MOST_NAMED),
+        unseen=question.unseen[:MOST_NAMED],
+        more_unseen=max(0, len(question.unseen) - MOST_NAMED),
+        changed=question.changed,
+    )
