@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsed
 from rich.progress import Progress as Bar
 from rich.table import Table
 
-from workbench.machine.start_folder import in_start_folder
+from workbench.machine.current_folder import CurrentFolder
 from workbench.session import rescore_words as words
 from workbench.session.rescore_all import Progress, RescoreOptions, rescore_all
 from workbench.session.rescore_messages import Verdict
@@ -20,6 +20,7 @@ from workbench.session.rescore_messages import Verdict
 
 def run_rescore(what: RescoreOptions, out: Console, err: Console, csv: Path | None, json: Path | None) -> int:
     """Judge, print, write the tables that are asked for; raises as `rescore_all`, and OSError for a table."""
+    here = CurrentFolder()  # a task may go to another
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Bar(*columns, console=err) as bar:
         row = bar.add_task("reading the recordings", total=None)
@@ -33,7 +34,7 @@ def run_rescore(what: RescoreOptions, out: Console, err: Console, csv: Path | No
         bar.update(row, total=len(verdicts), completed=len(verdicts), description="judged")
     for path, text in ((csv, words.as_csv), (json, words.as_json)):
         if path is not None:
-            with in_start_folder():
+            with here.again():
                 words.write_table(path, text(verdicts))
     print_verdicts(verdicts, out)
     for note in (*notes, *words.not_carried(verdicts)):

@@ -172,7 +172,11 @@ class LiveRecorder:
             self._end()
             with self._lock:
                 self._env_idx, self._problem = (), f"the recording ended: {error}"
-        left = () if self._gatherer is None else gatherer.env_idx
+            # Nothing more of `_env_idx`: another recording may have been started by now.
+            self._on_envs(())
+            self._on_change()
+            return
+        left = gatherer.env_idx
         if left != before:
             with self._lock:
                 self._env_idx = tuple(env for env in self._env_idx if env in left)

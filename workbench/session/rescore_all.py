@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from workbench.authoring.problem import TaskError
-from workbench.machine.start_folder import in_start_folder
+from workbench.machine.current_folder import CurrentFolder
 from workbench.session.messages import TaskOptions
 from workbench.session.open_task import OpenedTask, open_task
 from workbench.session.rescore import find_episodes, group_episodes, not_judged, with_renderer
@@ -52,6 +52,7 @@ def rescore_all(
         CannotStepIn: as TaskError, where a recorded text cannot be opened.
     """
     torch.set_num_threads(1)  # see workbench.session.worker.work
+    here = CurrentFolder()
     files = find_episodes([place.absolute() for place in what.places])
     groups, verdicts = group_episodes(
         files, what.num_envs, what.base, task=what.task, recorded_source=what.recorded_source
@@ -64,7 +65,7 @@ def rescore_all(
         try:
             if what.recorded_source:
                 folder, reference = write_source(group.info)
-            opened = _open(reference, group.options, on_activity)
+            opened = _open(reference, group.options, on_activity, here)
             before = steps
 
             def tell(now: int, before: int = before) -> None:
@@ -93,8 +94,10 @@ def rescore_all(
     return verdicts, tuple(dict.fromkeys(group.note for group in groups if group.note))
 
 
-def _open(reference: str, options: TaskOptions, on_activity: Callable[[str], None]) -> OpenedTask:
-    with in_start_folder(stay=True):  # the task before may have gone to another one
+def _open(
+    reference: str, options: TaskOptions, on_activity: Callable[[str], None], here: CurrentFolder
+) -> OpenedTask:
+    with here.again(stay=True):  # the task before may have gone to another one
         try:
             return open_task(reference, options, on_activity=on_activity)
         except TaskError:
