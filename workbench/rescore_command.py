@@ -15,7 +15,7 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 
 from workbench.exit_codes import Exit
-from workbench.machine.start_folder import in_start_folder
+from workbench.machine.current_folder import CurrentFolder
 from workbench.machine.terminal_text import plain_text
 from workbench.session import rescore_words as words
 from workbench.session.clearance import Clearances
@@ -28,6 +28,7 @@ def run_rescore(
     what: RescoreOptions, out: Console, err: Console, csv: Path | None, json: Path | None, trust: bool = False
 ) -> int:
     """Judge, print, write the tables that are asked for; raises as `rescore_all`, and OSError for a table."""
+    here = CurrentFolder()  # a task may go to another
     asks = can_ask()  # before the bar takes the terminal
     columns = (
         TextColumn("{task.description}", markup=False),
@@ -59,7 +60,7 @@ def run_rescore(
         bar.update(row, total=len(verdicts), completed=len(verdicts), description="judged")
     for path, text in ((csv, words.as_csv), (json, words.as_json)):
         if path is not None:
-            with in_start_folder():
+            with here.again():
                 words.write_table(path, text(verdicts))
     print_verdicts(verdicts, out)
     for note in (*notes, *words.not_carried(verdicts)):

@@ -193,5 +193,6 @@ def test_a_load_asks_for_the_class_and_the_seed_that_the_page_chose() -> None:
     assert state.choose_class("Other")
     state.seed = 7
     load = state.load_request(Wanted(None, b"moment"), "rebuilt")
-    assert load.task.endswith("push.py:Other") and load.options == TaskOptions(seed=7)
+    assert isinstance(load.task, str) and load.task.endswith("push.py:Other")
+    assert load.options == TaskOptions(seed=7)
     assert (load.source, load.level, load.snapshot) == (None, "rebuilt", b"moment")

@@ -255,6 +255,22 @@ def test_what_was_kept_before_a_failure_is_said(tmp_path: Path, capsys: pytest.C
     assert "1 episode that had ended before is kept: workbench review" in capsys.readouterr().out
 
 
+def test_a_task_that_goes_to_another_folder_changes_nothing_about_where_files_go(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (TASKS / "minimal.py").read_text()
+    (tmp_path / "goes.py").write_text(f"import os\n\nos.chdir('/')\n{text}")
+    (tmp_path / "act.py").write_text("def still(obs):\n    return obs.new_zeros(len(obs), 8)\n")
+    monkeypatch.chdir(tmp_path)
+    options = TaskOptions(num_envs=1)
+    what = RecordOptions(
+        "goes.py", Path("out"), 1, actions="act.py:still", pictures=False, max_steps=2, options=options
+    )
+    (written,) = record(what).written
+    assert written.path.parent == Path("out") and (tmp_path / written.path).is_file()
+    assert Path.cwd() == tmp_path
+
+
 def test_a_keyword_that_the_task_does_not_take_is_named(tmp_path: Path) -> None:
     options = TaskOptions(num_envs=1, env_kwargs={"colour": "red"})
     with pytest.raises(TaskError, match="unexpected keyword argument 'colour'"):

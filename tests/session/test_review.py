@@ -194,6 +194,21 @@ def test_more_than_can_be_open_are_left_out_with_a_word() -> None:
     assert len(view.opened) == MOST_OPEN and f"At most {MOST_OPEN}" in view.problems[0]
 
 
+def test_what_is_open_at_once_may_take_so_much_memory_and_no_more() -> None:
+    shelf, held = Shelf({f"e{i}": made(2) for i in range(6)}), []
+
+    def read(row: Row, shapes: SharedShapes) -> Episode:
+        held.append(np.ones(2**23))
+        return shelf.read(row, shapes)
+
+    review = Review(shelf, read, clock=shelf.clock, most_bytes=100 * 2**20)  # type: ignore[arg-type]
+    review.open([f"e{i}" for i in range(6)])
+    view = until(review, lambda v: bool(v.problems) and not v.loading, "the word for it")
+    assert len(view.opened) == 2 == len(held)
+    assert "and 3 more were not opened: those before take 100 MB" in view.problems[0]
+    review.close()
+
+
 def test_files_that_change_or_go_are_said_and_stay_open(tmp_path: Path) -> None:
     changed, gone = tmp_path / "a.rrd", tmp_path / "a.h5"
     changed.write_text("1")

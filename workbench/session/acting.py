@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from workbench.authoring.problem import TaskError
 from workbench.core import actions
 from workbench.core.task_env import TaskEnv
-from workbench.machine.start_folder import in_start_folder
+from workbench.machine.current_folder import CurrentFolder
 from workbench.session.messages import ActionSource
 from workbench.session.policy import Policy, load_policy, problem_of
 
@@ -23,11 +23,13 @@ from workbench.session.policy import Policy, load_policy, problem_of
 class Acting:
     """Chooses the action of every control step."""
 
-    def __init__(self, *, ctrl_c_leaves: bool = False) -> None:
+    def __init__(self, folder: CurrentFolder, *, ctrl_c_leaves: bool = False) -> None:
         """
         Args:
+            folder: from which a relative policy is meant.
             ctrl_c_leaves: a KeyboardInterrupt is a person's at the terminal; else the policy itself raised it.
         """
+        self._folder = folder
         self._leaves = (KeyboardInterrupt,) if ctrl_c_leaves else ()
         self._source: ActionSource = "random"
         self._policy: Policy | None = None
@@ -65,7 +67,7 @@ class Acting:
         if source != "policy" or not self._policy_name:
             return
         try:
-            with in_start_folder():
+            with self._folder.again():
                 self._policy = load_policy(self._policy_name, beside)
         except BaseException as error:
             if isinstance(error, self._leaves):
@@ -85,7 +87,7 @@ class Acting:
             # Never another action in its place: the page says that the policy acts.
             try:
                 if self._policy is None:
-                    with in_start_folder():
+                    with self._folder.again():
                         self._policy = load_policy(self._policy_name, self._beside)
                 return actions.to_flat_action(task.env, task.parts, self._policy(task.obs))
             except BaseException as error:

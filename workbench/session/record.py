@@ -25,7 +25,7 @@ from workbench.core.state_columns import read_state_columns
 from workbench.core.state_names import states_of
 from workbench.core.step import StepResult
 from workbench.core.step_pictures import step_pictures
-from workbench.machine.start_folder import in_start_folder
+from workbench.machine.current_folder import CurrentFolder
 from workbench.recording.episode_writer import EpisodeFiles
 from workbench.recording.landing import RecordingError
 from workbench.session.acting import Acting
@@ -216,12 +216,14 @@ def run_episodes(
         on_steps: called after each control step of the batch with the number of envs that had an episode.
     """
     torch.set_num_threads(1)  # see workbench.session.worker.work
-    with in_start_folder():
-        return _run_share(what, given, dealing, on_written, on_activity, on_steps, stop)
+    here = CurrentFolder()  # the task may go to another
+    with here.again():
+        return _run_share(what, here, given, dealing, on_written, on_activity, on_steps, stop)
 
 
 def _run_share(
     what: RecordOptions,
+    here: CurrentFolder,
     given: GivenEpisodes | None,
     dealing: Dealing,
     on_written: Callable[[Written], None],
@@ -229,10 +231,10 @@ def _run_share(
     on_steps: Callable[[int], None],
     stop: Callable[[], bool],
 ) -> int:
-    folder = what.out.absolute()  # now: the task may go to another folder
+    folder = what.out.absolute()
     opened = open_task(what.task, what.options, on_activity=on_activity)
     finisher = EpisodeFinisher()
-    share = _Share(opened, what, folder, given, dealing, finisher, on_written)
+    share = _Share(opened, what, here, folder, given, dealing, finisher, on_written)
     try:
         share.run(on_steps, stop)
     finally:
@@ -252,6 +254,7 @@ class _Share:
         self,
         opened: OpenedTask,
         what: RecordOptions,
+        here: CurrentFolder,
         folder: Path,
         given: GivenEpisodes | None,
         dealing: Dealing,
@@ -263,7 +266,7 @@ class _Share:
         self._envs = list(range(opened.env.num_envs))
         self._gatherer = EpisodeGatherer(opened.description, self._envs, folder, self._over, ends="reset")
         plain = given is None and what.actions != "random"
-        self._acting = RecordActing(_acting(what) if plain else None)
+        self._acting = RecordActing(_acting(what, here) if plain else None)
         self._wanted = recorded_pictures(opened.description.cameras) if what.pictures else ()
         self._running: dict[int, int] = {}
         """Number of the episode in each env that has one."""
@@ -406,12 +409,13 @@ class _Share:
             episode.writer.discard()
 
 
-def _acting(what: RecordOptions) -> Acting:
-    acting = Acting(ctrl_c_leaves=True)
+def _acting(what: RecordOptions, here: CurrentFolder) -> Acting:
+    acting = Acting(here, ctrl_c_leaves=True)
     acting.seed(what.options.seed)
     if what.actions in ("hold", "zero"):
         acting.use(what.actions, None)
     else:
-        file = named_file(what.task)
+        with here.again():
+            file = named_file(what.task)
         acting.use("policy", what.actions, None if file is None else file.parent)
     return acting

@@ -172,7 +172,11 @@ class LiveRecorder:
             self._end()
             with self._lock:
                 self._env_idx, self._problem = (), f"the recording ended: {error}"
-        left = () if self._gatherer is None else gatherer.env_idx
+            # Nothing more of `_env_idx`: another recording may have been started by now.
+            self._on_envs(())
+            self._on_change()
+            return
+        left = gatherer.env_idx
         if left != before:
             with self._lock:
                 self._env_idx = tuple(env for env in self._env_idx if env in left)
@@ -220,7 +224,9 @@ def recovered_in_words(paths: Sequence[str]) -> str:
 
 
 def _size(stepped: Stepped) -> int:
-    arrays = [*stepped.columns.values(), stepped.step.poses]
+    step = stepped.step
+    arrays = [*stepped.columns.values(), *step.evaluate.values(), step.poses, step.reward]
     for picture in stepped.captured:
         arrays += [a for a in (picture.rgb, picture.depth, picture.segmentation) if a is not None]
-    return sum(array.nbytes for array in arrays)
+    kept = len(stepped.snapshot) + sum(map(len, stepped.new_parts.values()))
+    return kept + sum(array.nbytes for array in arrays)

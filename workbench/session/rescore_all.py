@@ -11,7 +11,7 @@ import torch
 
 from workbench.authoring.problem import TaskError
 from workbench.authoring.reference import TaskName
-from workbench.machine.start_folder import in_start_folder
+from workbench.machine.current_folder import CurrentFolder
 from workbench.session.clearance import Clearances, NotCleared, NotTrusted
 from workbench.session.messages import TaskOptions
 from workbench.session.open_task import OpenedTask, open_task
@@ -59,6 +59,7 @@ def rescore_all(
         CannotStepIn: as TaskError, where a recorded text cannot be opened.
     """
     torch.set_num_threads(1)  # see workbench.session.worker.work
+    here = CurrentFolder()
     files = find_episodes([place.absolute() for place in what.places])
     groups, verdicts = group_episodes(
         files, what.num_envs, what.base, task=what.task, recorded_source=what.recorded_source
@@ -73,7 +74,7 @@ def rescore_all(
                 raise CannotStepIn(str(reference)) from reference
             if what.recorded_source:
                 folder, reference = write_source(group.info)
-            opened = _open(reference, group.options, on_activity)
+            opened = _open(reference, group.options, on_activity, here)
             before = steps
 
             def tell(now: int, before: int = before) -> None:
@@ -111,8 +112,10 @@ def _cleared(groups: list[Group], clearances: Clearances) -> list[TaskName | Not
     return cleared
 
 
-def _open(reference: TaskName, options: TaskOptions, on_activity: Callable[[str], None]) -> OpenedTask:
-    with in_start_folder(stay=True):  # the task before may have gone to another one
+def _open(
+    reference: TaskName, options: TaskOptions, on_activity: Callable[[str], None], here: CurrentFolder
+) -> OpenedTask:
+    with here.again(stay=True):  # the task before may have gone to another one
         try:
             return open_task(reference, options, on_activity=on_activity)
         except TaskError:

@@ -26,6 +26,7 @@ from workbench.core.shared_shapes import SharedShapes
 from workbench.machine.watched_thread import say_failure
 from workbench.recording.episode import Episode
 from workbench.recording.unreadable import UnreadableRecording
+from workbench.session.memory_limit import in_words, total_memory
 from workbench.session.recorded_scene import SceneError
 from workbench.session.review_events import happenings
 from workbench.session.review_rows import (
@@ -46,8 +47,8 @@ log = logging.getLogger(__name__)
 MOST_COMPARED = 4
 """Recordings that are drawn over each other; more cannot be told apart."""
 MOST_OPEN = 64
-MOST_HELD = 3 << 30
-"""Bytes that recordings may take that are open, after which no further one is opened."""
+MEMORY_SHARE = 0.25
+"""Of the machine's memory, for the recordings that are open: the page is not to be ended for want of it."""
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 FIRST_SHOWN = 0.4
 """Seconds after which the recordings that are read are shown while others are read; then after twice that, and so on:
@@ -86,6 +87,7 @@ class Review:
         read: Callable[[Row, SharedShapes], Episode] = read_row,
         make_scene: SceneMaker | None = None,
         clock: Callable[[], float] = time.monotonic,
+        most_bytes: int | None = None,
     ) -> None:
         """
         Args:
@@ -93,7 +95,9 @@ class Review:
             read: reads the recording of a row, with shapes of others; raises OSError or UnreadableRecording with a sentence.
             make_scene: for recordings without a scene; None leaves them without.
             clock: seconds.
+            most_bytes: of memory that the recordings which are opened at once may take; None for `MEMORY_SHARE`.
         """
+        self._most_bytes = int(MEMORY_SHARE * total_memory()) if most_bytes is None else most_bytes
         self._library, self._read, self._make_scene, self._clock = library, read, make_scene, clock
         self._changed = threading.Condition()
         self._view = ReviewView()
@@ -207,6 +211,13 @@ class Review:
         shown_at, wait = time.monotonic(), FIRST_SHOWN
         held, counted = 0, set[int]()
         for done, row in enumerate(rows):
+            if opened and held > self._most_bytes:
+                left = len(rows) - done
+                said.append(
+                    f"{row.name} {f'and {left - 1} more were' if left > 1 else 'was'} not opened: those before take "
+                    f"{in_words(self._most_bytes)} of memory. Open fewer at once."
+                )
+                break
             with self._changed:
                 if number != self._opening:
                     return
@@ -215,11 +226,6 @@ class Review:
                     shown_at, wait = time.monotonic(), 2 * wait
                 self._change(loading=opening_words(rows, done))
             stamps = stamps_of(row)
-            if held > MOST_HELD:
-                said.append(
-                    f"{row.name} was not opened: those before it take {held / 2**30:.1f} GB of memory. Open fewer at once."
-                )
-                continue
             try:
                 episode = shared(self._read(row, shapes), shapes)
                 held += size_of(episode, counted)

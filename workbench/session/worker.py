@@ -33,7 +33,7 @@ from workbench.authoring.reference import named_file
 from workbench.core.camera_configs import note_camera_sites
 from workbench.core.inspect_env import inspect_env
 from workbench.core.step import StepResult
-from workbench.machine.start_folder import in_start_folder
+from workbench.machine.current_folder import CurrentFolder
 from workbench.session import rescore_run
 from workbench.session.acting import Acting
 from workbench.session.camera_messages import (
@@ -104,7 +104,8 @@ class Worker:
         self._loaded_by: Load | None = None
         self._last: StepResult | None = None
         self._playing = False
-        self._acting = Acting()
+        self._started_in = CurrentFolder()
+        self._acting = Acting(self._started_in)
         self._episode_end: EpisodeEnd = "reset"
         self._pacer = Pacer(0.05)
         self._rate = Rate()
@@ -167,13 +168,14 @@ class Worker:
 
     def _load(self, request: Load) -> None:
         self._cameras.settle()
-        self._held.asked_for = named_file(request.task)
+        with self._started_in.again():
+            self._held.asked_for = named_file(request.task)
         before, running = self._held.opened, None
         if before is not None and self._loaded_by is not None and self._last is not None:
             running = Running(self._loaded_by, before, self._last)
         try:
             # What the version before did to the current folder is not for this one, unless it fails.
-            with in_start_folder(stay=True):
+            with self._started_in.again(stay=True):
                 opened, report = load_version(
                     request, running, on_activity=lambda activity: self._line.send(Loading(activity))
                 )
