@@ -188,8 +188,9 @@ class Reader:
         self._turns = _Turns()
         self._pid = 0
         self._connection: socket.socket | None = None
+        self._there: tuple[tuple[int, int] | None, ...] = ()
+        """What those and the folder were when the present process began."""
         self._forgotten: deque[tuple[int, int]] = deque()
-        self._closed = False
         self.process = 0
         """The number of the present process; 0 where there is none."""
 
@@ -259,13 +260,18 @@ class Reader:
             self._kill()
 
     def _started(self) -> socket.socket:
-        if self._connection is not None and select.select([self._connection], [], [], 0)[0]:
+        paths = (self._folder, *sorted(self._allowed))
+        # It may read what was there when it began: a folder that was made anew is another one.
+        there = tuple(map(_identity, paths))
+        if self._connection is not None and (
+            there != self._there
             # Nothing is asked, so this is its end: nobody's fault but of who ended it.
+            or select.select([self._connection], [], [], 0)[0]
+        ):
             self._kill()
         if self._connection is None:
-            paths = (self._folder, *sorted(self._allowed))
             self._pid, self._connection = _nursery.new_reader(paths, self._episodes)
-            self.process = next(self._numbers)
+            self.process, self._there = next(self._numbers), there
         return self._connection
 
     def _send_forgotten(self, connection: socket.socket) -> None:
@@ -320,6 +326,14 @@ class _Turns:
             with self._changed:
                 self._waiting.remove(me)
                 self._changed.notify_all()
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    try:
+        found = os.stat(path)
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
 
 
 def _in_words(status: int) -> str:
