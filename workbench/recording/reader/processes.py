@@ -224,8 +224,13 @@ class Reader:
         patience: float | None = None,
         process: int | None = None,
     ) -> list[Answered | ReaderEnded]:
-        """Several at once, of which each may take so long; one that ends the reader does not end the others."""
+        """Several at once, of which each may take so long; one that ends the reader does not end the others.
+
+        One whose reader dies is asked for once more: somebody else may have killed it.
+        """
         answers: list[Answered | ReaderEnded] = []
+        again = -1
+        """The number of the one that is asked for once more."""
         with self._turns.turn(patience):
             while len(answers) < len(requests):
                 connection = self._started()
@@ -240,7 +245,11 @@ class Reader:
                         answer, arrays = receive(connection, ANSWERS, time.monotonic() + seconds)
                         answers.append(Answered(answer, arrays, self.process))
                 except (Closed, TookTooLong, Garbled) as error:
-                    answers.append(self._ended(error, seconds))
+                    ended = self._ended(error, seconds)
+                    if isinstance(error, Closed) and again != len(answers):
+                        again = len(answers)
+                    else:
+                        answers.append(ended)
         return answers
 
     def allow(self, paths: Sequence[Path]) -> None:
