@@ -35,7 +35,6 @@ from workbench.session.review_rows import (
     opening_words,
     read_row,
     shared,
-    size_of,
     stamps_of,
 )
 from workbench.session.review_view import START, Opened, ReviewView
@@ -45,8 +44,6 @@ log = logging.getLogger(__name__)
 MOST_COMPARED = 4
 """Recordings that are drawn over each other; more cannot be told apart."""
 MOST_OPEN = 64
-MOST_HELD = 3 << 30
-"""Bytes that recordings may take that are open, after which no further one is opened."""
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 4.0)
 FIRST_SHOWN = 0.4
 """Seconds after which the recordings that are read are shown while others are read; then after twice that, and so on:
@@ -204,7 +201,6 @@ class Review:
         shapes = SharedShapes()
         files: dict[Path, Stamp] = {}
         shown_at, wait = time.monotonic(), FIRST_SHOWN
-        held, counted = 0, set[int]()
         for done, row in enumerate(rows):
             with self._changed:
                 if number != self._opening:
@@ -214,14 +210,8 @@ class Review:
                     shown_at, wait = time.monotonic(), 2 * wait
                 self._change(loading=opening_words(rows, done))
             stamps = stamps_of(row)
-            if held > MOST_HELD:
-                said.append(
-                    f"{row.name} was not opened: those before it take {held / 2**30:.1f} GB of memory. Open fewer at once."
-                )
-                continue
             try:
                 episode = shared(self._read(row, shapes), shapes)
-                held += size_of(episode, counted)
                 opened.append(Opened(row.id, row.name, episode, happenings(episode)))
                 files.update(stamps)
                 said += [broken.sentence for broken in episode.unread]
