@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import io
+import struct
+import zlib
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis.extra import numpy as hnp
+from PIL import Image
 
 from workbench.recording.encoded_pictures import EncodedPictures, encode
 
@@ -48,3 +53,23 @@ def test_colour_keeps_rows_and_channels_apart() -> None:
 def test_what_is_no_picture_is_an_error() -> None:
     with pytest.raises(OSError):
         EncodedPictures("rgb", [b"not a picture"])[0]
+
+
+def test_a_picture_that_claims_too_many_pixels_or_is_of_another_format_is_refused() -> None:
+    def png(width: int, height: int) -> bytes:
+        header = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
+        chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(bytes(1000))), (b"IEND", b""))
+        return b"\x89PNG\r\n\x1a\n" + b"".join(
+            struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+            for kind, content in chunks
+        )
+
+    for width, height in ((5000, 5000), (60_000, 60_000), (0, 5)):
+        with pytest.raises(OSError, match="pixels|no picture"):
+            EncodedPictures("depth", [png(width, height)])[0]
+    written = io.BytesIO()
+    Image.new("RGB", (4, 4)).save(written, "GIF")
+    with pytest.raises(OSError):
+        EncodedPictures("rgb", [written.getvalue()])[0]
+    with pytest.raises(OSError, match="no depth"):
+        EncodedPictures("depth", [encode("rgb", np.zeros((4, 4, 3), np.uint8))])[0]

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -211,3 +213,44 @@ def test_a_dataset_is_in_the_library_an_episode_a_row(
         assert is_lerobot(tmp_path / "sets" / "push")
     finally:
         library.close()
+
+
+def test_a_film_that_is_a_playlist_names_no_other_file(episode: Episode, tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    export(folder, episode)
+    (film, *_) = sorted(folder.glob("videos/**/*.mp4"))
+    other = tmp_path / "other.mp4"
+    shutil.copyfile(film, other)
+    playlists = (
+        f"ffconcat version 1.0\nfile {other}\n",
+        f"#EXTM3U\n#EXT-X-TARGETDURATION:5\n#EXTINF:5,\nfile:{other}\n#EXT-X-ENDLIST\n",
+    )
+    for playlist in playlists:
+        film.write_text(playlist)
+        pictures = read_lerobot(folder, 0).cameras[0].rgb
+        assert pictures is not None
+        with pytest.raises(UnreadableRecording, match="cannot be read"):
+            pictures[0]
+
+
+def test_what_a_dataset_claims_is_bounded(episode: Episode, tmp_path: Path) -> None:
+    folder = tmp_path / "set"
+    export(folder, episode)
+    info = json.loads((folder / "meta/info.json").read_text())
+    camera = next(key for key, feature in info["features"].items() if feature["dtype"] == "video")
+
+    def said(change: dict[str, Any]) -> None:
+        (folder / "meta/info.json").write_text(json.dumps({**info, **change}))
+
+    # Python's own formatting would write a gigabyte, or say what an object is made of.
+    for pattern in ("data/{chunk_index:01000000000d}.parquet", "data/{chunk_index.__class__}.parquet"):
+        said({"data_path": pattern})
+        with pytest.raises(UnreadableRecording, match="no LeRobot dataset"):
+            read_lerobot(folder, 0)
+    huge = {**info["features"][camera], "shape": [100_000, 100_000, 3]}
+    said({"features": {**info["features"], camera: huge}})
+    with pytest.raises(UnreadableRecording, match="100000 x 100000"):
+        read_lerobot(folder, 0)
+    said({})
+    os.mkfifo(folder / "data" / "chunk-000" / "file-001.parquet")
+    assert lerobot_rows(folder)[0].length == episode.length

@@ -32,7 +32,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from workbench.core.geometry import SceneGeometry
-from workbench.machine.regular_file import read_regular_file
 from workbench.recording.checksums import checksum
 from workbench.recording.columns import Column
 from workbench.recording.episode import EpisodeInfo, acted_by_from
@@ -159,10 +158,9 @@ def _source_where(path: str, task: str, folder: Path) -> Path | None:
         for begin in range(len(parts)):
             candidate = place.joinpath(*parts[begin:])
             try:
-                content = read_regular_file(candidate, MOST_SOURCE_BYTES)
-                if task.encode() in content:
+                if candidate.is_file() and task in candidate.read_text(encoding="utf-8"):
                     return candidate
-            except (OSError, ValueError):
+            except (OSError, UnicodeDecodeError):
                 continue
     return None
 

@@ -20,7 +20,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from workbench.recording.png16 import encode_png16
 
@@ -87,6 +87,8 @@ def open_picture(blob: bytes) -> Iterator[Image.Image]:
             if image.width * image.height > MOST_PIXELS:
                 raise OSError(f"it claims {image.width} x {image.height} pixels")
             yield image
+    except UnidentifiedImageError as error:
+        raise OSError("it is no picture") from error
     except (ValueError, SyntaxError, struct.error, zlib.error, Image.DecompressionBombError) as error:
         raise OSError(f"it is no picture ({error})") from error
 

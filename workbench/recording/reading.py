@@ -20,10 +20,11 @@ from workbench.recording.description import task_file
 from workbench.recording.encoded_pictures import Modality
 from workbench.recording.episode import Episode
 from workbench.recording.library_row import Entry, Facts, facts_from_dict, text
-from workbench.recording.library_scan import Found
+from workbench.recording.library_scan import NOTES, Found
 from workbench.recording.reader.episode_wire import KnownShapes, unpacked
 from workbench.recording.reader.processes import (
     Answered,
+    How,
     NotThere,
     Reader,
     ReaderEnded,
@@ -191,9 +192,10 @@ def _entries(found: Found, answered: Answered | ReaderEnded) -> list[Entry]:
     elif isinstance(answer, ReaderEnded):
         # It is read again when it has changed, or by who opens it.
         why = f"{answer}, and is left alone until it changes"
-    suffix = next(iter(found.sizes))
-    problem = text(f"{Path(found.key).name}{suffix} {why}.", 500)
-    kind = "rrd only" if suffix == ".rrd" else "maniskill"
+    # Which of them it was, nobody knows any more.
+    suffixes = [suffix for suffix in found.sizes if suffix != NOTES]
+    problem = text(f"{Path(found.key).name} ({', '.join(suffixes)}) {why}.", 500)
+    kind = "rrd only" if suffixes == [".rrd"] else "maniskill"
     return [(Facts(kind, written=found.newest / 1e9, problem=problem), None)]
 
 
@@ -257,7 +259,7 @@ class _Opened:
                 # Something else has ended the process since.
                 read, answered = _open(self._reader, self._wanted, self._name)
                 self._is_open_in(answered.process, read.opened)
-        raise OSError("the process that reads it is ended again and again")
+        raise ReaderEnded(How.DIED, "ended the process that reads recordings")
 
     def _is_open_in(self, process: int, opened: int) -> None:
         self._process, self._number = process, opened

@@ -15,6 +15,7 @@ from __future__ import annotations
 import datetime
 import logging
 import math
+import os
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -23,6 +24,7 @@ from pathlib import Path
 from typing import Protocol
 
 from workbench.core.shared_shapes import SharedShapes
+from workbench.machine.process_tree import resident_memory
 from workbench.machine.watched_thread import say_failure
 from workbench.recording.episode import Episode
 from workbench.recording.unreadable import UnreadableRecording
@@ -37,7 +39,6 @@ from workbench.session.review_rows import (
     opening_words,
     read_row,
     shared,
-    size_of,
     stamps_of,
 )
 from workbench.session.review_view import START, Opened, ReviewView
@@ -209,9 +210,9 @@ class Review:
         shapes = SharedShapes()
         files: dict[Path, Stamp] = {}
         shown_at, wait = time.monotonic(), FIRST_SHOWN
-        held, counted = 0, set[int]()
+        held = resident_memory(os.getpid())
         for done, row in enumerate(rows):
-            if opened and held > self._most_bytes:
+            if opened and resident_memory(os.getpid()) - held > self._most_bytes:
                 left = len(rows) - done
                 said.append(
                     f"{row.name} {f'and {left - 1} more were' if left > 1 else 'was'} not opened: those before take "
@@ -228,7 +229,6 @@ class Review:
             stamps = stamps_of(row)
             try:
                 episode = shared(self._read(row, shapes), shapes)
-                held += size_of(episode, counted)
                 opened.append(Opened(row.id, row.name, episode, happenings(episode)))
                 files.update(stamps)
                 said += [broken.sentence for broken in episode.unread]

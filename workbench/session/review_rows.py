@@ -66,24 +66,6 @@ def shared(episode: Episode, shapes: SharedShapes) -> Episode:
     return episode if episode.geometry is None else replace(episode, geometry=shapes.share(episode.geometry))
 
 
-def size_of(episode: Episode, counted: set[int]) -> int:
-    """Bytes of its columns and meshes; pictures stay in the file.
-
-    Args:
-        counted: ids of meshes that others share with it, and that were counted there. Its own are added.
-    """
-    columns = [episode.action, episode.reward, episode.terminated, episode.truncated]
-    columns += [] if episode.poses is None else [episode.poses]
-    for held in (episode.evaluate, episode.env_states, episode.obs):
-        columns += held.values()
-    for visual in () if episode.geometry is None else episode.geometry.visuals:
-        if id(visual.mesh) not in counted:
-            counted.add(id(visual.mesh))
-            parts = (visual.mesh.vertices, visual.mesh.faces, visual.mesh.normals, visual.mesh.uvs)
-            columns += [part for part in (*parts, visual.material.texture) if part is not None]
-    return sum(column.nbytes for column in columns)
-
-
 def stamps_of(row: Row) -> dict[Path, Stamp]:
     """Its files as they are now."""
     return {path: Stamp(row.name, _size_and_time(path)) for path in row.paths}

@@ -188,8 +188,9 @@ class Reader:
         self._turns = _Turns()
         self._pid = 0
         self._connection: socket.socket | None = None
+        self._there: tuple[tuple[int, int] | None, ...] = ()
+        """What those and the folder were when the present process began."""
         self._forgotten: deque[tuple[int, int]] = deque()
-        self._closed = False
         self.process = 0
         """The number of the present process; 0 where there is none."""
 
@@ -223,8 +224,13 @@ class Reader:
         patience: float | None = None,
         process: int | None = None,
     ) -> list[Answered | ReaderEnded]:
-        """Several at once, of which each may take so long; one that ends the reader does not end the others."""
+        """Several at once, of which each may take so long; one that ends the reader does not end the others.
+
+        One whose reader dies is asked for once more: somebody else may have killed it.
+        """
         answers: list[Answered | ReaderEnded] = []
+        again = -1
+        """The number of the one that is asked for once more."""
         with self._turns.turn(patience):
             while len(answers) < len(requests):
                 connection = self._started()
@@ -239,7 +245,11 @@ class Reader:
                         answer, arrays = receive(connection, ANSWERS, time.monotonic() + seconds)
                         answers.append(Answered(answer, arrays, self.process))
                 except (Closed, TookTooLong, Garbled) as error:
-                    answers.append(self._ended(error, seconds))
+                    ended = self._ended(error, seconds)
+                    if isinstance(error, Closed) and again != len(answers):
+                        again = len(answers)
+                    else:
+                        answers.append(ended)
         return answers
 
     def allow(self, paths: Sequence[Path]) -> None:
@@ -259,13 +269,18 @@ class Reader:
             self._kill()
 
     def _started(self) -> socket.socket:
-        if self._connection is not None and select.select([self._connection], [], [], 0)[0]:
+        paths = (self._folder, *sorted(self._allowed))
+        # It may read what was there when it began: a folder that was made anew is another one.
+        there = tuple(map(_identity, paths))
+        if self._connection is not None and (
+            there != self._there
             # Nothing is asked, so this is its end: nobody's fault but of who ended it.
+            or select.select([self._connection], [], [], 0)[0]
+        ):
             self._kill()
         if self._connection is None:
-            paths = (self._folder, *sorted(self._allowed))
             self._pid, self._connection = _nursery.new_reader(paths, self._episodes)
-            self.process = next(self._numbers)
+            self.process, self._there = next(self._numbers), there
         return self._connection
 
     def _send_forgotten(self, connection: socket.socket) -> None:
@@ -320,6 +335,14 @@ class _Turns:
             with self._changed:
                 self._waiting.remove(me)
                 self._changed.notify_all()
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    try:
+        found = os.stat(path)
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
 
 
 def _in_words(status: int) -> str:
