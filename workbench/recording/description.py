@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from workbench.core.geometry import SceneGeometry
+from workbench.machine.regular_file import read_regular_file
 from workbench.recording.checksums import checksum
 from workbench.recording.columns import Column
 from workbench.recording.episode import EpisodeInfo, acted_by_from
@@ -158,9 +159,9 @@ def _source_where(path: str, task: str, folder: Path) -> Path | None:
         for begin in range(len(parts)):
             candidate = place.joinpath(*parts[begin:])
             try:
-                if candidate.is_file() and task in candidate.read_text(encoding="utf-8"):
+                if task.encode(errors="surrogatepass") in read_regular_file(candidate, MOST_SOURCE_BYTES):
                     return candidate
-            except (OSError, UnicodeDecodeError):
+            except OSError:
                 continue
     return None
 
