@@ -6,7 +6,7 @@ be changed. So each worker is the child of a keeper, which is the *subreaper*: w
 child. When the worker ends, or the server asks (SIGTERM) or is gone, the keeper kills its children until it has none, and
 ends as the worker did. It kills nothing else, since a child's number is free for another only when its parent took note of the end.
 
-The keeper is a fork from the moment before anything is imported: one system call, and some 2 MB of its own. Against a
+The keeper is a fork from the moment before anything is imported: one system call, and 6 MB of its own. Against a
 cgroup it needs no rights, which a container or a login by ssh does not give, and the server's own children stay out of it.
 """
 
