@@ -106,10 +106,10 @@ def test_the_hash_is_of_what_the_texts_say_wherever_they_lie(tmp_path: Path) -> 
 def test_what_is_no_ordinary_file_of_text_is_refused_at_once(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe.py")
     (tmp_path / "zero.py").symlink_to("/dev/zero")
-    (tmp_path / "long.py").write_bytes(b"#" * (9 << 20))
+    (tmp_path / "long.py").write_bytes(b"#" * (17 << 20))
     (tmp_path / "bytes.py").write_bytes(b"\xff\xfe\x00")
     for name in ("pipe", "zero", "long", "bytes", "gone"):
-        with pytest.raises(CannotRead, match="/dev/zero is no ordinary" if name == "zero" else f"{name}.py"):
+        with pytest.raises(CannotRead, match="/dev/zero" if name == "zero" else f"{name}.py"):
             read_content(tmp_path / f"{name}.py")
     (tmp_path / "task.py").write_text("import pipe")
     assert read_content(tmp_path / "task.py").modules == (), "a pipe is no module"
