@@ -197,13 +197,13 @@ class _Doorkeeper:
             return self._refuse(verdict.reason)
         if isinstance(connection, Connection):
             connection.admit()
+        if asked.websocket and isinstance(verdict, gate.Admitted):
+            return viser_hook(connection, request)
         # websockets gives up 10 s after the last byte was handed to the kernel; on a slow line
         # megabytes are still on their way then.
         connection.close_timeout = RESPONSE_SECONDS
         if isinstance(verdict, gate.Entered):
             return entered_reply(verdict)
-        if asked.websocket:
-            return viser_hook(connection, request)
         return await admitted_reply(routes, viser_hook, connection, request, verdict.authority)
 
     def _count(self, refused: gate.Refused, connection: ServerConnection) -> None:

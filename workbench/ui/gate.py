@@ -15,7 +15,7 @@ cookie that scripts cannot read and that other sites' pages do not send. The fun
 
 What this does not stop: cookies know hosts but no ports, so another *server* on the same machine that
 the author visits under the same host name is sent our cookie too. There is no cookie attribute
-against that; it takes a hostile program on the author's own machine.
+against that; a Unix socket (`DoorOptions.socket`) is the way on a machine that others use too.
 """
 
 from __future__ import annotations
