@@ -94,7 +94,7 @@ def test_a_registered_id_gives_the_built_in_class_and_its_source() -> None:
         ("bad\0name.py", "not a path"),
         ("~nobody-of-that-name/push.py", "not a path"),
         ("x" * 5000 + ".py", "cannot look at the file"),
-        (os.devnull, "not a .py file"),
+        (os.devnull, "not an ordinary file"),
     ],
 )
 def test_a_wrong_reference_is_refused_in_words(reference: str, words: str) -> None:

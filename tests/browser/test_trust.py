@@ -51,18 +51,16 @@ def test_code_of_a_recording_from_elsewhere_runs_when_a_person_says_so(
 
         page.get_by_role("tab", name="Review").click()
         live.click()
-        other, _ = new_page(browser)
-        other.goto(opened.url)
         expect(window).to_be_visible(timeout=PATIENT)
-        expect(other.get_by_role("dialog")).to_contain_text(str(file), timeout=PATIENT)
+        # A page that comes later, or again, has the question too.
+        page.reload(wait_until="commit")
+        expect(window).to_contain_text(str(file), timeout=PATIENT)
         page.keyboard.press("Escape")
         expect(window).to_be_hidden(timeout=PATIENT)
-        expect(other.get_by_role("dialog")).to_be_hidden(timeout=PATIENT)
-        expect(page.get_by_text("cannot be gone into").first).to_be_visible(timeout=PATIENT)
         assert not mark.exists()
 
         live.click()
-        other.get_by_role("button", name="Run it, and ask again next time").click()
+        page.get_by_role("button", name="Run it, and ask again next time").click()
         expect(page.get_by_text("every body is where it was")).to_be_visible(timeout=PATIENT)
         assert mark.exists()
         assert not [error for error in errors if "non-existent component" not in error]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from tests.ui.scenes import description, problem, step_of, table_scene
+from workbench.authoring.reference import RecordedTask
 from workbench.core.pictures import Picture
 from workbench.session.judge import JudgementView
 from workbench.session.kept_worker import Death, Vitals
@@ -193,6 +195,14 @@ def test_a_load_asks_for_the_class_and_the_seed_that_the_page_chose() -> None:
     assert state.choose_class("Other")
     state.seed = 7
     load = state.load_request(Wanted(None, b"moment"), "rebuilt")
-    assert isinstance(load.task, str) and load.task.endswith("push.py:Other")
-    assert load.options == TaskOptions(seed=7)
+    assert str(load.task).endswith("push.py:Other") and load.options == TaskOptions(seed=7)
     assert (load.source, load.level, load.snapshot) == (None, "rebuilt", b"moment")
+
+
+def test_a_file_that_a_recording_named_is_what_was_agreed_to_until_it_is_saved() -> None:
+    agreed = RecordedTask("Push-v1", "/work/push.py", "Push", {"/work/push.py": "text"})
+    state = LiveState(agreed, TaskOptions(), 2**20)
+    assert state.own_file == Path("/work/push.py")
+    assert state.load_request(Wanted(None, None)).task is agreed
+    state.file_is_edited()
+    assert state.load_request(Wanted(None, None)).task == "/work/push.py:Push"
