@@ -22,7 +22,7 @@ from rich.progress import Progress as Bar
 
 from workbench.authoring.problem import Problem, TaskError
 from workbench.recording.landing import try_folder
-from workbench.recording.recover import recover
+from workbench.recording.mend import mend
 from workbench.session.record import Progress, Recorded, RecordOptions, record, with_given_actions
 
 
@@ -67,9 +67,8 @@ def record_in_terminal(
     try:
         try_folder(what.out)
         asked, _ = with_given_actions(what)
-        mended = recover(what.out) if what.out.is_dir() else []
-        if mended:
-            console.print(f"{_episodes(len(mended))} that an earlier recording left half written: mended")
+        if mended := mend(what.out):
+            console.print(f"{_episodes(mended)} that an earlier recording left half written: mended")
         with Bar(*columns, console=console) as bar:
             row = bar.add_task("opening", total=asked.successes or asked.episodes)
             with _StopAtInterrupt(lambda words: bar.update(row, description=words)) as interrupt:

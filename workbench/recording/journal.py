@@ -23,6 +23,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import stat
 import threading
 import time
 import weakref
@@ -32,6 +33,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pyarrow as pa
+
+from workbench.machine.regular_file import open_regular_file
 
 FOLDER = ".writing"
 SYNC_SECONDS = 0.4
@@ -302,7 +305,7 @@ def before_writing(flush: Callable[[], None]) -> None:
 
 def read_journal(path: Path) -> Iterator[list[Entry]]:
     """The entries of the journal `path`, a batch at a time, as far as it was written whole. Raises OSError."""
-    with path.open("rb") as file:
+    with open_regular_file(path) as file:
         try:
             reader = pa.ipc.open_stream(file)
         except (pa.ArrowInvalid, OSError):
@@ -327,7 +330,10 @@ def claim(path: Path) -> int | None:
         return None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if os.fstat(descriptor).st_nlink > 0:  # else whoever held it has just finished with it
+        found = os.fstat(descriptor)
+        if found.st_nlink > 0 and stat.S_ISREG(
+            found.st_mode
+        ):  # else whoever held it has just finished with it
             return descriptor
     except BlockingIOError:
         pass

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from workbench.recording.landing import RecordingError
-from workbench.recording.recover import recover
+from workbench.recording.mend import mend
 from workbench.session.episode_files import EpisodeFinisher
 from workbench.session.episodes import EpisodeGatherer, GatheredEpisode
 from workbench.session.messages import Stepped, TaskDescription
@@ -184,7 +184,7 @@ class LiveRecorder:
         if not self._folder.is_dir():
             return
         try:
-            recovered = len(recover(self._folder))
+            recovered = mend(self._folder)
         except RecordingError as error:
             with self._lock:
                 self._problem = f"what an earlier recording left could not be mended: {error}"

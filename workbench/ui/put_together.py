@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import viser
 
 from workbench.recording.library import Library
-from workbench.recording.recover import recover
+from workbench.recording.mend import mend
 from workbench.session.recorded_scene import SceneProcess
 from workbench.session.review import Review
 from workbench.session.review_rows import read_row
@@ -87,7 +87,7 @@ class Workplace:
     def _mend(self, shelf: Shelf) -> None:
         """Make episodes of what a writer left that was killed."""
         try:
-            mended = len(recover(self._recordings))
+            mended = mend(self._recordings)
         except OSError as error:
             shelf.review.say(str(error))
             return
