@@ -325,15 +325,14 @@ def claim(path: Path) -> int | None:
     The lock lasts until the descriptor that is returned is closed.
     """
     try:
+        if not stat.S_ISREG(os.lstat(path).st_mode):
+            return None  # no writer makes such
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
     except FileNotFoundError:
         return None
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        found = os.fstat(descriptor)
-        if found.st_nlink > 0 and stat.S_ISREG(
-            found.st_mode
-        ):  # else whoever held it has just finished with it
+        if os.fstat(descriptor).st_nlink > 0:  # else whoever held it has just finished with it
             return descriptor
     except BlockingIOError:
         pass
