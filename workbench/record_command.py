@@ -26,7 +26,7 @@ from workbench.authoring.modules import hidden_by_libraries
 from workbench.authoring.problem import Problem, TaskError
 from workbench.authoring.reference import named_file
 from workbench.recording.landing import try_folder
-from workbench.recording.recover import recover
+from workbench.recording.mend import mend
 from workbench.session.record import Progress, Recorded, RecordOptions, record, with_given_actions
 from workbench.terminal import say
 
@@ -72,8 +72,7 @@ def record_in_terminal(
     try:
         try_folder(what.out)
         asked, _ = with_given_actions(what)
-        mended = recover(what.out) if what.out.is_dir() else []
-        if mended:
+        if mended := mend(what.out):
             console.print(f"{_episodes(len(mended))} that an earlier recording left half written: mended")
         file = named_file(what.task)
         for hidden in () if file is None else hidden_by_libraries(file.resolve()):

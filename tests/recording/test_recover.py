@@ -17,8 +17,12 @@ import pytest
 
 from tests.recording.made import Made
 from tests.recording.verify_rrd import verify_rrd
+from tests.session.recordings import begin
+from tests.session.recordings import made as small
 from workbench.recording import make_files as making
 from workbench.recording.journal import FOLDER, SYNC_SECONDS, Journal, read_journal
+from workbench.recording.landing import RecordingError
+from workbench.recording.mend import mend
 from workbench.recording.read_episode import read_episode
 from workbench.recording.recover import recover
 
@@ -231,3 +235,27 @@ def test_without_its_meshes_an_episode_is_recovered_bare(make_episode: Maker, tm
     assert found.geometry is not None and found.poses is not None
     assert found.geometry.visuals == () and found.geometry.body_names == episode.geometry.body_names
     np.testing.assert_array_equal(found.poses, episode.poses)
+
+
+def test_mending_is_done_by_a_process_that_bears_what_a_folder_brings(tmp_path: Path) -> None:
+    assert mend(tmp_path / "none") == mend(tmp_path) == ()
+    begin(tmp_path, small(5, seed=8))
+    for name in ("pipe.arrow", "pipe.scene"):
+        os.mkfifo(tmp_path / FOLDER / name)
+    (tmp_path / FOLDER / "zero.arrow").symlink_to("/dev/zero")
+    (tmp_path / FOLDER / "noise.arrow").write_bytes(os.urandom(3000))
+    assert len(mend(tmp_path)) == 1
+    (path,) = tmp_path.glob("*.json")
+    assert read_episode(path).length == 5 and read_episode(path).unread == ()
+
+
+def test_files_of_another_folder_are_no_strays(tmp_path: Path) -> None:
+    folder, other = tmp_path / "recordings", tmp_path / "other"
+    folder.mkdir()
+    other.mkdir()
+    (other / "precious.json").write_text("{}")
+    (folder / FOLDER).symlink_to(other)
+    for recovering in (recover, mend):
+        with pytest.raises(RecordingError, match="is a link"):
+            recovering(folder)
+    assert (other / "precious.json").exists()

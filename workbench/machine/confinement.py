@@ -40,22 +40,25 @@ def landlock_version() -> int:
     return max(_call(_CREATE_RULESET, None, 0, _ASK_VERSION), 0)
 
 
-def confine(reads: Iterable[Path], most_memory: int) -> None:
+def confine(reads: Iterable[Path], most_memory: int, writes: Iterable[Path] = ()) -> None:
     """From now on this process and its children may read below `reads`, and what programs and libraries are made of.
 
-    They write no file, open no TCP connection, signal nobody outside, and get no rights by what they start.
+    They write no file but below `writes`, open no TCP connection, signal nobody outside, and get no rights by what
+    they start.
 
     Args:
         most_memory: bytes that may be allocated.
     """
+    writes = tuple(writes)
     resource.setrlimit(resource.RLIMIT_DATA, (most_memory, most_memory))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (MOST_WRITTEN, MOST_WRITTEN))
+    if not writes:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (MOST_WRITTEN, MOST_WRITTEN))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     most = min(MOST_OPEN_FILES, resource.getrlimit(resource.RLIMIT_NOFILE)[1])
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     ctypes.CDLL(None).prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0)
     if landlock_version():
-        _restrict(tuple(reads))
+        _restrict(tuple(reads), writes)
 
 
 def end_with_parent(parent: int) -> None:
@@ -65,7 +68,7 @@ def end_with_parent(parent: int) -> None:
         os._exit(1)
 
 
-def _restrict(reads: tuple[Path, ...]) -> None:
+def _restrict(reads: tuple[Path, ...], writes: tuple[Path, ...]) -> None:
     version = landlock_version()
     rights = sum(bits for since, bits in _FILE_RIGHTS.items() if since <= version)
     wanted = [rights, _TCP_RIGHTS if version >= 4 else 0, _SCOPES if version >= 6 else 0]
@@ -81,6 +84,8 @@ def _restrict(reads: tuple[Path, ...]) -> None:
             _allow(ruleset, path, read | _EXECUTE)
         for path in reads:
             _allow(ruleset, os.fspath(path), read)
+        for path in writes:
+            _allow(ruleset, os.fspath(path), rights & ~_EXECUTE)
         _allow(ruleset, os.devnull, _READ_FILE | _WRITE_FILE)
         if _call(_RESTRICT_SELF, ruleset, 0) < 0:
             raise OSError(ctypes.get_errno(), "Landlock does not restrict this process")

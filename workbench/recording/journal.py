@@ -23,6 +23,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import stat
 import threading
 import time
 import weakref
@@ -32,6 +33,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pyarrow as pa
+
+from workbench.machine.regular_file import open_regular_file
 
 FOLDER = ".writing"
 SYNC_SECONDS = 0.4
@@ -302,7 +305,7 @@ def before_writing(flush: Callable[[], None]) -> None:
 
 def read_journal(path: Path) -> Iterator[list[Entry]]:
     """The entries of the journal `path`, a batch at a time, as far as it was written whole. Raises OSError."""
-    with path.open("rb") as file:
+    with open_regular_file(path) as file:
         try:
             reader = pa.ipc.open_stream(file)
         except (pa.ArrowInvalid, OSError):
@@ -322,6 +325,8 @@ def claim(path: Path) -> int | None:
     The lock lasts until the descriptor that is returned is closed.
     """
     try:
+        if not stat.S_ISREG(os.lstat(path).st_mode):
+            return None  # no writer makes such
         descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
     except FileNotFoundError:
         return None

@@ -37,6 +37,9 @@ def recover(folder: Path) -> list[EpisodeFiles]:
         RecordingError: files cannot be written, or the folder not read; the journals stay.
     """
     folder = Path(folder)
+    if (folder / FOLDER).is_symlink():
+        # Strays are removed there: another folder's files would be.
+        raise RecordingError(f"Cannot recover what lies in {folder}: {FOLDER} is a link to another folder")
     made: list[EpisodeFiles] = []
     failed: RecordingError | None = None
     try:

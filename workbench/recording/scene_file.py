@@ -20,6 +20,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
+from workbench.machine.regular_file import open_regular_file
 
 _MESH = tuple(field.name for field in fields(Mesh))
 _lock = threading.Lock()
@@ -43,7 +44,7 @@ def keep_scene(geometry: SceneGeometry, path: Path) -> None:
 def read_scene(path: Path) -> SceneGeometry | None:
     """What `keep_scene` kept; None where the file is missing or broken."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with open_regular_file(path) as file, np.load(file, allow_pickle=False) as archive:
             return _geometry(archive)
     except (OSError, BadZipFile, KeyError, ValueError, TypeError, EOFError):
         return None

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from workbench.machine.watched_thread import say_failure, watched_thread
 from workbench.recording.landing import RecordingError
-from workbench.recording.recover import recover
+from workbench.recording.mend import mend
 from workbench.session.episode_files import EpisodeFinisher
 from workbench.session.episodes import EpisodeGatherer, GatheredEpisode
 from workbench.session.messages import Stepped, TaskDescription
@@ -197,7 +197,7 @@ class LiveRecorder:
         if not self._folder.is_dir():
             return
         try:
-            recovered = [str(files.rrd) for files in recover(self._folder)]
+            recovered = [str(file) for file in mend(self._folder)]
         except RecordingError as error:
             said = f"what an earlier recording left could not be mended: {error}"
             with self._lock:

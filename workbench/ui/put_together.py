@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import viser
 
 from workbench.recording.library import Library
-from workbench.recording.recover import recover
+from workbench.recording.mend import mend
 from workbench.session.record_live import recovered_in_words
 from workbench.session.recorded_scene import SceneProcess
 from workbench.session.review import Review
@@ -98,7 +98,7 @@ class Workplace:
     def _mend(self, shelf: Shelf) -> None:
         """Make episodes of what a writer left that was killed."""
         try:
-            mended = [str(files.rrd) for files in recover(self._recordings)]
+            mended = [str(file) for file in mend(self._recordings)]
         except OSError as error:
             shelf.review.say(str(error))
             self._on_notice(str(error))

@@ -36,7 +36,7 @@ START_SECONDS = 60.0
 """For a nursery to be there; it imports for half a second."""
 
 
-_ENVIRONMENT = {
+FOR_READING = {
     # It forks, which takes one thread along.
     "OPENBLAS_NUM_THREADS": "1",
     "OMP_NUM_THREADS": "1",
@@ -130,7 +130,7 @@ class _Nursery:
             with theirs:
                 self._process = subprocess.Popen(
                     python_command("-m", "workbench.recording.reader.nursery", str(theirs.fileno())),
-                    env=child_environment(**_ENVIRONMENT),
+                    env=child_environment(**FOR_READING),
                     stdin=subprocess.DEVNULL,
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.DEVNULL,
