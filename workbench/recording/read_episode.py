@@ -25,8 +25,15 @@ from workbench.recording.checksums import check
 from workbench.recording.columns import Column
 from workbench.recording.description import columns_from, info_from
 from workbench.recording.encoded_pictures import EncodedPictures, Modality
+from workbench.recording.entry_texts import tracks_from
 from workbench.recording.episode import CameraTrack, Episode, Unread
-from workbench.recording.layout import OBSERVATION, body_entities, camera_entities, evaluate_entity
+from workbench.recording.layout import (
+    OBSERVATION,
+    batch_entity,
+    body_entities,
+    camera_entities,
+    evaluate_entity,
+)
 from workbench.recording.maniskill_h5 import TRAJECTORY
 from workbench.recording.read_maniskill import UnreadableRecording as UnreadableRecording
 from workbench.recording.read_maniskill import leaves
@@ -82,7 +89,7 @@ def read_episode(path: Path, shapes: SharedShapes | None = None) -> Episode:
             _add_states(episode, states)
         elif table is not None:
             episode.obs = dict(_observations(table, columns_from(said["obs"]), episode.length + 1))
-    except (OSError, RuntimeError, KeyError, TypeError, ValueError, IndexError) as error:
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         raise UnreadableRecording(
             f"{path.stem} is a recording, but a broken one ({type(error).__name__}: {error})"
         ) from error
@@ -146,6 +153,11 @@ def _episode(said: dict[str, Any], table: RerunTable | None, folder: Path) -> Ep
         for name, column in columns_from(said["evaluate"]).items()
         if table is not None
     }
+    batch = {
+        name: _column(table, batch_entity(name), column, 0, states)
+        for name, column in columns_from(said.get("batch") or {}).items()
+        if table is not None
+    }
     actions = Column(np.dtype(np.float32), (len(said["action_names"]),))
     number, flag = Column(np.dtype(np.float32), ()), Column(np.dtype(np.bool_), ())
     return Episode(
@@ -160,6 +172,8 @@ def _episode(said: dict[str, Any], table: RerunTable | None, folder: Path) -> Ep
         truncated=_column(table, "/episode/truncated", flag, 1, states),
         evaluate=evaluate,
         cameras=cameras,
+        batch=batch,
+        texts=tracks_from(said.get("texts") or {}),
     )
 
 
