@@ -131,8 +131,6 @@ def _of_tensor(value: torch.Tensor, copy: bool) -> NDArray | None:
     try:
         if value.layout is not torch.strided:
             value = value.to_dense()
-        if value.is_quantized:
-            value = value.dequantize()
         if value.is_floating_point() and value.dtype not in (torch.float16, torch.float32, torch.float64):
             value = value.float()  # numpy has no bfloat16
         found = value.numpy(force=True)
