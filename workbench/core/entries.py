@@ -192,7 +192,7 @@ def type_text(value: Any) -> str:
 def _text(value: Any) -> tuple[str, bool]:
     """`value` for a person, and whether that is all of it."""
     if isinstance(value, np.generic):
-        value = value.item()
+        value = str(value)  # its repr names numpy, and Python's number has digits that it has not
     if isinstance(value, str):
         said = str.__str__(value)
     else:

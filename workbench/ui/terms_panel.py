@@ -62,8 +62,7 @@ class TermsPanel:
 
 def no_curve_text(names: tuple[str, ...]) -> str:
     listed = ", ".join(names[:MOST]) + (f" and {len(names) - MOST} more" if len(names) > MOST else "")
-    it = "it is no number" if len(names) == 1 else "they are no numbers"
-    return f'No curve of {listed} in info["reward_terms"]: {it} for each env, of shape (num_envs,).'
+    return f'No curve of {listed} in info["reward_terms"]: a curve needs one number for each env, of shape (num_envs,).'
 
 
 def term_data(curves: TermCurves, env: int) -> tuple[NDArray[np.float64], ...]:
