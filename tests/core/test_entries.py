@@ -18,6 +18,7 @@ from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 import workbench
 from tests.session.odd_entries import write_task
+from workbench.authoring.load import load_task
 from workbench.core.entries import MOST_ENTRIES, MOST_LETTERS, split_entries
 from workbench.core.open_env import open_env
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env
@@ -239,15 +240,22 @@ class OneTruth:
 
 @pytest.mark.parametrize("strict", [False, True])
 def test_one_truth_of_one_env_is_taken_as_stock_takes_it(odd_task: Path, strict: bool) -> None:
-    task = type(
-        "One", (OneTruth, workbench.make(odd_task, 1, render_backend="none").unwrapped._workbench_task), {}
-    )  # type: ignore[attr-defined]
+    task = type("One", (OneTruth, load_task(str(odd_task)).cls), {})
     kwargs = {"reward_mode": "sparse"}
     env = TaskEnv(make_env(task, EnvOptions(1, "cpu", render=False, strict=strict, kwargs=kwargs)))
     assert env.reset(seed=0).terminated.tolist() == [True]
     step = env.step(None)
     assert step.terminated.tolist() == [True] and step.reward.tolist() == [-1.0]
     assert step.evaluate["success"].tolist() == [False] and step.evaluate["fail"].tolist() == [True]
+    env.close()
+
+
+def test_a_mean_that_a_built_in_task_returns_is_one_number() -> None:
+    # tabletop/pull_cube_tool.py line 213: the mean over all envs.
+    env = workbench.make("PullCubeTool-v1", 2, backend="cpu", render_backend="none", strict=True)
+    task = TaskEnv(open_env(env))
+    progress = task.reset(seed=0).others["cube_progress"]
+    assert progress.numbers is not None and progress.numbers.shape == ()
     env.close()
 
 
@@ -259,7 +267,8 @@ def test_steps_and_judgements_tell_both_halves(odd_task: Path) -> None:
     for told in (step, task.judge(np.zeros((3, 8), np.float32))):
         assert told.others["phase"].texts == ("reach",) and told.others["stage"].numbers == 2
         assert told.others["best"].what == "None" and told.others["words"].texts[2] == "cube 2"
-        np.testing.assert_allclose(told.others["progress"].numbers, told.evaluate["away"].mean(), rtol=1e-6)
+        progress: Any = told.others["progress"].numbers
+        np.testing.assert_allclose(progress, told.evaluate["away"].mean(), rtol=1e-6)
         assert told.evaluate["turns"].shape == (3,) and "sometimes" in told.others
         assert told.others["reward_terms/mean"].numbers is not None
         assert "reward_terms/all" in told.evaluate and "elapsed_steps" not in told.evaluate

@@ -58,7 +58,7 @@ def text(entry: OtherEntry | None) -> str | None:
 def check_recorded(episode: Episode, env: int) -> None:
     """What the task of these tests returned, of an episode that began with its reset."""
     assert episode.length == STEPS
-    others = [episode.others_at(state) for state in range(STEPS + 1)]
+    others: Any = [episode.others_at(state) for state in range(STEPS + 1)]
     assert [text(each["phase"]) for each in others] == ["reach"] * 2 + ["push"] * 4
     assert [each["stage"].numbers for each in others] == [2] * 6
     assert [text(each["best"]) or float(each["best"].numbers) for each in others] == [

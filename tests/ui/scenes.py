@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +10,7 @@ import trimesh
 from workbench.authoring.problem import Problem
 from workbench.core.geometry import BodyKind, Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo, CameraKind
-from workbench.core.step import OtherEntry, StepResult
+from workbench.core.step import StepResult
 from workbench.session.messages import ActionDimension, TaskDescription
 from workbench.session.printed import NOTHING_PRINTED
 from workbench.session.view import RecordingStatus, SessionView
@@ -63,9 +62,7 @@ def table_scene(num_envs: int) -> tuple[SceneGeometry, np.ndarray]:
     return geometry, poses
 
 
-def step_of(
-    poses: np.ndarray, others: Mapping[str, OtherEntry] | None = None, **evaluate: object
-) -> StepResult:
+def step_of(poses: np.ndarray, **evaluate: object) -> StepResult:
     count = len(poses)
     return StepResult(
         elapsed_steps=np.full(count, 7, np.int32),
@@ -74,7 +71,6 @@ def step_of(
         truncated=np.zeros(count, bool),
         evaluate={name: np.asarray(value) for name, value in evaluate.items()},
         poses=poses,
-        others=dict(others or {}),
     )
 
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -78,7 +79,9 @@ OTHERS = {
 
 
 def test_what_has_no_row_for_each_env_is_shown_as_it_is_and_marked() -> None:
-    rows = {row.name: row for row in number_rows(step_of(POSES, OTHERS, away=[0.0] * 4), 1, None)}
+    rows = {
+        row.name: row for row in number_rows(replace(step_of(POSES, away=[0.0] * 4), others=OTHERS), 1, None)
+    }
     whole = {name: row.whole for name, row in rows.items() if row.whole}
     assert whole == {
         "best": "None",
@@ -98,7 +101,7 @@ def test_what_has_no_row_for_each_env_is_shown_as_it_is_and_marked() -> None:
 
 @pytest.mark.parametrize("num_envs", [1, 4])
 def test_the_mark_is_on_the_page(num_envs: int) -> None:
-    rows = number_rows(step_of(POSES[:num_envs], OTHERS), 0, None)
+    rows = number_rows(replace(step_of(POSES[:num_envs]), others=OTHERS), 0, None)
     html = render("numbers", rows=rows, env=0, num_envs=num_envs, has_success=True)
     marked = sum(1 for row in rows if row.whole)
     assert html.count("not per env</span>") == marked == 8
@@ -108,14 +111,14 @@ def test_the_mark_is_on_the_page(num_envs: int) -> None:
 
 def test_the_table_is_bounded() -> None:
     many = {f"e{number:03}": OtherEntry("str", ("x",)) for number in range(500)}
-    rows = number_rows(step_of(POSES, many, success=[True] * 4), 0, None)
+    rows = number_rows(replace(step_of(POSES, success=[True] * 4), others=many), 0, None)
     assert len(rows) == MOST_ROWS + 3 and rows[2].name == "success" and rows[-1].name == "… and 301 more"
 
 
 @given(ENTRIES, st.integers(1, 4), st.integers(0, 5))
 def test_any_dict_of_evaluate_is_shown(entries: dict[Any, Any], num_envs: int, env: int) -> None:
     columns, others = split_entries(entries, num_envs)
-    rows = number_rows(step_of(POSES[:num_envs], others, **columns), env, None)
+    rows = number_rows(replace(step_of(POSES[:num_envs]), evaluate=columns, others=others), env, None)
     html = render("numbers", rows=rows, env=env, num_envs=num_envs, has_success=False)
     html.encode()
     assert len(rows) == 2 + len(columns) + len(others)

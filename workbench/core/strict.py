@@ -9,12 +9,12 @@ changed by a partial reset, a reward of shape (). In strict mode they raise `Bro
 * SAPIEN's own setters, which the GPU does not look at (`behind_tensors`, at the line that called);
 * in a partial reset: state of other envs written, the simulation stepped, a tensor that the task keeps on
   itself left with the rows of the reset envs only (here, at the line where it is known, else at the hook);
-* ``success`` and ``fail`` of ``evaluate``, rewards and observations without a row for each env (`returns`).
+* returns of ``evaluate``, the reward and the observation hooks without a row for each env (`returns`).
 
 What the GPU refuses in any case (a pose of another batch size, a static actor moved, two applies without a
 fetch, state touched while the scene is loaded) is refused in every mode, see `struct_access`.
 
-Only what goes wrong is refused, by comparing values: ManiSkill's own tasks hear nothing, but for a few that
+Only what goes wrong is refused, by comparing values: ManiSkill's own tasks hear nothing, but for five that
 break a rule (``tests/core/test_strict.py`` lists them). ``strict="warn"`` makes every broken rule a
 `RuleWarning` with its place, once, for a task that is not the reader's to mend.
 
