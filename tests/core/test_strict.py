@@ -663,8 +663,6 @@ UPSTREAM_BREAKS = {
     **{f"RotateValveLevel{level}-v1": _ROTATE_VALVE for level in range(5)},
     # humanoid/humanoid_stand.py line 53: returns info["is_standing"], a bool, as the sparse reward.
     "UnitreeG1Stand-v1": ["compute_sparse_reward() returned a bool tensor"],
-    # tabletop/pull_cube_tool.py line 213: the mean over all envs.
-    "PullCubeTool-v1": ["evaluate() returned 'cube_progress' as a float32 tensor of shape ()"],
 }
 """Of ManiSkill 3.0.1's tasks (``mani_skill/envs/tasks``)."""
 

@@ -103,6 +103,7 @@ def appended(folder: Path, episode: Episode, pictures: bool, every: int = 1) -> 
                 terminated=bool(episode.terminated[state - 1]) if state else False,
                 truncated=bool(episode.truncated[state - 1]) if state else False,
                 pictures=(seen,) if pictures and state % every == 0 else (),
+                others=episode.others_at(state),
             )
         )
     return writer

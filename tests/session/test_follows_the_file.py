@@ -115,7 +115,7 @@ def test_a_file_that_does_not_import_is_shown_with_its_line(
         "return {'success': __import__('torch').zeros(3, dtype=bool)}",
         "return None",
         "return {'success': __import__('torch').zeros((2, 1), dtype=bool)}",
-        "return {'distance': 0.5}",
+        "return {'distance': 0.5, 'fail': None}",
     ],
 )
 def test_returns_of_the_wrong_shape_are_blamed_on_the_hook(

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from tests.ui.scenes import step_of, table_scene
+from workbench.core.step import OtherEntry
 from workbench.session.messages import Stepped
 from workbench.session.reward_terms import MOST, TermHistory
 
@@ -27,6 +28,19 @@ def test_terms_are_kept_by_their_name_and_other_entries_are_not() -> None:
     assert curves.terms.keys() == {"reach", "push"}
     assert curves.terms["reach"].tolist() == [[1, 2], [3, 4]]
     np.testing.assert_array_equal(curves.terms["push"], [[np.nan, np.nan], [5, 6]])
+
+
+def test_what_is_no_number_for_each_env_has_no_curve_and_is_named() -> None:
+    history = TermHistory(2)
+    result = stepped(reach=[1, 2], both=[[1, 2], [3, 4]]).step
+    mean, note = OtherEntry("float", numbers=np.array(0.5)), OtherEntry("str", ("none",))
+    result.others.update({"reward_terms/mean": mean, "reward_terms/note": note, "other": note})
+    for _ in range(2):
+        history.add(Stepped(result, STEP))
+    curves = history.curves()
+    assert (list(curves.terms), curves.no_curve) == (["reach"], ("both", "mean", "note"))
+    history.add(stepped(reach=[1, 2]))
+    assert history.curves().no_curve == ()
 
 
 def test_a_ring_keeps_the_newest_oldest_first() -> None:

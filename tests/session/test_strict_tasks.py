@@ -6,6 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
+from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
+from mani_skill.utils.registration import register_env
+from mani_skill.utils.structs.pose import Pose
 
 from workbench.authoring.problem import Problem, TaskError
 from workbench.core.strict import RuleWarning
@@ -86,6 +90,11 @@ def test_a_broken_rule_is_told_at_the_authors_line(body: str, stage: str, words:
 
 
 def test_an_installed_task_that_breaks_a_rule_is_shown_all_the_same() -> None:
-    with pytest.warns(RuleWarning, match="'cube_progress' as a float32 tensor"):
-        for _ in opened("PullCubeTool-v1"):
+    @register_env("InstalledTaskOfATest-v1", override=True)
+    class Lost(PickCubeEnv):
+        def _before_control_step(self) -> None:
+            self.cube.set_pose(Pose.create_from_pq(torch.rand((self.num_envs, 3))))
+
+    with pytest.warns(RuleWarning, match="The pose of 'cube' in envs 0, 1, 2, 3 was set and not applied"):
+        for _ in opened("InstalledTaskOfATest-v1"):
             pass

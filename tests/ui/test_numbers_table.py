@@ -1,13 +1,20 @@
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from tests.core.test_entries import ENTRIES
 from tests.ui.scenes import step_of, table_scene
+from workbench.core.entries import split_entries
+from workbench.core.step import OtherEntry
 from workbench.ui.fragments import render
-from workbench.ui.numbers_table import NumberRow, number_rows
+from workbench.ui.numbers_table import MOST_ROWS, NumberRow, number_rows
 
 _, POSES = table_scene(4)
 
@@ -56,6 +63,65 @@ def test_nan_is_said_and_not_hidden() -> None:
 def test_whatever_evaluate_returns_has_a_row(values: np.ndarray, env: int) -> None:
     rows = {row.name: row for row in number_rows(step_of(POSES, surprise=values), env, None)}
     assert rows["surprise"].selected != ""
+
+
+OTHERS = {
+    "best": OtherEntry("None", ("None",)),
+    "phase": OtherEntry("str", ("<b>reach</b>",)),
+    "stage": OtherEntry("int", numbers=np.array(2)),
+    "progress": OtherEntry("float32 tensor of shape ()", numbers=np.array(0.25, np.float32)),
+    "goal": OtherEntry("float32 tensor of shape (5,)", numbers=np.arange(5, dtype=np.float32)),
+    "map": OtherEntry("float32 tensor of shape (300, 300)", ("90,000 numbers",), whole=False),
+    "stats/mean/away": OtherEntry("float", numbers=np.array(np.nan)),
+    "words": OtherEntry("list", ("a", "b", "c", "d"), per_env=True),
+    "long": OtherEntry("str", ("x" * 400,)),
+}
+
+
+def test_what_has_no_row_for_each_env_is_shown_as_it_is_and_marked() -> None:
+    rows = {
+        row.name: row for row in number_rows(replace(step_of(POSES, away=[0.0] * 4), others=OTHERS), 1, None)
+    }
+    whole = {name: row.whole for name, row in rows.items() if row.whole}
+    assert whole == {
+        "best": "None",
+        "phase": "<b>reach</b>",
+        "stage": "2",
+        "progress": "0.250",
+        "goal": "[0.000, 1.000, 2.000, 3.000, … 5]",
+        "map": "90,000 numbers",
+        "stats/mean/away": rows["stats/mean/away"].whole,
+        "long": "x" * 159 + "…",
+    }
+    assert (rows["words"].selected, rows["words"].whole) == ("b", "")
+    assert rows["progress"].hint == "not per env: float32 tensor of shape ()"
+    assert rows["map"].hint.endswith("only a part of it is shown, and recorded")
+    assert rows["away"].batch == "mean 0.000" and rows["away"].hint == ""
+
+
+@pytest.mark.parametrize("num_envs", [1, 4])
+def test_the_mark_is_on_the_page(num_envs: int) -> None:
+    rows = number_rows(replace(step_of(POSES[:num_envs]), others=OTHERS), 0, None)
+    html = render("numbers", rows=rows, env=0, num_envs=num_envs, has_success=True)
+    marked = sum(1 for row in rows if row.whole)
+    assert html.count("not per env</span>") == marked == 8
+    assert html.count('colspan="2"') == (marked if num_envs > 1 else 0)
+    assert "&lt;b&gt;reach&lt;/b&gt; <span" in html and "<b>reach" not in html
+
+
+def test_the_table_is_bounded() -> None:
+    many = {f"e{number:03}": OtherEntry("str", ("x",)) for number in range(500)}
+    rows = number_rows(replace(step_of(POSES, success=[True] * 4), others=many), 0, None)
+    assert len(rows) == MOST_ROWS + 3 and rows[2].name == "success" and rows[-1].name == "… and 301 more"
+
+
+@given(ENTRIES, st.integers(1, 4), st.integers(0, 5))
+def test_any_dict_of_evaluate_is_shown(entries: dict[Any, Any], num_envs: int, env: int) -> None:
+    columns, others = split_entries(entries, num_envs)
+    rows = number_rows(replace(step_of(POSES[:num_envs]), evaluate=columns, others=others), env, None)
+    html = render("numbers", rows=rows, env=env, num_envs=num_envs, has_success=False)
+    html.encode()
+    assert len(rows) == 2 + len(columns) + len(others)
 
 
 def test_names_from_the_author_s_file_are_escaped() -> None:

@@ -12,6 +12,7 @@ import pytest
 import viser
 
 from tests.session.recordings import made, write
+from workbench.core.step import OtherEntry
 from workbench.recording.library import Library
 from workbench.session.review import Review
 from workbench.ui.review_page import ReviewOffers, ReviewPage
@@ -125,6 +126,33 @@ def test_a_name_with_markup_in_it_is_text(page: ReviewPage, folder: Path, tmp_pa
     open_seeds(page, 9)
     for html in (page._panel._list, page._status, page._panel._facts, page._timeline._strip):
         assert "<script>alert" not in html.content
+
+
+def test_what_is_not_per_env_is_shown_marked_and_drawn(page: ReviewPage, folder: Path) -> None:
+    for seed in (11, 12):
+        odd = made(4, seed=seed)
+        odd.batch = {"progress: all": np.linspace(0, 1, 5), "goal": np.ones((5, 2)) * seed}
+        odd.texts = {"phase": ((0, OtherEntry("str", ("reach",))), (2, OtherEntry("str", ("push",))))}
+        odd.evaluate["reward"] = np.arange(5.0)
+        write(folder, odd, pictures=False)
+    library_of(page).refresh()
+    open_seeds(page, 11)
+    numbers = page._curves._numbers.content
+    assert "reach" in numbers and numbers.count("not per env</span>") == 3
+    page._review.seek(3)
+    draw(page)
+    assert "push" in page._curves._numbers.content and "0.750" in page._curves._numbers.content
+    line = "progress: all (not per env)"
+    assert {line, "reward (evaluate)"} <= set(page._curves._entry.options)
+    page._curves._wish, page._curves._entry.value = line, line
+    page._review.seek(4)
+    draw(page)
+    chart = page._curves._charts["also"].handle
+    assert chart is not None and chart.title == line
+    np.testing.assert_array_equal(chart.data[1], np.linspace(0, 1, 5))
+    open_seeds(page, 11, 12)
+    words = "Not compared, since they are not numbers of this env alone: progress: all, goal, phase."
+    assert words in page._compare._html.content
 
 
 def test_many_recordings_stand_side_by_side(page: ReviewPage, folder: Path) -> None:

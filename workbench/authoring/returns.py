@@ -2,26 +2,25 @@
 
 ManiSkill 3.0.1 checks none of it. Some mistakes raise far from their cause (``success`` as a
 Python bool: "'bool' object has no attribute 'clone'", inside `BaseEnv.step`). The others are
-silent: ``success`` of shape ``()`` gives a ``terminated`` of shape ``()``; a reward of shape
+silent: with several envs ``success`` of shape ``()`` gives a ``terminated`` of shape ``()``; a reward of shape
 ``(N, 1)``, of shape ``()``, or a Python float is handed on, and then broadcasts against ``(N,)``
 into an ``(N, N)`` in somebody's trainer. With one env all of them look right. So they are checked
 here, and told at the ``def`` of the hook that returned them. (A NaN has the right shape: it is a value,
 and flagged in the env that has it, see `workbench.session.outliers`.)
 
-The rules are those of ManiSkill's guide to custom tasks ("ensure the data returned ... is all
-batched"), and the checks are pure: nothing is stepped, changed or moved from its device. Their words
-are those of `workbench.core.returns`, which the core's strict mode raises with.
+Entries of ``evaluate()`` besides ``success`` and ``fail`` may be anything: ManiSkill passes them on. The checks are
+pure: nothing is stepped, changed or moved from its device. Their words are those of `workbench.core.returns`, which the core's strict mode raises with.
 """
 
 from __future__ import annotations
 
 import linecache
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 from workbench.authoring.problem import Problem, hook_definition
-from workbench.core.returns import wrong_evaluate, wrong_reward, wrong_reward_terms
+from workbench.core.returns import wrong_evaluate, wrong_reward
 
 _REWARD_HOOKS = ("compute_dense_reward", "compute_normalized_dense_reward", "compute_sparse_reward")
 
@@ -35,18 +34,11 @@ def check_step_returns(
 ) -> Problem | None:
     """The first thing wrong with what one step of `num_envs` envs of `cls` gave, or None.
 
-    `evaluate` is what ``evaluate()`` returned: a dict of tensors with leading dimension N, in which
-    ``success`` and ``fail`` are bool of shape (N,); dicts in it are looked into, and strings left
-    alone. `reward` is (N,) and floating; None where no reward was computed. Tensors may be
-    on any device. A problem's stage is ``returns``; its place is in `source_files`, or None where
-    the hook is inherited.
+    `evaluate` is what ``evaluate()`` returned: a dict in which ``success`` and ``fail`` are bool tensors of shape
+    (N,), and the other entries whatever the author likes. `reward` is (N,) and floating; None where no reward was
+    computed. With one env both may be of shape () too. Tensors may be on any device. A problem's stage is ``returns``; its
+    place is in `source_files`, or None where the hook is inherited.
     """
-    # The reward's own entry in info, put there by another hook than evaluate.
-    terms = evaluate.get("reward_terms") if isinstance(evaluate, Mapping) else None
-    if terms is not None and reward is not None:
-        message = wrong_reward_terms(terms, num_envs)
-        if message is not None:
-            return problem_from_return(cls, _REWARD_HOOKS[0], message, source_files)
     message = wrong_evaluate(evaluate, num_envs)
     if message is not None:
         return problem_from_return(cls, "evaluate", message, source_files)

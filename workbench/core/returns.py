@@ -1,6 +1,6 @@
 """What is wrong with what a task's hooks return, in words; None where nothing is.
 
-ManiSkill takes every return for batched, a row for each env, and looks at none. The checks here are
+ManiSkill takes success, fail, rewards and observations for batched, a row for each env, and looks at none. The checks here are
 pure: they name a failing and leave it to the caller what that means (`strict` raises, the page shows it
 at the ``def`` of the hook).
 """
@@ -12,31 +12,22 @@ from typing import Any
 
 import torch
 
+from workbench.core.entries import FLAGS, safe_repr, type_text
+
 
 def wrong_evaluate(evaluate: object, num_envs: int) -> str | None:
-    """Said of ``evaluate()``: it must return a dict of tensors (N, ...), ``success`` and ``fail`` bool (N,)."""
+    """Said of ``evaluate()``: it must return a dict, in which ``success`` and ``fail`` are bool tensors (N,).
+
+    The other entries may be anything, as in ManiSkill: what has no row for each env is shown as it is (`entries`).
+    """
     if not isinstance(evaluate, Mapping):
         return f"returned {_describe(evaluate)}; it must return a dict ({{}} where there is nothing to say)"
-    for name, value in _entries(evaluate):
-        if not isinstance(name, str):
-            return f"returned the key {name!r}; names of entries must be strings"
-        if name in ("success", "fail"):
-            if not isinstance(value, torch.Tensor) or value.dtype != torch.bool or value.shape != (num_envs,):
-                return (
-                    f"returned {name!r} as {_describe(value)}; expected a bool tensor of shape ({num_envs},)"
-                )
-        elif isinstance(value, str):
-            continue
-        elif not isinstance(value, torch.Tensor):
-            return (
-                f"returned {name!r} as {_describe(value)}; expected a tensor with a row for each env, "
-                f"of shape ({num_envs}, ...)"
-            )
-        elif value.ndim == 0 or value.shape[0] != num_envs:
-            return (
-                f"returned {name!r} as {_describe(value)}; "
-                f"expected shape ({num_envs}, ...), a row for each env"
-            )
+    for name in FLAGS:
+        value = evaluate.get(name)
+        if name in evaluate and not (
+            isinstance(value, torch.Tensor) and value.dtype == torch.bool and _a_row_each(value, num_envs)
+        ):
+            return f"returned {name!r} as {_describe(value)}; expected a bool tensor of shape ({num_envs},)"
     return None
 
 
@@ -47,7 +38,7 @@ def wrong_reward(reward: object, num_envs: int, evaluate: Mapping[str, Any]) -> 
     timeline while the others go on, and no wrong shape.
     """
     expected = f"expected a floating tensor of shape ({num_envs},)"
-    if not isinstance(reward, torch.Tensor) or reward.shape != (num_envs,):
+    if not isinstance(reward, torch.Tensor) or not _a_row_each(reward, num_envs):
         return f"returned {_describe(reward)}; {expected}"
     if not reward.dtype.is_floating_point:
         # ManiSkill's own sparse reward is `success` itself where a task has no `fail`.
@@ -58,17 +49,9 @@ def wrong_reward(reward: object, num_envs: int, evaluate: Mapping[str, Any]) -> 
     return None
 
 
-def wrong_reward_terms(terms: object, num_envs: int) -> str | None:
-    """Said of ``info["reward_terms"]``, which a reward's hook may leave: a dict of numbers (N,), one a part."""
-    expected = f"expected a dict of tensors of shape ({num_envs},), one for each part of the reward"
-    if not isinstance(terms, Mapping):
-        return f"put into info 'reward_terms' as {_describe(terms)}; {expected}"
-    for name, value in terms.items():
-        if not isinstance(name, str):
-            return f"put the key {name!r} into info['reward_terms']; names of terms must be strings"
-        if not isinstance(value, torch.Tensor) or value.is_complex() or value.shape != (num_envs,):
-            return f"put into info 'reward_terms/{name}' as {_describe(value)}; {expected}"
-    return None
+def _a_row_each(value: torch.Tensor, num_envs: int) -> bool:
+    # A single truth is the row of a single env: ManiSkill and its wrappers take it, and tasks written for one env give it.
+    return value.shape == (num_envs,) or (num_envs == 1 and value.ndim == 0)
 
 
 def wrong_observation(obs: object, num_envs: int) -> str | None:
@@ -94,12 +77,9 @@ def _entries(returned: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[ob
 
 
 def _describe(value: object) -> str:
-    if isinstance(value, torch.Tensor):
-        return f"a {str(value.dtype).removeprefix('torch.')} tensor of shape {tuple(value.shape)}"
-    shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
-    if isinstance(shape, tuple) and dtype is not None:
-        return f"a {type(value).__module__.partition('.')[0]} {dtype} array of shape {shape}"
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        return f"a {type_text(value)}"
     if value is None:
         return "None"
-    text = " ".join(repr(value)[:480].split())
+    text = " ".join(safe_repr(value)[:480].split())
     return f"{type(value).__qualname__} ({text if len(text) <= 60 else text[:59] + '…'})"

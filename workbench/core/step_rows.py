@@ -20,16 +20,17 @@ import torch
 from numpy.typing import NDArray
 
 from workbench.core import seams
+from workbench.core.entries import split_entries
 from workbench.core.env_states import actors_with_states, states_of_steps, told_by_rows
 from workbench.core.state_columns import observed, parts_of, taken_apart
 from workbench.core.state_names import STATE
+from workbench.core.step import OtherEntry
 from workbench.core.task_env import TaskEnv, flat_entries
 
 ELAPSED = "elapsed"
 """(K, N) the number of each step in its episode: the source that is no column."""
 _BODIES, _QPOS, _QVEL, _HIDDEN, _OBS = "bodies", "qpos", "qvel", "hidden/", "obs/"
-_EVALUATE, _CONTROLLER = "evaluate/", "controller/"
-_NO_ENTRIES = ("elapsed_steps", "reconfigure")
+_EVALUATE, _BATCH, _CONTROLLER = "evaluate/", "batch/", "controller/"
 
 
 class StepRows:
@@ -49,6 +50,8 @@ class StepRows:
             for actor in self._table.actors
         ]
         self._parts: dict[tuple[str, int], Any] = {}
+        self.others: Mapping[str, OtherEntry] = {}
+        """Of the step that was read last: what `StepResult.others` would be."""
 
     def read(
         self, reward: Any, terminated: Any, truncated: Any, info: Mapping[str, Any], action: NDArray
@@ -69,9 +72,11 @@ class StepRows:
             ("terminated", _batch(terminated, count)),
             ("truncated", _batch(truncated, count)),
         ]
-        for name, value in flat_entries(info):
-            if name not in _NO_ENTRIES:
-                found.append((_EVALUATE + name, _batch(value, count)))
+        entries, self.others = split_entries(info, count, copy=False)
+        found += [(_EVALUATE + name, values) for name, values in entries.items()]
+        found += [
+            (_BATCH + name, entry.numbers) for name, entry in self.others.items() if entry.numbers is not None
+        ]
         for index, actor in enumerate(self._table.actors):
             if actor.hidden and (kept := seams.pose_before_hiding(actor)) is not None:
                 found.append((f"{_HIDDEN}{index}", _array(kept)))
@@ -120,6 +125,9 @@ class StepRows:
         for name, values in held.items():
             if name.startswith(_EVALUATE):
                 columns[name] = values
+        for name, values in held.items():
+            if name.startswith(_BATCH):
+                columns[name] = np.broadcast_to(values[:, None], (*shape, *values.shape[1:]))
         states = states_of_steps(self._task.env, bodies, held[_QPOS], held[_QVEL], hidden)
         columns.update((STATE + name, values) for name, values in states.items())
         for name, values in held.items():

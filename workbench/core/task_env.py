@@ -23,6 +23,7 @@ from workbench.core.backends import choose_backend
 from workbench.core.body_table import BodyTable, build_body_table, read_poses
 from workbench.core.contact_list import Contact, list_contacts
 from workbench.core.cpu_scene import batched_class
+from workbench.core.entries import FLAGS, split_entries
 from workbench.core.render_device import keep_render_device
 from workbench.core.seams import (
     drawing_from,
@@ -222,7 +223,9 @@ class TaskEnv:
         self.obs, reward, terminated, _, info = self.env.step(env_action)
         if self._check is not None:
             self._check(info, reward)
-        return self._result(info, to_numpy(reward).astype(np.float32), to_numpy(terminated), action)
+        count = self.num_envs
+        rewards = _batch(to_numpy(reward).astype(np.float32), count)
+        return self._result(info, rewards, _batch(to_numpy(terminated), count), action)
 
     def snapshot(self, env_idx: Sequence[int] | None = None) -> Snapshot:
         """Everything that decides how the episodes of these envs (None: of all) go on; see `snapshot`."""
@@ -261,7 +264,7 @@ class TaskEnv:
                 flat = actions.to_env_action(self.env, self.parts, action)
                 made: Any = common.to_tensor(flat, device=self.env.device) if self.parts else None
                 given = self.env.get_reward(obs=obs, action=made, info=info)
-                reward = to_numpy(given).astype(np.float32)
+                reward = _batch(to_numpy(given).astype(np.float32), self.num_envs)
             self.obs = flatten_observation(self.env, obs)
             keep_observation(self.env, self.obs)
         finally:
@@ -281,14 +284,15 @@ class TaskEnv:
         """What somebody else's ``env.step`` (or ``env.reset``: no action) gave, who went past this object."""
         self._refresh_if_rebuilt()
         self.obs = last_observation(self.env)
-        info = {key: value for key, value in info.items() if key != "reconfigure"}
         count = self.num_envs
+        evaluate, others = split_entries(info, count)
         return StepResult(
             elapsed_steps=to_numpy(self.env.elapsed_steps).astype(np.int32),
             reward=_batch(to_numpy(reward).astype(np.float32), count),
             terminated=_batch(to_numpy(terminated).astype(bool), count),
             truncated=_batch(to_numpy(truncated).astype(bool), count),
-            evaluate={k: _batch(to_numpy(v), count) for k, v in flat_entries(info) if k != "elapsed_steps"},
+            evaluate=evaluate,
+            others=others,
             poses=read_poses(self.env, self.table),
             action=action,
         )
@@ -317,7 +321,7 @@ class TaskEnv:
             self.parts = actions.action_parts(self.env)
 
     def _terminated(self, info: Mapping[str, Any]) -> NDArray[np.bool_]:
-        flags = [to_numpy(info[key]).astype(bool) for key in ("success", "fail") if key in info]
+        flags = [_batch(to_numpy(info[key]).astype(bool), self.num_envs) for key in FLAGS if key in info]
         return np.logical_or.reduce(flags) if flags else np.zeros(self.num_envs, bool)
 
     def _result(
@@ -330,15 +334,14 @@ class TaskEnv:
         elapsed = to_numpy(self.env.elapsed_steps).astype(np.int32)
         limit = self.max_episode_steps
         truncated = np.zeros(self.num_envs, bool) if limit is None else elapsed >= limit
-        evaluate = {
-            k: _batch(to_numpy(v), self.num_envs) for k, v in flat_entries(info) if k != "elapsed_steps"
-        }
+        evaluate, others = split_entries(info, self.num_envs)
         return StepResult(
             elapsed_steps=elapsed,
             reward=reward,
             terminated=terminated,
             truncated=truncated,
             evaluate=evaluate,
+            others=others,
             poses=read_poses(self.env, self.table),
             action=None if action is None else np.array(action, dtype=np.float32),
             sound_obs=_sound(self.obs, self.num_envs),
@@ -377,7 +380,7 @@ def flat_entries(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[st
 
 
 def _batch(value: NDArray[Any], num_envs: int) -> NDArray[Any]:
-    """(N, ...): one value for all envs (some installed tasks give one) is repeated for each."""
+    """(N, ...): one value for all envs, as of a task that is written for one env, is repeated for each."""
     batched = value.ndim > 0 and value.shape[0] == num_envs
     return value if batched else np.broadcast_to(value, (num_envs, *value.shape)).copy()
 

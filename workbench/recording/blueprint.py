@@ -13,11 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 import rerun.blueprint as rrb
 
+from workbench.recording.columns import BATCH
 from workbench.recording.encoded_pictures import MODALITIES
 from workbench.recording.layout import (
     EVENTS,
+    LOGS,
     REWARD_TERMS,
     WORLD,
+    batch_entity,
     camera_entities,
     evaluate_entity,
 )
@@ -40,6 +43,8 @@ class Arrangement:
     """Name, entity and modalities of each."""
     drawn: tuple[str, ...]
     """Entities of ``evaluate()`` that are curves."""
+    texts: bool
+    """Whether ``evaluate()`` returned texts."""
     acted: bool
     """Whether actions have names, and so curves."""
     fps: float | None
@@ -50,11 +55,13 @@ class Arrangement:
 def arrangement(survey: Survey) -> Arrangement:
     cameras = survey.cameras
     entities = camera_entities([camera.info for camera in cameras])
-    drawn = (
-        evaluate_entity(name)
+    entries = [
+        (evaluate_entity(name), column)
         for name, column in survey.evaluate().items()
-        if 0 < math.prod(column.shape) <= MAX_SERIES and not name.startswith(REWARD_TERMS)
-    )
+        if not name.startswith(REWARD_TERMS)
+    ]
+    entries += [(batch_entity(name), column) for name, column in survey.named(BATCH).items()]
+    drawn = (entity for entity, column in entries if 0 < math.prod(column.shape) <= MAX_SERIES)
     eye, looked_at = _eye(survey)
     return Arrangement(
         cameras=tuple(
@@ -62,6 +69,7 @@ def arrangement(survey: Survey) -> Arrangement:
             for camera, entity in zip(cameras, entities)
         ),
         drawn=tuple(drawn),
+        texts=bool(survey.texts),
         acted=bool(survey.header.action_names),
         fps=1.0 / survey.info.control_dt if survey.info.control_dt > 0 else None,
         eye=eye,
@@ -130,7 +138,8 @@ def _curves(arranged: Arrangement) -> rrb.ContainerLike:
     if arranged.acted:
         views.append(rrb.TimeSeriesView(name="Action", origin="/action", plot_legend=legend))
     columns = rrb.TextLogColumns(text_log_columns=["loglevel", "body"])
-    views.append(rrb.TextLogView(name="Events", origin=EVENTS, columns=columns))
+    origin = LOGS if arranged.texts else EVENTS
+    views.append(rrb.TextLogView(name="Events", origin=origin, columns=columns))
     return rrb.Horizontal(*views)
 
 

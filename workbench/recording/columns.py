@@ -23,10 +23,12 @@ from numpy.typing import NDArray
 from workbench.recording.row import EpisodeRow
 
 EVALUATE = "evaluate/"
+BATCH = "batch/"
+"""Numbers that ``evaluate()`` returned of the whole batch."""
 STATE = "state/"
 OBS = "obs/"
 FIXED = ("poses", "action", "reward", "terminated", "truncated")
-"""Names of the columns that every row has; `EVALUATE`, `STATE` and `OBS` begin those of the others."""
+"""Names of the columns that every row has; `EVALUATE`, `BATCH`, `STATE` and `OBS` begin those of the others."""
 
 _Key = tuple[tuple[str, np.dtype, tuple[int, ...]], ...]
 
@@ -63,7 +65,9 @@ class RowPacker:
             np.bool_(row.truncated),
         ]
         names = [*FIXED]
-        for prefix, held in ((EVALUATE, row.evaluate), (STATE, row.env_states), (OBS, row.obs)):
+        batch = {name: entry.numbers for name, entry in row.others.items() if entry.numbers is not None}
+        parts = ((EVALUATE, row.evaluate), (BATCH, batch), (STATE, row.env_states), (OBS, row.obs))
+        for prefix, held in parts:
             for name, value in held.items():
                 names.append(prefix + name)
                 arrays.append(np.asarray(value))

@@ -13,6 +13,9 @@ neither of the two formats keeps: the types of the entries of ``evaluate()``, th
     side_files      what else the task reads and is not held here: path as seen from the task's file, to hash; may lack
     length, return, success, success_once, fail, fail_once       the last four null where the task has no such entry
     action_names, cameras, segmentation, scene, evaluate, obs    what the columns are
+    batch           what the columns are of numbers that ``evaluate()`` returned without a row for each env; may lack
+    texts           of its entries that are no numbers, from each state on where it changes: type, text, whether it is per env, whether
+                    that is all of it; null where it is not there; may lack
     files           suffix of each of the other two files, to how many bytes it has and what they hash to; may lack; in the .json alone
     made_here       the seal of the installation that recorded it (`made_here`), null where it could not make one; may lack; in the .json alone
     thumbnail       base64 of a JPEG at most 160 pixels wide; null without cameras; in the .json alone
@@ -34,7 +37,8 @@ from PIL import Image
 from workbench.core.geometry import SceneGeometry
 from workbench.machine.regular_file import read_regular_file
 from workbench.recording.checksums import checksum
-from workbench.recording.columns import Column
+from workbench.recording.columns import BATCH, Column
+from workbench.recording.entry_texts import tracks_words
 from workbench.recording.episode import EpisodeInfo, acted_by_from
 from workbench.recording.made_here import seal, seal_from
 from workbench.recording.survey import Survey, camera_words
@@ -83,6 +87,8 @@ def describe(survey: Survey) -> dict[str, Any]:
         "segmentation": {str(key): name for key, name in survey.header.segmentation.items()},
         "scene": _scene(geometry),
         "evaluate": _columns(survey.evaluate()),
+        "batch": _columns(survey.named(BATCH)),
+        "texts": tracks_words(survey.texts),
         "obs": _columns(survey.named("obs/")),
     }
 

@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 
 from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import CameraInfo
+from workbench.core.step import OtherEntry
 from workbench.recording.encoded_pictures import EncodedPictures
+from workbench.recording.entry_texts import TextTrack, entry_at
 
 
 def _now() -> str:
@@ -130,13 +132,17 @@ class Episode:
     truncated: NDArray[np.bool_]
     """(T,)"""
     evaluate: dict[str, NDArray]
-    """(T + 1, ...) every entry of ``evaluate()``; ``success`` and ``fail`` are among them if the task has them, and the
+    """(T + 1, ...) every entry of ``evaluate()`` with a row for each env; ``success`` and ``fail`` are among them if the task has them, and the
     terms of the reward under ``reward_terms/`` if it names any. NaN where a state lacks an entry."""
     cameras: list[CameraTrack]
     env_states: dict[str, NDArray] = field(default_factory=dict)
     """``actors/cube``, ``articulations/panda``, each (T + 1, D) as ManiSkill's ``get_state_dict`` lays it out."""
     obs: dict[str, NDArray] = field(default_factory=dict)
     """State observations flattened by ``/``, each (T + 1, ...); no pictures. The key of one that was no dict is ``""``."""
+    batch: dict[str, NDArray] = field(default_factory=dict)
+    """(T + 1, ...) the numbers that ``evaluate()`` returned of the whole batch."""
+    texts: dict[str, TextTrack] = field(default_factory=dict)
+    """Its entries that are no numbers."""
     unread: tuple[Unread, ...] = ()
     """Of a recording that was read: its files that are broken."""
 
@@ -144,6 +150,24 @@ class Episode:
     def length(self) -> int:
         """T, the number of control steps."""
         return len(self.reward)
+
+    def others_at(self, state: int) -> dict[str, OtherEntry]:
+        """What ``evaluate()`` returned in this state besides `evaluate`."""
+        found: dict[str, OtherEntry] = {}
+        for name, values in self.batch.items():
+            value = np.asarray(values[state])
+            found[name] = OtherEntry(f"{value.dtype} of shape {value.shape}", numbers=value)
+        for name, track in self.texts.items():
+            entry = entry_at(track, state)
+            number = found.get(name)
+            # A state in which it was no number is NaN in the column.
+            if entry is not None and (number is None or _is_nan(number.numbers)):
+                found[name] = entry
+        return found
+
+
+def _is_nan(value: NDArray | None) -> bool:
+    return value is None or (value.dtype.kind == "f" and bool(np.isnan(value).all()))
 
 
 ActedBy = tuple[tuple[int, str], ...]

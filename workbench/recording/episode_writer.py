@@ -11,16 +11,19 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
+from workbench.core.step import OtherEntry
 from workbench.recording.batch_rows import Layout
 from workbench.recording.columns import RowPacker
 from workbench.recording.encode_soon import encode_soon
 from workbench.recording.encoded_pictures import MODALITIES, Modality
+from workbench.recording.entry_texts import TextWriter
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.journal import FOLDER, Entry, Journal
 from workbench.recording.journal import Item as JournalItem
@@ -32,6 +35,7 @@ from workbench.recording.scene_file import keep_scene
 from workbench.recording.survey import Header, header_text
 
 SCENE_SUFFIX = ".scene"
+NO_OTHERS: Mapping[str, OtherEntry] = MappingProxyType({})
 _PIXELS: dict[Modality, tuple[tuple[int, ...], str, str]] = {
     "rgb": ((3,), "u", "(H, W, 3) of uint8"),
     "depth": ((), "f", "(H, W) of floats"),
@@ -70,6 +74,7 @@ class EpisodeWriter:
         self._shared: dict[Layout, int] = {}
         self._encoded: dict[int | None, object] = {}
         """By camera, the form of pictures that `encode` has found well."""
+        self._texts = TextWriter()
         self._states = 0
         self._written = False
         self._finished: EpisodeFiles | None = None
@@ -116,7 +121,7 @@ class EpisodeWriter:
                 if self._states == 0
                 else f"step {self._states} has no action, so it cannot be replayed."
             )
-        self._append(*self._packer.pack(row), row.pictures)
+        self._append(*self._packer.pack(row), row.pictures, row.others)
 
     def acted_by(self, what: str) -> None:
         """What chooses the actions from the next one on, where it is not what `info` says.
@@ -170,12 +175,23 @@ class EpisodeWriter:
             encode_soon([(f"picture/{index}/{m}", state, m, image) for m, image in images.items()]),
         ]
 
-    def append_packed(self, layout: Layout, packed: bytes, pictures: Sequence[Picture] = ()) -> None:
+    def texts(self, state: int, others: Mapping[str, OtherEntry]) -> list[JournalItem]:
+        """What a state to come says in texts: for `append_steps`. `others` as in an `EpisodeRow`; states in order."""
+        return [*self._texts.news(state, others)]
+
+    def append_packed(
+        self,
+        layout: Layout,
+        packed: bytes,
+        pictures: Sequence[Picture] = (),
+        others: Mapping[str, OtherEntry] = NO_OTHERS,
+    ) -> None:
         """As `append`, with a row after the first that was packed together with those of other envs."""
         if self._states == 0:
             raise ValueError("the first row is the state after a reset, which no action led to.")
         number = self._shared.get(layout)
-        if number is not None and not pictures:
+        # Nearly always: there is nothing but numbers, of a layout that is known.
+        if number is not None and not pictures and not others and self._texts.is_silent:
             try:
                 self._journal.put("row", number, packed)
             except OSError as error:
@@ -185,17 +201,24 @@ class EpisodeWriter:
         text = None
         if number is None:
             number, text = self._packer.number_of(layout.key)
-        self._append(number, packed, text, pictures)
+        self._append(number, packed, text, pictures, others)
         self._shared[layout] = number
 
-    def _append(self, number: int, packed: bytes, layout: str | None, pictures: Sequence[Picture]) -> None:
+    def _append(
+        self,
+        number: int,
+        packed: bytes,
+        layout: str | None,
+        pictures: Sequence[Picture],
+        others: Mapping[str, OtherEntry],
+    ) -> None:
         try:
             given, items = self._pictures_of(pictures) if pictures else ({}, [])
         except ValueError:
             if layout is not None:
                 self._packer.forget(number)
             raise
-        self._keep(number, packed, layout, items)
+        self._keep(number, packed, layout, [*items, *self._texts.news(self._states, others)])
         self._given |= given
         self._states += 1
 

@@ -4,8 +4,9 @@ A recording is read by people in the viewer and by programs, so where a thing li
 
 - ``/world`` right-handed, z up; ``/world/<body>`` its pose, ``/world/<body>/<n>`` its static meshes;
 - ``/world/cameras/<name>`` pose and pinhole, with children ``rgb``, ``depth`` and ``segmentation``;
-- ``/action``, ``/reward`` and ``/reward/<term>``, ``/evaluate/<entry>``, ``/observation/state``,
-  ``/episode/{success,fail,terminated,truncated}`` as numbers, ``/logs/events`` as text.
+- ``/action``, ``/reward`` and ``/reward/<term>``, ``/evaluate/<entry>``, ``/batch/<entry>`` for numbers that ``evaluate()``
+  returned without a row for each env, ``/observation/state``,
+  ``/episode/{success,fail,terminated,truncated}`` as numbers, ``/logs/events`` and ``/logs/evaluate`` as text.
 
 Two timelines index all of it: ``step``, the state's number, and ``sim_time``. Row k is what
 `StepResult` k said: the state after k control steps, with the action that led there and the reward
@@ -34,14 +35,16 @@ from rerun.chunk import Chunk
 
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo
-from workbench.recording.columns import EVALUATE, OBS, Column
+from workbench.recording.columns import BATCH, EVALUATE, OBS, Column
 from workbench.recording.encoded_pictures import MILLIMETRES_PER_METRE, decode
 from workbench.recording.rerun_chunks import TimedChunks, series_chunk, static_chunk, still_pose
 from workbench.recording.survey import CameraSurvey, Piece, Survey
 
 WORLD = "/world"
 CAMERAS = "/world/cameras"
+LOGS = "/logs"
 EVENTS = "/logs/events"
+ENTRY_TEXTS = "/logs/evaluate"
 OBSERVATION = "/observation/state"
 """All observations but pictures as one batch, as LeRobot has them: an entity each would be 5 kB a file and 40 B a step."""
 REWARD_TERMS = "reward_terms/"
@@ -66,6 +69,8 @@ def static_chunks(survey: Survey) -> Iterator[Chunk]:
     yield from _lenses(survey)
     yield from _series(survey)
     yield _events(survey)
+    if survey.texts:
+        yield _texts(survey)
 
 
 def piece_chunks(survey: Survey, pieces: Iterable[Piece]) -> Iterator[Chunk]:
@@ -161,6 +166,11 @@ def evaluate_entity(name: str) -> str:
     if name.startswith(REWARD_TERMS):
         return rr.new_entity_path(["reward", name[len(REWARD_TERMS) :] or "unnamed"])
     return rr.new_entity_path(["evaluate", name or "unnamed"])
+
+
+def batch_entity(name: str) -> str:
+    """Of an entry of ``evaluate()`` that is a number of the whole batch."""
+    return rr.new_entity_path(["batch", name or "unnamed"])
 
 
 # --- scene ----------------------------------------------------------------------------------------
@@ -315,6 +325,8 @@ def _numbers(survey: Survey) -> list[tuple[str, str, list[str]]]:
     for name, column in survey.evaluate().items():
         series = series_names(name.removeprefix(REWARD_TERMS), column)
         found.append((EVALUATE + name, evaluate_entity(name), series))
+    for name, column in survey.named(BATCH).items():
+        found.append((BATCH + name, batch_entity(name), series_names(name, column)))
     return found
 
 
@@ -329,7 +341,8 @@ def _series(survey: Survey) -> Iterator[Chunk]:
     drawn: Counter[str] = Counter()
     found: list[tuple[str, list[str], int]] = []
     for _, entity, series in _numbers(survey):
-        folder = entity.split("/")[1]  # one view shows all entities of a folder
+        # One view shows all entities of a folder, and those of the whole batch with those of the env.
+        folder = entity.split("/")[1].replace("batch", "evaluate")
         found.append((entity, series, drawn[folder] if folder in ("evaluate", "reward") else 0))
         drawn[folder] += len(series)
     found += [(f"/episode/{name}", [name], 0) for name in survey.flags]
@@ -363,6 +376,21 @@ def _events(survey: Survey) -> Chunk:
     steps, levels, texts = zip(*events(survey))
     columns = rr.TextLog.columns(text=list(texts), level=list(levels))
     return TimedChunks(survey.info.control_dt).of(EVENTS, np.array(steps, dtype=np.int64), columns)
+
+
+def _texts(survey: Survey) -> Chunk:
+    """Entries that are no numbers, where they change."""
+    said = [
+        (
+            state,
+            f"{name}: {''.join(entry.texts)}" if entry is not None else f"{name} is not returned any more",
+        )
+        for name, track in survey.texts.items()
+        for state, entry in track
+    ]
+    steps, texts = zip(*sorted(said, key=lambda line: line[0]))
+    columns = rr.TextLog.columns(text=list(texts), level=["INFO"] * len(texts))
+    return TimedChunks(survey.info.control_dt).of(ENTRY_TEXTS, np.array(steps, dtype=np.int64), columns)
 
 
 # --- frames ---------------------------------------------------------------------------------------

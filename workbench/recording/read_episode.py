@@ -24,9 +24,16 @@ from workbench.recording.checksums import check
 from workbench.recording.columns import Column
 from workbench.recording.description import columns_from, info_from, task_file
 from workbench.recording.encoded_pictures import EncodedPictures, Modality
+from workbench.recording.entry_texts import tracks_from
 from workbench.recording.episode import CameraTrack, Episode, Unread
 from workbench.recording.json_file import NotJson, parse_json, read_json
-from workbench.recording.layout import OBSERVATION, body_entities, camera_entities, evaluate_entity
+from workbench.recording.layout import (
+    OBSERVATION,
+    batch_entity,
+    body_entities,
+    camera_entities,
+    evaluate_entity,
+)
 from workbench.recording.maniskill_h5 import TRAJECTORY
 from workbench.recording.read_maniskill import leaves
 from workbench.recording.read_maniskill import read_maniskill as read_maniskill
@@ -167,6 +174,11 @@ def _episode(said: dict[str, Any], table: RerunTable | None, folder: Path) -> Ep
         for name, column in columns_from(said["evaluate"]).items()
         if table is not None
     }
+    batch = {
+        name: _column(table, batch_entity(name), column, 0, states)
+        for name, column in columns_from(said.get("batch") or {}).items()
+        if table is not None
+    }
     actions = Column(np.dtype(np.float32), (len(said["action_names"]),))
     number, flag = Column(np.dtype(np.float32), ()), Column(np.dtype(np.bool_), ())
     return Episode(
@@ -181,6 +193,8 @@ def _episode(said: dict[str, Any], table: RerunTable | None, folder: Path) -> Ep
         truncated=_column(table, "/episode/truncated", flag, 1, states),
         evaluate=evaluate,
         cameras=cameras,
+        batch=batch,
+        texts=tracks_from(said.get("texts") or {}),
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.pictures import Picture
+from workbench.core.step import OtherEntry
 
 
 @dataclass(frozen=True)
@@ -16,7 +17,8 @@ class EpisodeRow:
     poses: NDArray[np.float32]
     """(B, 7) position and wxyz of every body; NaN for bodies this env lacks."""
     evaluate: Mapping[str, NDArray] = field(default_factory=dict)
-    """This env's value of every entry of ``evaluate()``: () or (...) each, booleans or real numbers."""
+    """This env's value of the entries of ``evaluate()`` that have a row for each env: () or (...) each, booleans or real
+    numbers."""
     env_states: Mapping[str, NDArray] = field(default_factory=dict)
     """``actors/cube``: (D,)"""
     obs: Mapping[str, NDArray] = field(default_factory=dict)
@@ -29,3 +31,5 @@ class EpisodeRow:
     pictures: tuple[Picture, ...] = ()
     """Of this env alone; every state keeps the modalities that the first picture of a camera had. They are encoded while the episode
     goes on, so nobody may write to them any more."""
+    others: Mapping[str, OtherEntry] = field(default_factory=dict)
+    """Its other entries, each as `OtherEntry.of_env` gives it."""

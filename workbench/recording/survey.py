@@ -21,6 +21,8 @@ from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import CameraInfo
 from workbench.recording.columns import EVALUATE, Column, assemble, layout_type, merge
 from workbench.recording.encoded_pictures import MODALITIES, Modality
+from workbench.recording.entry_texts import KIND as TEXT
+from workbench.recording.entry_texts import TextTrack, tracks_of
 from workbench.recording.episode import EpisodeInfo, acted_by_from
 from workbench.recording.journal import Entry, read_journal
 from workbench.recording.made_here import is_sealed, seal_text
@@ -143,6 +145,8 @@ class Survey:
     truncated: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
     flags: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
     """(T + 1,) ``success`` and ``fail``, those that the task has; a state that lacks it says no."""
+    texts: dict[str, TextTrack] = field(default_factory=dict)
+    """Entries of ``evaluate()`` that are no numbers."""
     sample: bytes | None = None
     """A picture of the episode (JPEG), near its end, of a camera for people if there is one."""
 
@@ -155,7 +159,7 @@ class Survey:
         return self.header.info
 
     def evaluate(self) -> dict[str, Column]:
-        """Entry of ``evaluate()`` to what its column is."""
+        """Entry of ``evaluate()`` with a row for each env to what its column is."""
         return self.named(EVALUATE)
 
     def named(self, prefix: str) -> dict[str, Column]:
@@ -188,6 +192,7 @@ class _Raw:
         self.pictures: dict[tuple[int, Modality], tuple[list[int], list[bytes]]] = {}
         self.poses: list[tuple[int, int, bytes]] = []
         self.acted: list[tuple[int, str]] = []
+        self.texts: list[tuple[int, bytes]] = []
         self.bytes = 0
 
     def runs(self, layouts: Sequence[np.dtype]) -> list[NDArray]:
@@ -265,6 +270,8 @@ class JournalReader:
             self.layouts.append(layout_type(entry.value.decode()))
         elif entry.kind == "acted":
             raw.acted.append((entry.number, entry.value.decode()))
+        elif entry.kind == TEXT:
+            raw.texts.append((entry.number, entry.value))
         elif entry.kind.startswith("camera/"):
             raw.poses.append((int(entry.kind[7:]), entry.number, entry.value))
         elif entry.kind.startswith("picture/"):
@@ -284,6 +291,7 @@ class JournalReader:
         flags: dict[str, list[NDArray[np.bool_]]] = {"success": [], "fail": []}
         samples: dict[str, bytes] = {}
         acted = list(header.info.acted_by)
+        texts: list[tuple[int, bytes]] = []
         for raw in self.raw():
             for run in raw.runs(self.layouts):
                 counts[run.dtype] = counts.get(run.dtype, 0) + len(run)
@@ -300,6 +308,7 @@ class JournalReader:
                 for name, parts in flags.items():
                     parts.append(_flag(run, EVALUATE + name))
             acted += raw.acted
+            texts += raw.texts
             for index, state, value in raw.poses:
                 cameras[index].frames.append(state)
                 cameras[index].poses.append(value)
@@ -311,6 +320,7 @@ class JournalReader:
                     samples[header.cameras[index].kind] = blobs[-1]
         survey.header = replace(header, info=replace(header.info, acted_by=tuple(acted)))
         survey.columns = merge(counts)
+        survey.texts = tracks_of(texts)
         survey.cameras = [
             seen.survey(info) for info, seen in zip(header.cameras, cameras, strict=True) if seen.frames
         ]

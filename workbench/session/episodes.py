@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 
 from workbench.core.pictures import Picture
 from workbench.core.state_names import STATE, named_states_of, observation_of, states_of
-from workbench.core.step import StepResult
+from workbench.core.step import OtherEntry, StepResult
 from workbench.recording.batch_rows import BatchPacker
 from workbench.recording.episode import EpisodeInfo
-from workbench.recording.episode_writer import EpisodeWriter
+from workbench.recording.episode_writer import NO_OTHERS, EpisodeWriter
 from workbench.recording.journal import Item as JournalItem
 from workbench.recording.row import EpisodeRow
 from workbench.recording.side_files import side_files
@@ -131,7 +131,7 @@ class EpisodeGatherer:
         Args:
             elapsed: (K, N) the number of each step in its episode.
             columns: what `batch_columns` names, (K, N, ...) each, with the states of all envs.
-            pictures: (K) env to what `EpisodeWriter.encode` gave for that step.
+            pictures: (K) env to what `EpisodeWriter.encode` and `texts` gave for that step.
         """
         assert self._ends == "reset"
         successes = columns.get("evaluate/success")
@@ -212,7 +212,7 @@ class EpisodeGatherer:
         if successes is not None:
             # One value an env, or several.
             success = np.any(successes.reshape(len(successes), -1), axis=1).tolist()
-        captured = stepped.captured
+        captured, others = stepped.captured, step.others
         layout, rows = self._packer.pack(batch_columns(step, stepped.columns, state_names))
         for episode in episodes:
             env = episode.env
@@ -220,7 +220,7 @@ class EpisodeGatherer:
                 raise _lost(env, episode.steps + 1, elapsed[env])
             pictures = [p for p in captured if p.env == env] if captured else ()
             episode.acts(stepped.acted_by)
-            episode.writer.append_packed(layout, rows[env], pictures)
+            episode.writer.append_packed(layout, rows[env], pictures, others_of(others, env))
             episode.steps += 1
             episode.total_reward += reward[env]
             episode.success = None if success is None else success[env]
@@ -249,11 +249,21 @@ def batch_columns(
     ]
     rows += [("evaluate/" + name, values) for name, values in step.evaluate.items()]
     rows += [
+        ("batch/" + name, np.broadcast_to(entry.numbers, (count, *entry.numbers.shape)))
+        for name, entry in step.others.items()
+        if entry.numbers is not None
+    ]
+    rows += [
         (name, values)
         for name, values in columns.items()
         if name[: len(STATE)] != STATE or name[len(STATE) :] in state_names
     ]
     return rows
+
+
+def others_of(others: Mapping[str, OtherEntry], env: int) -> Mapping[str, OtherEntry]:
+    """`StepResult.others` of one env."""
+    return {name: entry.of_env(env) for name, entry in others.items()} if others else NO_OTHERS
 
 
 def first_row(
@@ -266,6 +276,7 @@ def first_row(
         env_states=states_of(columns, env),
         obs=observation_of(columns, env),
         pictures=tuple(picture for picture in pictures if picture.env == env),
+        others=others_of(step.others, env),
     )
 
 

@@ -20,7 +20,7 @@ from workbench.core.task_env import TaskEnv
 from workbench.recording.encoded_pictures import MODALITIES, Modality
 from workbench.recording.journal import Item, before_writing
 from workbench.recording.step_ring import StepRing, Steps
-from workbench.session.episodes import EpisodeGatherer
+from workbench.session.episodes import EpisodeGatherer, others_of
 
 _Pictures = Mapping[int, Sequence[Item]]
 
@@ -33,6 +33,8 @@ class LaterSteps:
         self._task, self._gatherer, self._wanted = task, gatherer, wanted
         self._rows = StepRows(task)
         self._ring = StepRing(self._deliver, self._rows.learn)
+        self._told = True
+        """Whether the step before had entries that are no columns; at first nobody knows."""
         before_writing(self._ring.flush)
 
     def take(self, given: tuple[Any, ...], action: NDArray[np.float32]) -> bool:
@@ -48,9 +50,23 @@ class LaterSteps:
             pictures = self._encoded()
             if pictures is None:
                 return False
+        if self._rows.others or self._told:
+            pictures = self._with_texts(pictures)
         self._ring.take(found, pictures)
         self._say_what_failed()
         return True
+
+    def _with_texts(self, pictures: _Pictures | None) -> _Pictures:
+        """`pictures` with what ``evaluate`` returned in texts, where that is news."""
+        others = self._rows.others
+        self._told = bool(others)
+        elapsed = self._task.env.elapsed_steps.tolist()
+        items: dict[int, list[Item]] = {env: [*held] for env, held in (pictures or {}).items()}
+        for episode in self._gatherer.under_way:
+            env = episode.env
+            if news := episode.writer.texts(elapsed[env], others_of(others, env)):
+                items.setdefault(env, []).extend(news)
+        return items
 
     def flush(self) -> None:
         """What was taken is with the gatherer. Raises as `take`."""

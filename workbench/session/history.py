@@ -393,7 +393,7 @@ class History:
 def _step_bytes(step: StepResult) -> int:
     arrays = [step.elapsed_steps, step.reward, step.terminated, step.truncated, step.poses]
     arrays += [*step.evaluate.values()] + ([] if step.action is None else [step.action])
-    return sum(array.nbytes for array in arrays)
+    return sum(array.nbytes for array in arrays) + sum(entry.nbytes for entry in step.others.values())
 
 
 def _picture_bytes(picture: Picture) -> int:

@@ -186,11 +186,7 @@ def returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, A
     """What `TaskEnv` calls with what ``evaluate`` and the reward returned: raises TaskError for wrong shapes."""
 
     def check(evaluate: Mapping[str, Any], reward: Any) -> None:
-        # An installed task is not its reader's to mend: only what the page cannot do without is asked of
-        # it (PullCubeTool-v1 reports its `cube_progress` unbatched).
-        needed = {"success", "fail"} if not loaded.followed else evaluate.keys() - {"elapsed_steps"}
-        entries = {key: value for key, value in evaluate.items() if key in needed}
-        problem = check_step_returns(loaded.cls, num_envs, entries, reward, loaded.source_files)
+        problem = check_step_returns(loaded.cls, num_envs, evaluate, reward, loaded.source_files)
         if problem is not None:
             raise TaskError(problem)
 

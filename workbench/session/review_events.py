@@ -71,7 +71,11 @@ def curves(episode: Episode) -> dict[str, dict[str, tuple[NDArray[np.int64], NDA
             if values.ndim == 1 and len(terms) < MOST_LINES:
                 terms[name.removeprefix(PREFIX)] = (after, _numbers(values)[1:])
             continue
-        found[name] = dict(_lines(name, values, states))
+        label = f"{name} (evaluate)" if name in (REWARD, TERMS, ACTION) else name
+        found[label] = dict(_lines(name, values, states))
+    for name, values in episode.batch.items():
+        label = f"{name} (not per env)"
+        found[label] = dict(_lines(label, values, states))
     if terms:
         found[TERMS] = terms
     if episode.action.shape[1:] and episode.action.shape[1]:

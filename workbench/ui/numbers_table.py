@@ -1,8 +1,9 @@
 """The numbers of the task: one row an entry, the selected env beside the whole batch.
 
 What ``evaluate`` returns decides the rows. A bool is counted over the batch ("3 of 16"), a number is
-averaged, a vector is shortened; an entry that is a surprise (wrong length, NaN, a string array) is
-shown as it is rather than left out, because a surprise is what an author looks for.
+averaged, a vector is shortened; an entry that is a surprise (NaN, a string, None, a mean over the batch) is
+shown as it is rather than left out, because a surprise is what an author looks for. One that has no row for
+each env is marked as such.
 """
 
 from __future__ import annotations
@@ -12,9 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.step import StepResult
+from workbench.core.step import OtherEntry, StepResult
 
 LONGEST_VECTOR = 4
+LONGEST_TEXT = 160
+MOST_ROWS = 200
 
 
 @dataclass(frozen=True)
@@ -24,6 +27,10 @@ class NumberRow:
     batch: str
     mood: str = ""
     """``good`` or ``bad`` for success and failure of the selected env, else empty."""
+    whole: str = ""
+    """What is shown in place of both where the entry is not per env."""
+    hint: str = ""
+    """What else there is to know of the value."""
 
 
 def number_rows(step: StepResult, selected_env: int, max_episode_steps: int | None) -> list[NumberRow]:
@@ -35,14 +42,32 @@ def number_rows(step: StepResult, selected_env: int, max_episode_steps: int | No
         _reward_row(step, env),
     ]
     first = [key for key in ("success", "fail") if key in step.evaluate]
-    rest = sorted(key for key in step.evaluate if key not in first)
-    for key in first + rest:
+    rest = sorted(key for key in [*step.evaluate, *step.others] if key not in first)
+    shown = first + rest[: MOST_ROWS - len(first)]
+    for key in shown:
+        if key in step.others:
+            rows.append(_other_row(key, step.others[key], env))
+            continue
         values = np.asarray(step.evaluate[key])
         mood = ""
         if key in first and values.ndim and env < len(values) and bool(np.any(values[env])):
             mood = "good" if key == "success" else "bad"
         rows.append(NumberRow(str(key), _item(values, env), _batch(values), mood))
+    if hidden := len(first) + len(rest) - len(shown):
+        rows.append(NumberRow(f"… and {hidden} more", "", ""))
     return rows
+
+
+def _other_row(name: str, entry: OtherEntry, env: int) -> NumberRow:
+    hint = entry.what if entry.whole else f"{entry.what}; only a part of it is shown, and recorded"
+    if entry.per_env:
+        return NumberRow(name, _short(entry.texts[env]) if env < len(entry.texts) else "—", "", hint=hint)
+    value = _short("".join(entry.texts)) if entry.numbers is None else _value(entry.numbers)
+    return NumberRow(name, "", "", whole=value, hint=f"not per env: {hint}")
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= LONGEST_TEXT else text[: LONGEST_TEXT - 1] + "…"
 
 
 def _reward_row(step: StepResult, env: int) -> NumberRow:
@@ -59,7 +84,10 @@ def _reward_row(step: StepResult, env: int) -> NumberRow:
 def _item(values: NDArray, env: int) -> str:
     if values.ndim == 0 or env >= len(values):
         return "—"
-    item = np.asarray(values[env])
+    return _value(np.asarray(values[env]))
+
+
+def _value(item: NDArray) -> str:
     if item.ndim == 0:
         return _one(item)
     flat = item.reshape(-1)

@@ -148,6 +148,9 @@ def notes(a: Opened, b: Opened, found: Difference) -> list[str]:
         said.append("They are of different seeds, so they differ from the start.")
     if a.length != b.length:
         said.append(f"{a.length} and {b.length} steps; {found.compared} states are compared.")
+    of_batch = dict.fromkeys(name for each in (a, b) for name in (*each.episode.batch, *each.episode.texts))
+    if of_batch:
+        said.append(f"Not compared, since they are not numbers of this env alone: {', '.join(of_batch)}.")
     if abs(a.episode.info.control_dt - b.episode.info.control_dt) > 1e-9:
         said.append("A step is not the same time in both.")
     return said

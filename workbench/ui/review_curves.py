@@ -50,6 +50,8 @@ class ReviewCurves:
         self._lines_drawn: object = None
         self._drawn_at = self._numbers_at = 0.0
         self._found: dict[str, dict[str, Lines]] = {}
+        self._offered: dict[str, tuple[str, str]] = {}
+        """What is in the list, to the entry and which of its lines; empty where it has one."""
         self._wish = ""
         """The entry that was last chosen, kept while recordings without it are open."""
 
@@ -113,19 +115,18 @@ class ReviewCurves:
             self._wish = value
 
     def _offer(self, view: ReviewView, shown: Sequence[int]) -> None:
-        names = dict.fromkeys(
-            name
-            for index in shown
-            for name, lines in self._found[view.opened[index].id].items()
+        found = [self._found[view.opened[index].id] for index in shown]
+        self._offered = {
+            name if len(lines) == 1 else f"{name}: {line}": (name, "" if len(lines) == 1 else line)
+            for entries in found
+            for name, lines in entries.items()
             if name not in (REWARD, TERMS, ACTION)
-            for name in ([name] if len(lines) == 1 else [f"{name}: {line}" for line in lines])
-        )
-        for index in shown:
+            for line in lines
+        }
+        for entries in found:
             for group in (TERMS, ACTION):
-                names |= dict.fromkeys(
-                    f"{group}: {line}" for line in self._found[view.opened[index].id].get(group, {})
-                )
-        options = tuple(names)
+                self._offered |= {f"{group}: {line}": (group, line) for line in entries.get(group, {})}
+        options = tuple(self._offered)
         show(self._entry, bool(options))
         if options and options != self._entry.options:
             wish = self._wish if self._wish in options else "success" if "success" in options else options[0]
@@ -134,13 +135,13 @@ class ReviewCurves:
 
     def _draw_entry(self, chart: str, entry: str, view: ReviewView, shown: Sequence[int]) -> None:
         """One entry of all that are compared."""
-        group, _, line = entry.partition(": ")
+        group, line = self._offered.get(entry, (entry, ""))
         drawn: list[tuple[str, str, NDArray[np.float64]]] = []
         axis = axis_of(view)
         for index in shown:
             one = view.opened[index]
-            lines = self._found[one.id].get(group if line else entry)
-            if lines is None or (line and line not in lines):
+            lines = self._found[one.id].get(group)
+            if not lines or (line and line not in lines):
                 continue
             states, values = lines[line] if line else next(iter(lines.values()))
             name = f"{letter(index)}" if len(view.opened) > 1 else entry
@@ -214,9 +215,18 @@ def compared(
     for others, _ in beside:
         for row in others:
             moods.setdefault(row.name, "")
-    columns = [{row.name: known(row.selected, state) for row in others} for others, state in beside]
+    columns = [
+        {row.name: known(row.whole or row.selected, state) for row in others} for others, state in beside
+    ]
+    hints = {row.name: row.hint for others, _ in reversed(beside) for row in others if row.whole}
     return [
-        {"name": name, "mood": mood, "values": [column.get(name, "—") for column in columns]}
+        {
+            "name": name,
+            "mood": mood,
+            "whole": name in hints,
+            "hint": hints.get(name, ""),
+            "values": [column.get(name, "—") for column in columns],
+        }
         for name, mood in moods.items()
     ]
 

@@ -11,10 +11,10 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.session.reward_terms import TermCurves
+from workbench.session.reward_terms import MOST, TermCurves
 from workbench.session.session import Session
 from workbench.session.view import SessionView
-from workbench.ui.changed import show
+from workbench.ui.changed import fill, show
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import LONGEST, STEP, LineChart, line
 
@@ -34,6 +34,7 @@ class TermsPanel:
         self._session = session
         self._chart = LineChart(server, server.gui.add_folder(None), height=170)
         self._how_to = server.gui.add_html(render("note", text=HOW_TO), visible=False)
+        self._no_curve = server.gui.add_html("", visible=False)
         self._drawn: tuple[int, int, int] | None = None
         self._drawn_at = 0.0
 
@@ -46,13 +47,22 @@ class TermsPanel:
         if curves is not None and len(curves.tick) < 2:
             curves = None
         dense = view.task is not None and "dense" in view.task.reward_mode
-        show(self._how_to, curves is not None and not curves.terms and dense)
+        no_curve = () if curves is None else curves.no_curve
+        show(self._how_to, curves is not None and not curves.terms and not no_curve and dense)
+        show(self._no_curve, bool(no_curve))
+        if no_curve:
+            fill(self._no_curve, render("note", text=no_curve_text(no_curve)))
         if curves is None or not curves.terms:
             self._chart.hide()
             return
         env = view.selected_env
         lines = (line(name, colour, 1.6) for name, colour in zip(curves.terms, COLOURS, strict=False))
         self._chart.draw(f"reward terms, env {env}", term_data(curves, env), (STEP, *lines))
+
+
+def no_curve_text(names: tuple[str, ...]) -> str:
+    listed = ", ".join(names[:MOST]) + (f" and {len(names) - MOST} more" if len(names) > MOST else "")
+    return f'No curve of {listed} in info["reward_terms"]: a curve needs one number for each env, of shape (num_envs,).'
 
 
 def term_data(curves: TermCurves, env: int) -> tuple[NDArray[np.float64], ...]:

@@ -19,6 +19,7 @@ from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo
 from workbench.core.shared_shapes import SharedShapes
 from workbench.recording.encoded_pictures import MODALITIES, MOST_PIXELS, EncodedPictures, Modality
+from workbench.recording.entry_texts import tracks_from, tracks_words
 from workbench.recording.episode import CameraTrack, Episode, Unread
 from workbench.recording.reader.requests import (
     CameraRead,
@@ -81,6 +82,7 @@ def packed(
             ("evaluate", episode.evaluate),
             ("env_states", episode.env_states),
             ("obs", episode.obs),
+            ("batch", episode.batch),
         )
     }
     return EpisodeRead(
@@ -96,6 +98,7 @@ def packed(
         terminated=arrays.ref(episode.terminated),
         truncated=arrays.ref(episode.truncated),
         cameras=[_camera(track, arrays) for track in episode.cameras],
+        texts=tracks_words(episode.texts),
         unread=list(episode.unread),
         **many,
     ), arrays
@@ -243,7 +246,8 @@ def unpacked(
         _must(len(end) == length, f"{len(end)} flags for {length} steps")
     unread = list(read.unread)
     many = [
-        dict(_rows(arrays, held, length + 1, unread)) for held in (read.evaluate, read.env_states, read.obs)
+        dict(_rows(arrays, held, length + 1, unread))
+        for held in (read.evaluate, read.env_states, read.obs, read.batch)
     ]
     return Episode(
         info=read.info,
@@ -259,6 +263,8 @@ def unpacked(
         cameras=[_track(camera, number, arrays, fetch) for number, camera in enumerate(read.cameras)],
         env_states=many[1],
         obs=many[2],
+        batch=many[3],
+        texts=tracks_from(read.texts),
         unread=tuple(unread),
     )
 

@@ -118,6 +118,10 @@ class GeometryRead(msgspec.Struct, frozen=True):
     visuals: list[VisualRead]
 
 
+TracksSaid = dict[str, list[tuple[int, tuple[str, str, bool, bool] | None]]]
+"""As `entry_texts.tracks_words`."""
+
+
 class EpisodeRead(msgspec.Struct, frozen=True, tag=True):
     opened: int
     info: EpisodeInfo
@@ -135,6 +139,8 @@ class EpisodeRead(msgspec.Struct, frozen=True, tag=True):
     cameras: list[CameraRead]
     env_states: dict[str, ArrayRef]
     obs: dict[str, ArrayRef]
+    batch: dict[str, ArrayRef]
+    texts: TracksSaid
     unread: list[Unread]
 
 
