@@ -31,8 +31,8 @@ from workbench.recording.library_row import (
     clean_note,
     clean_tags,
     moment,
-    number,
     text,
+    total,
     truth,
     whole,
 )
@@ -126,7 +126,7 @@ def _episode(kind: Kind, said: dict[str, Any], if_undated: float) -> Facts:
         seed=None if seed is None or seed < 0 else seed,
         env_index=whole(said.get("env_index")),
         length=whole(said.get("length")),
-        total_reward=number(said.get("return")),
+        total_reward=total(said.get("return")),
         success=truth(said.get("success")),
         success_once=truth(said.get("success_once")),
         fail=truth(said.get("fail")),
@@ -260,7 +260,7 @@ def _look_into(
                 rewards = group.get("rewards")
                 is_numbers = isinstance(rewards, h5py.Dataset) and rewards.dtype.kind in "fiu"
                 totals[name] = (
-                    number(float(np.asarray(rewards, dtype=np.float64).sum())) if is_numbers else None
+                    total(float(np.asarray(rewards, dtype=np.float64).sum())) if is_numbers else None
                 )
                 if (picture := _last_picture(group)) is not None:
                     pictures[name] = picture
