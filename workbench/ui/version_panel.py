@@ -8,10 +8,12 @@ otherwise. Where a file has several tasks, this is where one of them is chosen.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import viser
 
+from workbench.authoring.problem import Problem
 from workbench.session.messages import LoadLevel, ReloadReport
 from workbench.session.session import Session
 from workbench.session.view import SessionView
@@ -66,24 +68,34 @@ class VersionPanel:
                 self._task.handle.options = self._names
             self._task.show(names[0])
         show(self._task.handle, len(names) > 1)
-        wanted = (view.reload, view.stale, task is None)
+        refused = view.refused if view.state not in ("starting", "loading") else None
+        wanted = (view.reload, refused, task is None)
         if wanted != self._drawn:
             self._drawn = wanted
-            self._html.content = version_html(view.reload, loaded=task is not None)
+            self._html.content = version_html(view.reload, task is not None, refused)
 
     def _load(self, value: object) -> None:
         self._session.reload(LEVELS[checked_choice(value, LEVELS, "way to load")])
 
 
-def version_html(report: ReloadReport | None, loaded: bool) -> str:
-    """What the page says of the last reload; every value escaped."""
+def version_html(report: ReloadReport | None, loaded: bool, refused: Problem | None = None) -> str:
+    """What the page says of the version that runs, and of the file where it holds another; every value escaped.
+
+    Args:
+        report: how the version that runs came in; None for the first.
+        loaded: whether one runs.
+        refused: why what is in the file does not.
+    """
+    where = "" if refused is None or refused.file is None else Path(refused.file).name
+    line = "" if refused is None or refused.line is None else f", line {refused.line}"
+    told = {"loaded": loaded, "refused": refused, "where": f"{where}{line}" if where else ""}
     if report is None:
-        return render("version", report=None, loaded=loaded)
+        return render("version", report=None, **told)
     missing = list(report.not_carried.items())
     return render(
         "version",
         report=report,
-        loaded=loaded,
+        **told,
         took=took(report.milliseconds),
         carried=len(report.carried),
         missing=missing[:MOST_SHOWN],
