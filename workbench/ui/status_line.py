@@ -59,9 +59,9 @@ class StatusLine:
         on_flagged: Callable[[], None],
     ) -> None:
         self._env_rows, self._on_flagged = env_rows, on_flagged
-        with server.gui.add_folder(None):
-            self._handle = server.gui.add_html("")
-            self._presses = Presses(server)
+        self._handle = server.gui.add_html("")
+        # At the end of the panel, behind the tabs: all that comes after it is hidden.
+        self._presses = Presses(server)
         self._drawn_at = 0.0
         self._state = ""
         self._task_serial = 0
