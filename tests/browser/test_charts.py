@@ -17,6 +17,7 @@ from workbench.ui.curves_panel import REDRAW_EVERY, CurvesPanel
 from workbench.ui.line_chart import SELECTED_COLOUR
 
 pytestmark = pytest.mark.browser
+expect.set_options(timeout=60_000)
 ENVS = 3
 COLUMNS_OF = """([colour]) => {
     const canvas = document.querySelector(".uplot canvas");

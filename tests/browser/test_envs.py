@@ -83,6 +83,11 @@ def test_an_odd_env_is_flagged_with_its_reason_and_found_by_the_filter(page: Pag
     until(lambda: len(envs(page)) == ENVS, "all rows again")
     page.keyboard.press("Shift+E")
     until(lambda: selected(page) == [4], "the flagged env selected by its key")
+    press(page, "tr[data-env='0']")
+    until(lambda: selected(page) == [0], "another env")
+    assert f"1 of {ENVS} envs flagged: cube_height is NaN" in page.locator(".wb-marks").inner_text()
+    press(page, ".wb-marks [data-press]")
+    until(lambda: selected(page) == [4], "the flagged env selected by the mark above the tabs")
 
 
 def test_columns_sort_both_ways(page: Page) -> None:

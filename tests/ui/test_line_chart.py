@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import viser
 
-from workbench.ui.line_chart import CURSOR, STEP, YES_OR_NO, LineChart, line, span_of, with_gaps
+from workbench.ui.line_chart import CURSOR, STEP, TAKING_TURNS, YES_OR_NO, LineChart, line, span_of, with_gaps
 
 SERIES = (STEP, line("one", "#228be6", 1.8))
 X = np.arange(3.0)
@@ -34,14 +34,21 @@ def test_new_data_go_to_the_same_chart_and_other_lines_to_another(server: viser.
         assert chart.handle is not before
 
 
-def test_another_chart_stands_where_the_one_before_stood(server: viser.ViserServer) -> None:
+def test_charts_take_turns_in_one_place_and_one_is_shown(server: viser.ViserServer) -> None:
     folder = server.gui.add_folder(None)
     upper, lower = LineChart(server, folder, 150), LineChart(server, folder, 150)
     upper.draw("reward", (X, Y), SERIES)
     lower.draw("success", (X, Y), SERIES)
-    upper.draw("reward", (X, Y, Y), (*SERIES, CURSOR))
-    assert upper.handle is not None and lower.handle is not None
-    assert upper.handle.order < lower.handle.order
+    seen = [upper.handle]
+    for env in range(5):
+        upper.draw(f"reward of env {env}", (X, Y), SERIES)
+        assert upper.handle is not None and lower.handle is not None and upper.handle not in seen[-2:]
+        assert upper.handle.title == f"reward of env {env}" and upper.handle.order < lower.handle.order
+        seen.append(upper.handle)
+        assert [chart.visible for chart in upper._charts] == [False] * (len(upper._charts) - 1) + [True]
+    assert len(upper._charts) == TAKING_TURNS
+    upper.hide()
+    assert not any(chart.visible for chart in upper._charts)
 
 
 def test_yes_or_no_has_one_range_and_numbers_that_of_the_data() -> None:

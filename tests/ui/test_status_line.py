@@ -62,9 +62,11 @@ def test_flagged_envs_stand_in_the_line_while_it_runs_and_a_press_leads_to_the_f
     rows, went = rows_of(outliers={4: (lost,), 2: (lost,)}), []
     line = StatusLine(server, lambda: rows, lambda: went.append("first"))
     line.draw(running(6))
-    content = line._handle.content
+    content = line._standing.content
     assert "2 of 6 envs flagged: the reward is &lt;b&gt;NaN" in content and "In env 2, step 3:" in content
-    assert "running" in content and "wb-marked" in content
+    assert "wb-running wb-marked" in line._handle.content and line._standing.visible
+    line.draw(running(6, steps_per_second=21.0))
+    assert line._standing.content is content, "it stays under the finger that presses"
     (pressed,) = re.findall(r'data-press="([^"]+)"', content)
     button = server.gui._gui_input_handle_from_uuid[pressed]
     for callback in button._impl.update_cb:
@@ -75,7 +77,7 @@ def test_flagged_envs_stand_in_the_line_while_it_runs_and_a_press_leads_to_the_f
 def test_no_env_flagged_is_no_mark(server: viser.ViserServer) -> None:
     line = StatusLine(server, lambda: rows_of(outliers={}), lambda: None)
     line.draw(running(6))
-    assert "flagged" not in line._handle.content and "wb-marked" not in line._handle.content
+    assert not line._standing.visible and "wb-marked" not in line._handle.content
     assert flagged_text(rows_of(outliers={})) is None
 
 

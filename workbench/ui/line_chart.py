@@ -4,7 +4,7 @@ viser keeps what part of the x axis one sees as a share of the data's range, and
 once when uPlot makes its chart anew, which it does for a change of anything but the data. So after such a change the
 axis shows another part of the data than before, for good, and in the end none of it. And uPlot finds no range for
 data with NaN in it, and draws through it. So all that draw curves have the chart through here: only data are ever
-sent to a chart that is there, with gaps where there is no number, and for other lines there is another chart.
+sent to a chart that is shown, with gaps where there is no number, and for other lines another chart is shown.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from workbench.ui.changed import show
 from workbench.ui.viser_seam import send_lines
 
+TAKING_TURNS = 3
+"""Charts of which one is shown. Of two, a browser that is busy might see no change where there were two in a row."""
 LONGEST = 600
 """Points of a curve. More do not fit in the panel's 300 pixels."""
 SELECTED_COLOUR = "#228be6"
@@ -44,8 +46,14 @@ class LineChart:
         order: float | None = None,
     ) -> None:
         self._server, self._folder, self._height, self._order = server, folder, height, order
+        self._charts: list[viser.GuiUplotHandle] = []
+        """One of them is shown at most; the last one was last."""
         self._made_for: object = None
-        self.handle: viser.GuiUplotHandle | None = None
+
+    @property
+    def handle(self) -> viser.GuiUplotHandle | None:
+        """The chart that was drawn last; None before there was something to draw."""
+        return self._charts[-1] if self._charts else None
 
     def hide(self) -> None:
         if self.handle is not None:
@@ -66,32 +74,50 @@ class LineChart:
             span: The range along y; None for that of the data.
         """
         data, series = tuple(data), tuple(series)
-        sent = tuple(with_gaps(values) for values in data)
         wanted = (title, series, span)
-        if self.handle is not None and wanted == self._made_for:
-            send_lines(self.handle, data, sent)
-            show(self.handle, True)
-            return
         # The data must fit the series in every state that the browser may see.
         with self._server.atomic():
-            if self.handle is not None:
-                self._order = self.handle.order
-                self.handle.remove()
-            with self._folder:
-                self.handle = self._server.gui.add_uplot(
-                    data,
-                    series,
-                    title=title,
-                    scales={"x": uplot.Scale(time=False)}
-                    | ({} if span is None else {"y": uplot.Scale(range=span)}),
-                    axes=(uplot.Axis(size=30), uplot.Axis(size=46)),
-                    legend=uplot.Legend(show=True),
-                    height=self._height,
-                    padding=(6, 12, 0, 0),
-                    order=self._order,
-                )
-            send_lines(self.handle, data, sent)
+            if self.handle is None or wanted != self._made_for:
+                self._change_to(title, data, series, span)
+            chart = self._charts[-1]
+            send_lines(chart, data, tuple(with_gaps(values) for values in data))
+            show(chart, True)
         self._made_for = wanted
+
+    def _change_to(
+        self,
+        title: str,
+        data: tuple[NDArray[np.float64], ...],
+        series: tuple[uplot.Series, ...],
+        span: Span | None,
+    ) -> None:
+        """Make a chart that is not in the page the one to draw: there it begins anew, with its x axis too.
+
+        It is not removed and added, since a browser that is busy meets the data of before after that, and says so.
+        """
+        scales = {"x": uplot.Scale(time=False)} | ({} if span is None else {"y": uplot.Scale(range=span)})
+        self.hide()
+        if len(self._charts) == TAKING_TURNS:
+            chart = self._charts.pop(0)
+            chart.title, chart.series, chart.scales = title, series, scales
+            self._charts.append(chart)
+            return
+        with self._folder:
+            chart = self._server.gui.add_uplot(
+                data,
+                series,
+                title=title,
+                scales=scales,
+                axes=(uplot.Axis(size=30), uplot.Axis(size=46)),
+                legend=uplot.Legend(show=True),
+                height=self._height,
+                padding=(6, 12, 0, 0),
+                # All in one place.
+                order=self._order,
+                visible=False,
+            )
+        self._order = chart.order
+        self._charts.append(chart)
 
 
 def line(label: str, colour: str, width: float) -> uplot.Series:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,7 @@ import viser
 from workbench.session.env_table import EnvRows
 from workbench.session.last_words import Busy
 from workbench.session.view import SessionView
-from workbench.ui.changed import fill
+from workbench.ui.changed import fill, show
 from workbench.ui.env_strip import first_flagged, mask
 from workbench.ui.fragments import render
 from workbench.ui.presses import Presses
@@ -60,6 +60,8 @@ class StatusLine:
     ) -> None:
         self._env_rows, self._on_flagged = env_rows, on_flagged
         self._handle = server.gui.add_html("")
+        # On its own: the line above is made anew four times a second, under the finger that presses.
+        self._standing = server.gui.add_html("", visible=False)
         # At the end of the panel, behind the tabs: all that comes after it is hidden.
         self._presses = Presses(server)
         self._drawn_at = 0.0
@@ -80,7 +82,11 @@ class StatusLine:
         if state == self._state and now - self._drawn_at < REDRAW_EVERY:
             return
         self._drawn_at, self._state = now, state
-        fill(self._handle, render("status_line", **status_values(view, fresh, self._marks())))
+        marks = self._marks()
+        fill(self._handle, render("status_line", **status_values(view, fresh, marked=bool(marks))))
+        if marks:
+            fill(self._standing, render("standing_marks", marks=marks))
+        show(self._standing, bool(marks))
 
     def _marks(self) -> list[Mark]:
         rows = self._env_rows()
@@ -104,8 +110,13 @@ def flagged_text(rows: EnvRows) -> tuple[str, str] | None:
     return f"⚑ {envs}flagged: {outlier.reason}", hint
 
 
-def status_values(view: SessionView, fresh: bool = False, marks: Sequence[Mark] = ()) -> dict[str, object]:
-    """What the template is given; `fresh` when a new version of the file has just come in."""
+def status_values(view: SessionView, fresh: bool = False, marked: bool = False) -> dict[str, object]:
+    """What the template is given.
+
+    Args:
+        fresh: a new version of the file has just come in.
+        marked: something stands below the line that is not as it should be.
+    """
     task = view.task
     # While the renderer is at work, what the session says of it is more than that it is busy.
     busy = None if view.busy is not None and view.busy.drawing and view.activity else view.busy
@@ -131,7 +142,7 @@ def status_values(view: SessionView, fresh: bool = False, marks: Sequence[Mark] 
         "real_time_factor": f"{view.real_time_factor:.2f}",
         "behind": moving and view.speed != float("inf") and view.real_time_factor < 0.85 * view.speed,
         "speed": f"{view.speed:g}",
-        "marks": marks,
+        "marked": marked,
     }
 
 
