@@ -78,11 +78,16 @@ def test_an_odd_env_is_flagged_with_its_reason_and_found_by_the_filter(page: Pag
     until(lambda: "flagged 1" in page.locator(".wb-pills").inner_text(), "the flag")
     press(page, ".wb-pills span:nth-child(4)")
     until(lambda: envs(page) == [4], "the filter")
-    assert "cube_height is not a number (" in page.locator("tr[data-why='4']").inner_text()
+    assert "cube_height is NaN (" in page.locator("tr[data-why='4']").inner_text()
     press(page, ".wb-pills span:nth-child(1)")
     until(lambda: len(envs(page)) == ENVS, "all rows again")
     page.keyboard.press("Shift+E")
     until(lambda: selected(page) == [4], "the flagged env selected by its key")
+    press(page, "tr[data-env='0']")
+    until(lambda: selected(page) == [0], "another env")
+    assert f"1 of {ENVS} envs flagged: cube_height is NaN" in page.locator(".wb-marks").inner_text()
+    press(page, ".wb-marks [data-press]")
+    until(lambda: selected(page) == [4], "the flagged env selected by the mark above the tabs")
 
 
 def test_columns_sort_both_ways(page: Page) -> None:

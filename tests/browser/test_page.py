@@ -71,6 +71,7 @@ def calm(desk: Desk) -> Desk:
 def test_the_page_opens_with_the_task_and_without_an_error(desk: Desk) -> None:
     expect(desk.page.get_by_text("WorkbenchPushCube-v1")).to_be_visible()
     expect(desk.page.get_by_text("2 envs on cpu (batched)")).to_be_visible()
+    assert desk.page.title() == "WorkbenchPushCube-v1 · Workbench"
     assert "token" not in desk.page.url
     assert desk.page.locator("canvas").count() >= 1
     assert desk.errors == []

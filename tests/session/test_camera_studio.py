@@ -185,9 +185,49 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     studio.file.undo_write()
     view = wait_until(session, said(lambda s: "as it was before." in s.writing.message), "the file of before")
     assert task_file.read_text() == before
-    # The placement was not written any more, but it is not lost.
-    assert moved(view) == {BASE} and view.studio.camera(BASE).info.settings == start
-    wait_until(session, seen_from(BASE, view.studio.camera(BASE).now), "the camera where it was placed")
+    # Taken back is the placement too, and one step of undo brings it again.
+    assert not moved(view) and view.studio.camera(BASE).now == view.studio.camera(BASE).info.settings == start
+    assert view.studio.writing.message.endswith(
+        "base_camera stands as it says; Undo puts it where you placed it."
+    )
+    wait_until(session, seen_from(BASE, start), "the camera where the file has it")
+    assert view.studio.undo == "took back the change of base_camera"
+    session.studio.undo()
+    view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement again")
+    assert not differences(view.studio.camera(BASE).now, now.now)
+
+
+def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
+    session: Session, task_file: Path
+) -> None:
+    studio, before = session.studio, task_file.read_text()
+    there = replace(camera(session, BASE).now, position=(0.2, 0.1, 0.7))
+    studio.place(BASE, there)
+    studio.file.plan_remove(BASE)
+    view = wait_until(session, said(lambda s: s.writing.stage in ("planned", "refused")), "the plan")
+    assert view.studio.writing.stage == "planned", view.studio.writing.message
+    studio.file.write()
+    wait_until(session, said(lambda s: s.writing.stage == "checked"), "the version without it")
+    studio.file.undo_write()
+    wait_until(session, said(lambda s: "as it was before." in s.writing.message), "the file of before")
+    assert task_file.read_text() == before
+    assert moved(session.view()) == {BASE} and camera(session, BASE).now == there
+    wait_until(session, seen_from(BASE, there), "the camera where it was placed")
+    studio.file.drop_plan()
+
+
+def test_the_target_that_the_file_gives_is_known(session: Session, task_file: Path) -> None:
+    good = task_file.read_text()
+    assert camera(session, BASE).info.target == pytest.approx((0.08, 0, 0))
+    task_file.write_text(good.replace("target=[0.08, 0, 0]", "target=[0.08, 0, 0.2]"))
+    view = wait_until(
+        session, lambda v: v.studio.camera(BASE).info.target == pytest.approx((0.08, 0, 0.2)), "the other"
+    )
+    session.studio.place(BASE, replace(view.studio.camera(BASE).now, position=(0.2, 0.1, 0.7)))
+    view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement")
+    assert view.studio.camera(BASE).info.target == pytest.approx((0.08, 0, 0.2))
+    task_file.write_text(good)
+    wait_until(session, lambda v: v.studio.camera(BASE).info.target[2] == 0, "the first")
 
 
 def settled(session: Session, reached: Callable[[StudioView], bool], what: str) -> StudioView:

@@ -78,14 +78,14 @@ def test_a_hook_that_raises_is_shown_with_its_line_and_the_last_good_version_run
     assert (view.problem.file, view.problem.line) == (str(task_file), number)
     assert view.problem.code == line
     assert "Traceback" in view.problem.traceback
-    assert view.stale and view.task_serial == before
+    assert view.stale and view.task_serial == before and view.refused is view.problem
     serial = view.step_serial
     session.step()
     wait_until(session, lambda v: v.step_serial > serial, "a step of the last good version")
     assert session.view().problem is not None, "the file is still broken"
     task_file.write_text(good)
     view = wait_until(session, lambda v: v.problem is None, "the banner's end")
-    assert view.task_serial == before + 1 and not view.stale
+    assert view.task_serial == before + 1 and not view.stale and view.refused is None
 
 
 @pytest.mark.parametrize(

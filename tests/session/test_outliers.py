@@ -126,12 +126,12 @@ def test_each_kind_is_found_in_the_env_that_does_it_and_nowhere_else(one_of_each
 def test_the_reason_says_what_and_when(one_of_each: Session) -> None:
     outliers = one_of_each.env_rows().outliers
     assert outliers[1][0].reason.startswith("cube moved at ") and outliers[1][0].step == 1
-    assert outliers[2][0].reason == "distance is not a number" and outliers[2][0].step == 3
+    assert outliers[2][0].reason == "distance is NaN" and outliers[2][0].step == 3
     assert any(o.reason == "ghost is under the floor" for o in outliers[3])
     assert outliers[4][0].reason.startswith("cube dropped 0.")
     assert outliers[5][0].reason == "the reward is 1.5, above 1"
-    assert (outliers[6][0].reason, outliers[6][0].step) == ("the reward is not a number", 1)
-    assert (outliers[7][0].reason, outliers[7][0].step) == ("the observation is not a number", 2)
+    assert (outliers[6][0].reason, outliers[6][0].step) == ("the reward is NaN", 1)
+    assert (outliers[7][0].reason, outliers[7][0].step) == ("the observation is NaN or infinite", 2)
     one_of_each.select_env(6)
     [odd] = [what for what in one_of_each.past.strip(0, 10**6).events if what[1] & NOT_A_NUMBER]
     assert odd[0] == one_of_each.view().timeline.first + 1
@@ -183,7 +183,7 @@ def test_poses_that_are_lost_are_named_and_bodies_that_were_never_there_are_not(
     lost = poses.copy()
     lost[1, 3] = np.nan
     [sight] = watch.look(step_of(lost))
-    assert sight.envs.tolist() == [False, True] and sight.reason(1) == "the pose of cube is not a number"
+    assert sight.envs.tolist() == [False, True] and sight.reason(1) == "the pose of cube is NaN"
 
 
 def test_a_speed_below_the_limit_is_none() -> None:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 from tests.session.conftest import TASKS, wait_until
+from workbench.authoring.load import load_task
 from workbench.recording.episode import Episode
 from workbench.recording.read_episode import read_episode
 from workbench.session.messages import TaskOptions
@@ -87,6 +90,14 @@ def test_what_was_kept_after_the_fact_is_what_recording_it_gave(session: Session
     every = written(session, 4)
     kept = {episode.info.env_index: episode for episode in every[2:]}
     assert kept.keys() == {0, 1}
+    load_task(str(TASKS / "push_cube.py"))  # registers it
+    stock: Any = gym.make("WorkbenchPushCube-v1", num_envs=1, sim_backend="physx_cpu", render_backend="none")
+    for episode in live:
+        stock.reset(seed=episode.info.seed)
+        start = stock.unwrapped.get_state_dict()["actors"]["cube"][0].numpy()
+        # The seed that a person reads of it starts it again, though the page reset both envs.
+        np.testing.assert_allclose(episode.env_states["actors/cube"][0], start, rtol=0, atol=1e-6)
+    stock.close()
     for episode in live:
         assert episode.length == STEPS
         assert episode.info.acted_by == ((0, "random"),)
@@ -104,6 +115,16 @@ def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> N
     session.keep_past((0,), before=True)
     kept = written(session, count + 1)[-1]
     assert kept.length == 3 and kept.info.env_index == 0
+    # Nobody recorded, so both envs were reset at once: the first of them as alone, and the other otherwise.
+    said = session.view().recording.keeping.said
+    assert kept.info.seed == 5 and "no seed" not in said
+    session.keep_past((1,), before=True)
+    kept = written(session, count + 2)[-1]
+    assert kept.info.env_index == 1 and kept.info.seed == -1
+    said = wait_until(
+        session, lambda view: bool(view.recording.keeping.said), "what came of it"
+    ).recording.keeping.said
+    assert "its start was drawn for several envs at once" in said
     assert kept.info.acted_by == ((0, "random"), (1, "hold still"))
     session.set_action_source("random")
 

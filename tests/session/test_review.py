@@ -338,7 +338,7 @@ def test_events_and_curves_of_an_episode() -> None:
     episode.reward[8] = np.nan
     found = [(h.state, h.name) for h in happenings(episode)]
     assert found == [
-        (0, "reset"), (2, "grasped"), (4, "success"), (6, "grasped"), (9, "reward is not a number"),
+        (0, "reset"), (2, "grasped"), (4, "success"), (6, "grasped"), (9, "reward is NaN or infinite"),
     ]  # fmt: skip
     lines = curves(episode)
     assert list(lines[ACTION]) == ["arm/joint1", "gripper"] and list(lines[TERMS]) == ["reach"]

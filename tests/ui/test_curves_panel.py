@@ -62,3 +62,18 @@ def test_without_a_past_nothing_is_drawn(server: viser.ViserServer) -> None:
     panel.draw(running(4, curves=curves(1, 4)))
     assert panel._reward.handle is None and panel._success.handle is None
     assert panel._empty.visible
+
+
+def test_envs_whose_reward_is_nan_are_counted_and_left_out_of_the_mean(server: viser.ViserServer) -> None:
+    past = curves(50, 4)
+    past.reward[40:, :3] = np.nan
+    panel = CurvesPanel(server)
+    panel.draw(running(4, curves=past, selected_env=0))
+    chart = panel._reward.handle
+    assert chart is not None
+    np.testing.assert_array_equal(chart.data[1][40:], past.reward[40:, 3])
+    assert np.isnan(chart.data[2][40:]).all()
+    assert "NaN in 3 of 4 envs; the mean is of the others" in panel._lost.content and panel._lost.visible
+    panel._drawn_at = 0.0
+    panel.draw(running(4, curves=curves(50, 4, serial=2)))
+    assert not panel._lost.visible

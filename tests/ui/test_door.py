@@ -212,7 +212,7 @@ def test_viser_has_every_private_name_that_the_seam_relies_on(door):
 @pytest.mark.parametrize("name", viser_seam.PRIVATE_NAMES)
 def test_a_name_that_viser_took_away_is_named(name, monkeypatch):
     *path, last = name.split(".")
-    roots = {"infra": viser.infra._infra, "messages": viser._messages}
+    roots = {"infra": viser.infra._infra, "messages": viser._messages, "gui": viser._gui_handles}
     here = roots[path[0]]
     for part in path[1:]:
         here = getattr(here, part)

@@ -34,6 +34,7 @@ def rows_of(**changes: object) -> EnvRows:
         "steps": np.array([3, 34, 20, 50, 3, 30], np.int32),
         "end": np.array([-1, 33, 20, 50, -1, -1], np.int32),
         "total": np.array([1.0, 20.0, 5.0, math.nan, 0.5, 3.0]),
+        "followed": np.array([True, True, True, False, True, True]),
         "first_true": {
             "success": np.array([-1, 33, -1, -1, -1, -1]),
             "near": np.array([1, 20, -1, 7, -1, 0]),
@@ -121,7 +122,7 @@ def test_the_moment_of_an_env_is_its_first_outlier_else_its_end() -> None:
 
 def test_small_curves_share_one_scale_and_stay_in_their_box() -> None:
     lowest, *_, highest = (row.curve for row in make_rows(rows_of(), np.arange(6)))
-    points = [[float(n) for n in point.split(",")] for point in f"{lowest} {highest}".split()]
+    points = [[float(n) for n in point.split(",")] for line in (*lowest, *highest) for point in line.split()]
     assert len(points) == 6
     assert points[0] == [0, 13] and points[-1] == [60, 1]
     assert all(0 <= x <= 60 and 1 <= y <= 13 for x, y in points)
@@ -129,7 +130,8 @@ def test_small_curves_share_one_scale_and_stay_in_their_box() -> None:
 
 def test_a_long_episode_has_no_more_points_than_can_be_seen() -> None:
     rewards = np.random.default_rng(0).normal(size=(6, KEPT_REWARDS)).astype(np.float32)
-    assert all(len(row.curve.split()) <= 40 for row in make_rows(rows_of(rewards=rewards), np.arange(6)))
+    rows = make_rows(rows_of(rewards=rewards), np.arange(6))
+    assert all(len(line.split()) <= 40 for row in rows for line in row.curve)
 
 
 def test_a_reward_that_is_not_a_number_leaves_a_gap_and_no_reward_no_curve() -> None:
@@ -137,9 +139,11 @@ def test_a_reward_that_is_not_a_number_leaves_a_gap_and_no_reward_no_curve() -> 
     rewards[0, -2] = np.nan
     rewards[1, -1] = np.inf
     first, second, *_ = make_rows(rows_of(rewards=rewards), np.arange(6))
-    assert len(first.curve.split()) == len(second.curve.split()) == 2
+    # Ends of one point each, drawn as a dot; and a line of the two that are left.
+    assert len(first.curve) == 2 and all(len(set(line.split())) == 1 for line in first.curve)
+    assert len(second.curve) == 1 and len(set(second.curve[0].split())) == 2
     nothing = rows_of(rewards=np.full((6, KEPT_REWARDS), np.nan, np.float32))
-    assert {row.curve for row in make_rows(nothing, np.arange(6))} == {""}
+    assert all(row.curve == [] for row in make_rows(nothing, np.arange(6)))
 
 
 def test_a_task_with_many_entries_keeps_success_and_fail() -> None:
@@ -147,3 +151,13 @@ def test_a_task_with_many_entries_keeps_success_and_fail() -> None:
     rows = rows_of(first_true={name: np.zeros(6, np.int32) for name in names})
     assert entry_names(rows)[:2] == ("success", "fail") and len(entry_names(rows)) == MOST_ENTRIES
     assert Outcome.RUNNING == 0
+
+
+def test_a_return_that_is_nan_is_said_and_its_curve_has_a_gap() -> None:
+    rewards = np.full((6, KEPT_REWARDS), np.nan, np.float32)
+    rewards[:] = np.arange(KEPT_REWARDS)
+    rewards[0, 50] = np.nan
+    rows = rows_of(rewards=rewards, total=np.full(6, math.nan))
+    odd, other = make_rows(rows, np.array([0, 1]))
+    assert odd.total == "NaN" and len(odd.curve) == 2 and len(other.curve) == 1
+    assert make_rows(rows, np.array([3]))[0].total == ""

@@ -98,7 +98,7 @@ def test_a_pose_is_copied_as_python_that_makes_it_again() -> None:
 @pytest.mark.parametrize(
     ("value", "text"),
     [(0.0, "0.000"), (1.23456, "1.235"), (1e-9, "0.000"), (2e-4, "2.0e-04"), (12345.0, "1.2e+04")]
-    + [(float("nan"), "nan"), (True, "yes"), (7, "7")],
+    + [(float("nan"), "NaN"), (True, "yes"), (7, "7")],
 )
 def test_numbers_are_short(value: object, text: str) -> None:
     assert number(value) == text

@@ -29,7 +29,9 @@ def episode(env: int = 0, **changes: Any) -> EpisodeDifference:
 def summary(*differences: EpisodeDifference, **changes: Any) -> Summary:
     names = ("reward", "success")
     differing = frozenset({"reward"} if differences else ())
-    found = Summary(12, len(differences), differences, (3, 3), (1.0, 2.0), 0.0, 0.0, None, names, differing)
+    found = Summary(
+        12, len(differences), differences, (3, 3), (1.0, 2.0), ("", ""), 0.0, 0.0, None, names, differing
+    )
     return replace(found, **changes)
 
 
@@ -201,3 +203,18 @@ def test_of_a_long_record_the_part_round_the_shown_moment_is_drawn() -> None:
     assert len(x) == LONGEST
     assert x[np.flatnonzero(np.isfinite(cursor))].tolist() == [LONGEST]
     assert len(chart_data(curve, 10**6)) == 3
+
+
+def test_a_reward_that_turned_nan_is_said_so_and_counted_in_the_mean() -> None:
+    lost, nan = float("inf"), float("nan")
+    assert words.difference(episode(largest=lost, returns=(1.0, nan))) == ["reward NaN now"]
+    assert words.difference(episode(largest=lost, returns=(nan, 1.0))) == ["reward no longer NaN"]
+    assert words.difference(episode(largest=lost, returns=(nan, nan))) == ["reward NaN at other steps"]
+    told = done(summary(episode(), mean_return=(1.0, 2.0), lost_returns=("", "NaN in 3 of 12")))
+    assert words.numbers(told)[-1] == "mean return: 1 → 2, NaN in 3 of 12"
+    assert (
+        words.numbers(done(summary(episode(), mean_return=(1.0, nan), lost_returns=("", "NaN in 12 of 12"))))[
+            -1
+        ]
+        == "mean return: 1 → NaN in 12 of 12"
+    )

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from workbench.recording.library_row import Facts, LibraryRow
+from workbench.recording.library_row import Facts, LibraryRow, facts_as_dict, facts_from_dict
 from workbench.ui.library_rows import (
     COLUMNS,
     SECOND_LINE,
@@ -158,3 +158,11 @@ def test_an_empty_list_says_which_filter_emptied_it() -> None:
     assert none_like_that(" zebra ", "all", None) == "No recording has “zebra”."
     assert none_like_that("", "failed", "Push-v1") == "There is no failed recording of Push-v1."
     assert none_like_that("x", "success", "Push-v1") == "No successful recording of Push-v1 has “x”."
+
+
+def test_a_return_that_is_nan_is_said_and_comes_last_whichever_way_it_is_sorted() -> None:
+    kept = facts_from_dict(facts_as_dict(row("n", total_reward=float("nan")).facts))
+    lost = row("n", total_reward=kept.total_reward)
+    assert kept == facts_from_dict(facts_as_dict(kept))
+    assert cells(lost, {}, NOW).total == "NaN"
+    assert {ids(ordered((*ROWS[:2], lost), "return", down))[-1] for down in (True, False)} == {"n"}

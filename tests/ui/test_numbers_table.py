@@ -50,7 +50,21 @@ def test_long_vector_is_shortened() -> None:
 
 
 def test_nan_is_said_and_not_hidden() -> None:
-    assert rows_of(distance=np.full(4, np.nan))["distance"].selected == "nan"
+    """One way everywhere: as it is in the selected env, counted over the batch, and left out of the mean."""
+    rows = rows_of(
+        0,
+        distance=np.array([np.nan, 1.0, 2.0, np.nan]),
+        all_lost=np.full(4, np.nan),
+        far=np.array([np.inf, 1.0, np.nan, 2.0]),
+        pose=np.array([[0.0, np.nan], [0, 0], [0, 0], [-np.inf, 0]]),
+    )
+    assert (rows["distance"].selected, rows["distance"].batch) == ("NaN", "mean 1.500, NaN in 2 of 4")
+    assert rows["all_lost"].batch == "NaN in 4 of 4"
+    assert (rows["far"].selected, rows["far"].batch) == (
+        "infinite",
+        "mean 1.500, NaN in 1, infinite in 1 of 4",
+    )
+    assert (rows["pose"].selected, rows["pose"].batch) == ("[0.000, NaN]", "NaN in 1, infinite in 1 of 4")
 
 
 @given(

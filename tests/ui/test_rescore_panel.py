@@ -74,6 +74,15 @@ def test_numbers_that_are_none_are_null_in_json() -> None:
     assert words.as_csv([]) == "\n"
 
 
+def test_a_reward_that_turned_nan_is_said_so_and_counted_in_the_mean() -> None:
+    nan = float("nan")
+    lost = verdict("lost", largest=float("inf"), first_difference=4, returns=(1.0, nan))
+    assert words.what_changed(lost) == "reward NaN now, from step 4"
+    assert words.returns(lost) == "1 → NaN"
+    other = verdict("other", returns=(2.0, 2.0))
+    assert "mean return 1.5 → 2, NaN in 1 of 2." in words.summary([lost, other])
+
+
 def test_a_problem_is_told_with_file_and_line_and_escaped() -> None:
     problem = Problem("reward", "KeyError: '<b>'", "/home/me/push.py", 88, "raise <b>", "")
     html = status_html(RescoreView("failed", 1, 3, why="the code raised", problem=problem))

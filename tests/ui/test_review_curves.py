@@ -8,8 +8,8 @@ from workbench.ui.review_curves import compared, known
 
 
 def test_a_nan_that_the_task_returned_is_shown_and_what_the_first_state_lacks_is_not() -> None:
-    assert known("nan", 0) == "—"
-    assert known("nan", 7) == "NaN"
+    assert known("NaN", 0) == "—"
+    assert known("NaN", 7) == "NaN"
     assert known("0.50", 0) == known("0.50", 7) == "0.50"
 
 

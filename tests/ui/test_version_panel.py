@@ -2,8 +2,20 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
+import viser
+
+from tests.ui.scenes import problem, running
 from workbench.session.messages import ReloadReport
-from workbench.ui.version_panel import MOST_SHOWN, took, version_html
+from workbench.ui.version_panel import MOST_SHOWN, VersionPanel, took, version_html
+
+
+class StillSession:
+    """Does nothing that a page asks for."""
+
+    def choose_class(self, name: str) -> None: ...
+    def reload(self, level: str) -> None: ...
 
 
 def test_level_reason_and_time_are_said() -> None:
@@ -33,6 +45,22 @@ def test_what_comes_of_the_file_is_escaped() -> None:
 def test_before_the_first_reload_it_says_what_saving_does() -> None:
     assert "Save the file" in version_html(None, loaded=True)
     assert version_html(None, loaded=False).strip() == ""
+
+
+def test_while_the_file_is_broken_the_broken_save_is_what_it_speaks_of(server: viser.ViserServer) -> None:
+    """It spoke of the good save before, as if that were what had just been saved."""
+    panel = VersionPanel(server, cast(Any, StillSession()))
+    good = ReloadReport("patched", "only evaluate changed", 43.2)
+    panel.draw(running(4, reload=good))
+    assert "not loaded" not in panel._html.content
+    panel.draw(running(4, reload=good, stale=True, state="error", refused=problem()))
+    told = panel._html.content
+    assert (
+        told.index("not loaded") < told.index("The version before it goes on") < told.index("only evaluate")
+    )
+    assert "push.py, line 88" in told and "KeyError" in told
+    panel.draw(running(4, reload=good, stale=True, state="loading", refused=problem()))
+    assert "not loaded" not in panel._html.content  # another one is being tried
 
 
 def test_times_are_short() -> None:

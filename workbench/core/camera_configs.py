@@ -18,7 +18,8 @@ from workbench.core.camera_settings import CameraSettings
 
 
 def note_camera_sites() -> None:
-    """From now on every camera config of this process knows where it was made (`seams.camera_site`)."""
+    """From now on every camera config of this process knows where it was made (`seams.camera_site`), and what its
+    pose was made to look at (`target_of`)."""
     seams.mark_camera_configs()
 
 
@@ -49,6 +50,18 @@ def settings_of(config: Any) -> CameraSettings | None:
         far=far,
         shader_pack=str(config.shader_pack),
     )
+
+
+def target_of(config: Any) -> tuple[float, float, float] | None:
+    """The point that the config's ``look_at`` names, in the frame of its pose, of the first env where it differs.
+
+    None where the pose was not made by ``look_at``, or not noted.
+    """
+    target = seams.camera_target(config)
+    if target is None:
+        return None
+    x, y, z = (float(number) for number in _numbers(target).reshape(-1, 3)[0])
+    return x, y, z
 
 
 def rows_of_pose(config: Any) -> np.ndarray:

@@ -42,6 +42,8 @@ class CameraInfo:
     """Its pose differs between envs, or is another than its config says: the task's code moves it."""
     site: CallSite | None = None
     """Where the config was made; None where that was not noted."""
+    target: tuple[float, float, float] | None = None
+    """The point that the config's ``look_at`` names, in the frame of `settings`; None where its pose has no such point."""
 
     @property
     def key(self) -> CameraKey:

@@ -13,6 +13,7 @@ upgrade fails loudly there and not in the middle of an author's task.
 from __future__ import annotations
 
 import sys
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cached_property, wraps
@@ -29,7 +30,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
 from mani_skill.sensors.camera import CameraConfig
-from mani_skill.utils import common
+from mani_skill.utils import common, sapien_utils
 from mani_skill.utils.structs.actor import Actor
 from mani_skill.utils.structs.articulation import Articulation
 from mani_skill.utils.structs.articulation_joint import ArticulationJoint
@@ -352,18 +353,32 @@ def camera_components(camera: Any) -> list[Any] | None:
 
 
 def mark_camera_configs() -> None:
-    """Let every ``CameraConfig`` of this process keep where it was made, for `camera_site`. Safe to call again."""
+    """Let every ``CameraConfig`` of this process keep where it was made, for `camera_site`, and at what its pose was
+    said to look, for `camera_target`. Of tasks that are imported after this. Safe to call again."""
     stock = CameraConfig.__init__
     if hasattr(stock, "_workbench_stock"):
         return
+    stock_look_at = sapien_utils.look_at
+    looked: deque[tuple[Pose, Any]] = deque(maxlen=64)
+    """The last poses of ``look_at``, and their targets. Tensors are not read before a camera is made: on a GPU that waits."""
 
     @wraps(stock)
     def init(self: Any, *args: Any, **kwargs: Any) -> None:
         stock(self, *args, **kwargs)
         self._workbench_site = _place_of_call(sys._getframe(1))
+        own = self.pose.raw_pose
+        same = (to for pose, to in reversed(looked) if torch.equal(pose.raw_pose.to(own.device), own))
+        self._workbench_target = next(same, None)
+
+    @wraps(stock_look_at)
+    def look_at(eye: Any, target: Any, *args: Any, **kwargs: Any) -> Pose:
+        pose = stock_look_at(eye, target, *args, **kwargs)
+        looked.append((pose, target))
+        return pose
 
     init._workbench_stock = stock  # type: ignore[attr-defined]
     CameraConfig.__init__ = init  # type: ignore[method-assign]
+    sapien_utils.look_at = look_at
 
 
 def _place_of_call(frame: FrameType) -> CallSite:
@@ -379,6 +394,11 @@ def _place_of_call(frame: FrameType) -> CallSite:
 def camera_site(config: Any) -> CallSite | None:
     """Where a config was made; None where that was not kept."""
     return getattr(config, "_workbench_site", None)
+
+
+def camera_target(config: Any) -> Any:
+    """What ``look_at`` was given as its target when it made the config's pose; None where another thing made it."""
+    return getattr(config, "_workbench_target", None)
 
 
 def shader_packs() -> dict[str, Any]:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from workbench.core import seams
 from workbench.core.body_table import BodyTable, build_body_table
-from workbench.core.camera_configs import rows_of_pose, settings_of
+from workbench.core.camera_configs import rows_of_pose, settings_of, target_of
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 
 _MODALITIES = ("rgb", "depth", "segmentation", "position", "normal", "albedo")
@@ -69,6 +69,7 @@ def list_cameras(env: Any, table: BodyTable | None = None) -> tuple[CameraInfo, 
                 settings=settings_of(camera.config),
                 varies=_varies(camera.config, components),
                 site=seams.camera_site(camera.config),
+                target=target_of(camera.config),
             )
         )
     return tuple(infos)

@@ -32,8 +32,8 @@ from workbench.recording.library_row import (
     clean_note,
     clean_tags,
     moment,
-    number,
     text,
+    total,
     truth,
     whole,
 )
@@ -125,7 +125,7 @@ def _episode(kind: Kind, said: dict[str, Any], if_undated: float) -> Facts:
         seed=None if seed is None or seed < 0 else seed,
         env_index=whole(said.get("env_index")),
         length=whole(said.get("length")),
-        total_reward=number(said.get("return")),
+        total_reward=total(said.get("return")),
         success=truth(said.get("success")),
         success_once=truth(said.get("success_once")),
         fail=truth(said.get("fail")),
@@ -266,7 +266,7 @@ def _look_into(
                 totals[name] = None
                 rewards = group.get("rewards")
                 if isinstance(rewards, H5Dataset) and rewards.is_numbers:
-                    totals[name] = number(float(rewards.read().sum(dtype=np.float64)))
+                    totals[name] = total(float(rewards.read().sum(dtype=np.float64)))
                 if (picture := _last_picture(group)) is not None:
                     pictures[name] = picture
     except RefusedH5 as error:

@@ -150,7 +150,7 @@ def facts_from_dict(values: object) -> Facts:
         seed=whole(values["seed"]),
         env_index=whole(values["env_index"]),
         length=whole(values["length"]),
-        total_reward=number(values["total_reward"]),
+        total_reward=total(values["total_reward"]),
         success=truth(values["success"]),
         success_once=truth(values["success_once"]),
         fail=truth(values["fail"]),
@@ -196,6 +196,14 @@ def number(value: object) -> float | None:
     except OverflowError:
         return None
     return as_float if math.isfinite(as_float) else None
+
+
+def total(value: object) -> float | None:
+    """A sum of rewards, NaN and infinite ones too."""
+    if isinstance(value, float) and not math.isfinite(value):
+        # One object, or a row would not equal itself when it is read again.
+        return math.nan if math.isnan(value) else value
+    return number(value)
 
 
 def truth(value: object) -> bool | None:

@@ -350,8 +350,10 @@ class CameraStudio:
             self._serial += 1
             if level not in ("same", "cameras"):
                 self._judging.outdate()
-            # The dropped ones too: their placement may have been on its way while the version came in.
-            return (*self._cameras.placements.all_moved, *dropped)
+            # The dropped ones too: their placement may have been on its way while the version came in. And those that
+            # were changed here: taken back, one stands as the file says, which a version that is the same does not tell.
+            asked = (*self._cameras.placements.all_moved, *dropped, *(own & said.keys()))
+            return tuple(dict.fromkeys(asked))
 
     def answered(self, answer: CameraAnswer) -> None:
         """The worker that plays answered a question about a camera."""

@@ -293,14 +293,19 @@ class CameraWriting:
             for change in edit.changes
         )
 
-    def compare(self, task: TaskDescription) -> None:
-        """The version that was awaited runs: does it have what was written?"""
+    def compare(self, task: TaskDescription, went_back: bool) -> None:
+        """The version that was awaited runs: does it have what was written?
+
+        Args:
+            went_back: the camera stands as the file says again, and not as it was placed.
+        """
         view, wish = self.view, self.wish
         assert view.edit is not None and wish is not None
         infos = {c.key: c for c in task.cameras}
         file = view.edit.names
         if view.stage == "undone":
-            self.view = replace(view, message=f"{file} {_was(view.edit)} before.")
+            back = f" {wish.key[1]} stands as it says; Undo puts it where you placed it." if went_back else ""
+            self.view = replace(view, message=f"{file} {_was(view.edit)} before.{back}")
             return
         wrong = _mismatch(wish, infos, view.edit.settings)
         if wrong:

@@ -54,7 +54,9 @@ class EnvRows:
     end: NDArray[np.int32]
     """(N,) the step at which it ended; -1 while it runs."""
     total: NDArray[np.float64]
-    """(N,) undiscounted return so far; NaN for an episode that was not followed from its start."""
+    """(N,) undiscounted return so far; NaN after a reward that is."""
+    followed: NDArray[np.bool_]
+    """(N,) whether the episode was followed from its start; of another there is no return."""
     first_true: dict[str, NDArray[np.int32]]
     """By bool entry of ``evaluate``: (N,) the first step at which it was true (0: after the reset); -1: never."""
     rewards: NDArray[np.float32]
@@ -88,6 +90,7 @@ class EnvTable:
         self._outcome = np.zeros(count, np.int8)
         self._end = np.full(count, -1, np.int32)
         self._total = np.zeros(count)
+        self._followed = np.ones(count, bool)
         self._first_true: dict[str, NDArray[np.int32]] = {}
         self._rewards = np.full((count, KEPT_REWARDS), np.nan, np.float32)
         self._outliers: dict[int, tuple[Outlier, ...]] = {}
@@ -108,7 +111,13 @@ class EnvTable:
         moment = None if history is None else history.at(history.last)
         if moment is not None:
             moment.standing = Standing(
-                self._outcome, self._end, self._total, self._first_true, self._outliers, self._last
+                self._outcome,
+                self._end,
+                self._total,
+                self._followed,
+                self._first_true,
+                self._outliers,
+                self._last,
             )
 
     def _take(self, stepped: Stepped, history: History | None) -> None:
@@ -144,6 +153,7 @@ class EnvTable:
             steps=self._steps.copy(),
             end=self._end,
             total=self._total,
+            followed=self._followed,
             first_true=dict(self._first_true),
             rewards=self._rewards[:, oldest_first],
             outliers=dict(self._outliers),
@@ -170,6 +180,7 @@ class EnvTable:
         self._outcome = np.where(envs, np.int8(Outcome.RUNNING), self._outcome)
         self._end = np.where(envs, np.int32(-1), self._end)
         self._total = np.where(envs, np.where(step.elapsed_steps == 0, 0.0, np.nan), self._total)
+        self._followed = np.where(envs, step.elapsed_steps == 0, self._followed)
         self._rewards[envs] = np.nan
         for shown in self._shown.values():
             shown[envs] = False
@@ -189,6 +200,7 @@ class EnvTable:
         self._outcome = _with(self._outcome, envs, then.outcome[source])
         self._end = _with(self._end, envs, then.end[source])
         self._total = _with(self._total, envs, then.total[source])
+        self._followed = _with(self._followed, envs, then.followed[source])
         self._first_true = {
             name: _with(steps, envs, then.first_true[name][source]) if name in then.first_true else steps
             for name, steps in self._first_true.items()

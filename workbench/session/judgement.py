@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from workbench.core.snapshot_bytes import WholeSnapshot
 from workbench.core.step import StepResult
 from workbench.session.history import History, Moment
+from workbench.session.number_text import lost_text
 
 MOST_ENTRIES = 24
 """Entries of ``evaluate`` that are compared; each takes 8 bytes for every moment and env."""
@@ -68,6 +69,9 @@ class Summary:
     successes: tuple[int, int] | None
     """Episodes with a success, as recorded and now; None for a task without one."""
     mean_return: tuple[float, float]
+    """Of those whose return is finite, as recorded and now; NaN where none is."""
+    lost_returns: tuple[str, str]
+    """How many are not, as `lost_text` says it."""
     drift_metres: float
     drift_radians: float
     drift_at: tuple[int, int] | None
@@ -193,7 +197,7 @@ class Judgement:
         steps = self._is_step & self._judged
         old, new = self._old.get("reward", self._metres[:0]), self._new.get("reward")
         if new is None or not steps.any():
-            return Summary(0, 0, (), None, (0.0, 0.0), 0.0, 0.0, None, ("reward",), frozenset())
+            return Summary(0, 0, (), None, (0.0, 0.0), ("", ""), 0.0, 0.0, None, ("reward",), frozenset())
         rows, envs = np.nonzero(np.broadcast_to(steps[:, None], self._jumped.shape))
         episode = self._episode[rows, envs]
         change = _difference(new[rows, envs], old[rows, envs])
@@ -222,7 +226,8 @@ class Judgement:
             successes=None
             if "success" not in self._old and "success" not in self._new
             else (int((success[0][seen] >= 0).sum()), int((success[1][seen] >= 0).sum())),
-            mean_return=(float(returns[0][seen].mean()), float(returns[1][seen].mean())),
+            mean_return=(_mean(returns[0][seen]), _mean(returns[1][seen])),
+            lost_returns=(lost_text(returns[0][seen]), lost_text(returns[1][seen])),
             drift_metres=metres,
             drift_radians=float(self._radians.max()),
             drift_at=(int(furthest[1]), int(self._serial[furthest[0]])) if metres > 0 else None,
@@ -350,6 +355,12 @@ def _numbers(step: StepResult) -> Iterator[tuple[str, NDArray]]:
     for name, values in step.evaluate.items():
         if values.dtype.kind in "fiub" and values.shape in ((count,), (count, 1)):
             yield name, values.reshape(count)
+
+
+def _mean(values: NDArray) -> float:
+    """Of those that are finite; NaN where none is."""
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else float("nan")
 
 
 def _difference(new: NDArray, old: NDArray) -> NDArray[np.float64]:

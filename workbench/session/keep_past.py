@@ -15,8 +15,11 @@ from __future__ import annotations
 import pickle
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
+
+import numpy as np
 
 from workbench.recording.episode_writer import EpisodeWriter
 from workbench.recording.landing import RecordingError
@@ -32,13 +35,17 @@ from workbench.session.messages import (
     PlaceCamera,
     Placed,
     Request,
+    Reset,
+    Stepped,
 )
 from workbench.session.moment_messages import Captured, CaptureMoments, MomentToCapture
 from workbench.session.past_episodes import PastEpisode, WhatToKeep, moments_of
 
 _IDLE_SECONDS = 60.0
 """How long the process stays when nothing is kept: it holds some 0.75 GB."""
-_Answer = TypeVar("_Answer", Captured, Loaded, Placed)
+_SAME_START = 1e-6
+"""Metres and quaternion components."""
+_Answer = TypeVar("_Answer", Captured, Loaded, Placed, Stepped)
 
 
 class PastKeeper:
@@ -82,6 +89,7 @@ class PastKeeper:
 
     def _work(self, job: Job, what: WhatToKeep) -> None:
         self._have_loaded(job, what)
+        what, lost = self._with_sure_seeds(job, what)
         writers: dict[int, GatheredEpisode] = {}
         try:
             self._capture_all(job, what, writers)
@@ -99,7 +107,37 @@ class PastKeeper:
         steps = sum(episode.steps for episode in what.episodes)
         unfinished = sum(not episode.ended for episode in what.episodes)
         kept = f"kept {len(made)} episode{'' if len(made) == 1 else 's'}, {steps} steps"
-        self._say(kept + _not_ended(unfinished, len(made)))
+        self._say(kept + _not_ended(unfinished, len(made)) + _no_seed(lost, len(made)))
+
+    def _with_sure_seeds(self, job: Job, what: WhatToKeep) -> tuple[WhatToKeep, int]:
+        """Each episode with its seed only if that, alone, starts it; and of how many it does not.
+
+        What envs that were reset together drew from torch's generator hangs on all of them.
+        """
+        sure: list[PastEpisode] = []
+        for done, episode in enumerate(what.episodes):
+            job.tell(done, len(what.episodes), "trying the seeds")
+            sure.append(episode if self._starts(job, episode) else replace(episode, seed=-1))
+        lost = sum(was.seed != now.seed for was, now in zip(what.episodes, sure, strict=True))
+        return replace(what, episodes=tuple(sure)), lost
+
+    def _starts(self, job: Job, episode: PastEpisode) -> bool:
+        """Whether a reset of its env alone with its seed gives its first state."""
+        if episode.seed < 0:
+            return True
+        first, env = episode.moments[0]
+        self._process.send(Reset((env,), episode.seed))
+        while True:
+            event = self._answer(job, Stepped)
+            # The one that the version began with may come before.
+            if event.reset_mask.sum() == 1 and event.seeds is not None and event.seeds[env] == episode.seed:
+                return np.allclose(
+                    event.step.poses[env],
+                    first.as_recorded.poses[env],
+                    rtol=0,
+                    atol=_SAME_START,
+                    equal_nan=True,
+                )
 
     def _capture_all(self, job: Job, what: WhatToKeep, writers: dict[int, GatheredEpisode]) -> None:
         names = [dimension.name for dimension in what.task.actions]
@@ -155,6 +193,9 @@ class PastKeeper:
 
     def _ask(self, job: Job, request: Request, kind: type[_Answer]) -> _Answer:
         self._process.send(request)
+        return self._answer(job, kind)
+
+    def _answer(self, job: Job, kind: type[_Answer]) -> _Answer:
         try:
             event = self._process.answer(job, kind, Failed)
         except Stopped:
@@ -181,6 +222,13 @@ def _not_ended(count: int, kept: int) -> str:
     if kept == 1:
         return "; it had not ended"
     return "; none of them had ended" if count == kept else f"; {count} of them had not ended"
+
+
+def _no_seed(count: int, kept: int) -> str:
+    if not count:
+        return ""
+    what = "its start was" if kept == 1 else "their starts were" if count == kept else f"{count} starts were"
+    return f"; {what} drawn for several envs at once, so their first state is recorded and no seed"
 
 
 def _discard(writers: dict[int, GatheredEpisode]) -> None:

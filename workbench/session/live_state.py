@@ -393,6 +393,7 @@ class LiveState:
             picture_milliseconds=self.picture_milliseconds,
             problem=self.problem,
             problem_serial=self.problem_serial,
+            refused=self.problem if self.stale and not self.problem_at_run else None,
             curves=None if self.chronicle is None else self.chronicle.curves(),
             selected_env=self.selected_env,
             playing=self.playing,

@@ -1,4 +1,4 @@
-"""What no env of a healthy task does: numbers that are none, bodies that fly off or fall, odd rewards.
+"""What no env of a healthy task does: NaN and infinite numbers, bodies that fly off or fall, odd rewards.
 
 One env in sixty-four that has blown up does not show in a mean, and by the time a person looks its episode may
 be over. So every control step of the batch is looked at, with a handful of array operations, and what an env
@@ -38,7 +38,7 @@ ROUNDING = 1e-4
 
 
 class Kind(Enum):
-    NOT_A_NUMBER = "not a number"
+    NOT_A_NUMBER = "NaN or infinite"
     FAST = "fast"
     UNDER_FLOOR = "under the floor"
     DROPPED = "dropped"
@@ -100,13 +100,18 @@ class OutlierWatch:
         sights = self._odd_poses(step) if step.poses.shape[:2] == self._there.shape else []
         for name, values in _numbers(step):
             wrong: Any = ~np.isfinite(values.reshape(len(values), -1)).all(axis=1)
-            sights.append(Sight(Kind.NOT_A_NUMBER, wrong, lambda env, name=name: f"{name} is not a number"))
+            sights.append(
+                Sight(
+                    Kind.NOT_A_NUMBER, wrong, lambda env, of=values, name=name: f"{name} {_is_lost(of[env])}"
+                )
+            )
         if step.sound_obs is not None:
             sights.append(
-                Sight(Kind.NOT_A_NUMBER, ~step.sound_obs, lambda _: "the observation is not a number")
+                Sight(Kind.NOT_A_NUMBER, ~step.sound_obs, lambda _: "the observation is NaN or infinite")
             )
         with np.errstate(invalid="ignore"):
             out = (step.reward < self._low - ROUNDING) | (step.reward > self._high + ROUNDING)
+        out &= np.isfinite(step.reward)
         sights.append(Sight(Kind.REWARD, out, lambda env: self._say_reward(float(step.reward[env]))))
         return [sight for sight in sights if sight.envs.any()]
 
@@ -131,7 +136,9 @@ class OutlierWatch:
 
         return [
             Sight(
-                Kind.NOT_A_NUMBER, lost.any(axis=1), lambda e: f"the pose of {first(lost, e)} is not a number"
+                Kind.NOT_A_NUMBER,
+                lost.any(axis=1),
+                lambda e: f"the pose of {first(lost, e)} {_is_lost(step.poses[e, int(lost[e].argmax())])}",
             ),
             Sight(Kind.FAST, fast.any(axis=1), lambda e: "{} moved at {:.3g} m/s".format(*worst(speed, e))),
             Sight(Kind.UNDER_FLOOR, under.any(axis=1), lambda e: f"{first(under, e)} is under the floor"),
@@ -141,6 +148,11 @@ class OutlierWatch:
     def _say_reward(self, reward: float) -> str:
         side = f"below {self._low:g}" if reward < self._low else f"above {self._high:g}"
         return f"the reward is {reward:.3g}, {side}"
+
+
+def _is_lost(values: NDArray) -> str:
+    """What is wrong with numbers of which one at least is not finite."""
+    return "is NaN" if np.isnan(values).any() else "is infinite"
 
 
 def lowest_still_point(geometry: SceneGeometry, poses: NDArray[np.float32]) -> float:

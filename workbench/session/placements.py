@@ -106,6 +106,24 @@ class Placements:
         """The file says now what was placed, or says nothing of this camera any more."""
         self._now.pop(key, None)
 
+    def taken_back(self, key: CameraKey, written: CameraSettings, said: CameraSettings) -> bool:
+        """The file says again what it said before a placement was written to it: the camera stands as that says, and
+        the placement is one step of undo away. False, and nothing is done, if it was placed elsewhere since.
+
+        Args:
+            written: what was taken out of the file.
+            said: what it says now.
+        """
+        placed = self._now.get(key)
+        if placed is not None and differences(placed, written):
+            return False
+        self._now.pop(key, None)
+        if differences(written, said):
+            words = f"took back the change of {key[1]}"
+            self._done = [*self._done[-_MOST_STEPS + 1 :], Step(key, written, said, words)]
+            self._undone.clear()
+        return True
+
     def keep(self, key: CameraKey, settings: CameraSettings) -> None:
         """Place a camera that the next version may have, or have otherwise, without a step of undo."""
         self._now[key] = settings

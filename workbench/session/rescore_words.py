@@ -14,7 +14,8 @@ import numpy as np
 
 from workbench.recording.replace_file import replace_file
 from workbench.session.lengths import length
-from workbench.session.otherwise import counted, turned
+from workbench.session.number_text import mean_text, number_text
+from workbench.session.otherwise import counted, reward_change, turned
 from workbench.session.rescore_messages import Verdict
 
 
@@ -27,7 +28,7 @@ def what_changed(verdict: Verdict) -> str:
     if told:
         return ", ".join(told)
     if verdict.differs:
-        return f"reward by up to {verdict.largest:.4g}, from step {verdict.first_difference}"
+        return f"{reward_change(verdict.largest, verdict.returns)}, from step {verdict.first_difference}"
     if verdict.differing:
         return f"as it was, but for {', '.join(verdict.differing[:3])}"
     return "as it was"
@@ -35,8 +36,8 @@ def what_changed(verdict: Verdict) -> str:
 
 def returns(verdict: Verdict) -> str:
     if math.isnan(verdict.returns[0]) and np.isnan(verdict.old_reward).all():
-        return f"none → {verdict.returns[1]:.4g}"
-    was, now = (f"{value:.4g}" for value in verdict.returns)
+        return f"none → {number_text(verdict.returns[1])}"
+    was, now = (number_text(value) for value in verdict.returns)
     return was if was == now else f"{was} → {now}"
 
 
@@ -61,7 +62,7 @@ def summary(verdicts: Sequence[Verdict]) -> str:
     if any(verdict.has_success for verdict in judged):
         was, now = (sum(verdict.success[k] is not None for verdict in judged) for k in (0, 1))
         sentence += f"; successes: {was}" + ("" if was == now else f" → {now}")
-    was, now = (f"{sum(v.returns[k] for v in judged) / len(judged):.4g}" for k in (0, 1))
+    was, now = (mean_text([v.returns[k] for v in judged]) for k in (0, 1))
     sentence += f"; mean return {was}" + ("" if was == now else f" → {now}")
     skipped = len(verdicts) - len(judged)
     return sentence + (f"; {counted(skipped, 'episode')} not judged" if skipped else "") + "."

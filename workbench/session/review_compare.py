@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from workbench.recording.episode import Episode
 from workbench.session.lengths import length
+from workbench.session.number_text import number_text
 
 ARM = 0.1
 """Metres; a body of this size is thought at each pose, so that an angle is a way."""
@@ -188,7 +189,7 @@ def _numbers(
     begin: int,
     whole: tuple[NDArray, NDArray] | None = None,
 ) -> Parting:
-    totals = "" if whole is None else f"{float(np.sum(whole[0])):.4g} → {float(np.sum(whole[1])):.4g}"
+    totals = "" if whole is None else " → ".join(number_text(float(np.sum(x))) for x in whole)
     if a.shape[1:] != b.shape[1:]:
         return Parting(name, begin, f"shape {a.shape[1:]} → {b.shape[1:]}", "", totals)
     yes = a.dtype.kind == "b" and b.dtype.kind == "b"
@@ -202,14 +203,17 @@ def _numbers(
         return Parting(name, None, "", "", totals)
     first = int(rows[0])
     column = int(np.flatnonzero(differs[first])[0])
-    said = [_said(x[first, column], yes) for x in (one, two)]
+    said = [_said(x[first, column], yes, first) for x in (one, two)]
     label = "" if one.shape[1] == 1 else f"[{column}] "
-    most = "" if yes else f"{np.nanmax(gap, initial=0.0):.3g}"
+    most = "" if yes else number_text(float(np.nanmax(gap, initial=0.0)), ".3g")
     return Parting(name, begin + first, f"{label}{said[0]} → {said[1]}", most, totals)
 
 
-def _said(value: float, yes: bool) -> str:
-    return ("yes" if value else "no") if yes else "—" if np.isnan(value) else f"{value:.4g}"
+def _said(value: float, yes: bool, row: int) -> str:
+    if yes:
+        return "yes" if value else "no"
+    # A start, which no step led to, has NaN for what belongs to a step, and is the first row of those compared.
+    return "—" if np.isnan(value) and row == 0 else number_text(value)
 
 
 def _not_in_both(a: Episode, b: Episode) -> tuple[str, ...]:

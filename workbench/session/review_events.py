@@ -47,7 +47,7 @@ def happenings(episode: Episode) -> tuple[Happening, ...]:
         for state in _beginnings(np.asarray(episode.truncated, bool))
     ]
     found += [
-        Happening(state + 1, "reward is not a number", "odd")
+        Happening(state + 1, "reward is NaN or infinite", "odd")
         for state in _beginnings(~np.isfinite(np.asarray(episode.reward, np.float64)))
     ]
     return tuple(sorted(found, key=lambda h: (h.state, h.style == "other")))

@@ -36,6 +36,7 @@ class Standing:
     outcome: NDArray[np.int8]
     end: NDArray[np.int32]
     total: NDArray[np.float64]
+    followed: NDArray[np.bool_]
     first_true: dict[str, NDArray[np.int32]]
     outliers: dict[int, tuple[Outlier, ...]]
     last: LastEpisode

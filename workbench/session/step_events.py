@@ -46,6 +46,11 @@ class StepEvents:
         begun = self._captured & set(env_idx) if from_reset else set(env_idx)
         self._captured, self._armed = begun, set(env_idx) - begun
 
+    @property
+    def recorded(self) -> frozenset[int]:
+        """The envs that somebody records, from now on or from their next reset."""
+        return frozenset(self._captured | self._armed)
+
     def pictures_due(self, step: StepResult, reset_mask: NDArray[np.bool_]) -> bool:
         """Whether the event of this step draws: no other pictures may be under way then."""
         begun = {env for env in self._armed if reset_mask[env] and step.elapsed_steps[env] == 0}

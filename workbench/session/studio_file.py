@@ -33,6 +33,8 @@ class StudioFile:
         self.folder = Path.cwd()
         """Where a copy of a task goes: where the program was started."""
         self._writing = CameraWriting()
+        self._removed: dict[CameraKey, CameraSettings] = {}
+        """Where cameras were placed, otherwise than the file said, that were taken out of it."""
         self._thread = ThreadPoolExecutor(1, "studio")
         self._closing = False
 
@@ -136,8 +138,9 @@ class StudioFile:
         wish = self._writing.wish
         if wish is None or not self._writing.is_in(task):
             return frozenset()
-        self._follow_the_file(wish)
-        self._writing.compare(task)
+        said = {info.key: info.settings for info in task.cameras}
+        went_back = self._follow_the_file(wish, said.get(wish.key))
+        self._writing.compare(task, went_back)
         return frozenset({wish.key, wish.result})
 
     def plan_in_copy(self, task: TaskDescription) -> None:
@@ -146,8 +149,16 @@ class StudioFile:
         if refused is not None and not self._closing:
             self._submit(self._find_plan, refused)
 
-    def _follow_the_file(self, wish: Wish) -> None:
-        """What an edit, or its being taken back, means for the placements: none is to be lost by it."""
+    def _follow_the_file(self, wish: Wish, said: CameraSettings | None) -> bool:
+        """What an edit, or its being taken back, means for the placements: none is to be lost by it.
+
+        Args:
+            said: what the version that came in says of the camera; None where it has none.
+
+        Returns:
+            whether the camera went back from where it was placed to where the file says.
+        """
+        went_back = False
         placements, undone = self._cameras.placements, self._writing.view.stage == "undone"
         now = placements.now(wish.key)
         if wish.what == "rename":
@@ -156,12 +167,18 @@ class StudioFile:
         elif wish.what == "duplicate" and not undone and placements.moved(wish.key) and now is not None:
             placements.keep(wish.result, now)
         elif wish.what == "edit" and wish.settings is not None:
-            if undone and not placements.moved(wish.key):
-                placements.keep(wish.key, wish.settings)
+            if undone and said is not None:
+                went_back = placements.taken_back(wish.key, wish.settings, said)
             elif not undone and now is not None and not differences(now, wish.settings):
                 placements.written(wish.key)  # but for what was rounded
+        elif wish.what == "remove":
+            if not undone and placements.moved(wish.key) and now is not None:
+                self._removed[wish.key] = now
+            elif undone and (placed := self._removed.pop(wish.key, None)) is not None:
+                placements.keep(wish.key, placed)
         if not undone and wish.what in ("add", "duplicate", "rename"):
             self._cameras.selected = wish.result
+        return went_back
 
     def failed_to_load(self) -> None:
         """A version does not load; the lock is held."""

@@ -119,5 +119,7 @@ class SessionView:
     """The newest answer to `Session.inspect`, of whichever env was selected then."""
     judgement: JudgementView = JudgementView()
     """What the new code says of the episodes that were run with the old."""
+    refused: Problem | None = None
+    """Why what the file holds does not run, while another version does or none."""
     studio: StudioView = StudioView()
     """Cameras, as they are placed by hand."""

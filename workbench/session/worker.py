@@ -303,13 +303,39 @@ class Worker:
         self, opened: OpenedTask, env_idx: tuple[int, ...] | None, seed: int | list[int] | None
     ) -> None:
         self._cameras.finish_picture()  # a reset may build the scene anew
-        step = reset_checked(opened.env, opened.loaded, seed, env_idx)
+        step = self._reset_with_seeds(opened, env_idx, seed)
         self._cameras.put_back()
         mask = np.ones(opened.env.num_envs, bool)
         if env_idx is not None:
             mask[:] = False
             mask[list(env_idx)] = True
         self._send_step(step, mask, seeds=opened.env.episode_seeds)
+
+    def _reset_with_seeds(
+        self, opened: OpenedTask, env_idx: tuple[int, ...] | None, seed: int | list[int] | None
+    ) -> StepResult:
+        """Reset these envs: those that are recorded each alone, so that its seed gives the same start anywhere.
+
+        What envs that are reset together draw from torch's generator hangs on all of them, and on the first one's seed.
+        """
+        every = range(opened.env.num_envs) if env_idx is None else env_idx
+        alone = [env for env in every if env in self._steps.recorded] if len(every) > 1 else []
+        if seed is None or not alone:
+            return reset_checked(opened.env, opened.loaded, seed, env_idx)
+        seeds = dict(
+            zip(every, range(seed, seed + len(every)) if isinstance(seed, int) else seed, strict=True)
+        )
+        step = None
+        if env_idx is None:
+            step = reset_checked(
+                opened.env, opened.loaded, seed
+            )  # what only a reset of all does: a new scene
+        elif rest := [env for env in every if env not in alone]:
+            step = reset_checked(opened.env, opened.loaded, [seeds[env] for env in rest], rest)
+        for env in alone:
+            step = reset_checked(opened.env, opened.loaded, [seeds[env]], [env])
+        assert step is not None
+        return step
 
     def _restore_envs(self, opened: OpenedTask, request: Restore) -> None:
         self._cameras.finish_picture()  # the envs get new scenes, with the same entities

@@ -13,9 +13,11 @@ import viser
 import viser.uplot as uplot
 from numpy.typing import NDArray
 
+from workbench.session.number_text import lost_text, number_text
 from workbench.session.view import SessionView
-from workbench.ui.changed import show
-from workbench.ui.line_chart import CURSOR, LONGEST, SELECTED_COLOUR, STEP, LineChart, Span, line, value_span
+from workbench.ui.changed import fill, show
+from workbench.ui.fragments import render
+from workbench.ui.line_chart import CURSOR, LONGEST, SELECTED_COLOUR, STEP, YES_OR_NO, LineChart, Span, line
 
 REDRAW_EVERY = 0.2
 HEIGHT = 150
@@ -27,6 +29,7 @@ class CurvesPanel:
         folder = server.gui.add_folder(None)
         self._reward = LineChart(server, folder, HEIGHT)
         self._success = LineChart(server, folder, HEIGHT)
+        self._lost = server.gui.add_html("", visible=False)
         self._empty = server.gui.add_html('<div class="wb-note">Curves appear with the first step.</div>')
         self._drawn: tuple[int, int, int, int | None] | None = None
         self._drawn_at = 0.0
@@ -38,6 +41,7 @@ class CurvesPanel:
         if curves is None or not drawable:
             self._reward.hide()
             self._success.hide()
+            show(self._lost, False)
             return
         shown = None if view.timeline.shown is None else view.timeline.tick
         wanted = (curves.serial, view.selected_env, curves.reward.shape[1], shown)
@@ -46,7 +50,11 @@ class CurvesPanel:
         self._drawn, self._drawn_at = wanted, time.monotonic()
         env = view.selected_env
         _draw(self._reward, "reward", curves.tick, curves.reward, env, None, shown)
-        _draw(self._success, "success", curves.tick, curves.success, env, (-0.05, 1.05), shown)
+        lost = said_of(curves.reward[-1])
+        if lost:
+            fill(self._lost, render("warning", text=lost))
+        show(self._lost, bool(lost))
+        _draw(self._success, "success", curves.tick, curves.success, env, YES_OR_NO, shown)
 
 
 def _draw(
@@ -63,12 +71,22 @@ def _draw(
         return
     data, labels = curve_data(tick, values, env)
     series = chart_series(labels)
-    if shown is not None or not all(np.isfinite(values).all() for values in data[1:]):
-        # uPlot finds no range for data with NaN in it.
-        span = span or value_span(data[1:])
     if shown is not None:
         data, series = (*data, cursor_data(data, shown)), (*series, CURSOR)
     chart.draw(title, data, series, span)
+
+
+def said_of(reward: NDArray[np.float32]) -> str:
+    """What the curve does not show of a step: in how many envs its reward is no finite number. Empty for none."""
+    lost = lost_text(reward)
+    if not lost:
+        return ""
+    rest = ": no curve goes on there." if not np.isfinite(reward).any() else "; the mean is of the others."
+    return (
+        f"The reward is {lost} envs{rest}"
+        if len(reward) > 1
+        else f"The reward is {number_text(float(reward[0]))}."
+    )
 
 
 def curve_data(

@@ -25,6 +25,7 @@ from workbench.ui.env_strip import (
     Filter,
     columns,
     entry_names,
+    first_flagged,
     make_rows,
     mask,
     moment_of,
@@ -43,7 +44,7 @@ HINTS = {
     "steps": "Control steps of the episode",
     "return": "Sum of the rewards of the episode so far",
     "last": "How the episode before ended, and at which step",
-    "flags": "What is odd: not a number, too fast, fallen, reward out of range",
+    "flags": "What is odd: NaN or infinite, too fast, fallen, reward out of range",
 }
 
 
@@ -159,6 +160,14 @@ class EnvPanel:
 
     def _turn(self, by: int) -> None:
         self._first = max(0, self._first + by)
+
+    def select_first_flagged(self) -> None:
+        """The first env with something odd, at the step at which that began."""
+        rows = self._session.env_rows()
+        env = None if rows is None else first_flagged(rows)
+        if env is not None:
+            self._choose_env(env)
+            self._changed = True
 
     def select_next(self, wanted: Filter) -> None:
         """The next env, by number and round the end, that a filter lets through; none if there is none."""

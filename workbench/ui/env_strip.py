@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.session.env_table import EnvRows, Outcome
+from workbench.session.number_text import number_text
+from workbench.ui.timeline_strip import polylines
 
 Filter = Literal["all", "failed", "running", "flagged"]
 FILTERS: tuple[Filter, ...] = ("all", "failed", "running", "flagged")
@@ -61,8 +63,8 @@ class Row:
     steps: str
     first_true: tuple[str, ...]
     """Of each of the columns; empty where it never was."""
-    curve: str
-    """``points`` of an SVG polyline; empty without a reward."""
+    curve: list[str]
+    """``points`` of SVG polylines, with a gap where the reward is not finite; empty without one."""
     last: str
     """How the episode before ended: ``success 34``; empty if there was none."""
     last_state: str
@@ -109,6 +111,11 @@ def mask(rows: EnvRows, wanted: Filter) -> NDArray[np.bool_]:
     return everyone
 
 
+def first_flagged(rows: EnvRows) -> int | None:
+    """The first env with something odd: in the episode under way, or else in the one before; None for none."""
+    return min(rows.outliers, default=None) if rows.outliers else min(rows.last.outliers, default=None)
+
+
 def order(rows: EnvRows, column: str, descending: bool, wanted: Filter = "all") -> NDArray[np.int64]:
     """The envs that a filter lets through, sorted by a column; envs without a value last."""
     envs = np.flatnonzero(mask(rows, wanted))
@@ -141,7 +148,7 @@ def make_rows(rows: EnvRows, envs: NDArray[np.int64]) -> list[Row]:
             Row(
                 env=env,
                 state=WORDS[outcome],
-                total="" if np.isnan(rows.total[env]) else f"{rows.total[env]:.3g}",
+                total=number_text(float(rows.total[env]), ".3g") if rows.followed[env] else "",
                 steps=str(int(rows.steps[env])),
                 first_true=tuple(_step(int(rows.first_true[name][env])) for name in names),
                 curve=curve,
@@ -178,22 +185,26 @@ def _keys(rows: EnvRows, column: str) -> NDArray[np.float64]:
     return np.arange(rows.num_envs, dtype=np.float64)
 
 
-def _curves(rewards: NDArray[np.float32], envs: NDArray[np.int64]) -> list[str]:
+def _curves(rewards: NDArray[np.float32], envs: NDArray[np.int64]) -> list[list[str]]:
     """SVG points of each env's rewards, all on one scale: rows are there to be compared."""
     chosen = rewards[envs].astype(np.float64)
     finite = np.isfinite(chosen)
     if not finite.any():
-        return [""] * len(envs)
+        return [[] for _ in envs]
     # As wide as the longest episode shown.
     chosen = chosen[:, int(finite.any(axis=0).argmax()) :]
-    chosen = chosen[:, :: -(-chosen.shape[1] // POINTS)]
-    finite = np.isfinite(chosen)
+    every = np.arange(0, chosen.shape[1], -(-chosen.shape[1] // POINTS))
+    # A single step without a number is seen too.
+    finite = np.logical_and.reduceat(np.isfinite(chosen), every, axis=1)
+    chosen = chosen[:, every]
+    if not finite.any():
+        return [[] for _ in envs]
     low, high = chosen[finite].min(), chosen[finite].max()
     span = high - low if high > low else 1.0
     x = np.round(np.linspace(0, CURVE_WIDTH, chosen.shape[1]), 1)
     y = np.round(CURVE_HEIGHT - 1 - (CURVE_HEIGHT - 2) * (np.where(finite, chosen, low) - low) / span, 1)
     return [
-        " ".join(f"{a:g},{b:g}" for a, b in zip(x[ok], heights[ok], strict=True))
+        polylines([f"{a:g},{b:g}" if there else None for a, b, there in zip(x, heights, ok, strict=True)])
         for heights, ok in zip(y, finite, strict=True)
     ]
 

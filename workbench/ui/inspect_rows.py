@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.inspection import JointReadings, Leaf, Touching
+from workbench.session.number_text import number_text
 
 NEAR_A_LIMIT = 0.02
 """Part of a joint's range."""
@@ -130,9 +131,9 @@ def contact_rows(contacts: Sequence[Touching]) -> list[ContactRow]:
         ContactRow(
             first=pair.bodies[0],
             second=pair.bodies[1],
-            force=f"{np.linalg.norm(pair.force):.3g} N",
+            force=f"{number_text(float(np.linalg.norm(pair.force)), '.3g')} N",
             vector=vector(pair.force),
-            impulse=f"{np.linalg.norm(pair.impulse):.3g} N s",
+            impulse=f"{number_text(float(np.linalg.norm(pair.impulse)), '.3g')} N s",
             point=vector(pair.points.mean(axis=0)) if len(pair.points) else "",
             note=_depth(pair),
         )
@@ -159,7 +160,7 @@ def number(value: object) -> str:
     if not isinstance(value, float):
         return str(value)
     if not math.isfinite(value):
-        return str(value)
+        return number_text(value)
     if value and not 1e-3 <= abs(value) < 1e4:
         return "0.000" if abs(value) < 1e-6 else f"{value:.1e}"
     return f"{value:.3f}"

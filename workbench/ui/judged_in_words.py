@@ -7,7 +7,8 @@ import math
 from workbench.session.judge import JudgementView
 from workbench.session.judgement import EpisodeDifference, Summary
 from workbench.session.lengths import length
-from workbench.session.otherwise import counted, turned
+from workbench.session.number_text import number_text
+from workbench.session.otherwise import counted, reward_change, turned
 
 FAR_METRES = 1e-3
 FAR_RADIANS = 1e-2
@@ -46,8 +47,9 @@ def numbers(view: JudgementView) -> list[str]:
     lines: list[str] = []
     if summary.successes is not None and summary.successes[0] != summary.successes[1]:
         lines.append(f"episodes with success: {summary.successes[0]} → {summary.successes[1]}")
-    if summary.mean_return[0] != summary.mean_return[1]:
-        lines.append(f"mean return: {change(*summary.mean_return)}")
+    was, now = (_mean(*told) for told in zip(summary.mean_return, summary.lost_returns, strict=True))
+    if was != now:
+        lines.append(f"mean return: {was} → {now}")
     return lines
 
 
@@ -71,12 +73,12 @@ def difference(episode: EpisodeDifference) -> list[str]:
     """What is otherwise in one episode: success and fail, or else the reward."""
     flags = (("success", episode.success), ("fail", episode.fail))
     lines = [turned(name, was, now) for name, (was, now) in flags if was != now]
-    return lines or [f"reward by up to {_short(episode.largest)}"]
+    return lines or [reward_change(episode.largest, episode.returns)]
 
 
 def change(was: float, now: float) -> str:
-    return f"{_short(was)} → {_short(now)}"
+    return f"{number_text(was)} → {number_text(now)}"
 
 
-def _short(value: float) -> str:
-    return f"{value:.4g}"
+def _mean(mean: float, lost: str) -> str:
+    return ", ".join(part for part in ("" if math.isnan(mean) else number_text(mean), lost) if part)

@@ -7,11 +7,13 @@ come last whichever way it is sorted, and ties keep the newest first, which is t
 from __future__ import annotations
 
 import datetime
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 from workbench.recording.library_row import LibraryRow
+from workbench.session.number_text import number_text
 from workbench.ui.file_size import size_in_words
 
 Column = Literal["task", "date", "seed", "steps", "return", "success", "version", "tags", "note", "name"]
@@ -149,7 +151,8 @@ def _key(row: LibraryRow, column: Column) -> float | str | None:
     if column == "steps":
         return row.length
     if column == "return":
-        return row.total_reward
+        known = row.total_reward
+        return known if known is not None and math.isfinite(known) else None
     if column == "success":
         return {"success": 3.0, "once": 2.0, "no": 1.0, "fail": 0.0}.get(_outcome(row))
     texts = {"task": row.task, "version": row.source_hash, "note": row.note, "name": row.name}
@@ -177,7 +180,7 @@ def cells(row: LibraryRow, newest: dict[str, str], now: datetime.datetime) -> Ce
         when="" if when is None else f"{when:%Y-%m-%d %H:%M:%S}",
         seed="" if row.seed is None else str(row.seed),
         steps="" if row.length is None else str(row.length),
-        total="" if total is None else f"{total:.4g}",
+        total="" if total is None else number_text(total),
         outcome=_outcome(row),
         version=row.source_hash[:HASH],
         other_version=bool(row.source_hash) and newest.get(row.task, row.source_hash) != row.source_hash,

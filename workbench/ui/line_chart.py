@@ -1,8 +1,10 @@
-"""One chart of lines over steps, made when there is something to draw and kept from then on.
+"""One chart of lines over steps, made when there is something to draw.
 
-A chart that is made anew flickers, and viser's takes its lines, its range and its data as three properties: whoever
-looks while one of them is already the new one sees a chart that cannot be drawn. So all that draw curves have the chart
-through here, which sends together what belongs together, and no more than has changed.
+viser keeps what part of the x axis one sees as a share of the data's range, and works that out from two charts at
+once when uPlot makes its chart anew, which it does for a change of anything but the data. So after such a change the
+axis shows another part of the data than before, for good, and in the end none of it. And uPlot finds no range for
+data with NaN in it, and draws through it. So all that draw curves have the chart through here: only data are ever
+sent to a chart that is shown, with gaps where there is no number, and for other lines another chart is shown.
 """
 
 from __future__ import annotations
@@ -15,7 +17,10 @@ import viser.uplot as uplot
 from numpy.typing import NDArray
 
 from workbench.ui.changed import show
+from workbench.ui.viser_seam import send_lines
 
+TAKING_TURNS = 3
+"""Charts of which one is shown. Of two, a browser that is busy might see no change where there were two in a row."""
 LONGEST = 600
 """Points of a curve. More do not fit in the panel's 300 pixels."""
 SELECTED_COLOUR = "#228be6"
@@ -26,6 +31,8 @@ CURSOR = uplot.Series(
 )
 
 Span = tuple[float, float]
+YES_OR_NO: Span = (-0.05, 1.05)
+"""The range of a curve that is 0 or 1."""
 
 
 class LineChart:
@@ -39,7 +46,14 @@ class LineChart:
         order: float | None = None,
     ) -> None:
         self._server, self._folder, self._height, self._order = server, folder, height, order
-        self.handle: viser.GuiUplotHandle | None = None
+        self._charts: list[viser.GuiUplotHandle] = []
+        """One of them is shown at most; the last one was last."""
+        self._made_for: object = None
+
+    @property
+    def handle(self) -> viser.GuiUplotHandle | None:
+        """The chart that was drawn last; None before there was something to draw."""
+        return self._charts[-1] if self._charts else None
 
     def hide(self) -> None:
         if self.handle is not None:
@@ -55,36 +69,55 @@ class LineChart:
         """
         Args:
             title: Over the chart.
-            data: Steps, then one array a line, each (K,).
+            data: Steps, then one array a line, each (K,); a line has a gap where it is not finite.
             series: What each of them is.
-            span: The range along y; None for that of the data, which must hold no NaN then: uPlot finds none.
+            span: The range along y; None for that of the data.
         """
         data, series = tuple(data), tuple(series)
+        wanted = (title, series, span)
+        # The data must fit the series in every state that the browser may see.
+        with self._server.atomic():
+            if self.handle is None or wanted != self._made_for:
+                self._change_to(title, data, series, span)
+            chart = self._charts[-1]
+            send_lines(chart, data, tuple(with_gaps(values) for values in data))
+            show(chart, True)
+        self._made_for = wanted
+
+    def _change_to(
+        self,
+        title: str,
+        data: tuple[NDArray[np.float64], ...],
+        series: tuple[uplot.Series, ...],
+        span: Span | None,
+    ) -> None:
+        """Make a chart that is not in the page the one to draw: there it begins anew, with its x axis too.
+
+        It is not removed and added, since a browser that is busy meets the data of before after that, and says so.
+        """
         scales = {"x": uplot.Scale(time=False)} | ({} if span is None else {"y": uplot.Scale(range=span)})
-        if self.handle is None:
-            with self._folder:
-                self.handle = self._server.gui.add_uplot(
-                    data,
-                    series,
-                    title=title,
-                    scales=scales,
-                    axes=(uplot.Axis(size=30), uplot.Axis(size=46)),
-                    legend=uplot.Legend(show=True),
-                    height=self._height,
-                    padding=(6, 12, 0, 0),
-                    order=self._order,
-                )
+        self.hide()
+        if len(self._charts) == TAKING_TURNS:
+            chart = self._charts.pop(0)
+            chart.title, chart.series, chart.scales = title, series, scales
+            self._charts.append(chart)
             return
-        if self.handle.title != title:
-            self.handle.title = title
-        if self.handle.series != series or self.handle.scales != scales:
-            # The data must fit the series in every state that the browser may see.
-            with self._server.atomic():
-                self.handle.series, self.handle.scales = series, scales
-                self.handle.data = data
-        else:
-            self.handle.data = data
-        show(self.handle, True)
+        with self._folder:
+            chart = self._server.gui.add_uplot(
+                data,
+                series,
+                title=title,
+                scales=scales,
+                axes=(uplot.Axis(size=30), uplot.Axis(size=46)),
+                legend=uplot.Legend(show=True),
+                height=self._height,
+                padding=(6, 12, 0, 0),
+                # All in one place.
+                order=self._order,
+                visible=False,
+            )
+        self._order = chart.order
+        self._charts.append(chart)
 
 
 def line(label: str, colour: str, width: float) -> uplot.Series:
@@ -92,10 +125,15 @@ def line(label: str, colour: str, width: float) -> uplot.Series:
     return uplot.Series(label=label, stroke=colour, width=width, points={"show": False})
 
 
-def value_span(lines: Sequence[NDArray[np.float64]]) -> Span:
-    """A range that holds every finite value, with some room above and below."""
+def with_gaps(values: NDArray[np.float64]) -> NDArray[np.float64] | list[float | None]:
+    """A line as uPlot wants it: None where it is not finite, which is a gap to uPlot as NaN is not."""
+    finite = np.isfinite(values)
+    if finite.all():
+        return values
+    return [value if there else None for value, there in zip(values.tolist(), finite.tolist(), strict=True)]
+
+
+def span_of(lines: Sequence[NDArray[np.float64]]) -> Span | None:
+    """The range of a chart: of a yes or no always the same one, whether it changes or not; else that of the data."""
     values = np.concatenate(lines)
-    values = values[np.isfinite(values)]
-    low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
-    room = 0.08 * (high - low) or 0.5
-    return low - room, high + room
+    return YES_OR_NO if np.isin(values[np.isfinite(values)], (0.0, 1.0)).all() else None

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.step import OtherEntry, StepResult
+from workbench.session.number_text import lost_text, mean_text, number_text
 
 LONGEST_VECTOR = 4
 LONGEST_TEXT = 160
@@ -102,11 +103,12 @@ def _one(value: NDArray) -> str:
     if value.dtype.kind in "iu":
         return str(int(value))
     if value.dtype.kind == "f":
-        number = float(value)
-        if not np.isfinite(number):
-            return str(number)
-        return f"{number:.3f}" if 1e-3 <= abs(number) < 1e4 or number == 0 else f"{number:.2e}"
+        return _float(float(value))
     return repr(value.item())
+
+
+def _float(value: float) -> str:
+    return number_text(value, ".3f" if 1e-3 <= abs(value) < 1e4 or value == 0 else ".2e")
 
 
 def _batch(values: NDArray) -> str:
@@ -114,7 +116,13 @@ def _batch(values: NDArray) -> str:
         return _one(values)
     if values.ndim == 1 and values.dtype.kind == "b":
         return f"{int(values.sum())} of {len(values)}"
+    if values.ndim > 1 and values.dtype.kind == "f":
+        # Of a vector the envs are counted that have one anywhere in it.
+        rows = values.reshape(len(values), -1)
+        infinite = np.where(np.isinf(rows).any(axis=1), np.inf, 0.0)
+        return lost_text(np.where(np.isnan(rows).any(axis=1), np.nan, infinite))
     if values.ndim == 1 and values.dtype.kind in "iuf" and len(values):
-        mean = np.asarray(values, np.float64).mean()
-        return f"mean {mean:.1f}" if values.dtype.kind in "iu" else f"mean {_one(np.asarray(mean))}"
+        if not np.isfinite(values).any():
+            return lost_text(values)
+        return f"mean {mean_text(values, _float if values.dtype.kind == 'f' else lambda mean: f'{mean:.1f}')}"
     return ""

@@ -86,7 +86,9 @@ class Page:
         server.gui.main_panel.set_width(PANEL_WIDTH)
         server.gui.set_panel_label("Workbench")
 
-        self._status = StatusLine(server)
+        self._status = StatusLine(
+            server, session.env_rows, on_flagged=lambda: self._envs.select_first_flagged()
+        )
         run_tab = self._add_tabs(dark)
         self._timeline = TimelinePanel(server, session)
         self._add_table_of_envs()

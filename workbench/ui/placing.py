@@ -85,14 +85,21 @@ class Placing:
             gesture = self._gesture if gesture is None else gesture
         self._session.studio.place(key, settings, gesture)
 
-    # --- the target: a camera has a direction; how far it looks is the page's own knowledge -----------
+    # --- the target: a camera has a direction; how far it looks is said by its look_at, or known to the page ----
 
     def distance(self, camera: StudioCamera) -> float:
-        """Metres from the eye to the target: as it was when the camera stood so, or as it was last."""
+        """Metres from the eye to the target: as it was set when the camera stood so, as the file gives it where the
+        camera stands as that has it, or as it was last."""
         now = camera.now
         if now is None:
             return USUAL
-        distance = self._distances.get(_stand(camera.key, now), self._distance.get(camera.key))
+        set_here, said = self._distances.get(_stand(camera.key, now)), _said_distance(camera)
+        if set_here is None and said is not None:
+            # Not kept for this place: the file may give another target that is seen the same way.
+            with self._lock:
+                self._distance[camera.key] = said
+            return said
+        distance = self._distance.get(camera.key) if set_here is None else set_here
         if distance is None:
             distance = usual_distance(self.frame(camera).to_env(now))
         self.set_distance(camera.key, now, distance)
@@ -126,6 +133,13 @@ class Placing:
         turned = frame.from_view(settings, looking_at(pose, pose[:3], target))
         self.set_distance(camera.key, turned, float(np.linalg.norm(target - pose[:3])))
         self.place(camera.key, turned, hand)
+
+
+def _said_distance(camera: StudioCamera) -> float | None:
+    """Metres to the target that the file gives; None where it gives none, or the camera was moved."""
+    if camera.moved or camera.now is None or camera.info.target is None:
+        return None
+    return float(np.linalg.norm(np.subtract(camera.info.target, camera.now.position)))
 
 
 def _stand(key: CameraKey, settings: CameraSettings) -> tuple[object, ...]:

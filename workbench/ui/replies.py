@@ -44,6 +44,7 @@ SCRIPTS = (
     "unfolded.js",
     "typed_first.js",
     "steady_resolution.js",
+    "tab_title.js",
 )
 """Of ``web_assets/``, run by the page; each says what it is for."""
 STYLES = "panels/page.css"

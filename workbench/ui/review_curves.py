@@ -20,7 +20,7 @@ from workbench.session.review_events import ACTION, REWARD, TERMS, curves
 from workbench.session.review_view import ReviewView, column_at
 from workbench.ui.changed import fill, show
 from workbench.ui.fragments import render
-from workbench.ui.line_chart import CURSOR, LONGEST, STEP, LineChart, Span, line, value_span
+from workbench.ui.line_chart import CURSOR, LONGEST, STEP, LineChart, line, span_of
 from workbench.ui.numbers_table import NumberRow, number_rows
 from workbench.ui.review_as_session import step_of
 from workbench.ui.review_scene import COLOURS, letter
@@ -185,22 +185,12 @@ class ReviewCurves:
         self._charts[chart].draw(title, data, series, span_of(data[1:]))
 
 
-def span_of(lines: tuple[NDArray[np.float64], ...]) -> Span:
-    """The range of a chart; of a yes or no always the same one, whether it changes or not."""
-    values = np.concatenate(lines)
-    if np.isin(values[np.isfinite(values)], (0.0, 1.0)).all():
-        return -0.05, 1.05
-    return value_span(lines)
-
-
 def known(number: str, state: int) -> str:
     """A number as it is said in the table: what the first state lacks, of which no step came before, is kept as NaN.
 
     Later a NaN is what the task returned, and what somebody looks for.
     """
-    if number != "nan":
-        return number
-    return "NaN" if state > 0 else "—"
+    return "—" if number == "NaN" and state == 0 else number
 
 
 def compared(

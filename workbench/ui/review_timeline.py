@@ -33,7 +33,7 @@ NAMES = {
     "success": "success",
     "fail": "fail",
     "limit": "time limit",
-    "odd": "not a number",
+    "odd": "NaN or infinite",
     "other": "other event",
 }
 

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 
+import numpy as np
 import viser
 
+from workbench.session.env_table import EnvRows
 from workbench.session.last_words import Busy
 from workbench.session.view import SessionView
-from workbench.ui.changed import fill
+from workbench.ui.changed import fill, show
+from workbench.ui.env_strip import first_flagged, mask
 from workbench.ui.fragments import render
+from workbench.ui.presses import Presses
 from workbench.ui.version_panel import took
 
 REDRAW_EVERY = 0.25
@@ -29,9 +35,35 @@ WORDS = {
 }
 
 
+@dataclass(frozen=True)
+class Mark:
+    """What stands in the status line for as long as it is so; a press leads to it."""
+
+    text: str
+    hint: str
+    press: str
+    """As `Presses.id_of` gives it."""
+
+
 class StatusLine:
-    def __init__(self, server: viser.ViserServer) -> None:
+    """
+    Args:
+        env_rows: The envs as they stand; None before there is a task.
+        on_flagged: Called when the mark of flagged envs is pressed.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        env_rows: Callable[[], EnvRows | None],
+        on_flagged: Callable[[], None],
+    ) -> None:
+        self._env_rows, self._on_flagged = env_rows, on_flagged
         self._handle = server.gui.add_html("")
+        # On its own: the line above is made anew four times a second, under the finger that presses.
+        self._standing = server.gui.add_html("", visible=False)
+        # At the end of the panel, behind the tabs: all that comes after it is hidden.
+        self._presses = Presses(server)
         self._drawn_at = 0.0
         self._state = ""
         self._task_serial = 0
@@ -50,11 +82,41 @@ class StatusLine:
         if state == self._state and now - self._drawn_at < REDRAW_EVERY:
             return
         self._drawn_at, self._state = now, state
-        fill(self._handle, render("status_line", **status_values(view, fresh)))
+        marks = self._marks()
+        fill(self._handle, render("status_line", **status_values(view, fresh, marked=bool(marks))))
+        if marks:
+            fill(self._standing, render("standing_marks", marks=marks))
+        show(self._standing, bool(marks))
+
+    def _marks(self) -> list[Mark]:
+        rows = self._env_rows()
+        flagged = None if rows is None else flagged_text(rows)
+        if flagged is None:
+            return []
+        return [Mark(*flagged, self._presses.id_of("flagged", lambda _: self._on_flagged()))]
 
 
-def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
-    """What the template is given; `fresh` when a new version of the file has just come in."""
+def flagged_text(rows: EnvRows) -> tuple[str, str] | None:
+    """How many envs are flagged and what is odd in the first of them, in short and in full; None where none is."""
+    count = int(np.count_nonzero(mask(rows, "flagged")))
+    env = first_flagged(rows)
+    if env is None:
+        return None
+    outlier = (rows.outliers.get(env) or rows.last.outliers[env])[0]
+    when = f"step {outlier.step}" + ("" if env in rows.outliers else " of the episode before")
+    envs = "" if rows.num_envs == 1 else f"{count} of {rows.num_envs} envs "
+    press = "Press to see it" if env in rows.outliers else "Press to choose it"
+    hint = f"In env {env}, {when}: {outlier.reason}. {press}; the table of envs (B) has them all."
+    return f"⚑ {envs}flagged: {outlier.reason}", hint
+
+
+def status_values(view: SessionView, fresh: bool = False, marked: bool = False) -> dict[str, object]:
+    """What the template is given.
+
+    Args:
+        fresh: a new version of the file has just come in.
+        marked: something stands below the line that is not as it should be.
+    """
     task = view.task
     # While the renderer is at work, what the session says of it is more than that it is busy.
     busy = None if view.busy is not None and view.busy.drawing and view.activity else view.busy
@@ -80,6 +142,7 @@ def status_values(view: SessionView, fresh: bool = False) -> dict[str, object]:
         "real_time_factor": f"{view.real_time_factor:.2f}",
         "behind": moving and view.speed != float("inf") and view.real_time_factor < 0.85 * view.speed,
         "speed": f"{view.speed:g}",
+        "marked": marked,
     }
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.ui.line_chart import CURSOR, SELECTED_COLOUR, STEP, LineChart, line, value_span
+from workbench.ui.line_chart import CURSOR, SELECTED_COLOUR, STEP, LineChart, line, span_of
 
 RECORD_COLOUR = "#adb5bd"
 SERIES = (STEP, line("as recorded", RECORD_COLOUR, 1.2), line("judged again", SELECTED_COLOUR, 1.8))
@@ -35,4 +35,4 @@ class ThenAndNow:
             data: Steps, the record, what is said now, each (K,); and a point at the moment that is shown, if one is.
         """
         series = SERIES if len(data) == 3 else (*SERIES, CURSOR)
-        self._chart.draw(title, data, series, value_span(data[1:]))
+        self._chart.draw(title, data, series, span_of(data[1:]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import groupby
 
 import numpy as np
@@ -16,7 +17,7 @@ POINTS = 240
 HEIGHT = 30.0
 """Units of the picture's height that the line has; the marks are above."""
 MARKS: tuple[tuple[int, str, str], ...] = (
-    (NOT_A_NUMBER, "odd", "reward is not a number"),
+    (NOT_A_NUMBER, "odd", "reward is NaN or infinite"),
     (FAIL, "fail", "fail"),
     (SUCCESS, "success", "success"),
     (TRUNCATED, "limit", "time limit"),
@@ -99,10 +100,14 @@ def reward_lines(reward: NDArray[np.float32]) -> list[str]:
         places = np.repeat(edges, 2)
     x = 100 * places / (len(known) - 1)
     y = HEIGHT * (1 - (values - low) / (high - low))
-    points = [None if np.isnan(b) else f"{a:.2f},{b:.1f}" for a, b in zip(x, y, strict=True)]
-    runs = [list(run) for there, run in groupby(points, key=lambda point: point is not None) if there]
+    return polylines([None if np.isnan(b) else f"{a:.2f},{b:.1f}" for a, b in zip(x, y, strict=True)])
+
+
+def polylines(points: Sequence[str | None]) -> list[str]:
+    """What SVG's polylines are given for these points, with a gap at each None."""
+    runs = [[point for point in run if point] for there, run in groupby(points, key=bool) if there]
     # A line of one point is not drawn; one of length zero with round ends is a dot.
-    return [" ".join(str(point) for point in (run if len(run) > 1 else run * 2)) for run in runs]
+    return [" ".join(run if len(run) > 1 else run * 2) for run in runs]
 
 
 def megabytes(size: int) -> str:

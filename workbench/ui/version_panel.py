@@ -8,10 +8,12 @@ otherwise. Where a file has several tasks, this is where one of them is chosen.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import viser
 
+from workbench.authoring.problem import Problem
 from workbench.session.messages import LoadLevel, ReloadReport
 from workbench.session.session import Session
 from workbench.session.view import SessionView
@@ -67,29 +69,46 @@ class VersionPanel:
             self._task.show(names[0])
         show(self._task.handle, len(names) > 1)
         notices = () if task is None else task.notices
-        wanted = (view.reload, view.stale, task is None, notices)
+        refused = view.refused if view.state not in ("starting", "loading") else None
+        wanted = (view.reload, refused, task is None, notices)
         if wanted != self._drawn:
             self._drawn = wanted
-            self._html.content = version_html(view.reload, loaded=task is not None, notices=notices)
+            self._html.content = version_html(view.reload, task is not None, refused, notices)
 
     def _load(self, value: str) -> None:
         self._session.reload(LEVELS[value])
 
 
-def version_html(report: ReloadReport | None, loaded: bool, notices: tuple[str, ...] = ()) -> str:
-    """What the page says of the last reload; every value escaped."""
+def version_html(
+    report: ReloadReport | None, loaded: bool, refused: Problem | None = None, notices: tuple[str, ...] = ()
+) -> str:
+    """What the page says of the version that runs, and of the file where it holds another; every value escaped.
+
+    Args:
+        report: how the version that runs came in; None for the first.
+        loaded: whether one runs.
+        refused: why what is in the file does not.
+        notices: what the author should know of it besides.
+    """
+    where = "" if refused is None or refused.file is None else Path(refused.file).name
+    line = "" if refused is None or refused.line is None else f", line {refused.line}"
     shown = [
         *notices[:MOST_SHOWN],
         *([f"And {len(notices) - MOST_SHOWN} more."] if len(notices) > MOST_SHOWN else []),
     ]
+    told = {
+        "loaded": loaded,
+        "refused": refused,
+        "where": f"{where}{line}" if where else "",
+        "notices": shown,
+    }
     if report is None:
-        return render("version", report=None, loaded=loaded, notices=shown)
+        return render("version", report=None, **told)
     missing = list(report.not_carried.items())
     return render(
         "version",
         report=report,
-        loaded=loaded,
-        notices=shown,
+        **told,
         took=took(report.milliseconds),
         carried=len(report.carried),
         missing=missing[:MOST_SHOWN],

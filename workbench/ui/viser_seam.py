@@ -31,12 +31,15 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import rich
 import viser
+import viser._gui_handles
 import viser._messages
 import viser.infra
 import viser.infra._infra
 import websockets.asyncio.server
+from numpy.typing import NDArray
 from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
@@ -70,8 +73,12 @@ PRIVATE_NAMES = (
     "infra.WebsockMessageHandler.unregister_handler",
     "messages.Message",
     *(f"messages.{name}" for name in (*sorted(KINDS), *REFUSED_FROM_CLIENTS)),
+    "gui.AssignablePropsBase._queue_update",
 )
-"""Names that this module relies on; ``infra`` is ``viser.infra._infra``, ``messages`` ``viser._messages``."""
+"""Names that this module relies on.
+
+``infra`` is ``viser.infra._infra``, ``messages`` ``viser._messages``, ``gui`` ``viser._gui_handles``.
+"""
 
 PRIVATE_ATTRIBUTES = (
     "_websock_server",
@@ -106,6 +113,17 @@ class SeamError(RuntimeError):
 def element_id(handle: viser.GuiButtonHandle | viser.GuiNumberHandle) -> str:
     """The ``id`` of its element in the page (viser's ``Button.tsx``, ``NumberInput.tsx``), for HTML that works it."""
     return handle._impl.uuid
+
+
+def send_lines(
+    handle: viser.GuiUplotHandle,
+    data: tuple[NDArray[np.float64], ...],
+    sent: tuple[NDArray[np.float64] | list[float | None], ...],
+) -> None:
+    """Give a chart these data, and its browsers `sent`, in which None is a gap: viser's property makes NaN of it."""
+    props: Any = handle._impl.props
+    props.data = data
+    handle._queue_update("data", sent)
 
 
 def wait_until_taken(server: viser.ViserServer, patience: float) -> None:
@@ -145,7 +163,8 @@ def _missing(root: object, dotted: tuple[str, ...]) -> list[str]:
 
 def missing_names() -> list[str]:
     """Those of `PRIVATE_NAMES` that the installed viser does not have."""
-    return _missing(SimpleNamespace(infra=infra, messages=viser._messages), PRIVATE_NAMES)
+    roots = SimpleNamespace(infra=infra, messages=viser._messages, gui=viser._gui_handles)
+    return _missing(roots, PRIVATE_NAMES)
 
 
 def _page_is_known() -> bool:

@@ -1,0 +1,114 @@
+"""Half an hour before a page that plays while its file is saved again and again: does it go on showing what is so?
+
+    python tests/sweeps/many_saves.py [--saves 30] [--every 10] [--num-envs 16] [--pictures FOLDER]
+
+A real Chromium looks at the Reward tab of ``tasks/push_cube.py`` while good versions are saved, some with a syntax error,
+some with a reward that is NaN in every third env, and some for which all envs are built anew. Between two saves it is
+looked several times whether the curve of the reward is drawn, in the pixels of the canvas; and after each, what the
+server and its worker hold. The last lines count the looks at an empty chart, and say how much the server grew.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import psutil
+import tyro
+from playwright.sync_api import Page, expect
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from tests.browser.opened import TASK, page_on
+from tests.browser.test_charts import drawn
+from workbench.machine.chromium import find_chromium
+
+Kind = Literal["good", "NaN", "rebuilding", "broken"]
+LOOKS = 4
+"""Between two saves."""
+MEANT = "return reward\n"
+SCENE = "CUBE_HALF_SIZE = 0.02\n"
+
+
+@dataclass(frozen=True)
+class Options:
+    saves: int = 30
+    every: float = 10.0
+    """Seconds between two saves."""
+    num_envs: int = 16
+    pictures: Path | None = None
+    """Where a picture of the page after each save goes."""
+
+
+def kind_of(number: int) -> Kind:
+    if number % 7 == 6:
+        return "rebuilding"
+    if number % 5 == 2:
+        return "NaN"
+    return "broken" if number % 6 == 4 else "good"
+
+
+def version(text: str, number: int) -> str:
+    """The file as it is saved for the so-manieth time; the scene is that of the last save that rebuilt it."""
+    assert MEANT in text and SCENE in text
+    kind, scene = kind_of(number), sum(kind_of(n) == "rebuilding" for n in range(number + 1))
+    text = text.replace(SCENE, f"CUBE_HALF_SIZE = {0.02 + 1e-4 * scene:.4f}\n", 1)
+    reward = f"reward = reward + {number} * 1e-6\n        "
+    if kind == "NaN":
+        reward += "reward[::3] = torch.nan\n        "
+    text = text.replace(MEANT, reward + MEANT, 1)
+    return text + (f"\ndef broken(:  # {number}\n" if kind == "broken" else "")
+
+
+def megabytes(process: psutil.Process) -> float:
+    return process.memory_info().rss / 2**20
+
+
+def held(page: Page, pid: int) -> str:
+    server = psutil.Process(pid)
+    workers = server.children(recursive=True)
+    heap = page.evaluate("performance.memory?.usedJSHeapSize ?? 0") / 2**20
+    others = ", ".join(f"{megabytes(worker):.0f}" for worker in workers if worker.is_running())
+    return f"server {megabytes(server):.0f} MB, its processes {others} MB, the page's heap {heap:.0f} MB"
+
+
+def main(options: Options) -> None:
+    chromium = find_chromium()
+    assert chromium is not None
+    empty, looks = 0, 0
+    with tempfile.TemporaryDirectory() as name:
+        file = Path(shutil.copy(TASK, name))
+        good = file.read_text()
+        with page_on(file, "--num-envs", str(options.num_envs), chromium=chromium) as (page, errors, opened):
+            page.get_by_role("button", name="Play", exact=True).click()
+            page.get_by_role("tab", name="Reward").click()
+            expect(page.locator(".uplot canvas").first).to_be_visible(timeout=300_000)
+            before = megabytes(psutil.Process(opened.process.pid))
+            for number in range(options.saves):
+                kind, saved_at = kind_of(number), time.monotonic()
+                file.write_text(version(good, number))
+                seen = []
+                for look in range(1, LOOKS + 1):
+                    page.wait_for_timeout(
+                        max(0.0, 1000 * (saved_at + look * options.every / LOOKS - time.monotonic()))
+                    )
+                    seen.append(len(drawn(page)))
+                empty, looks = empty + sum(not columns for columns in seen), looks + len(seen)
+                print(
+                    f"{number + 1} {kind}: {seen} columns drawn | {held(page, opened.process.pid)}",
+                    flush=True,
+                )
+                if options.pictures is not None:
+                    page.screenshot(path=options.pictures / f"save_{number + 1:02}_{kind}.png")
+            after = megabytes(psutil.Process(opened.process.pid))
+            print(
+                f"empty in {empty} of {looks} looks; the server went from {before:.0f} to {after:.0f} MB; console: {errors}"
+            )
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
