@@ -169,3 +169,14 @@ def test_without_an_agreement_only_a_registered_id_is_opened(
         load_task(RecordedTask("Lift-v1", str(file), "Lift"))
     assert ran(tmp_path) == set()
     assert load_task(RecordedTask("PickCube-v1")).class_name == "PickCubeEnv"
+
+
+def test_what_is_refused_for_a_recording_is_found_for_a_task_that_a_person_opens_after_it(
+    tmp_path: Path,
+) -> None:
+    hidden = "__builtins__['__imp' + 'ort__']('other')"
+    file = lay(tmp_path, task=TASK, other="")
+    load_task(recorded(file))
+    mine = tmp_path / "mine.py"
+    mine.write_text(f"{TASK}{hidden}")
+    assert load_task(str(mine)).class_name == "Lift" and "other" in ran(tmp_path)

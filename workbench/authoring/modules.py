@@ -104,7 +104,7 @@ class AuthorFinder(MetaPathFinder):
                 if candidate in self.given:
                     return self._spec(fullname, candidate, is_package)
         if self.only_given:
-            return self._given_folder(fullname, last, path)
+            return self._given_folder(fullname, last, path) if self._is_newest else None
         found = importlib.machinery.PathFinder.find_spec(fullname, path, target)
         if (
             found is None
@@ -121,14 +121,9 @@ class AuthorFinder(MetaPathFinder):
     ) -> importlib.machinery.ModuleSpec | None:
         """For a name that is no given text: what is installed, else a folder of given texts without an ``__init__.py``.
 
-        Raises ModuleNotFoundError for what is neither: Python would go on to `PathFinder`, and that to this folder, where
-        an earlier task, or the code itself, has put it on ``sys.path``.
+        Raises ModuleNotFoundError for what lies beside the file, where an earlier task, or the code itself, has put the
+        folder on ``sys.path``: Python would go on to `PathFinder`, and find it.
         """
-        for finder in sys.meta_path:
-            if not isinstance(finder, AuthorFinder) and finder is not importlib.machinery.PathFinder:
-                spec = finder.find_spec(fullname, path)
-                if spec is not None:
-                    return spec
         root = str(self.file.parent)
         places = [place for place in (sys.path if path is None else path) if not _is_in(place, root)]
         found = importlib.machinery.PathFinder.find_spec(fullname, places) if places else None
@@ -143,7 +138,19 @@ class AuthorFinder(MetaPathFinder):
             spec = importlib.machinery.ModuleSpec(fullname, None, is_package=True)
             spec.submodule_search_locations = folders
             return spec
+        if importlib.machinery.PathFinder.find_spec(fullname, path) is None:
+            return None
+        for finder in sys.meta_path:
+            if not isinstance(finder, AuthorFinder) and finder is not importlib.machinery.PathFinder:
+                spec = finder.find_spec(fullname, path)
+                if spec is not None:
+                    return spec
         raise ModuleNotFoundError(f"No module named {fullname!r}", name=fullname)
+
+    @property
+    def _is_newest(self) -> bool:
+        """Whether what is imported now is imported for this task, and not for one that was loaded after it."""
+        return next((f for f in sys.meta_path if isinstance(f, AuthorFinder)), None) is self
 
     def text(self, path: str) -> str:
         """What is executed for `path`. Raises OSError, or SyntaxError for what is no text."""
