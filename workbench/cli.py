@@ -234,7 +234,8 @@ def rescore(
     try:
         return run_rescore(what, terminal, err, csv, json, trust)
     except NotTrusted as error:
-        refuse(not_trusted(error.questions))
+        for line in not_trusted(error.questions):
+            refuse(line)
         return Exit.NOT_TRUSTED
     except TaskError as error:
         print_problem(error.problem)
