@@ -14,8 +14,8 @@ from typing import Annotated, Any
 import tyro
 
 from workbench.machine.software_vulkan import use_private_driver
-from workbench.task_arguments import Backend, history_bytes, task_options
-from workbench.terminal import err, print_problem, refuse
+from workbench.task_arguments import Backend, Rules, history_bytes, task_options
+from workbench.terminal import err, print_finding, print_problem, refuse
 from workbench.terminal import out as terminal
 
 Task = Annotated[str, tyro.conf.Positional]
@@ -38,6 +38,7 @@ def open_page(
     history: str = "256MB",
     memory_limit: str = "auto",
     spare: bool = True,
+    rules: Rules = None,
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
 ) -> int:
     """Open a task in a browser page that follows its file.
@@ -56,6 +57,8 @@ def open_page(
             sets no limit. A process that uses more is ended and replaced.
         spare: keep a second process ready to take over when the task's dies (--no-spare: it then takes some
             seconds more, and about 0.8 GB of memory less).
+        rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
+            given, what writes over the state of other envs stops, all else is a warning.
         env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
     """
     from workbench.authoring.reference import named_file
@@ -69,7 +72,7 @@ def open_page(
     from workbench.ui.door import DoorOptions
 
     try:
-        options = task_options(num_envs, backend, seed, env)
+        options = task_options(num_envs, backend, seed, env, rules)
         past = history_bytes(history)
         worker = WorkerOptions(parse_memory(memory_limit), spare)
         at = DoorOptions(host=host, port=port, token=token)
@@ -94,6 +97,7 @@ def record(
     pictures: bool = True,
     max_steps: int | None = None,
     backend: Backend = "auto",
+    rules: Rules = None,
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
 ) -> int:
     """Record episodes of a task without a page: for each an .rrd, and ManiSkill's own .h5 with its .json.
@@ -113,6 +117,8 @@ def record(
         pictures: record what every camera sees (--no-pictures is much faster).
         max_steps: longest episode; else the task's own limit.
         backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (gpu if it works).
+        rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
+            given, what writes over the state of other envs stops, all else is a warning.
         env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
     """
     use_private_driver()
@@ -120,13 +126,13 @@ def record(
     from workbench.session.record import RecordOptions
 
     try:
-        options = task_options(num_envs, backend, seed, env)
+        options = task_options(num_envs, backend, seed, env, rules)
     except ValueError as error:
         return refuse(str(error))
     what = RecordOptions(
         task, out, episodes, successes, tries, actions, use_env_states, pictures, max_steps, workers, options
     )
-    return record_in_terminal(what, err, print_problem, refuse)
+    return record_in_terminal(what, err, print_problem, print_finding, refuse)
 
 
 @app.command
@@ -136,6 +142,7 @@ def review(
     host: str = "127.0.0.1",
     port: int = 8080,
     token: bool = True,
+    rules: Rules = None,
     task: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = (),
 ) -> int:
     """Look through a folder of recordings in a browser page: play, compare, share. No task file is needed.
@@ -146,6 +153,8 @@ def review(
         host: address to listen on; anything but this machine's own needs the token.
         port: port of the page; 0 takes any free one.
         token: ask for the token of the printed address (--no-token: this machine only).
+        rules: what happens where a task that is opened from here breaks a rule of GPU simulation: stop, warn, or off
+            to check none. If not given, what writes over the state of other envs stops, all else is a warning.
         task: a task file in which the envs of ManiSkill's recordings may be found; repeatable. Envs that ManiSkill
             itself has need none.
     """
@@ -163,7 +172,7 @@ def review(
         at = DoorOptions(host=host, port=port, token=token)
     except ValueError as error:
         return refuse(str(error))
-    return review_in_terminal(folder, task, at, WorkerOptions(parse_memory("auto")))
+    return review_in_terminal(folder, task, at, WorkerOptions(parse_memory("auto")), rules)
 
 
 @app.command
@@ -175,6 +184,7 @@ def rescore(
     use_env_states: bool = False,
     num_envs: int = 16,
     backend: Backend = "auto",
+    rules: Rules = None,
     csv: Path | None = None,
     json: Path | None = None,
 ) -> int:
@@ -187,6 +197,8 @@ def rescore(
         use_env_states: put every recorded state in after its step, so that nothing drifts from the record.
         num_envs: episodes to run at once.
         backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (gpu if it works).
+        rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
+            given, what writes over the state of other envs stops, all else is a warning.
         csv: also write the table to this file, as CSV.
         json: also write the table to this file, as JSON.
     """
@@ -198,7 +210,7 @@ def rescore(
         if table is not None and not table.resolve().parent.is_dir():
             return refuse(f"there is no folder {table.resolve().parent} to write {table.name} into")
     try:
-        base = task_options(num_envs, backend, 0, ())
+        base = task_options(num_envs, backend, 0, (), rules)
     except ValueError as error:
         return refuse(str(error))
     use_private_driver()
@@ -207,7 +219,7 @@ def rescore(
 
     what = RescoreOptions(places, task, recorded_source, use_env_states, num_envs, base)
     try:
-        return run_rescore(what, terminal, err, csv, json)
+        return run_rescore(what, terminal, err, csv, json, print_finding)
     except TaskError as error:
         print_problem(error.problem)
         return 1

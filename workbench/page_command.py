@@ -22,6 +22,7 @@ from workbench.machine.software_vulkan import use_private_driver
 from workbench.session.kept_worker import WorkerOptions
 from workbench.session.messages import Event, Failed, TaskOptions
 from workbench.session.session import Session
+from workbench.task_arguments import Rules
 from workbench.terminal import out, print_event, print_line, refuse, warn
 from workbench.ui.door import Door, DoorError, DoorOptions, open_door
 from workbench.ui.pages import Which
@@ -62,20 +63,23 @@ def open_in_terminal(
     )
     place = Workplace(door.server, recordings, session)
     what = f"{task}, {options.num_envs} envs"
-    _serve(door, place, "live", what, recordings, WorkerOptions(worker.memory_limit), end, session.close)
+    beside = WorkerOptions(worker.memory_limit)
+    _serve(door, place, "live", what, recordings, beside, options.rules, end, session.close)
 
 
-def review_in_terminal(folder: Path, tasks: tuple[Path, ...], at: DoorOptions, worker: WorkerOptions) -> int:
+def review_in_terminal(
+    folder: Path, tasks: tuple[Path, ...], at: DoorOptions, worker: WorkerOptions, rules: Rules
+) -> int:
     """Serve the page of a folder of recordings; returns only where the door cannot be opened.
 
     Args:
-        worker: Of tasks that are opened from there.
+        worker, rules: Of tasks that are opened from there.
     """
     door = _opened(at, "Recordings")
     if isinstance(door, int):
         return door
     place = Workplace(door.server, folder, tasks=tasks)
-    _serve(door, place, "review", f"recordings in {folder}", folder, worker, _End(), lambda: None)
+    _serve(door, place, "review", f"recordings in {folder}", folder, worker, rules, _End(), lambda: None)
 
 
 def _opened(at: DoorOptions, label: str) -> Door | int:
@@ -98,6 +102,7 @@ def _serve(
     what: str,
     recordings: Path,
     worker: WorkerOptions,
+    rules: Rules,
     end: _End,
     close_session: Callable[[], None],
 ) -> NoReturn:
@@ -108,7 +113,7 @@ def _serve(
 
     sharing = Sharing(door)
     place.offer(sharing.offer)
-    close_others = offer_going_back_in(place, open_task)
+    close_others = offer_going_back_in(place, open_task, rules)
     end.at_signals()
     try:
         place.pages.start(first)

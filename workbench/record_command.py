@@ -21,6 +21,7 @@ from rich.progress import (
 from rich.progress import Progress as Bar
 
 from workbench.authoring.problem import Problem, TaskError
+from workbench.core.rules import Finding
 from workbench.recording.landing import try_folder
 from workbench.recording.recover import recover
 from workbench.session.record import Progress, Recorded, RecordOptions, record, with_given_actions
@@ -52,6 +53,7 @@ def record_in_terminal(
     what: RecordOptions,
     console: Console,
     say_problem: Callable[[Problem], None],
+    say_finding: Callable[[Finding], None],
     refuse: Callable[[str], int],
 ) -> int:
     """Record, and say what came of it; returns the exit code."""
@@ -78,6 +80,7 @@ def record_in_terminal(
                     lambda activity: bar.update(row, description=activity),
                     _Rate(bar, row, interrupt).show,
                     lambda: interrupt.asked,
+                    say_finding,
                 )
             bar.update(row, completed=len(recorded.written), description="recorded")
     except TaskError as error:

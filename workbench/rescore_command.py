@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from rich.console import Console
@@ -12,12 +13,20 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsed
 from rich.progress import Progress as Bar
 from rich.table import Table
 
+from workbench.core.rules import Finding
 from workbench.session import rescore_words as words
 from workbench.session.rescore_all import Progress, RescoreOptions, rescore_all
 from workbench.session.rescore_messages import Verdict
 
 
-def run_rescore(what: RescoreOptions, out: Console, err: Console, csv: Path | None, json: Path | None) -> int:
+def run_rescore(
+    what: RescoreOptions,
+    out: Console,
+    err: Console,
+    csv: Path | None,
+    json: Path | None,
+    say_finding: Callable[[Finding], None],
+) -> int:
     """Judge, print, write the tables that are asked for; raises as `rescore_all`, and OSError for a table."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Bar(*columns, console=err) as bar:
@@ -28,7 +37,9 @@ def run_rescore(what: RescoreOptions, out: Console, err: Console, csv: Path | No
                 row, total=now.total, completed=now.episodes, description=f"judging, {now.steps} steps"
             )
 
-        verdicts, notes = rescore_all(what, lambda activity: bar.update(row, description=activity), tell)
+        verdicts, notes = rescore_all(
+            what, lambda activity: bar.update(row, description=activity), tell, say_finding
+        )
         bar.update(row, total=len(verdicts), completed=len(verdicts), description="judged")
     for path, text in ((csv, words.as_csv), (json, words.as_json)):
         if path is not None:

@@ -9,6 +9,7 @@ from rich.markup import escape
 
 if TYPE_CHECKING:
     from workbench.authoring.problem import Problem
+    from workbench.core.rules import Finding
     from workbench.session.messages import Event
 
 out = Console(highlight=False)
@@ -37,9 +38,20 @@ def print_problem(problem: Problem) -> None:
         err.print(f"[dim]{escape(problem.traceback.rstrip())}[/]", soft_wrap=True)
 
 
+def print_finding(finding: Finding) -> None:
+    """A rule of GPU simulation that the author's code broke, with its place; the task goes on."""
+    place = "" if finding.file is None else f"{finding.file}:{finding.line or 1}: "
+    err.print(
+        f"[yellow]warning[/] {escape(place)}{escape(finding.message)} [dim](rule {finding.rule})[/]",
+        soft_wrap=True,
+    )
+    if finding.code:
+        err.print(f"    {escape(finding.code)}", soft_wrap=True)
+
+
 def print_event(event: Event) -> None:
     """What the page shows of loads and failures, in the terminal as well."""
-    from workbench.session.messages import Failed, Loaded
+    from workbench.session.messages import Failed, Loaded, RulesBroken
 
     if isinstance(event, Loaded):
         parts = ", ".join(f"{name} {ms:.0f}" for name, ms in event.milliseconds.items())
@@ -55,6 +67,9 @@ def print_event(event: Event) -> None:
         if event.kept:
             back = "comes back where it was" if event.problem.stage == "worker" else "keeps running"
             err.print(f"[dim]the last good version {back}[/]")
+    elif isinstance(event, RulesBroken):
+        for finding in event.new:
+            print_finding(finding)
 
 
 def print_line(line: str) -> None:

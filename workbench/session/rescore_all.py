@@ -10,6 +10,8 @@ from pathlib import Path
 import torch
 
 from workbench.authoring.problem import TaskError
+from workbench.core.broken_rule import warn_of
+from workbench.core.rules import Finding
 from workbench.session.messages import TaskOptions
 from workbench.session.open_task import OpenedTask, open_task
 from workbench.session.rescore import find_episodes, group_episodes, not_judged, with_renderer
@@ -42,6 +44,7 @@ def rescore_all(
     what: RescoreOptions,
     on_activity: Callable[[str], None] = lambda activity: None,
     on_progress: Callable[[Progress], None] = lambda progress: None,
+    on_finding: Callable[[Finding], None] = warn_of,
 ) -> tuple[list[Verdict], tuple[str, ...]]:
     """The verdicts, in the order of the files; and what is not as it was recorded on purpose, in words.
 
@@ -56,6 +59,13 @@ def rescore_all(
         files, what.num_envs, what.base, task=what.task, recorded_source=what.recorded_source
     )
     steps = 0
+    told: set[object] = set()
+
+    def tell_once(finding: Finding) -> None:
+        if finding.key not in told:  # a task may be opened several times, and break the rule each time
+            told.add(finding.key)
+            on_finding(finding)
+
     failed: list[TaskError | CannotStepIn] = []
     for group in groups:
         folder: Path | None = None
@@ -63,7 +73,7 @@ def rescore_all(
         try:
             if what.recorded_source:
                 folder, reference = write_source(group.info)
-            opened = _open(reference, group.options, on_activity)
+            opened = _open(reference, group.options, on_activity, tell_once)
             before = steps
 
             def tell(now: int, before: int = before) -> None:
@@ -92,8 +102,13 @@ def rescore_all(
     return verdicts, tuple(dict.fromkeys(group.note for group in groups if group.note))
 
 
-def _open(reference: str, options: TaskOptions, on_activity: Callable[[str], None]) -> OpenedTask:
+def _open(
+    reference: str,
+    options: TaskOptions,
+    on_activity: Callable[[str], None],
+    on_finding: Callable[[Finding], None],
+) -> OpenedTask:
     try:
-        return open_task(reference, options, on_activity=on_activity)
+        return open_task(reference, options, on_activity=on_activity, on_finding=on_finding)
     except TaskError:
-        return open_task(reference, with_renderer(options), on_activity=on_activity)
+        return open_task(reference, with_renderer(options), on_activity=on_activity, on_finding=on_finding)

@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Literal
 
 from workbench.authoring.problem import Problem
+from workbench.core.rules import Degree
 from workbench.session.background import BackgroundProcess
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
-from workbench.session.messages import Failed, Load, Loaded
+from workbench.session.messages import Failed, Load, Loaded, TaskOptions
 from workbench.session.rescore import Group, group_episodes, not_judged, with_renderer
 from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored, Verdict
 from workbench.session.step_back import CannotStepIn, file_of, write_source
@@ -70,7 +71,12 @@ class _Asked:
 class Rescorer:
     """One judgement at a time; a new one takes the place of the one before. All methods return at once."""
 
-    def __init__(self) -> None:
+    def __init__(self, rules: Degree | None = None) -> None:
+        """
+        Args:
+            rules: as `TaskOptions.rules`.
+        """
+        self._base = TaskOptions(rules=rules)
         self._lock = threading.Lock()
         """Of `view`: what a job that was stopped still has to say is not heard."""
         self._view = RescoreView()
@@ -123,6 +129,7 @@ class Rescorer:
             groups, unread = group_episodes(
                 asked.files,
                 MOST_AT_ONCE,
+                self._base,
                 file=asked.file,
                 recorded_source=asked.recorded_source,
             )

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import viser
 
+from workbench.core.rules import Degree
 from workbench.recording.library import Library
 from workbench.recording.side_files import side_files_in_words
 from workbench.session.messages import TaskOptions
@@ -49,10 +50,17 @@ class StepIn:
     Args:
         place: The pages, and the session that is open, if one is.
         make_session: Opens a task; gets what `Session` gets.
+        rules: As `TaskOptions.rules`.
     """
 
-    def __init__(self, place: Workplace, make_session: Callable[[str, TaskOptions], Session]) -> None:
+    def __init__(
+        self,
+        place: Workplace,
+        make_session: Callable[[str, TaskOptions], Session],
+        rules: Degree | None = None,
+    ) -> None:
         self._place, self._make = place, make_session
+        self._base = TaskOptions(rules=rules)
         self._first = place.session
         self._lock = threading.Lock()
         self._own: tuple[Session, Path | None] | None = None
@@ -79,14 +87,16 @@ class StepIn:
                 if self.recorded_source:
                     run = replace(run, name=f"{run.name} as it was recorded")
                     folder, reference = write_source(info)
-                    session = self._open(reference, options_of(info, self._count()), folder)
+                    options = options_of(info, self._count(), self._base)
+                    session = self._open(reference, options, folder)
                 elif not fits or session is None or (self._own is not None and self._own[1] is not None):
                     known = self._first if self._first is not session else None
                     task = None if known is None else known.view().task
                     if known is not None and task is not None and not why_not_into(task, info):
                         session = known
                     else:
-                        session = self._open(reference_of(info), options_of(info, self._count()), None)
+                        options = options_of(info, self._count(), self._base)
+                        session = self._open(reference_of(info), options, None)
         except CannotStepIn as error:
             self._say(str(error))
             return
@@ -209,11 +219,12 @@ class Judging:
 
     Args:
         place: The pages.
+        rules: As `TaskOptions.rules`.
     """
 
-    def __init__(self, place: Workplace) -> None:
+    def __init__(self, place: Workplace, rules: Degree | None = None) -> None:
         self._place = place
-        self.rescorer = Rescorer()
+        self.rescorer = Rescorer(rules)
         self._choices = RescoreChoices()
         self._panel: RescorePanel | None = None
         self._server: viser.ViserServer | None = None
@@ -266,14 +277,17 @@ def episode_files(library: Library, ids: Sequence[str]) -> list[EpisodeFile]:
 
 
 def offer_going_back_in(
-    place: Workplace, make_session: Callable[[str, TaskOptions], Session]
+    place: Workplace, make_session: Callable[[str, TaskOptions], Session], rules: Degree | None = None
 ) -> Callable[[], None]:
     """Put both into what the review page offers.
+
+    Args:
+        rules: Of tasks that are opened for it; as `TaskOptions.rules`.
 
     Returns:
         what ends them, to be called after the pages were stopped.
     """
-    step_in, judging = StepIn(place, make_session), Judging(place)
+    step_in, judging = StepIn(place, make_session, rules), Judging(place, rules)
 
     def add(_: Workplace, offers: ReviewOffers) -> ReviewOffers:
         return replace(
