@@ -82,7 +82,7 @@ class ResetWatch:
             rule = "rows-lost"
             message = (
                 f"self.{shown} is left with a row for each of the {len(self._chosen)} envs that are being reset, where "
-                f"it had one for each of {total}: write self.{change.path}[env_idx] = ... instead of replacing it."
+                f"it had one for each of {total}: write `self.{change.path}[env_idx] = ...` instead of replacing it."
             )
         else:
             rule = "rows-rewritten"
@@ -90,7 +90,7 @@ class ResetWatch:
             of = " for each i of env_idx" if "[i]" in change.path else ""
             message = (
                 f"self.{shown} is changed in {envs_named(change.envs)}, which {_are(change.envs)} not being reset and "
-                f"in the middle of an episode. Change the rows of env_idx only: self.{index} = ...{of}."
+                f"in the middle of an episode. Change the rows of env_idx only: `self.{index} = ...`{of}."
             )
         place = None
         if not change.frames:

@@ -26,7 +26,7 @@ class Rule:
     """Unless a person chooses one for all rules."""
     asks: str
     """Of the task, in a sentence."""
-    else_: str
+    otherwise: str
     """What happens on the GPU where the task does not."""
 
 
