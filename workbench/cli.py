@@ -132,7 +132,7 @@ def record(
     what = RecordOptions(
         task, out, episodes, successes, tries, actions, use_env_states, pictures, max_steps, workers, options
     )
-    return record_in_terminal(what, err, print_problem, print_finding, refuse)
+    return record_in_terminal(what, err, print_problem, refuse, print_finding)
 
 
 @app.command

@@ -53,8 +53,8 @@ def record_in_terminal(
     what: RecordOptions,
     console: Console,
     say_problem: Callable[[Problem], None],
-    say_finding: Callable[[Finding], None],
     refuse: Callable[[str], int],
+    say_finding: Callable[[Finding], None],
 ) -> int:
     """Record, and say what came of it; returns the exit code."""
     columns = (

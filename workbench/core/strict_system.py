@@ -328,7 +328,7 @@ class StrictCpuSystem(BatchedCpuSystem):
             self.rules.breaks(
                 "stepped-in-reset",
                 f"The simulation is stepped in _initialize_episode while {envs_named(others)} are not being reset: "
-                "their episodes are moved on as well.",
+                "their episodes are moved on as well. (With one env, as --num-envs 1 opens it, there are no others.)",
             )
         super().step()
 

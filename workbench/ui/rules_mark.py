@@ -9,7 +9,7 @@ from pathlib import Path
 
 import viser
 
-from workbench.core.rules import Finding
+from workbench.core.rules import RULES, Finding
 from workbench.session.messages import RulesBroken
 from workbench.session.view import SessionView
 from workbench.ui.changed import fill, show
@@ -67,6 +67,7 @@ def _row(finding: Finding) -> dict[str, str]:
         where = Path(finding.file).name + (f":{finding.line}" if finding.line else "")
     return {
         "rule": finding.rule,
+        "asks": f"{RULES[finding.rule].asks} Else, on the GPU: {RULES[finding.rule].otherwise}",
         "where": where,
         "path": finding.file or "",
         "function": f"in {finding.function}" if finding.function else "",
