@@ -208,8 +208,8 @@ def test_threads_and_strictness_are_the_cores() -> None:
 
     workbench.make(Unbatched, 3, **CPU).close()
     with pytest.raises(Exception, match="success"):
-        workbench.make(Unbatched, 3, strict=True, **CPU)
-    env = workbench.make("PushCube-v1", 3, threads=1, strict=True, **CPU)
+        workbench.make(Unbatched, 3, rules="stop", **CPU)
+    env = workbench.make("PushCube-v1", 3, threads=1, rules="stop", **CPU)
     env.reset(seed=0)
     env.step(env.action_space.sample())
     env.reset(options={"env_idx": torch.tensor([1])})
@@ -279,7 +279,7 @@ def test_the_default_reward_is_stocks_or_where_stock_has_none_the_richest() -> N
         ("PickCube-v1", 2, {**CPU, "obs_mode": "rgb+dept"}, ValueError, "none of .*depth"),
         ("PickCube-v1", 2, {**CPU, "render_mode": "rgb"}, ValueError, "none of .*rgb_array"),
         ("PickCube-v1", 2, {"backend": "cppu"}, ValueError, "auto, cpu, gpu"),
-        ("PickCube-v1", 2, {**CPU, "strict": "yes"}, ValueError, "True, False or 'warn'"),
+        ("PickCube-v1", 2, {**CPU, "rules": "yes"}, ValueError, "'stop', 'warn' or 'off'"),
         ("PickCube-v1", 2, {"backend": "cpu", "render_mode": "human"}, ValueError, "workbench open"),
         ("PickCube-v1", 2, {**CPU, "parallel_in_single_scene": True}, ValueError, "parallel_in_single_scene"),
         ("PickCube-v1", 2, {**CPU, "reward_mode": "lavish"}, ValueError, "none of .*normalized_dense"),

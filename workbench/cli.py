@@ -20,8 +20,8 @@ import tyro
 from workbench.exit_codes import Exit
 from workbench.machine.guarded_terminal import guard_terminal
 from workbench.machine.software_vulkan import use_private_driver
-from workbench.task_arguments import Backend, history_bytes, task_options
-from workbench.terminal import err, print_problem, refuse
+from workbench.task_arguments import Backend, Rules, history_bytes, task_options
+from workbench.terminal import err, print_finding, print_problem, refuse
 from workbench.terminal import out as terminal
 
 Task = Annotated[str, tyro.conf.Positional]
@@ -46,6 +46,7 @@ def open_page(
     memory_limit: str = "auto",
     spare: bool = True,
     trust: bool = False,
+    rules: Rules = None,
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
 ) -> int:
     """Open a task in a browser page that follows its file.
@@ -67,6 +68,8 @@ def open_page(
         spare: keep a second process ready to take over when the task's dies (--no-spare: it then takes some
             seconds more, and about 0.8 GB of memory less).
         trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it.
+        rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
+            given, what writes over the state of other envs stops, all else is a warning.
         env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
     """
     from workbench.authoring.reference import named_file
@@ -80,7 +83,7 @@ def open_page(
     from workbench.ui.door import DoorOptions
 
     try:
-        options = task_options(num_envs, backend, seed, env)
+        options = task_options(num_envs, backend, seed, env, rules)
         past = history_bytes(history)
         worker = WorkerOptions(parse_memory(memory_limit), spare)
         at = DoorOptions(host=host, port=port, socket=socket, token=token)
@@ -105,6 +108,7 @@ def record(
     pictures: bool = True,
     max_steps: int | None = None,
     backend: Backend = "auto",
+    rules: Rules = None,
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
 ) -> int:
     """Record episodes of a task without a page: for each an .rrd, and ManiSkill's own .h5 with its .json.
@@ -124,6 +128,8 @@ def record(
         pictures: record what every camera sees (--no-pictures is much faster).
         max_steps: longest episode; else the task's own limit.
         backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (gpu if it works).
+        rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
+            given, what writes over the state of other envs stops, all else is a warning.
         env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
     """
     use_private_driver()
@@ -131,13 +137,13 @@ def record(
     from workbench.session.record import RecordOptions
 
     try:
-        options = task_options(num_envs, backend, seed, env)
+        options = task_options(num_envs, backend, seed, env, rules)
     except ValueError as error:
         return refuse(str(error))
     what = RecordOptions(
         task, out, episodes, successes, tries, actions, use_env_states, pictures, max_steps, workers, options
     )
-    return record_in_terminal(what, err, print_problem, refuse)
+    return record_in_terminal(what, err, print_problem, refuse, print_finding)
 
 
 @app.command
@@ -148,6 +154,7 @@ def review(
     port: int = 8080,
     socket: Path | None = None,
     token: bool = True,
+    rules: Rules = None,
     task: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = (),
     trust: bool = False,
 ) -> int:
@@ -161,6 +168,8 @@ def review(
         socket: listen on a Unix socket with this path instead, for machines that others use too: only you can
             connect, by the ssh line that is printed.
         token: ask for the token of the printed address (--no-token: this machine only).
+        rules: what happens where a task that is opened from here breaks a rule of GPU simulation: stop, warn, or off
+            to check none. If not given, what writes over the state of other envs stops, all else is a warning.
         task: a task file in which the envs of ManiSkill's recordings may be found; repeatable. Envs that ManiSkill
             itself has need none.
         trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it.
@@ -183,7 +192,7 @@ def review(
         at = DoorOptions(host=host, port=port, socket=socket, token=token)
     except ValueError as error:
         return refuse(str(error))
-    return review_in_terminal(folder, task, at, WorkerOptions(parse_memory("auto")), trust)
+    return review_in_terminal(folder, task, at, WorkerOptions(parse_memory("auto")), rules, trust)
 
 
 @app.command
@@ -195,6 +204,7 @@ def rescore(
     use_env_states: bool = False,
     num_envs: int = 16,
     backend: Backend = "auto",
+    rules: Rules = None,
     csv: Path | None = None,
     json: Path | None = None,
     trust: bool = False,
@@ -208,6 +218,8 @@ def rescore(
         use_env_states: put every recorded state in after its step, so that nothing drifts from the record.
         num_envs: episodes to run at once.
         backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (gpu if it works).
+        rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
+            given, what writes over the state of other envs stops, all else is a warning.
         csv: also write the table to this file, as CSV.
         json: also write the table to this file, as JSON.
         trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it. Without
@@ -221,7 +233,7 @@ def rescore(
         if table is not None and not table.resolve().parent.is_dir():
             return refuse(f"there is no folder {table.resolve().parent} to write {table.name} into")
     try:
-        base = task_options(num_envs, backend, 0, ())
+        base = task_options(num_envs, backend, 0, (), rules)
     except ValueError as error:
         return refuse(str(error))
     use_private_driver()
@@ -232,7 +244,7 @@ def rescore(
 
     what = RescoreOptions(places, task, recorded_source, use_env_states, num_envs, base)
     try:
-        return run_rescore(what, terminal, err, csv, json, trust)
+        return run_rescore(what, terminal, err, csv, json, print_finding, trust)
     except NotTrusted as error:
         for line in not_trusted(error.questions):
             refuse(line)

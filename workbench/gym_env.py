@@ -24,7 +24,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec, WrapperSpec
@@ -34,6 +34,8 @@ from mani_skill.envs.utils.observations import CameraObsTextures
 from workbench.authoring import registry
 from workbench.authoring.load import load_task
 from workbench.core.backends import BackendUnavailable, find_renderer
+from workbench.core.broken_rule import class_is_installed
+from workbench.core.rules import Degree
 from workbench.core.task_env import Backend, EnvOptions, build_env, default_reward_mode
 
 _STATE_MODES = {"state", "state_dict", "none"}
@@ -49,6 +51,7 @@ class _Found:
     max_episode_steps: int | None
     default_kwargs: Mapping[str, Any]
     asset_ids: Sequence[str]
+    installed: bool
 
 
 def make(
@@ -58,7 +61,7 @@ def make(
     backend: Backend = "auto",
     max_episode_steps: int | None = None,
     threads: int | None = None,
-    strict: bool | Literal["warn"] = False,
+    rules: Degree | None = None,
     **kwargs: Any,
 ) -> gym.Env:
     """A gymnasium env of `num_envs` envs, as ``gym.make`` gives it for a GPU.
@@ -72,7 +75,9 @@ def make(
             CUDA and PhysX's GPU library are there, else the CPU. Takes the place of ``sim_backend``.
         max_episode_steps: the time limit; None for the registered one, -1 for none.
         threads: how many step the envs on the CPU; None for one on each core that the process may use.
-        strict: on the CPU, raise (or ``"warn"``) where GPU simulation would silently go wrong.
+        rules: of GPU simulation, checked on the CPU: ``stop`` raises where one is broken, ``warn`` warns, ``off``
+            checks none. None stops where other envs are written over and warns elsewhere; of a task that is
+            installed it only warns.
         kwargs: whatever ``gym.make`` takes for the task: ``obs_mode``, ``reward_mode``, ``control_mode``,
             ``render_mode``, ``robot_uids``, ``sensor_configs``, ``reconfiguration_freq``, ``sim_config`` ...
 
@@ -86,6 +91,8 @@ def make(
     found = _find(task)
     _refuse_unknown_modes(found.cls, kwargs)
     given = {**found.default_kwargs, **kwargs}
+    if rules is None and found.installed:
+        rules = "warn"  # nobody here can mend it
     if given.get("reward_mode") is None and not _stock_reward_works(found.cls):
         # Among the spec's arguments, so that a replay by gym.make has a reward too.
         kwargs["reward_mode"] = default_reward_mode(found.cls)
@@ -98,7 +105,7 @@ def make(
         # out again by this one.
         entry = "mani_skill.utils.registration:TimeLimitWrapper"
         limits = (WrapperSpec("MSTimeLimit", entry_point=entry, kwargs={"max_episode_steps": limit}),)
-    options = EnvOptions(num_envs=int(num_envs), backend=backend, threads=threads, strict=strict)
+    options = EnvOptions(num_envs=int(num_envs), backend=backend, threads=threads, rules=rules)
     spec = EnvSpec(
         id=found.env_id,
         entry_point=partial(_build, found.cls, tuple(found.asset_ids), options),
@@ -183,7 +190,14 @@ def _find(task: str | Path | type[BaseEnv]) -> _Found:
         warnings.warn(notice, stacklevel=3)
     spec = registry.environment(loaded.env_id)
     asset_ids = () if spec is None else spec.asset_download_ids or ()
-    return _Found(loaded.cls, loaded.env_id, loaded.max_episode_steps, loaded.default_kwargs, asset_ids)
+    return _Found(
+        loaded.cls,
+        loaded.env_id,
+        loaded.max_episode_steps,
+        loaded.default_kwargs,
+        asset_ids,
+        installed=not loaded.followed and class_is_installed(loaded.cls),
+    )
 
 
 def _registered_class(cls: type) -> _Found:
@@ -193,5 +207,5 @@ def _registered_class(cls: type) -> _Found:
         spec = registry.environment(env_id)
         if spec is not None and spec.cls is cls:
             limit, assets = spec.max_episode_steps, spec.asset_download_ids or ()
-            return _Found(cls, env_id, limit, dict(spec.default_kwargs), assets)
-    return _Found(cls, cls.__name__, None, {}, ())
+            return _Found(cls, env_id, limit, dict(spec.default_kwargs), assets, class_is_installed(cls))
+    return _Found(cls, cls.__name__, None, {}, (), class_is_installed(cls))

@@ -22,6 +22,7 @@ from workbench.recording.reading import start_reading
 from workbench.session.kept_worker import WorkerOptions
 from workbench.session.messages import Event, Failed, Loaded, TaskOptions
 from workbench.session.session import Session
+from workbench.task_arguments import Rules
 from workbench.terminal import out, print_event, print_line, refuse, say, warn
 from workbench.ui.commands import Command
 from workbench.ui.door import Door, DoorError, DoorOptions, open_door
@@ -72,25 +73,31 @@ def open_in_terminal(
     )
     place = Workplace(door.server, recordings, session, on_notice=warn)
     what = f"{task}, {options.num_envs} envs"
-    _serve(
-        door, place, "live", what, recordings, WorkerOptions(worker.memory_limit), end, session.close, trust
-    )
+    beside = WorkerOptions(worker.memory_limit)
+    _serve(door, place, "live", what, recordings, beside, options.rules, end, session.close, trust)
 
 
 def review_in_terminal(
-    folder: Path, tasks: tuple[Path, ...], at: DoorOptions, worker: WorkerOptions, trust: bool = False
+    folder: Path,
+    tasks: tuple[Path, ...],
+    at: DoorOptions,
+    worker: WorkerOptions,
+    rules: Rules,
+    trust: bool = False,
 ) -> int:
     """Serve the page of a folder of recordings; returns only where the door cannot be opened.
 
     Args:
-        worker: Of tasks that are opened from there.
+        worker, rules: Of tasks that are opened from there.
         trust: Run what recordings name without asking.
     """
     door = _opened(at, "Recordings")
     if isinstance(door, int):
         return door
     place = Workplace(door.server, folder, tasks=tasks, on_notice=warn)
-    _serve(door, place, "review", f"recordings in {folder}", folder, worker, _End(), lambda: None, trust)
+    _serve(
+        door, place, "review", f"recordings in {folder}", folder, worker, rules, _End(), lambda: None, trust
+    )
 
 
 def _opened(at: DoorOptions, label: str) -> Door | int:
@@ -113,6 +120,7 @@ def _serve(
     what: str,
     recordings: Path,
     worker: WorkerOptions,
+    rules: Rules,
     end: _End,
     close_session: Callable[[], None],
     trust: bool,
@@ -132,7 +140,7 @@ def _serve(
     place.offer(sharing.offer)
     if door.options.token:
         place.commands = (Command("Renew the token and close every page", end.renew),)
-    close_others = offer_going_back_in(place, open_task, trust)
+    close_others = offer_going_back_in(place, open_task, rules, trust)
     end.at_signals()
     try:
         place.pages.start(first)

@@ -25,6 +25,7 @@ from workbench.authoring.library_names import named_like_library
 from workbench.authoring.modules import hidden_by_libraries
 from workbench.authoring.problem import Problem, TaskError
 from workbench.authoring.reference import named_file
+from workbench.core.rules import Finding
 from workbench.recording.landing import try_folder
 from workbench.recording.mend import mend
 from workbench.session.record import Progress, Recorded, RecordOptions, record, with_given_actions
@@ -58,6 +59,7 @@ def record_in_terminal(
     console: Console,
     say_problem: Callable[[Problem], None],
     refuse: Callable[[str], int],
+    say_finding: Callable[[Finding], None],
 ) -> int:
     """Record, and say what came of it; returns the exit code."""
     columns = (
@@ -85,6 +87,7 @@ def record_in_terminal(
                     lambda activity: bar.update(row, description=activity),
                     _Rate(bar, row, interrupt).show,
                     lambda: interrupt.asked,
+                    say_finding,
                 )
             bar.update(row, completed=len(recorded.written), description="recorded")
     except TaskError as error:

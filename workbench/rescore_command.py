@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsed
 from rich.progress import Progress as Bar
 from rich.table import Table
 
+from workbench.core.rules import Finding
 from workbench.exit_codes import Exit
 from workbench.machine.current_folder import CurrentFolder
 from workbench.machine.terminal_text import plain_text
@@ -25,7 +26,13 @@ from workbench.trust_prompt import TerminalPrompt, can_ask
 
 
 def run_rescore(
-    what: RescoreOptions, out: Console, err: Console, csv: Path | None, json: Path | None, trust: bool = False
+    what: RescoreOptions,
+    out: Console,
+    err: Console,
+    csv: Path | None,
+    json: Path | None,
+    say_finding: Callable[[Finding], None],
+    trust: bool = False,
 ) -> int:
     """Judge, print, write the tables that are asked for; raises as `rescore_all`, and OSError for a table."""
     here = CurrentFolder()  # a task may go to another
@@ -55,6 +62,7 @@ def run_rescore(
             what,
             lambda activity: bar.update(row, description=activity),
             tell,
+            say_finding,
             Clearances(ask=ask, all_trusted=trust),
         )
         bar.update(row, total=len(verdicts), completed=len(verdicts), description="judged")

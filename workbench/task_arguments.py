@@ -13,17 +13,21 @@ if TYPE_CHECKING:
     from workbench.session.messages import TaskOptions
 
 Backend = Literal["auto", "cpu", "gpu"]
+Rules = Literal["stop", "warn", "off"] | None
+"""None is each rule's own degree."""
 
 
-def task_options(num_envs: int, backend: Backend, seed: int, env: Sequence[str]) -> TaskOptions:
-    """Of ``--num-envs``, ``--backend``, ``--seed`` and each ``--env``."""
+def task_options(
+    num_envs: int, backend: Backend, seed: int, env: Sequence[str], rules: Rules = None
+) -> TaskOptions:
+    """Of ``--num-envs``, ``--backend``, ``--seed``, each ``--env`` and ``--rules``."""
     from workbench.session.messages import TaskOptions
 
     if not 1 <= num_envs <= 4096:
         raise ValueError(f"--num-envs must be from 1 to 4096, not {num_envs}")
     if not 0 <= seed < 2**31:
         raise ValueError(f"--seed must be from 0 to {2**31 - 1}, not {seed}")
-    return TaskOptions(num_envs, backend, seed, dict(_env_argument(pair) for pair in env))
+    return TaskOptions(num_envs, backend, seed, dict(_env_argument(pair) for pair in env), rules)
 
 
 def _env_argument(pair: str) -> tuple[str, Any]:

@@ -20,6 +20,7 @@ from workbench.machine.terminal_text import for_terminal, plain_text
 
 if TYPE_CHECKING:
     from workbench.authoring.problem import Problem
+    from workbench.core.rules import Finding
     from workbench.session.messages import Event
     from workbench.session.printed import PrintedLine
 
@@ -82,9 +83,20 @@ def print_problem(problem: Problem) -> None:
         err.print(f"[dim]{escape(plain_text(problem.traceback.rstrip(), _LINES))}[/]", soft_wrap=True)
 
 
+def print_finding(finding: Finding) -> None:
+    """A rule of GPU simulation that the author's code broke, with its place; the task goes on."""
+    place = "" if finding.file is None else f"{finding.file}:{finding.line or 1}: "
+    err.print(
+        f"[yellow]warning[/] {escape(place)}{escape(finding.message)} [dim](rule {finding.rule})[/]",
+        soft_wrap=True,
+    )
+    if finding.code:
+        err.print(f"    {escape(finding.code)}", soft_wrap=True)
+
+
 def print_event(event: Event) -> None:
     """What the page shows of loads and failures, in the terminal as well."""
-    from workbench.session.messages import Failed, Loaded
+    from workbench.session.messages import Failed, Loaded, RulesBroken
 
     if isinstance(event, Loaded):
         parts = ", ".join(f"{plain_text(name)} {ms:.0f}" for name, ms in event.milliseconds.items())
@@ -105,6 +117,9 @@ def print_event(event: Event) -> None:
         if event.kept:
             back = "comes back where it was" if event.problem.stage == "worker" else "keeps running"
             err.print(f"[dim]the last good version {back}[/]")
+    elif isinstance(event, RulesBroken):
+        for finding in event.new:
+            print_finding(finding)
 
 
 def print_line(line: PrintedLine) -> None:

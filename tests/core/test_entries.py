@@ -205,7 +205,7 @@ def same(ours: Any, stock: Any) -> bool:
 
 
 def test_info_is_what_stock_maniskill_gives(odd_task: Path) -> None:
-    ours: Any = workbench.make(odd_task, 1, backend="cpu", render_backend="none", strict=True)
+    ours: Any = workbench.make(odd_task, 1, backend="cpu", render_backend="none", rules="stop")
     stock: Any = gym.make("OddEntries-v1", num_envs=1, sim_backend="physx_cpu", render_backend="none")
     for env in (ours, stock):
         env.reset(seed=3)
@@ -238,11 +238,11 @@ class OneTruth:
         return {"success": torch.tensor(False), "fail": torch.tensor(True)}
 
 
-@pytest.mark.parametrize("strict", [False, True])
-def test_one_truth_of_one_env_is_taken_as_stock_takes_it(odd_task: Path, strict: bool) -> None:
+@pytest.mark.parametrize("rules", ["off", "stop"])
+def test_one_truth_of_one_env_is_taken_as_stock_takes_it(odd_task: Path, rules: Any) -> None:
     task = type("One", (OneTruth, load_task(str(odd_task)).cls), {})
     kwargs = {"reward_mode": "sparse"}
-    env = TaskEnv(make_env(task, EnvOptions(1, "cpu", render=False, strict=strict, kwargs=kwargs)))
+    env = TaskEnv(make_env(task, EnvOptions(1, "cpu", render=False, rules=rules, kwargs=kwargs)))
     assert env.reset(seed=0).terminated.tolist() == [True]
     step = env.step(None)
     assert step.terminated.tolist() == [True] and step.reward.tolist() == [-1.0]
@@ -252,7 +252,7 @@ def test_one_truth_of_one_env_is_taken_as_stock_takes_it(odd_task: Path, strict:
 
 def test_a_mean_that_a_built_in_task_returns_is_one_number() -> None:
     # tabletop/pull_cube_tool.py line 213: the mean over all envs.
-    env = workbench.make("PullCubeTool-v1", 2, backend="cpu", render_backend="none", strict=True)
+    env = workbench.make("PullCubeTool-v1", 2, backend="cpu", render_backend="none", rules="stop")
     task = TaskEnv(open_env(env))
     progress = task.reset(seed=0).others["cube_progress"]
     assert progress.numbers is not None and progress.numbers.shape == ()

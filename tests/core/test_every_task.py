@@ -62,7 +62,9 @@ def test_a_fault_of_the_task_is_at_the_line_that_is_named_and_the_error_says_so(
     fault: Fault, env_id: str
 ) -> None:
     spec = REGISTERED_ENVS[env_id]
-    made = make_env(spec.cls, EnvOptions(4, "cpu", render=False), default_kwargs=spec.default_kwargs)
+    made = make_env(
+        spec.cls, EnvOptions(4, "cpu", render=False, rules="off"), default_kwargs=spec.default_kwargs
+    )
     env = TaskEnv(made)
     env.reset(seed=1)
     act = {"partial reset": lambda: env.reset(seed=5, env_idx=[1, 3]), "get_state": made.get_state}[
@@ -81,7 +83,9 @@ def test_a_fault_of_the_task_is_at_the_line_that_is_named_and_the_error_says_so(
 
 def test_the_buffers_that_a_partial_reset_replaced_are_named() -> None:
     spec = REGISTERED_ENVS["RotateValveLevel0-v1"]
-    env: Any = make_env(spec.cls, EnvOptions(4, "cpu", render=False), default_kwargs=spec.default_kwargs)
+    env: Any = make_env(
+        spec.cls, EnvOptions(4, "cpu", render=False, rules="off"), default_kwargs=spec.default_kwargs
+    )
     with pytest.raises(RuntimeError) as caught:
         env.reset(options={"env_idx": torch.tensor([0, 2, 3])})
     assert "self.rest_qpos: 4 rows before, 3 now" in caught.value.__notes__[0]

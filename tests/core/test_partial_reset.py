@@ -22,7 +22,7 @@ PICK_CUBE: Any = REGISTERED_ENVS["PickCube-v1"].cls
 
 
 def made(task: type[BaseEnv] = PICK_CUBE, num_envs: int = 4, **kwargs: Any) -> Any:
-    return make_env(task, EnvOptions(num_envs, "cpu", render=False, kwargs=kwargs))
+    return make_env(task, EnvOptions(num_envs, "cpu", render=False, rules="off", kwargs=kwargs))
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,10 @@ class ForgetsRows(PICK_CUBE):
             WrongBatch,
             ["test_partial_reset.py:", "in _initialize_episode", "Envs [1, 2] of 4", "len(env_idx)"],
         ),
-        (ForgetsRows, ["in evaluate", "It replaced self.start: 4 rows before, 2 now"]),
+        (
+            ForgetsRows,
+            ["in evaluate", "It replaced self.start: 4 rows before, 2 now (test_partial_reset.py:"],
+        ),
     ],
 )
 def test_an_error_of_the_task_is_called_its_own(task: type[BaseEnv], words: list[str]) -> None:

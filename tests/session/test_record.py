@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -250,7 +251,12 @@ def test_what_was_kept_before_a_failure_is_said(tmp_path: Path, capsys: pytest.C
         "PushCube-v1", tmp_path / "out", 2, actions=policy, pictures=False, max_steps=3, options=options
     )
     said: list[Problem] = []
-    assert record_in_terminal(what, Console(file=io.StringIO()), said.append, lambda why: 2) == 1
+    assert (
+        record_in_terminal(
+            what, Console(file=io.StringIO()), said.append, lambda why: 2, lambda finding: None
+        )
+        == 1
+    )
     assert "tired" in said[0].message
     assert "1 episode that had ended before is kept: workbench review" in capsys.readouterr().out
 
@@ -269,6 +275,35 @@ def test_a_task_that_goes_to_another_folder_changes_nothing_about_where_files_go
     (written,) = record(what).written
     assert written.path.parent == Path("out") and (tmp_path / written.path).is_file()
     assert Path.cwd() == tmp_path
+
+
+DRAWS = """
+import torch
+from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
+
+
+class Draws(PushCubeEnv):
+    def _initialize_episode(self, env_idx, options):
+        super()._initialize_episode(env_idx, options)
+        self.target = torch.rand((self.num_envs, 2))
+"""
+
+
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_rule_that_the_task_breaks_is_told_once_by_however_many_processes(
+    workers: int, tmp_path: Path
+) -> None:
+    file, found = tmp_path / "draws.py", []
+    file.write_text(DRAWS)
+    # A partial reset in each process takes two envs.
+    options = TaskOptions(num_envs=2 * workers)
+    what = RecordOptions(
+        str(file), tmp_path / "out", 4, pictures=False, max_steps=2, workers=workers, options=options
+    )
+    assert len(record(what, on_finding=found.append).written) == 4
+    assert [(finding.rule, finding.line) for finding in found] == [("rows-rewritten", 9)]
+    off = replace(what, options=replace(options, rules="off"))
+    assert len(record(off, on_finding=found.append).written) == 4 and len(found) == 1
 
 
 def test_a_keyword_that_the_task_does_not_take_is_named(tmp_path: Path) -> None:

@@ -216,7 +216,9 @@ def test_files_beside_the_task_are_there_as_they_are_today_and_outlive_the_folde
 
 def test_its_env_is_made_with_its_own_robot_and_modes() -> None:
     kwargs = {"robot_uids": "panda_wristcam", "obs_mode": "rgb", "num_envs": 64, "sim_backend": "gpu"}
-    options = options_of(replace(info(None, "PickCube-v1"), env_kwargs=kwargs), 2)
+    base = TaskOptions(rules="warn")
+    options = options_of(replace(info(None, "PickCube-v1"), env_kwargs=kwargs), 2, base)
+    assert options.rules == "warn"
     assert options.env_kwargs == {
         "robot_uids": "panda_wristcam",
         "obs_mode": "rgb",

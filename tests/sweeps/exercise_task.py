@@ -85,7 +85,7 @@ def exercise(env_id: str) -> Row:
 def _made(env_id: str) -> TaskEnv:
     spec = REGISTERED_ENVS[env_id]
     kwargs = {"obs_mode": obs_mode_of(spec.cls), "render_mode": "rgb_array"}
-    options = EnvOptions(NUM_ENVS, "cpu", render=True, kwargs=kwargs)
+    options = EnvOptions(NUM_ENVS, "cpu", render=True, rules="off", kwargs=kwargs)
     env = make_env(
         spec.cls, options, asset_ids=spec.asset_download_ids or (), default_kwargs=spec.default_kwargs
     )

@@ -70,7 +70,7 @@ def test_times_are_short() -> None:
 def test_what_the_author_should_know_stands_there_before_and_after_a_reload() -> None:
     notices = tuple(f"<b>file{i}.py</b> has the name of a library" for i in range(MOST_SHOWN + 2))
     for report in (None, ReloadReport("same", "", 1.0)):
-        html = version_html(report, True, notices)
+        html = version_html(report, True, notices=notices)
         assert (
             html.count("has the name of a library") == MOST_SHOWN
             and "And 2 more." in html

@@ -3,10 +3,10 @@
 ``actor._objs[0].set_pose(...)`` moves a body on a stock CPU env. In GPU simulation the state lives
 on the GPU, and the call changes an object that nobody reads. Here SAPIEN's objects are the
 simulation, so the call would work, and the task that was tried out would not be the task that trains.
-In strict mode these setters raise, at the author's line.
+Where rules are checked, these setters tell of it, at the author's line.
 
 SAPIEN's classes are shared by all scenes of a process: the setters are replaced once, when the first
-strict scene is built, and do what they did for every object that belongs to no strict scene, before a
+scene with rules is built, and do what they did for every object that belongs to none, before a
 scene is complete, and when the core itself calls them.
 """
 
@@ -108,10 +108,18 @@ def _refuse(owner: Any, called: str, instead: str) -> None:
         if env is None or not system.laid_out:
             continue
         name = owner.name if isinstance(owner, physx.PhysxArticulation) else entity.name
-        system.break_rule(
-            f"{called} on '{name}' (env {env}) goes behind the tensors: on the GPU it does nothing. Use {instead} of "
-            "ManiSkill's object, which sets all envs, or those that are being reset."
-        )
+        if system.being_reset is not None and not bool(system.being_reset[env]):
+            system.rules.breaks(
+                "other-env-written",
+                f"{called} on '{name}' writes env {env}, which is not being reset (on the GPU it does nothing). Use "
+                f"{instead} of ManiSkill's object, which sets those that are being reset.",
+            )
+        else:
+            system.rules.breaks(
+                "behind-the-tensors",
+                f"{called} on '{name}' (env {env}) goes behind the tensors: on the GPU it does nothing. Use {instead} "
+                "of ManiSkill's object, which sets all envs, or those that are being reset.",
+            )
 
 
 def _entity(owner: Any) -> Any:

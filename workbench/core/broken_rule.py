@@ -1,4 +1,4 @@
-"""A rule of GPU simulation that a task broke, told at the line that broke it.
+"""What a task broke of the rules: raised, or noted as a row, at the line that did it.
 
 What goes wrong shows later than it is done: at the fetch, after the write. So whoever notes a write keeps the
 frames that led to it, and the error carries those as the innermost of its traceback.
@@ -7,10 +7,23 @@ frames that led to it, and the error carries those as the innermost of its trace
 from __future__ import annotations
 
 import inspect
+import linecache
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
 from types import FrameType, TracebackType
+from typing import Any, Literal
 
+import mani_skill
+
+from workbench.core.rules import Degree, Finding
+
+MOST_ROWS = 64
+"""Places that are kept apart; a task that breaks rules at more has the others counted."""
 _GENERAL_CODE = ("workbench.", "mani_skill.utils.", "mani_skill.envs.s")
 """``mani_skill.envs.sapien_env`` and ``.scene``: they write what they are told to."""
 _FRAMES_KEPT = 12
@@ -19,22 +32,195 @@ _BASE_ENV, _OUTERMOST = "mani_skill.envs.sapien_env", ("step", "reset")
 
 Frame = tuple[FrameType, int, int]
 """A frame with its last instruction and its line at the time."""
+Occasion = Literal["step", "reset"]
+_Key = tuple[str, Hashable]
+"""A rule, and the line or the thing that it was broken at."""
+Place = tuple[str, int, str]
+"""File, line, and the name of the function."""
 
 
 class BrokenRule(RuntimeError):
     """The task did what goes wrong, or is lost, in GPU simulation."""
 
+    def __init__(self, message: str, rule: str, place: Place | None = None) -> None:
+        super().__init__(f"{message} (Rule {rule}; with --rules warn, or rules='warn', it goes on.)")
+        self.rule, self.place = rule, place
+
+
+class WrongReturn(BrokenRule):
+    """What a hook returned is not what ManiSkill takes it for: `hook` is its name, `said` the failing."""
+
+    def __init__(self, said: str, hook: str, rule: str, place: Place | None) -> None:
+        super().__init__(f"{hook}() {said}{in_brackets(place)}.", rule, place)
+        self.said, self.hook = said, hook
+
 
 class RuleWarning(UserWarning):
-    """What would be a `BrokenRule`, in a task that is only to be reported on."""
+    """A broken rule that does not stop the task."""
 
 
-def broken_at(message: str, frames: Sequence[Frame]) -> BrokenRule:
+def warn_of(finding: Finding) -> None:
+    """As Python warns, at the author's line."""
+    if finding.file is None or finding.line is None:
+        warnings.warn(finding.message, RuleWarning, stacklevel=2)
+    else:
+        warnings.warn_explicit(finding.message, RuleWarning, finding.file, finding.line)
+
+
+class BrokenRules:
+    """The rules that one env checks, and where its task broke them."""
+
+    def __init__(
+        self, degrees: Mapping[str, Degree], on_finding: Callable[[Finding], None] = warn_of
+    ) -> None:
+        """
+        Args:
+            degrees: of each rule; see `rules.degrees_of`.
+            on_finding: called with each place the first time that the task goes on after it.
+        """
+        self._degrees, self._on_finding = degrees, on_finding
+        self._rows: dict[_Key, Finding] = {}
+        self._occasions: dict[_Key, Occasion] = {}
+        """At what each row was last broken."""
+        self._unconfirmed: set[_Key] = set()
+        """Rows of the version before, which the present one has not broken yet."""
+        self._vague: set[_Key] = set()
+        """Rows whose line is no more than likely."""
+        self._now: Occasion = "reset"
+        self.more = 0
+        """Times that rules were broken at places for which there is no row left."""
+        self.serial = 0
+        """Grows with every change."""
+        self.step: int = 0
+        """Control steps that were made."""
+
+    @property
+    def rows(self) -> tuple[Finding, ...]:
+        return tuple(self._rows.values())
+
+    def degree(self, rule: str) -> Degree:
+        return self._degrees[rule]
+
+    def breaks(
+        self,
+        rule: str,
+        message: str,
+        frames: Sequence[Frame] | None = (),
+        place: Place | None = None,
+        subject: Hashable = None,
+    ) -> None:
+        """Raise, or note it and return, as the rule's degree has it.
+
+        Args:
+            frames: who is at fault, to become the innermost of the traceback; empty for whoever calls now,
+                None where no line is at fault, or only `place` is known.
+            subject: what was broken, where one row is for that and not for the line.
+        """
+        degree = self._degrees[rule]
+        if degree == "off":
+            return
+        if frames is not None:
+            frames = frames or frames_of_the_task()
+            place = place_of(frames)
+        if degree == "stop":
+            raise broken_at(BrokenRule(message, rule, place), frames or ())
+        self._note(rule, message, place, subject, exact=frames is not None)
+
+    def begin(self) -> None:
+        """The task was tried, and begins now: steps are counted from here."""
+        self.step = 0
+        self._rows = {key: replace(row, first_step=0) for key, row in self._rows.items()}
+
+    def returned(self, rule: str, hook: str, said: str, place: Place | None) -> None:
+        """As `breaks`, of what a hook returned."""
+        if self._degrees[rule] == "stop":
+            raise WrongReturn(said, hook, rule, place)
+        if self._degrees[rule] == "warn":
+            self._note(rule, f"{hook}() {said}.", place, hook, exact=False)
+
+    def _note(self, rule: str, message: str, place: Place | None, subject: Hashable, exact: bool) -> None:
+        self.serial += 1
+        key = rule, place or message if subject is None else subject
+        row = self._rows.get(key)
+        if row is None and len(self._rows) >= MOST_ROWS:
+            self.more += 1
+            return
+        self._occasions[key] = self._now
+        if row is not None:
+            self._unconfirmed.discard(key)
+            if exact and place is not None and key in self._vague:
+                self._vague.discard(key)
+                row = _at(row, place)
+            self._rows[key] = replace(row, count=row.count + 1)
+            return
+        if not exact:
+            self._vague.add(key)
+        row = Finding(rule, self._degrees[rule], message, None, None, "", "", 1, self.step)
+        self._rows[key] = row = row if place is None else _at(row, place)
+        self._on_finding(row)
+
+    # --- an edited file ------------------------------------------------------------------------------
+
+    @contextmanager
+    def during(self, occasion: Occasion, confirms: bool = True) -> Iterator[None]:
+        """What is broken within is broken at this; what was not again is mended.
+
+        Args:
+            confirms: whether all rules that can be broken at it could be.
+        """
+        before, self._now = self._now, occasion
+        try:
+            yield
+        finally:
+            self._now = before
+        if confirms and self._unconfirmed:
+            gone = {key for key in self._unconfirmed if self._occasions[key] == occasion}
+            self._rows = {key: row for key, row in self._rows.items() if key not in gone}
+            self._unconfirmed -= gone
+            self.serial += 1
+
+    def copy(self) -> tuple[Any, ...]:
+        """What is known now, for `put_back`."""
+        return dict(self._rows), dict(self._occasions), set(self._unconfirmed), set(self._vague), self.more
+
+    def put_back(self, kept: tuple[Any, ...]) -> None:
+        """Another version was tried, and is not taken."""
+        self._rows, self._occasions, self._unconfirmed, self._vague, self.more = kept
+        self.serial += 1
+
+    def edited(self, place_now: Callable[[Finding], tuple[str, int] | None]) -> None:
+        """Another version of the file runs on: a row whose function is another now leaves, and the others have to be
+        broken again at the next occasion to stay.
+
+        Args:
+            place_now: file and line of a row in the new version; None where its function is another.
+        """
+        rows, occasions = self._rows, self._occasions
+        self._rows, self._occasions = {}, {}
+        self.serial += 1
+        for (rule, subject), row in rows.items():
+            place = place_now(row)
+            if place is None:
+                continue
+            there = (*place, row.function)
+            key = rule, there if subject == (row.file, row.line, row.function) else subject
+            self._rows[key] = _at(row, there)
+            self._occasions[key] = occasions[rule, subject]
+        self._unconfirmed = set(self._rows)
+
+
+def _at(row: Finding, place: Place) -> Finding:
+    file, line, function = place
+    code = linecache.getline(file, line).strip()
+    return replace(row, file=file, line=line, code=code, function=function)
+
+
+def broken_at(error: BrokenRule, frames: Sequence[Frame]) -> BrokenRule:
     """The error, with `frames` (innermost first) as the innermost of its traceback."""
     trace = None
     for frame, instruction, line in frames:
         trace = TracebackType(trace, frame, instruction, line)
-    return BrokenRule(message).with_traceback(trace)
+    return error.with_traceback(trace)
 
 
 def frames_of_the_task(innermost: FrameType | None = None) -> tuple[Frame, ...]:
@@ -50,15 +236,46 @@ def frames_of_the_task(innermost: FrameType | None = None) -> tuple[Frame, ...]:
     return tuple(kept)
 
 
-def place_of_hook(task: type, hook: str) -> str:
-    """The file and line of a hook's definition, in brackets; or nothing."""
+def place_of_hook(task: type, hook: str) -> Place | None:
+    """Where a hook is defined."""
     code = getattr(inspect.unwrap(getattr(task, hook)), "__code__", None)
-    return "" if code is None else f" ({code.co_filename}:{code.co_firstlineno})"
+    return None if code is None else (code.co_filename, code.co_firstlineno, hook)
 
 
-def place_of(frames: Sequence[Frame]) -> str:
-    """The file and line of the first frame that is not in ManiSkill's general code, in brackets; or nothing."""
+def place_of(frames: Sequence[Frame]) -> Place | None:
+    """The first line that a person wrote who is no author of a library; else the first not in ManiSkill's general code."""
+    general = None
     for frame, _, line in frames:
-        if not frame.f_globals.get("__name__", "").startswith(_GENERAL_CODE):
-            return f" ({frame.f_code.co_filename}:{line})"
-    return ""
+        code = frame.f_code
+        if frame.f_globals.get("__name__", "").startswith(_GENERAL_CODE):
+            continue
+        if not is_installed(code.co_filename):
+            return code.co_filename, line, code.co_name
+        general = general or (code.co_filename, line, code.co_name)
+    return general
+
+
+def in_brackets(place: Place | None) -> str:
+    return "" if place is None else f" ({place[0]}:{place[1]})"
+
+
+def class_is_installed(cls: type) -> bool:
+    """Whether a class comes from a package, and not from a file of whoever runs it."""
+    try:
+        return is_installed(inspect.getfile(cls))
+    except (TypeError, OSError):  # made in a notebook, or by type()
+        return False
+
+
+@cache
+def is_installed(file: str) -> bool:
+    """Whether a source file belongs to Python, to an installed package or to the workbench."""
+    if file.startswith(("<", *_OWN_FOLDERS)):
+        return True
+    return not {"site-packages", "dist-packages"}.isdisjoint(Path(file).parts)
+
+
+_OWN_FOLDERS = tuple(
+    f"{Path(file).parent}/" for file in (inspect.__file__, mani_skill.__file__, str(Path(__file__).parent))
+)
+"""Of Python, of ManiSkill wherever it was installed from, and of the workbench."""

@@ -12,8 +12,9 @@ reach it), and a picture of env i renders env i alone.
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import sapien
 import sapien.physx as physx
@@ -24,10 +25,11 @@ from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.envs.utils.system.backend import BackendInfo
 from mani_skill.render.utils import can_render
 
-from workbench.core.broken_rule import frames_of_the_task, place_of
+from workbench.core.broken_rule import frames_of_the_task, in_brackets, place_of, warn_of
 from workbench.core.contacts import CpuArray
 from workbench.core.cpu_system import BatchedCpuSystem
 from workbench.core.partial_reset import KeptControllers, others, told_whose_fault
+from workbench.core.rules import Degree, Finding, degrees_of
 from workbench.core.scene_limit import require_scenes
 from workbench.core.seams import asks_for_a_gpu, install_index_seams, substeps_are_unwatched
 from workbench.core.strict import StrictMixin
@@ -123,7 +125,7 @@ class BatchedCpuScene(ManiSkillScene):
                 "on the GPU that is an error too. Fetch after every apply, and once before the end of "
                 f"_initialize_episode, after which ManiSkill applies. The first call{self._applied_at}."
             )
-        self._applied_at = place_of(frames_of_the_task()) or " was ManiSkill's own"
+        self._applied_at = in_brackets(place_of(frames_of_the_task())) or " was ManiSkill's own"
         self.px.apply_changes()  # type: ignore[union-attr]
         self._needs_fetch = True
 
@@ -247,12 +249,16 @@ class BatchedCpuMixin:
 
 
 def batched_class(
-    task: type[BaseEnv], threads: int | None = None, strict: bool | Literal["warn"] = False
+    task: type[BaseEnv],
+    threads: int | None = None,
+    rules: Degree | None = None,
+    on_finding: Callable[[Finding], None] = warn_of,
 ) -> type[BaseEnv]:
     """`task` with the batched CPU simulation in front of it; `task` itself is left as it is.
 
     Args:
-        strict: True raises where the GPU would silently go wrong, ``"warn"`` only says so; see `strict`.
+        rules: the degree of all rules of GPU simulation, or None for each rule's own; see `rules`.
+        on_finding: called with each place where a rule is broken that does not stop the task, the first time.
     """
     install_index_seams()
     install_struct_access()
@@ -263,7 +269,7 @@ def batched_class(
         "_workbench_task": task,
         "_workbench_threads": threads,
     }
-    if strict:
-        namespace["_strict_only_warns"] = strict == "warn"
-        return type(task.__name__, (StrictMixin, BatchedCpuMixin, task), namespace)
-    return type(task.__name__, (BatchedCpuMixin, task), namespace)
+    if all(degree == "off" for degree in degrees_of(rules).values()):
+        return type(task.__name__, (BatchedCpuMixin, task), namespace)
+    namespace |= {"_rule_choice": rules, "_on_finding": staticmethod(on_finding)}
+    return type(task.__name__, (StrictMixin, BatchedCpuMixin, task), namespace)

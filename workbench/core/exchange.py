@@ -32,10 +32,10 @@ def put_class(env: BaseEnv, task: type[BaseEnv]) -> None:
     if not issubclass(own, BatchedCpuMixin):
         env.__class__ = task
         return
-    strict: Any = False
     if issubclass(own, StrictMixin):
-        strict = "warn" if own._strict_only_warns else True
-    env.__class__ = batched_class(task, own._workbench_threads, strict)
+        env.__class__ = batched_class(task, own._workbench_threads, own._rule_choice, own._on_finding)
+    else:
+        env.__class__ = batched_class(task, own._workbench_threads, "off")
 
 
 def can_exchange_cameras(env: BaseEnv) -> bool:

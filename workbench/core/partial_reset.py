@@ -26,6 +26,11 @@ from mani_skill.agents.controllers.base_controller import BaseController, Combin
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs import Pose
 
+from workbench.core.assignments import find_assignment
+from workbench.core.broken_rule import BrokenRule
+from workbench.core.kept_rows import rows_of_tensors
+from workbench.core.seams import task_class
+
 _CORE = str(Path(__file__).parent)
 
 
@@ -71,25 +76,24 @@ def others(env: Any, options: dict[str, Any] | None) -> list[int]:
 @contextmanager
 def told_whose_fault(env: Any, untouched: list[int]) -> Iterator[None]:
     """Add a note to an exception that leaves a reset by way of the task's own code."""
-    before = _buffers(env) if untouched else {}
+    before = rows_of_tensors(env) if untouched else {}
     try:
         yield
+    except BrokenRule:
+        raise  # says it all
     except Exception as error:
         line = _line_of_the_task(error, env)
+        now = rows_of_tensors(env) if untouched else {}
         rows = env.num_envs - len(untouched)
-        shrunk = [
-            name
-            for name, value in _buffers(env).items()
-            if untouched and name in before and len(before[name]) == env.num_envs and len(value) == rows
-        ]
+        shrunk = [path for path, count in now.items() if count == rows and before.get(path) == env.num_envs]
         if line is not None or shrunk:
             error.add_note(_note(env, untouched, line, shrunk))
         raise
 
 
 def _note(env: BaseEnv, untouched: list[int], line: traceback.FrameSummary | None, shrunk: list[str]) -> str:
-    where = "" if line is None else f" {Path(line.filename).name}:{line.lineno}, in {line.name}."
-    note = f"This error is {type(env).__name__}'s own, not the batched core's:{where or ' see below.'}"
+    where = "." if line is None else f": {Path(line.filename).name}:{line.lineno}, in {line.name}."
+    note = f"This error is {type(env).__name__}'s own, not the batched core's{where}"
     if not untouched:
         return note
     chosen = [i for i in range(env.num_envs) if i not in untouched]
@@ -97,14 +101,11 @@ def _note(env: BaseEnv, untouched: list[int], line: traceback.FrameSummary | Non
         f" Envs {chosen} of {env.num_envs} were being reset: _initialize_episode must make len(env_idx) rows, "
         "not num_envs, and write what it keeps on self as `self.x[env_idx] = ...`."
     )
-    if shrunk:
-        names = ", ".join(f"self.{name}" for name in shrunk)
-        note += f" It replaced {names}: {env.num_envs} rows before, {len(chosen)} now."
+    for path in shrunk:
+        place = find_assignment(task_class(env), path)
+        at = "" if place is None else f" ({Path(place[0]).name}:{place[1]})"
+        note += f" It replaced self.{path}: {env.num_envs} rows before, {len(chosen)} now{at}."
     return note + " ManiSkill's GPU simulation runs the same code."
-
-
-def _buffers(env: BaseEnv) -> dict[str, torch.Tensor]:
-    return {n: v for n, v in vars(env).items() if isinstance(v, torch.Tensor) and v.ndim > 0}
 
 
 def _line_of_the_task(error: Exception, env: BaseEnv) -> traceback.FrameSummary | None:

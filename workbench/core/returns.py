@@ -1,7 +1,7 @@
 """What is wrong with what a task's hooks return, in words; None where nothing is.
 
 ManiSkill takes success, fail, rewards and observations for batched, a row for each env, and looks at none. The checks here are
-pure: they name a failing and leave it to the caller what that means (`strict` raises, the page shows it
+pure: they name a failing and leave it to the caller what that means (`strict` tells it, the page shows it
 at the ``def`` of the hook).
 """
 

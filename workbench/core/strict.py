@@ -1,49 +1,47 @@
-"""Strict mode: what would go wrong on the GPU goes wrong here, with a sentence that says so.
+"""The rules, checked: what would go wrong on the GPU is told here, at the line that does it.
 
 The batched CPU core runs a task through the code that the GPU runs, so most mistakes that the GPU does not
 forgive stop here too. The rest are silent: a write that the next fetch takes back, a neighbour's episode
-changed by a partial reset, a reward of shape (). In strict mode they raise `BrokenRule`:
+changed by a partial reset, a reward of shape (). `rules` lists them, with what happens where one is broken:
 
 * state set and not applied, applied or read without a fetch after a step, links read before their
   articulation's new qpos reached them (`strict_system`, at the line that wrote or read);
 * SAPIEN's own setters, which the GPU does not look at (`behind_tensors`, at the line that called);
-* in a partial reset: state of other envs written, the simulation stepped, a tensor that the task keeps on
-  itself left with the rows of the reset envs only (here, at the line where it is known, else at the hook);
+* in a partial reset: state of other envs written, the simulation stepped, and rows of other envs lost or
+  changed in what the task keeps on itself (here; `kept_rows` finds the assignment);
 * returns of ``evaluate``, the reward and the observation hooks without a row for each env (`returns`).
 
 What the GPU refuses in any case (a pose of another batch size, a static actor moved, two applies without a
-fetch, state touched while the scene is loaded) is refused in every mode, see `struct_access`.
+fetch, state touched while the scene is loaded) is refused whatever the degree, see `struct_access`.
 
-Only what goes wrong is refused, by comparing values: ManiSkill's own tasks hear nothing, but for five that
-break a rule (``tests/core/test_strict.py`` lists them). ``strict="warn"`` makes every broken rule a
-`RuleWarning` with its place, once, for a task that is not the reader's to mend.
-
-It costs about 0.3 ms a control step, whatever the number of envs: of PickCube-v1 with state observations
-5 per cent at 16 envs (6.4 ms without) and 1 to 2 per cent at 64 (20.7 ms), on two cores.
+Only what goes wrong is told, by comparing values: ManiSkill's own tasks hear nothing, but for those that
+break a rule (``tests/core/test_strict.py`` lists them).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from typing import Any
 
 import torch
+from mani_skill.envs.sapien_env import BaseEnv
 
 from workbench.core.behind_tensors import guard_scenes
-from workbench.core.broken_rule import BrokenRule, RuleWarning, place_of_hook
+from workbench.core.broken_rule import (
+    BrokenRule,
+    BrokenRules,
+    RuleWarning,
+    WrongReturn,
+    place_of_hook,
+    warn_of,
+)
+from workbench.core.partial_reset import others
+from workbench.core.reset_watch import ResetWatch
 from workbench.core.returns import wrong_evaluate, wrong_observation, wrong_reward
+from workbench.core.rules import Degree, Finding, degrees_of
 from workbench.core.strict_system import StrictCpuSystem
 
 __all__ = ["BrokenRule", "RuleWarning", "StrictMixin", "WrongReturn"]
-
-
-class WrongReturn(BrokenRule):
-    """What a hook returned is not what ManiSkill takes it for: `hook` is its name, `said` the failing."""
-
-    def __init__(self, said: str, hook: str, place: str) -> None:
-        super().__init__(f"{hook}() {said}{place}")
-        self.said, self.hook = said, hook
-
 
 _REWARD_HOOK = {
     "dense": "compute_dense_reward",
@@ -57,20 +55,61 @@ class StrictMixin:
 
     num_envs: int
     scene: Any
-    _workbench_task: type
+    _workbench_task: type[BaseEnv]
     _system_class = StrictCpuSystem
-    _strict_only_warns = False
+    _rule_choice: Degree | None = None
+    """The degree of all rules; None for each rule's own."""
+    _on_finding: Callable[[Finding], None] = staticmethod(warn_of)
+    _rules: BrokenRules | None = None
+    _reset_watch: ResetWatch | None = None
+    _wrong_obs: tuple[str, str] | None = None
+    """The hook, and what is wrong, of an observation that is being put together."""
+
+    @property
+    def broken_rules(self) -> BrokenRules:
+        """What the task broke so far; of the env, whatever becomes of its scene and its class."""
+        if self._rules is None:
+            self._rules = BrokenRules(degrees_of(self._rule_choice), self._on_finding)
+        return self._rules
 
     def _setup_scene(self) -> None:
         super()._setup_scene()  # type: ignore[misc]
-        self._strict_system.only_warn = self._strict_only_warns
+        self._strict_system.rules = self.broken_rules
         guard_scenes(self._strict_system)
 
     @property
     def _strict_system(self) -> StrictCpuSystem:
         return self.scene.px
 
+    def step(self, action: Any) -> Any:
+        with self.broken_rules.during("step"):
+            stepped = super().step(action)  # type: ignore[misc]
+        self.broken_rules.step += 1
+        return stepped
+
     # --- partial resets ------------------------------------------------------------------------------
+
+    def reset(self, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
+        untouched, watch = others(self, options), self._watch
+        partial = bool(untouched)
+        with self.broken_rules.during("reset", confirms=partial or self.num_envs == 1):
+            watch.whole = partial and self._workbench_task.reset is not BaseEnv.reset
+            try:
+                if watch.whole:
+                    chosen = [i for i in range(self.num_envs) if i not in untouched]
+                    watch.start(self, self._workbench_task, chosen)  # type: ignore[arg-type]
+                made = super().reset(seed=seed, options=options)  # type: ignore[misc]
+                watch.tell()
+                return made
+            finally:
+                watch.stop()
+                watch.whole = False
+
+    @property
+    def _watch(self) -> ResetWatch:
+        if self._reset_watch is None:
+            self._reset_watch = ResetWatch(self.broken_rules)
+        return self._reset_watch
 
     def _clear_sim_state(self) -> None:
         reset = self.scene._reset_mask
@@ -82,66 +121,70 @@ class StrictMixin:
         system, reset = self._strict_system, self.scene._reset_mask.clone()
         if bool(reset.all()):
             return super()._initialize_episode(env_idx, options)  # type: ignore[misc]
-        state, kept = system.copy_of_state(), self._own_tensors()
+        state = system.copy_of_state()
         system.being_reset, system.stepped_in_reset = reset, False
+        system.told_elsewhere.clear()
+        system.hook_of_reset = place_of_hook(self._workbench_task, "_initialize_episode")
+        watch = self._watch
+        if not watch.looks:
+            watch.start(self, self._workbench_task, torch.nonzero(reset)[:, 0].tolist())  # type: ignore[arg-type]
         try:
             super()._initialize_episode(env_idx, options)  # type: ignore[misc]
+            system.being_reset = None
+            system.refuse_changes_elsewhere(state, reset)
+            watch.tell(over=not watch.whole)
         finally:
             system.being_reset = None
-        system.refuse_changes_elsewhere(state, reset)
-        self._refuse_replaced_tensors(kept, reset)
-
-    def _own_tensors(self) -> dict[str, torch.Tensor]:
-        """Copies of the tensors that the task keeps on itself with a row for each env."""
-        return {
-            name: value.clone()
-            for name, value in vars(self).items()
-            if isinstance(value, torch.Tensor) and value.ndim > 0 and len(value) == self.num_envs
-        }
-
-    def _refuse_replaced_tensors(self, before: Mapping[str, torch.Tensor], reset: torch.Tensor) -> None:
-        count = int(reset.sum())
-        for name, old in before.items():
-            now = vars(self).get(name)
-            if not isinstance(now, torch.Tensor) or now.shape == old.shape:
-                continue
-            if now.shape == (count, *old.shape[1:]):
-                self._strict_system.break_rule(
-                    f"_initialize_episode left self.{name} with a row for each of the {count} envs that were "
-                    f"reset, where it had one for each of {self.num_envs}: write self.{name}[env_idx] = ... "
-                    f"instead of replacing it{place_of_hook(self._workbench_task, '_initialize_episode')}.",
-                    None,
-                )
+            watch.stop()
 
     # --- returns -------------------------------------------------------------------------------------
 
     def evaluate(self) -> dict[str, Any]:
         evaluated = super().evaluate()  # type: ignore[misc]
-        self._refuse_return(wrong_evaluate(evaluated, self.num_envs), "evaluate")
+        self._returned("evaluate-rows", "evaluate", wrong_evaluate(evaluated, self.num_envs))
         return evaluated
 
     def get_reward(self, obs: Any, action: torch.Tensor, info: dict[str, Any]) -> torch.Tensor:
         reward = super().get_reward(obs=obs, action=action, info=info)  # type: ignore[misc]
         hook = _REWARD_HOOK.get(self.reward_mode)  # type: ignore[attr-defined]
         if hook is not None:
-            self._refuse_return(wrong_reward(reward, self.num_envs, info), hook)
+            self._returned("reward-rows", hook, wrong_reward(reward, self.num_envs, info))
         return reward
 
     def _get_obs_extra(self, info: dict[str, Any]) -> Any:
         obs = super()._get_obs_extra(info)  # type: ignore[misc]
-        self._refuse_return(wrong_observation(obs, self.num_envs), "_get_obs_extra")
+        self._observed("_get_obs_extra", obs)
         return obs
 
     def _get_obs_agent(self) -> Any:
         obs = super()._get_obs_agent()  # type: ignore[misc]
-        self._refuse_return(wrong_observation(obs, self.num_envs), "_get_obs_agent")
+        self._observed("_get_obs_agent", obs)
         return obs
 
-    def _refuse_return(self, said: str | None, hook: str) -> None:
-        if said is None:
-            return
-        place = place_of_hook(self._workbench_task, hook)
-        if self._strict_only_warns:
-            self._strict_system.break_rule(f"{hook}() {said}{place}", None)
-        else:
-            raise WrongReturn(said, hook, place)
+    def get_obs(self, *args: Any, **kwargs: Any) -> Any:
+        self._wrong_obs = None
+        try:
+            obs = super().get_obs(*args, **kwargs)  # type: ignore[misc]
+        except Exception as error:
+            if self._wrong_obs is None or isinstance(error, BrokenRule):
+                raise
+            # ManiSkill cannot put it together ("Sizes of tensors must match"): the rule's words are the better ones.
+            hook, said = self._wrong_obs  # type: ignore[misc]
+            place = place_of_hook(self._workbench_task, hook)
+            raise WrongReturn(said, hook, "observation-rows", place) from error
+        finally:
+            self._wrong_obs = None
+        if self._watch.whole and not self._watch.looks:
+            # From here on only the task's own reset is at work: what `evaluate` keeps for all is no matter of it.
+            self._watch.go_on(self)  # type: ignore[arg-type]
+        return obs
+
+    def _observed(self, hook: str, obs: Any) -> None:
+        said = wrong_observation(obs, self.num_envs)
+        if said is not None:
+            self._wrong_obs = hook, said
+            self._returned("observation-rows", hook, said)
+
+    def _returned(self, rule: str, hook: str, said: str | None) -> None:
+        if said is not None:
+            self.broken_rules.returned(rule, hook, said, place_of_hook(self._workbench_task, hook))

@@ -5,7 +5,7 @@ simulation holds, ``gpu_apply_*`` writes the simulation over with what they hold
 both without a word. So a pose that was set and not applied is gone after the next fetch, an apply after a
 step without a fetch puts every body of every env back to where it was, and a read between the two
 gives the past. `BatchedCpuSystem` does the first and the last as the GPU does, and is kinder about the
-second; this one raises `BrokenRule` on all three.
+second; this one tells of all three. Where the rule only warns, what it does is what that one does, bit for bit.
 
 It compares values and not calls, so that what changes nothing is no fault: a pose set to what it was, an
 apply of bodies that have not moved. Where the setters of ManiSkill's structs were called from
@@ -16,7 +16,6 @@ only at the fetch.
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -27,13 +26,13 @@ import sapien
 import torch
 from numpy.typing import NDArray
 
-from workbench.core.broken_rule import Frame, RuleWarning, broken_at, frames_of_the_task, place_of
+from workbench.core.broken_rule import BrokenRules, Place
 from workbench.core.contacts import CpuArray
 from workbench.core.cpu_system import BatchedCpuSystem
 from workbench.core.drive_targets import Setters
 from workbench.core.who_wrote import TENSORS, Group, Writes
 
-ENVS_NAMED = 8
+ENVS_NAMED = THINGS_NAMED = 8
 _MOVING: tuple[Group, ...] = ("bodies", "links", "joints")
 """What a step moves; targets and joint forces stay what they were set to."""
 _MOVED = 1e-4
@@ -44,21 +43,24 @@ _IN_ENV = re.compile(r"^scene-\d+[-_]")
 class StrictCpuSystem(BatchedCpuSystem):
     """See the module's text."""
 
-    only_warn = False
-    """True reports a broken rule as a `RuleWarning`, once, and goes on."""
+    rules: BrokenRules
+    """What a broken rule is told to; of the env, so that it outlives a scene."""
     being_reset: torch.Tensor | None = None
     """(N,) bool while ``_initialize_episode`` runs for some envs and not for others."""
     stepped_in_reset = False
+    hook_of_reset: Place | None = None
+    """Where the task defines ``_initialize_episode``."""
 
     def __init__(self, scenes: Sequence[sapien.Scene], *args: Any, **kwargs: Any) -> None:
         self._writes = Writes()
         self._stale: set[Group] = set()
+        self.told_elsewhere: set[str] = set()
+        """Of other envs, in the partial reset under way: the names of what was told already."""
         self._applying = 0
         self._outdated: set[int] = set()
         """Articulations whose links in the tensor are those of before a write of qpos or root pose."""
         self._not_updated: set[int] = set()
         """Articulations applied since PhysX last computed where links are."""
-        self._told: set[str] = set()
         super().__init__(scenes, *args, **kwargs)
 
     def gpu_init(self) -> None:
@@ -83,20 +85,6 @@ class StrictCpuSystem(BatchedCpuSystem):
         articulations = self._laid_out.articulations
         return [[_unguarded(joint, method) for joint in a.active_joints] for a in articulations]
 
-    def break_rule(self, message: str, frames: Sequence[Frame] | None = ()) -> None:
-        """Raise, or warn once a sentence.
-
-        Args:
-            frames: who is at fault, to become the innermost of the traceback; empty for whoever calls now,
-                None where no line is at fault.
-        """
-        if not self.only_warn:
-            raise broken_at(message, frames or ())
-        if message not in self._told:
-            self._told.add(message)
-            place = "" if frames is None else place_of(frames or frames_of_the_task())
-            warnings.warn(message + place, RuleWarning, stacklevel=2)
-
     @property
     def laid_out(self) -> bool:
         """Whether the scene is complete; before that nothing has a row."""
@@ -111,9 +99,11 @@ class StrictCpuSystem(BatchedCpuSystem):
             envs = struct._scene_idxs.long()
             others = struct.scene._reset_mask[envs] & ~self.being_reset[envs]
             if bool(others.any()):
-                self.break_rule(
-                    f"'{struct.name}' is written in {_envs(envs[others].numpy())}, which "
-                    "are not being reset: in _initialize_episode only the envs of env_idx may be changed."
+                self.told_elsewhere.add(struct.name)
+                self.rules.breaks(
+                    "other-env-written",
+                    f"'{struct.name}' is written in {envs_named(envs[others])}, which "
+                    "are not being reset: in _initialize_episode only the envs of env_idx may be changed.",
                 )
 
     def about_to_read(self, struct: Any, group: Group, index: torch.Tensor) -> None:
@@ -128,10 +118,11 @@ class StrictCpuSystem(BatchedCpuSystem):
         at = np.searchsorted(self._laid_out.body_rows, rows) if group == "bodies" else rows
         at = np.searchsorted(self._laid_out.link_rows, rows) if group == "links" else at
         if (np.abs(now[at] - truth[at]) > _MOVED).any():
-            self.break_rule(
+            self.rules.breaks(
+                "read-before-fetch",
                 f"The state of '{struct.name}' is read after the simulation moved on and before it was fetched: "
                 "on the GPU, and here, this gives the state before the step. Call self.scene._gpu_fetch_all() "
-                "first (under `if self.gpu_sim_enabled:`)."
+                "first (under `if self.gpu_sim_enabled:`).",
             )
 
     def _refuse_old_links(self, link: Any) -> None:
@@ -143,10 +134,11 @@ class StrictCpuSystem(BatchedCpuSystem):
         owners = {layout.index_of[id(body.articulation)] for body in link._bodies} if old else set()
         if old & owners:
             name = self._articulation_names[min(old & owners)]
-            self.break_rule(
+            self.rules.breaks(
+                "link-before-update",
                 f"The pose of link '{link.name}' is read after the qpos or pose of '{name}' was set: on the GPU, "
                 "and here, it is still where it was. Call self.scene._gpu_apply_all(), "
-                "self.scene.px.gpu_update_articulation_kinematics() and self.scene._gpu_fetch_all() before."
+                "self.scene.px.gpu_update_articulation_kinematics() and self.scene._gpu_fetch_all() before.",
             )
 
     # --- fetches -------------------------------------------------------------------------------------
@@ -210,21 +202,28 @@ class StrictCpuSystem(BatchedCpuSystem):
             return
         what = what or ("pose" if lost[:, :7].any() else "velocity")
         lost_rows = rows[hit]
-        name = names[lost_rows[0]]
-        mine = lost_rows[[names[row] == name for row in lost_rows]]
-        # As on the GPU: without this the write would be applied after all, by the reset that follows.
-        now[rows] = seen[rows]
-        links = group == "links" and what == "pose" and not np.isin(mine, self._laid_out.root_rows).any()
-        self.break_rule(
-            f"The pose of link '{name}' was set in {_envs(envs[mine])}: on the GPU, and here, that does nothing. "
-            "Links follow their articulation: set its qpos or its root pose."
-            if links
-            else f"The {what} of '{name}' in {_envs(envs[mine])} was set and not applied: on the GPU, and here, the "
-            "next fetch writes it over and the simulation never sees it. Outside _initialize_episode, call "
-            "self.scene._gpu_apply_all() and self.scene._gpu_fetch_all() after the write (under "
-            "`if self.gpu_sim_enabled:`).",
-            self._writes.frames(group, mine),
-        )
+        roots = self._laid_out.root_rows
+        if "stop" in (self.rules.degree("not-applied"), self.rules.degree("link-pose-set")):
+            # As on the GPU: without this the write would be applied after all, by the reset that follows.
+            now[rows] = seen[rows]
+        for name, mine in _by_name(lost_rows, names):
+            where, frames = envs_named(envs[mine]), self._writes.frames(group, mine)
+            seen_by = ", pictures on the GPU do" if what == "pose" else ""
+            if group == "links" and what == "pose" and not np.isin(mine, roots).any():
+                self.rules.breaks(
+                    "link-pose-set",
+                    f"The pose of link '{name}' was set in {where}: physics never sees it{seen_by}. "
+                    "Links follow their articulation: set its qpos or its root pose.",
+                    frames,
+                )
+            else:
+                self.rules.breaks(
+                    "not-applied",
+                    f"The {what} of '{name}' in {where} was set and not applied: physics never sees it{seen_by}, and "
+                    "the next fetch writes it over. To have it seen, call self.scene._gpu_apply_all() and "
+                    "self.scene._gpu_fetch_all() after the write (under `if self.gpu_sim_enabled:`).",
+                    frames,
+                )
 
     # --- applies -------------------------------------------------------------------------------------
 
@@ -302,10 +301,11 @@ class StrictCpuSystem(BatchedCpuSystem):
             rows, seen = layout.body_rows, self._data_seen[layout.body_rows]
         undone = ((np.abs(now - truth) > _MOVED) & (now == seen)).any(axis=1)
         if undone.any():
-            self.break_rule(
+            self.rules.breaks(
+                "apply-before-fetch",
                 f"State is applied after the simulation moved on and before it was fetched: on the GPU this puts "
                 f"'{names[rows[undone][0]]}', and whatever else moved, back to before the step, in all envs. "
-                "Call self.scene._gpu_fetch_all() before you write."
+                "Here only what was written is applied. Call self.scene._gpu_fetch_all() before you write.",
             )
 
     # --- steps and direct access -----------------------------------------------------------------------
@@ -314,18 +314,21 @@ class StrictCpuSystem(BatchedCpuSystem):
         if self._layout is not None and (self._qf != self._qf_seen).any():
             hit = np.flatnonzero((self._qf != self._qf_seen).any(axis=1))
             name, envs = self._articulation_names[hit[0]], self._articulation_envs[hit]
-            self._qf[:] = self._qf_seen
-            self.break_rule(
-                f"The joint forces (qf) of '{name}' in {_envs(envs)} were set and not applied: on the GPU, and here, "
+            if self.rules.degree("not-applied") == "stop":
+                self._qf[:] = self._qf_seen
+            self.rules.breaks(
+                "not-applied",
+                f"The joint forces (qf) of '{name}' in {envs_named(envs)} were set and not applied: on the GPU, and here, "
                 "the step does not see them. Call self.scene.px.gpu_apply_articulation_qf() after the write.",
                 self._writes.frames("forces", hit),
             )
         if self.being_reset is not None:
             self.stepped_in_reset = True
             others = np.flatnonzero(~self.being_reset.numpy())
-            self.break_rule(
-                f"The simulation is stepped in _initialize_episode while {_envs(others)} are not being reset: "
-                "their episodes are moved on as well."
+            self.rules.breaks(
+                "stepped-in-reset",
+                f"The simulation is stepped in _initialize_episode while {envs_named(others)} are not being reset: "
+                "their episodes are moved on as well. (With one env, as --num-envs 1 opens it, there are no others.)",
             )
         super().step()
 
@@ -365,18 +368,18 @@ class StrictCpuSystem(BatchedCpuSystem):
             rows = np.flatnonzero(written.any(axis=1) & ~reset.numpy()[env_of_row])
             if len(rows) == 0:
                 continue
-            name = names[rows[0]]
-            envs = env_of_row[[row for row in rows if names[row] == name]]
-            found: Group = "links" if rigid and rows[0] in layout.link_rows else group
-            frames = self._writes.frames(found, rows)
-            if not self.only_warn:
+            if self.rules.degree("applied-by-reset") == "stop":
                 now[rows] = seen[rows]
-            self.break_rule(
-                f"The {what} of '{name}' in {_envs(envs)} was set outside _initialize_episode and not applied: on the "
-                "GPU, and here, the reset of other envs applies it now. Call self.scene._gpu_apply_all() and "
-                "self.scene._gpu_fetch_all() after the write (under `if self.gpu_sim_enabled:`).",
-                frames,
-            )
+            for name, mine in _by_name(rows, names):
+                found: Group = "links" if rigid and mine[0] in layout.link_rows else group
+                self.rules.breaks(
+                    "applied-by-reset",
+                    f"The {what} of '{name}' in {envs_named(env_of_row[mine])} was set outside _initialize_episode and "
+                    "not applied: on the GPU, and here, the reset of other envs applies it now. Call "
+                    "self.scene._gpu_apply_all() and self.scene._gpu_fetch_all() after the write (under "
+                    "`if self.gpu_sim_enabled:`).",
+                    self._writes.frames(found, mine),
+                )
 
     def copy_of_state(self) -> dict[str, NDArray[np.float32]]:
         """The tensors as they are."""
@@ -403,15 +406,17 @@ class StrictCpuSystem(BatchedCpuSystem):
                 poses = (now[:, :7] != before[what][:, :7]).any(axis=1)
                 links = np.isin(changed, np.setdiff1d(self._laid_out.link_rows, self._laid_out.root_rows))
                 changed = changed[~links | poses[changed]]
-            if len(changed):
-                name = names[changed[0]]
-                envs = env_of_row[[row for row in changed if names[row] == name]]
-                groups: tuple[Group, ...] = ("bodies", "links") if rigid else ("joints", "targets")
-                frames = [self._writes.frames(group, changed) for group in groups]
-                self.break_rule(
-                    f"_initialize_episode changed the {what} of '{name}' in {_envs(envs)}, which are not being "
-                    "reset: only the envs of env_idx may be changed.",
-                    next((found for found in frames if found), ()),
+            groups: tuple[Group, ...] = ("bodies", "links") if rigid else ("joints", "targets")
+            for name, mine in _by_name(changed, names):
+                if name in self.told_elsewhere:
+                    continue
+                frames = [self._writes.frames(group, mine) for group in groups]
+                self.rules.breaks(
+                    "other-env-written",
+                    f"_initialize_episode changed the {what} of '{name}' in {envs_named(env_of_row[mine])}, which are "
+                    "not being reset: only the envs of env_idx may be changed.",
+                    next((found for found in frames if found), None),
+                    self.hook_of_reset,
                 )
 
 
@@ -438,7 +443,16 @@ def _unguarded(owner: Any, method: str) -> Callable[[float], None]:
     return partial(getattr(function, "__wrapped__", function), owner)
 
 
-def _envs(envs: Any) -> str:
+def _by_name(rows: NDArray[np.int64], names: list[str]) -> Iterator[tuple[str, NDArray[np.int64]]]:
+    """The rows of each thing, at most `THINGS_NAMED` of them."""
+    found: dict[str, list[int]] = {}
+    for row in rows:
+        found.setdefault(names[row], []).append(int(row))
+    for name in list(found)[:THINGS_NAMED]:
+        yield name, np.array(found[name], dtype=np.int64)
+
+
+def envs_named(envs: Any) -> str:
     """``env 3``, or ``envs 0, 1, 2``, at most eight of them."""
     numbers = sorted({int(env) for env in envs})
     named = ", ".join(str(env) for env in numbers[:ENVS_NAMED])

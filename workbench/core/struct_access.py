@@ -7,7 +7,7 @@ an assertion, its velocity in a KeyError. The setters are therefore wrapped, onc
 error comes from the author's own call, names the object, and says what batch was wanted. A stock scene
 gets the stock setter and nothing else.
 
-A scene in strict mode is told of every read and write besides (`StrictCpuSystem`).
+Where rules are checked, `StrictCpuSystem` is told of every read and write besides.
 """
 
 from __future__ import annotations

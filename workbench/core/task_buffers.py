@@ -100,7 +100,7 @@ def _scene_of(env: BaseEnv) -> _Scene:
 def note_scene(env: BaseEnv) -> None:
     """Remember what the task holds now, right after its scene was built, as belonging to the scene."""
     _scenes[env.scene] = scene = _Scene()
-    scene.add(_look_over(env).leaves)
+    scene.add(look_over_env(env).leaves)
     forget_look(env)
 
 
@@ -110,13 +110,13 @@ def note_constructed(env: BaseEnv) -> None:
     An env made of the edited file would otherwise be given the old file's ``self.threshold = 0.02``.
     """
     scene = _scene_of(env)
-    scene.add([leaf for leaf in _look_over(env).leaves if isinstance(leaf.value, (*PLAIN, tuple))])
+    scene.add([leaf for leaf in look_over_env(env).leaves if isinstance(leaf.value, (*PLAIN, tuple))])
     forget_look(env)
 
 
 def read_task_state(env: BaseEnv, env_idx: list[int]) -> TaskState:
     """Copies of what the task remembers about the envs in `env_idx`, and of what holds for the batch."""
-    walk = _look_over(env)
+    walk = look_over_env(env)
     scene = _scene_of(env)
     chosen = np.array(env_idx, dtype=np.int64)
     rows: Any = slice(None) if env_idx == list(range(env.num_envs)) else torch.from_numpy(chosen)
@@ -126,7 +126,7 @@ def read_task_state(env: BaseEnv, env_idx: list[int]) -> TaskState:
         value = leaf.value
         if not _changed(value, scene.marks.get(leaf.path)):
             continue
-        per_env = _is_per_env(value, env.num_envs)
+        per_env = is_per_env(value, env.num_envs)
         if isinstance(value, torch.Tensor):
             if per_env:
                 kept = value.detach()[rows]
@@ -160,7 +160,7 @@ def write_task_state(
     Returns:
         Paths that were carried, and paths that were not with the reason.
     """
-    walk = _look_over(env, state.buffers)
+    walk = look_over_env(env, state.buffers)
     scene = _scene_of(env)
     carried: dict[str, None] = {}
     missed = dict(state.omitted)
@@ -176,7 +176,7 @@ def write_task_state(
                 continue
             if mark is None or leaf.path not in state.built:
                 # A controller's start and step exist from its first action on, and mean nothing before it.
-                if _is_per_env(value, env.num_envs) and not leaf.path.startswith("agent."):
+                if is_per_env(value, env.num_envs) and not leaf.path.startswith("agent."):
                     missed[leaf.path] = "the snapshot has none of this name: left as it is"
                 continue
             kept, chosen = _as_built(mark, env.num_envs), env_idx
@@ -269,11 +269,11 @@ def _as_found(kept: Buffer, env: BaseEnv) -> Any:
 
 def _as_built(mark: _Mark, num_envs: int) -> Buffer:
     if mark.copy is not None:
-        return Buffer(mark.copy.cpu().numpy(), _is_per_env(mark.copy, num_envs), mark.copy.dtype)
-    return Buffer(mark.value, _is_per_env(mark.value, num_envs), None)
+        return Buffer(mark.copy.cpu().numpy(), is_per_env(mark.copy, num_envs), mark.copy.dtype)
+    return Buffer(mark.value, is_per_env(mark.value, num_envs), None)
 
 
-def _look_over(env: BaseEnv, wanted: Collection[str] = ()) -> Walk:
+def look_over_env(env: BaseEnv, wanted: Collection[str] = ()) -> Walk:
     """Everything that may have changed since the scene was built, and what is at the paths in `wanted`."""
     scene = _scene_of(env)
     built = scene.plain
@@ -288,7 +288,7 @@ def _look_over(env: BaseEnv, wanted: Collection[str] = ()) -> Walk:
 # --- comparing -------------------------------------------------------------------------------------
 
 
-def _is_per_env(value: Any, num_envs: int) -> bool:
+def is_per_env(value: Any, num_envs: int) -> bool:
     if isinstance(value, (torch.Tensor, np.ndarray)):
         return value.ndim > 0 and value.shape[0] == num_envs
     return isinstance(value, list) and len(value) == num_envs
@@ -297,7 +297,7 @@ def _is_per_env(value: Any, num_envs: int) -> bool:
 def _mark(value: Any) -> _Mark:
     if isinstance(value, torch.Tensor):
         copy = value.detach().clone()
-        return _Mark(value, _version(value), copy.float() if copy.dtype == torch.bfloat16 else copy)
+        return _Mark(value, version_of(value), copy.float() if copy.dtype == torch.bfloat16 else copy)
     return _Mark(value.copy() if isinstance(value, (np.ndarray, list)) else value, 0, None)
 
 
@@ -308,11 +308,11 @@ def _changed(value: Any, mark: _Mark | None) -> bool:
     if value is mark.value and isinstance(value, PLAIN):
         return False
     if isinstance(value, torch.Tensor):
-        return value is not mark.value or _version(value) != mark.version
+        return value is not mark.value or version_of(value) != mark.version
     return not _equal(value, mark.value)
 
 
-def _version(tensor: torch.Tensor) -> int:
+def version_of(tensor: torch.Tensor) -> int:
     return 0 if tensor.is_inference() else tensor._version
 
 

@@ -21,10 +21,12 @@ from workbench.core import actions
 from workbench.core.assets import refuse_downloads, require_assets, robots_of
 from workbench.core.backends import choose_backend
 from workbench.core.body_table import BodyTable, build_body_table, read_poses
+from workbench.core.broken_rule import BrokenRules, warn_of
 from workbench.core.contact_list import Contact, list_contacts
 from workbench.core.cpu_scene import batched_class
 from workbench.core.entries import FLAGS, split_entries
 from workbench.core.render_device import keep_render_device
+from workbench.core.rules import Degree, Finding, degrees_of
 from workbench.core.seams import (
     drawing_from,
     episode_seeds,
@@ -57,9 +59,10 @@ class EnvOptions:
     """False makes no render system: no pictures, and nothing asked of a graphics driver."""
     threads: int | None = None
     """Threads that step the envs of the CPU core; None for one on each core that the process may use."""
-    strict: bool | Literal["warn"] = False
-    """True raises where GPU simulation would silently go wrong, ``"warn"`` says so and goes on (on the CPU;
-    see `strict`, also for what it costs)."""
+    rules: Degree | None = None
+    """The degree of all rules of GPU simulation (on the CPU); None for each rule's own, see `rules`."""
+    on_finding: Callable[[Finding], None] = warn_of
+    """Called with each place where a rule is broken that does not stop the task, the first time."""
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     """Further keyword arguments of the task class: ``obs_mode``, ``robot_uids``, ``control_mode`` ... A
     ``render_backend`` among them is used instead of the one that is found."""
@@ -69,8 +72,7 @@ class EnvOptions:
             raise ValueError(f"num_envs must be at least 1, not {self.num_envs}")
         if self.backend not in get_args(Backend):
             raise ValueError(f"backend must be one of {', '.join(get_args(Backend))}, not {self.backend!r}")
-        if self.strict not in (True, False, "warn"):
-            raise ValueError(f"strict must be True, False or 'warn', not {self.strict!r}")
+        degrees_of(self.rules)  # raises for what is no degree
         if self.threads is not None and self.threads < 1:
             raise ValueError(f"threads must be at least 1, or None for all cores, not {self.threads}")
 
@@ -117,7 +119,7 @@ def build_env(
     with refuse_downloads(task.__name__):
         if backend.simulation == "gpu":
             return task(sim_backend="physx_cuda", **kwargs)
-        return batched_class(task, options.threads, options.strict)(**kwargs)
+        return batched_class(task, options.threads, options.rules, options.on_finding)(**kwargs)
 
 
 def default_reward_mode(task: type[BaseEnv]) -> str:
@@ -306,6 +308,11 @@ class TaskEnv:
     def episode_seeds(self) -> NDArray[np.int64]:
         """(N,) the seeds that the envs were last reset with."""
         return np.array(episode_seeds(self.env), dtype=np.int64)
+
+    @property
+    def broken_rules(self) -> BrokenRules | None:
+        """What the task broke of the rules of GPU simulation; None where none is checked."""
+        return getattr(self.env, "broken_rules", None)
 
     def contacts(self, env: int) -> tuple[Contact, ...]:
         """What touches what in one env, in its last substep; see `list_contacts`."""

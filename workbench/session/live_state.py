@@ -39,6 +39,7 @@ from workbench.session.messages import (
     ReloadReport,
     Request,
     Restore,
+    RulesBroken,
     SetActionSource,
     SetEpisodeEnd,
     SetSpeed,
@@ -80,6 +81,9 @@ class LiveState:
     problem_at_run: bool = False
     """It came while the task ran, not while a version was loaded."""
     busy: Busy | None = None
+    rules: RulesBroken | None = None
+    """What the version that runs has broken of the rules; None while nothing."""
+    rules_serial: int = 0
     # --- the batch ---
     chronicle: Chronicle | None = None
     """None before a task is loaded."""
@@ -134,6 +138,7 @@ class LiveState:
         self.step, self.load_milliseconds, self.reload = event.first, event.milliseconds, report
         self.first_due = not scene_kept(event)
         if not scene_kept(event):
+            self.rules, self.rules_serial = None, self.rules_serial + 1  # those of this scene come after it
             same = restored and before is not None and before.source_hash == task.source_hash
             self._new_scene(task, event.first, its_past_stays=same)
         elif self.timeline is not None:
@@ -179,6 +184,9 @@ class LiveState:
             self.problem_at_run = self.state != "loading"
             self.state = "error"
             self.stale = self.stale or not self.problem_at_run
+        elif isinstance(event, RulesBroken):
+            self.rules = event if event.rows else None
+            self.rules_serial += 1
         elif isinstance(event, PastPictures):
             if self.timeline is not None:
                 self.timeline.add_pictures(event)
@@ -409,6 +417,8 @@ class LiveState:
             timeline=past,
             printed=printed,
             busy=self.busy,
+            rules=self.rules,
+            rules_serial=self.rules_serial,
             vitals=vitals,
             inspection=self.inspection,
             judgement=judgement,

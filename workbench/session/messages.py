@@ -22,6 +22,7 @@ from workbench.core.geometry import SceneGeometry
 from workbench.core.inspection import Inspection, Section
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.core.recorded_run import RecordedRun
+from workbench.core.rules import Degree, Finding
 from workbench.core.step import StepResult
 from workbench.session.camera_messages import (
     CameraAnswer,
@@ -51,6 +52,8 @@ class TaskOptions:
     seed: int = 0
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Further keyword arguments of the task class (``robot_uids``, ``obs_mode`` ...)."""
+    rules: Degree | None = None
+    """The degree of all rules of GPU simulation; None for each rule's own, see `core.rules`."""
 
 
 @dataclass(frozen=True)
@@ -434,6 +437,17 @@ class Status:
 
 
 @dataclass(frozen=True)
+class RulesBroken:
+    """What the version that runs has broken of the rules and is not stopped by; sent when it changes."""
+
+    rows: tuple[Finding, ...]
+    more: int = 0
+    """Times at places for which there was no row left."""
+    new: tuple[Finding, ...] = ()
+    """Those of the rows that the event before did not have."""
+
+
+@dataclass(frozen=True)
 class WarmedUp:
     """The answer to `WarmUp`."""
 
@@ -455,5 +469,6 @@ Event = (
     | Rescored
     | Captured
     | Status
+    | RulesBroken
     | WarmedUp
 )

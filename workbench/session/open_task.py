@@ -8,10 +8,11 @@ passes is handed over. The page, ``workbench record`` and the benchmarks open ta
 
 from __future__ import annotations
 
+import linecache
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,11 +23,12 @@ from workbench.authoring.reference import TaskName
 from workbench.authoring.returns import check_step_returns, problem_from_return
 from workbench.core import actions
 from workbench.core.backends import find_renderer
+from workbench.core.broken_rule import BrokenRule, WrongReturn, class_is_installed, warn_of
 from workbench.core.env_kwargs import env_kwargs
+from workbench.core.rules import Degree, Finding
 from workbench.core.scene_geometry import read_geometry
 from workbench.core.snapshot import RestoreReport, Snapshot
 from workbench.core.step import StepResult
-from workbench.core.strict import BrokenRule, WrongReturn
 from workbench.core.take_pictures import list_cameras, segmentation_names
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env
 from workbench.core.visibility import objects_to_see
@@ -50,8 +52,12 @@ def open_task(
     options: TaskOptions,
     *,
     on_activity: Callable[[str], None] = lambda activity: None,
+    on_finding: Callable[[Finding], None] = warn_of,
 ) -> OpenedTask:
     """Import, build, rehearse and reset a task.
+
+    Args:
+        on_finding: called with each place where it breaks a rule that does not stop it, the first time.
 
     Raises:
         TaskError: with the author's file and line; nothing of the task stays behind.
@@ -62,7 +68,7 @@ def open_task(
     clock.lap("import")
 
     try:
-        return build_task(loaded, options, clock, on_activity)
+        return build_task(loaded, options, clock, on_activity, on_finding)
     except BaseException:
         # The class imported and cannot be used: without this the last good version would go on with
         # the new version's helper modules and registrations behind its back.
@@ -71,7 +77,11 @@ def open_task(
 
 
 def build_task(
-    loaded: LoadedTask, options: TaskOptions, clock: Clock, on_activity: Callable[[str], None]
+    loaded: LoadedTask,
+    options: TaskOptions,
+    clock: Clock,
+    on_activity: Callable[[str], None],
+    on_finding: Callable[[Finding], None],
 ) -> OpenedTask:
     """The second half of `open_task`; raises as it does, and leaves taking back `loaded` to the caller."""
     on_activity(f"building {options.num_envs} {'env' if options.num_envs == 1 else 'envs'}")
@@ -81,8 +91,8 @@ def build_task(
             EnvOptions(
                 num_envs=options.num_envs,
                 backend=options.backend,
-                # An installed task is not its reader's to mend: its faults are told, and it is shown.
-                strict=True if loaded.followed else "warn",
+                rules=_rules(loaded, options),
+                on_finding=on_finding,
                 kwargs=options.env_kwargs,
             ),
             asset_ids=_asset_ids(loaded),
@@ -95,6 +105,8 @@ def build_task(
         on_activity("trying a reset and a step")
         rehearse(task, loaded, options.seed)
         clock.lap("rehearse")
+        if task.broken_rules is not None:
+            task.broken_rules.begin()
         first = reset_checked(task, loaded, options.seed)
         clock.lap("reset")
         on_activity("reading the shapes")
@@ -193,6 +205,13 @@ def returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, A
     return check
 
 
+def _rules(loaded: LoadedTask, options: TaskOptions) -> Degree | None:
+    """An installed task is not its reader's to mend: unless it is asked for, it is told of and never stopped."""
+    if options.rules is None and not loaded.followed and class_is_installed(loaded.cls):
+        return "warn"
+    return options.rules
+
+
 def _asset_ids(loaded: LoadedTask) -> list[str]:
     spec = registry.environment(loaded.env_id)
     return [] if spec is None else list(spec.asset_download_ids or [])
@@ -222,7 +241,9 @@ class blamed:
         if isinstance(error, WrongReturn):
             return problem_from_return(loaded.cls, error.hook, error.said, loaded.source_files)
         env = self._task.env if self._task is not None else _env_on_traceback(error, loaded.cls)
-        known = isinstance(error, BrokenRule) or _raised_in(error, loaded.source_files)
+        if isinstance(error, BrokenRule):
+            return _problem_of_rule(error, self._stage, loaded)
+        known = _raised_in(error, loaded.source_files)
         if env is not None and not known:
             # Raised in ManiSkill's own code, most often over what evaluate() returned; the last line of
             # the author's on the traceback is then only their call of super().__init__().
@@ -236,6 +257,15 @@ class blamed:
             if blamed is not None:
                 return blamed
         return problem_from_exception(error, self._stage, loaded.source_files, loaded.cls)
+
+
+def _problem_of_rule(error: BrokenRule, stage: str, loaded: LoadedTask) -> Problem:
+    """At the line that broke it, also where that was over before it showed, and is on no traceback."""
+    problem = problem_from_exception(error, stage, loaded.source_files, loaded.cls)
+    if error.place is None or Path(error.place[0]) not in loaded.source_files:
+        return problem
+    file, line, _ = error.place
+    return replace(problem, file=file, line=line, code=linecache.getline(file, line).strip() or None)
 
 
 def _raised_in(error: BaseException, files: Sequence[Path]) -> bool:

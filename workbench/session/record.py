@@ -19,8 +19,10 @@ import numpy as np
 import torch
 
 from workbench.authoring.reference import named_file
+from workbench.core.broken_rule import warn_of
 from workbench.core.pictures import Picture
 from workbench.core.recorded_state import apart, write_states
+from workbench.core.rules import Finding
 from workbench.core.state_columns import read_state_columns
 from workbench.core.state_names import states_of
 from workbench.core.step import StepResult
@@ -170,10 +172,12 @@ def record(
     on_activity: Callable[[str], None] = lambda activity: None,
     on_progress: Callable[[Progress], None] = lambda progress: None,
     stop: Callable[[], bool] = lambda: False,
+    on_finding: Callable[[Finding], None] = warn_of,
 ) -> Recorded:
     """Record into ``what.out``, in this process or, with several workers, in processes of their own.
 
     Args:
+        on_finding: called with each place where the task breaks a rule that does not stop it, once.
         stop: asked between steps; when it says yes, what is over is kept, the rest is not, and that is it.
 
     Raises:
@@ -185,7 +189,7 @@ def record(
     if what.workers > 1:
         from workbench.session.record_workers import record_in_processes
 
-        return record_in_processes(what, dealer_of(what), on_activity, on_progress, stop)
+        return record_in_processes(what, dealer_of(what), on_activity, on_progress, stop, on_finding)
     dealer = dealer_of(what)
     written: list[Written] = []
     steps = 0
@@ -195,7 +199,16 @@ def record(
         steps += count
         on_progress(Progress(dealer.kept, steps))
 
-    put_right = run_episodes(what, given, dealer, written.append, on_activity, on_steps, stop)  # type: ignore[arg-type]
+    put_right = run_episodes(
+        what,
+        given,
+        dealer,  # type: ignore[arg-type]
+        written.append,
+        on_activity,
+        on_steps,
+        stop,
+        on_finding,
+    )
     written.sort(key=lambda episode: episode.index)
     return Recorded(tuple(written), dealer.tried, stop(), put_right)
 
@@ -208,6 +221,7 @@ def run_episodes(
     on_activity: Callable[[str], None],
     on_steps: Callable[[int], None],
     stop: Callable[[], bool],
+    on_finding: Callable[[Finding], None],
 ) -> int:
     """One process's share; returns how many starts were put right. Raises as `record`.
 
@@ -218,7 +232,7 @@ def run_episodes(
     torch.set_num_threads(1)  # see workbench.session.worker.work
     here = CurrentFolder()  # the task may go to another
     with here.again():
-        return _run_share(what, here, given, dealing, on_written, on_activity, on_steps, stop)
+        return _run_share(what, here, given, dealing, on_written, on_activity, on_steps, stop, on_finding)
 
 
 def _run_share(
@@ -230,9 +244,10 @@ def _run_share(
     on_activity: Callable[[str], None],
     on_steps: Callable[[int], None],
     stop: Callable[[], bool],
+    on_finding: Callable[[Finding], None],
 ) -> int:
     folder = what.out.absolute()
-    opened = open_task(what.task, what.options, on_activity=on_activity)
+    opened = open_task(what.task, what.options, on_activity=on_activity, on_finding=on_finding)
     finisher = EpisodeFinisher()
     share = _Share(opened, what, here, folder, given, dealing, finisher, on_written)
     try:

@@ -85,6 +85,7 @@ def _work(connection: Connection) -> None:
             lambda activity: connection.send(("activity", activity)),
             lambda steps: connection.send(("steps", steps)),
             lambda: dealing.stopped,
+            lambda finding: connection.send(("finding", finding)),
         )
         connection.send(("done", put_right))
     except TaskError as error:

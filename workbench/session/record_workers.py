@@ -18,6 +18,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from workbench.authoring.problem import Problem, TaskError
+from workbench.core.rules import Finding
 from workbench.machine.child_python import child_environment, python_command
 from workbench.recording.landing import RecordingError
 from workbench.session.dealer import Dealer
@@ -42,10 +43,11 @@ def record_in_processes(
     on_activity: Callable[[str], None],
     on_progress: Callable[[Progress], None],
     stop: Callable[[], bool],
+    on_finding: Callable[[Finding], None],
 ) -> Recorded:
     """See `record.record`, which this is the other way of doing; raises as it does."""
     workers = _start(what)
-    parent = _Parent(workers, dealer, on_activity, on_progress)
+    parent = _Parent(workers, dealer, on_activity, on_progress, on_finding)
     try:
         parent.serve(stop)
     except KeyboardInterrupt:
@@ -98,9 +100,13 @@ class _Parent:
         dealer: Dealer,
         on_activity: Callable[[str], None],
         on_progress: Callable[[Progress], None],
+        on_finding: Callable[[Finding], None],
     ) -> None:
         self._workers, self._dealer = workers, dealer
         self._on_activity, self._on_progress = on_activity, on_progress
+        self._on_finding = on_finding
+        self._found: set[object] = set()
+        """Each process finds the same, and it is told once."""
         self._steps = 0
         self._busy = set(workers)
         self._whose: dict[int, Connection] = {}
@@ -188,6 +194,10 @@ class _Parent:
             self._on_progress(Progress(self._dealer.kept, self._steps))
         elif word == "activity":
             self._on_activity(value)
+        elif word == "finding":
+            if value.key not in self._found:
+                self._found.add(value.key)
+                self._on_finding(value)
         elif word == "done":
             self.put_right += value
             self._busy.discard(connection)
@@ -216,6 +226,7 @@ _VALUES: dict[str, type | tuple[type, ...]] = {
     "activity": str,
     "done": int,
     "failed": (Problem, str),
+    "finding": Finding,
 }
 
 

@@ -85,7 +85,9 @@ def make(wanted: SceneWanted) -> TaskEnv:
     try:
         env = make_env(
             loaded.cls,
-            EnvOptions(num_envs=1, backend="cpu", kwargs={**wanted.env_kwargs, "obs_mode": "none"}),
+            EnvOptions(
+                num_envs=1, backend="cpu", rules="off", kwargs={**wanted.env_kwargs, "obs_mode": "none"}
+            ),
             default_kwargs=loaded.default_kwargs,
         )
     except Exception as error:

@@ -21,7 +21,9 @@ from workbench.authoring.inherited import inherited_by
 from workbench.authoring.load import LoadedTask, load_task, take_back, with_late_imports
 from workbench.authoring.modules import read_source
 from workbench.authoring.problem import TaskError
+from workbench.authoring.same_function import line_in
 from workbench.core import actions
+from workbench.core.broken_rule import BrokenRules, warn_of
 from workbench.core.exchange import (
     can_exchange_cameras,
     exchange_cameras,
@@ -29,6 +31,7 @@ from workbench.core.exchange import (
     put_class,
     rehearse_hooks,
 )
+from workbench.core.rules import Finding
 from workbench.core.seams import task_class
 from workbench.core.snapshot import RestoreReport, Snapshot, restore_snapshot
 from workbench.core.step import StepResult
@@ -61,7 +64,10 @@ class _MustRebuild(Exception):
 
 
 def load_version(
-    request: Load, running: Running | None, on_activity: Callable[[str], None] = lambda activity: None
+    request: Load,
+    running: Running | None,
+    on_activity: Callable[[str], None] = lambda activity: None,
+    on_finding: Callable[[Finding], None] = warn_of,
 ) -> tuple[OpenedTask, ReloadReport | None]:
     """Load the task, or the version of it that is on disk now, keeping what can be kept of `running`.
 
@@ -85,7 +91,7 @@ def load_version(
                 return opened, replace(report, milliseconds=1000 * (perf_counter() - began))
             except _MustRebuild as why:
                 change = replace(change, level="rebuilt", reason=str(why))
-        opened, report = _build(request, running, loaded, change, clock, on_activity)
+        opened, report = _build(request, running, loaded, change, clock, on_activity, on_finding)
     except BaseException:
         # The last good version must not go on with the new one's helper modules and registrations.
         take_back(loaded)
@@ -147,9 +153,13 @@ def _exchange(
     if change.level == "cameras" and not can_exchange_cameras(env):
         raise _MustRebuild(f"{change.reason}, and GPU simulation cannot exchange cameras")
     before = task_class(env)
+    rules = opened.env.broken_rules or BrokenRules({})
+    kept_rules = rules.copy()
     put_class(env, loaded.cls)
     left: dict[str, str] = {}
     try:
+        if change.level != "same":
+            rules.edited(lambda row: _place_now(row, opened.loaded, loaded))
         task = TaskEnv(
             env, loaded.max_episode_steps, check=returns_check(loaded, opened.env.num_envs), like=opened.env
         )
@@ -157,7 +167,8 @@ def _exchange(
             with blamed("build", loaded, task):
                 exchange_cameras(env)
         if change.tried_hooks:
-            with blamed("reset", loaded, task):
+            resets = "_initialize_episode" in change.tried_hooks
+            with blamed("reset", loaded, task), rules.during("reset", confirms=resets):
                 left = rehearse_hooks(env, change.tried_hooks)
         clock.lap("rehearse")
         first = running.last if change.level == "same" else _judge(task, loaded, running.last, change)
@@ -165,6 +176,7 @@ def _exchange(
             keep_observation_space(env, task.obs)
     except BaseException:
         put_class(env, before)
+        rules.put_back(kept_rules)
         if change.level == "cameras":
             exchange_cameras(env)
         raise
@@ -183,6 +195,15 @@ def _exchange(
         description = replace(description, cameras=list_cameras(env, task.table))
     report = ReloadReport(change.level, change.reason, 0.0, not_carried=left)
     return OpenedTask(loaded, task, description, first, clock.laps), report
+
+
+def _place_now(row: Finding, before: LoadedTask, after: LoadedTask) -> tuple[str, int] | None:
+    """Where a row's line is in the new version; None where its function says something else now."""
+    if row.file is None or row.line is None or row.file not in before.source:
+        return None if row.file is None else (row.file, row.line or 1)
+    text = after.source.get(row.file)
+    line = None if text is None else line_in(before.source[row.file], text, row.line)
+    return None if line is None else (row.file, line)
 
 
 def _judge(task: TaskEnv, loaded: LoadedTask, last: StepResult, change: Change) -> StepResult:
@@ -212,9 +233,10 @@ def _build(
     change: Change,
     clock: Clock,
     on_activity: Callable[[str], None],
+    on_finding: Callable[[Finding], None],
 ) -> tuple[OpenedTask, ReloadReport | None]:
     snapshot = _moment(request, running, loaded)
-    opened = build_task(loaded, request.options, clock, on_activity)
+    opened = build_task(loaded, request.options, clock, on_activity, on_finding)
     if snapshot is None:
         report = ReloadReport("rebuilt", change.reason, 0.0) if running is not None else None
         return opened, report

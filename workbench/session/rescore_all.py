@@ -11,6 +11,8 @@ import torch
 
 from workbench.authoring.problem import TaskError
 from workbench.authoring.reference import TaskName
+from workbench.core.broken_rule import warn_of
+from workbench.core.rules import Finding
 from workbench.machine.current_folder import CurrentFolder
 from workbench.session.clearance import Clearances, NotCleared, NotTrusted
 from workbench.session.messages import TaskOptions
@@ -45,6 +47,7 @@ def rescore_all(
     what: RescoreOptions,
     on_activity: Callable[[str], None] = lambda activity: None,
     on_progress: Callable[[Progress], None] = lambda progress: None,
+    on_finding: Callable[[Finding], None] = warn_of,
     clearances: Clearances | None = None,
 ) -> tuple[list[Verdict], tuple[str, ...]]:
     """The verdicts, in the order of the files; and what is not as it was recorded on purpose, in words.
@@ -66,6 +69,13 @@ def rescore_all(
     )
     cleared = _cleared(groups, clearances or Clearances())
     steps = 0
+    told: set[object] = set()
+
+    def tell_once(finding: Finding) -> None:
+        if finding.key not in told:  # a task may be opened several times, and break the rule each time
+            told.add(finding.key)
+            on_finding(finding)
+
     failed: list[TaskError | CannotStepIn] = []
     for group, reference in zip(groups, cleared):
         folder: Path | None = None
@@ -74,7 +84,7 @@ def rescore_all(
                 raise CannotStepIn(str(reference)) from reference
             if what.recorded_source:
                 folder, reference = write_source(group.info)
-            opened = _open(reference, group.options, on_activity, here)
+            opened = _open(reference, group.options, on_activity, tell_once, here)
             before = steps
 
             def tell(now: int, before: int = before) -> None:
@@ -113,10 +123,16 @@ def _cleared(groups: list[Group], clearances: Clearances) -> list[TaskName | Not
 
 
 def _open(
-    reference: TaskName, options: TaskOptions, on_activity: Callable[[str], None], here: CurrentFolder
+    reference: TaskName,
+    options: TaskOptions,
+    on_activity: Callable[[str], None],
+    on_finding: Callable[[Finding], None],
+    here: CurrentFolder,
 ) -> OpenedTask:
     with here.again(stay=True):  # the task before may have gone to another one
         try:
-            return open_task(reference, options, on_activity=on_activity)
+            return open_task(reference, options, on_activity=on_activity, on_finding=on_finding)
         except TaskError:
-            return open_task(reference, with_renderer(options), on_activity=on_activity)
+            return open_task(
+                reference, with_renderer(options), on_activity=on_activity, on_finding=on_finding
+            )

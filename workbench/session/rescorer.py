@@ -17,10 +17,11 @@ from typing import Literal
 
 from workbench.authoring.problem import Problem
 from workbench.authoring.reference import TaskName, named_file
+from workbench.core.rules import Degree
 from workbench.session.background import BackgroundProcess
 from workbench.session.clearance import Clearances, NotCleared
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
-from workbench.session.messages import Failed, Load, Loaded
+from workbench.session.messages import Failed, Load, Loaded, TaskOptions
 from workbench.session.rescore import Group, group_episodes, not_judged, with_renderer
 from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored, Verdict
 from workbench.session.step_back import CannotStepIn, write_source
@@ -72,12 +73,14 @@ class _Asked:
 class Rescorer:
     """One judgement at a time; a new one takes the place of the one before. All methods return at once."""
 
-    def __init__(self, clearances: Clearances | None = None) -> None:
+    def __init__(self, clearances: Clearances | None = None, rules: Degree | None = None) -> None:
         """
         Args:
             clearances: says what of the code that recordings name may run; None asks nobody.
+            rules: as `TaskOptions.rules`.
         """
         self._clearances = clearances or Clearances()
+        self._base = TaskOptions(rules=rules)
         self._lock = threading.Lock()
         """Of `view`: what a job that was stopped still has to say is not heard."""
         self._view = RescoreView()
@@ -130,6 +133,7 @@ class Rescorer:
             groups, unread = group_episodes(
                 asked.files,
                 MOST_AT_ONCE,
+                self._base,
                 file=asked.file,
                 recorded_source=asked.recorded_source,
             )

@@ -106,7 +106,7 @@ def options_of(info: EpisodeInfo, num_envs: int, base: TaskOptions | None = None
     for name in ("num_envs", "sim_backend", "render_backend", "render_mode", "human_render_camera_configs"):
         kwargs.pop(name, None)  # how it is run, and not what it is
     base = base or TaskOptions()
-    return TaskOptions(num_envs, base.backend, max(info.seed, 0), kwargs)
+    return TaskOptions(num_envs, base.backend, max(info.seed, 0), kwargs, base.rules)
 
 
 @contextmanager

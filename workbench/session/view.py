@@ -20,7 +20,7 @@ from workbench.session.judge import JudgementView
 from workbench.session.keep_status import KeepStatus
 from workbench.session.kept_worker import Vitals
 from workbench.session.last_words import Busy
-from workbench.session.messages import ActionSource, EpisodeEnd, ReloadReport, TaskDescription
+from workbench.session.messages import ActionSource, EpisodeEnd, ReloadReport, RulesBroken, TaskDescription
 from workbench.session.printed import Printed
 from workbench.session.studio_view import StudioView
 from workbench.session.timeline import TimelineView
@@ -113,6 +113,9 @@ class SessionView:
     """The past. While a moment of it is shown, `step` and `pictures` are of that moment."""
     busy: Busy | None = None
     """What the worker has been at for long."""
+    rules: RulesBroken | None = None
+    """What the version that is shown has broken of the rules of GPU simulation; None while nothing."""
+    rules_serial: int = 0
     vitals: Vitals = field(default_factory=Vitals)
     """What the processes hold."""
     inspection: Inspection | None = None

@@ -60,6 +60,7 @@ from workbench.session.messages import (
     Reset,
     Restore,
     Restored,
+    RulesBroken,
     SetActionSource,
     SetCapture,
     SetEpisodeEnd,
@@ -110,6 +111,9 @@ class Worker:
         self._pacer = Pacer(0.05)
         self._rate = Rate()
         self._status_sent = 0.0
+        self._rules_sent = 0.0
+        self._rules_told = RulesBroken(())
+        self._rules_serial: tuple[object, int] = None, 0
         self._quit = False
         self._handlers: dict[type, Callable[[Any], None]] = {
             Load: self._load,
@@ -154,6 +158,8 @@ class Worker:
                 self._held.at_work("stepping", self._cameras.place_waiting)
             self._cameras.make(nothing_else_to_do=not self._playing)
             self._send_status(time.monotonic())
+            if time.monotonic() - self._rules_sent > _STATUS_PERIOD:
+                self._tell_of_rules()
 
     # --- requests ----------------------------------------------------------------------------------
 
@@ -177,7 +183,10 @@ class Worker:
             # What the version before did to the current folder is not for this one, unless it fails.
             with self._started_in.again(stay=True):
                 opened, report = load_version(
-                    request, running, on_activity=lambda activity: self._line.send(Loading(activity))
+                    request,
+                    running,
+                    on_activity=lambda activity: self._line.send(Loading(activity)),
+                    on_finding=lambda finding: None,  # see `_tell_of_rules`
                 )
         except TaskError as error:
             self._cameras.put_back()  # trying new cameras took the old ones away
@@ -187,6 +196,7 @@ class Worker:
         # From here on it is one thing: an interrupt in the middle would leave the page with another task than ours.
         with self._interrupts.shielded():
             self._take_over(opened, report, request)
+            self._tell_of_rules()
 
     def _take_over(self, opened: OpenedTask, report: ReloadReport | None, request: Load) -> None:
         before, self._held.opened = self._held.opened, opened
@@ -405,6 +415,22 @@ class Worker:
         self._status_sent = moment
         steps = self._rate.per_second(moment) if self._playing else 0.0
         self._line.send(Status(self._playing, steps, steps * self._pacer.control_dt, activity))
+
+    def _tell_of_rules(self) -> None:
+        """What the task that is held has broken, if that is something else than was told."""
+        self._rules_sent = time.monotonic()
+        opened = self._held.opened
+        rules = None if opened is None else opened.env.broken_rules
+        serial = rules, 0 if rules is None else rules.serial
+        if serial == self._rules_serial:
+            return
+        self._rules_serial = serial
+        rows, more = ((), 0) if rules is None else (rules.rows, rules.more)
+        known = {row.key for row in self._rules_told.rows}
+        told = RulesBroken(rows, more, tuple(row for row in rows if row.key not in known))
+        if told.rows or self._rules_told.rows:
+            self._line.send(told)
+        self._rules_told = told
 
 
 _DOING: dict[type, Doing] = {

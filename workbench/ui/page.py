@@ -33,6 +33,7 @@ from workbench.ui.log_panel import LogPanel
 from workbench.ui.numbers_panel import NumbersPanel
 from workbench.ui.record_panel import RecordPanel
 from workbench.ui.redraw_loop import RedrawLoop, draw_apart
+from workbench.ui.rules_mark import RulesMark
 from workbench.ui.run_panel import RunPanel
 from workbench.ui.selection_mark import SelectionMark
 from workbench.ui.stage import Stage
@@ -89,6 +90,7 @@ class Page:
         self._status = StatusLine(
             server, session.env_rows, on_flagged=lambda: self._envs.select_first_flagged()
         )
+        self._rules = RulesMark(server)
         run_tab = self._add_tabs(dark)
         self._timeline = TimelinePanel(server, session)
         self._add_table_of_envs()
@@ -167,6 +169,7 @@ class Page:
 
     def _draw_panels(self, view: SessionView) -> None:
         self._status.draw(view)
+        self._rules.draw(view)
         self._banner.draw(view)
         self._busy_banner.draw(view)
         self._run.draw(view)
@@ -317,6 +320,7 @@ class Page:
             Command("Frame what is shown", lambda: self.frame(session.view()), "F"),
             Command("Start or stop recording", self._record.toggle, "C"),
             Command("Keep what I just saw", self._record.keep, "C", "shift"),
+            Command("Open or close the list of warnings", self._rules.toggle, "W"),
             Command("Load the file again", session.reload, "L"),
             Command("Interrupt what the task is doing", session.interrupt, "I"),
             Command("Restart the worker", session.restart_worker, "L", "shift"),

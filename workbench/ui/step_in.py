@@ -17,6 +17,7 @@ import viser
 
 from workbench.authoring.reference import RecordedTask, TaskName
 from workbench.core.recorded_run import RecordedRun
+from workbench.core.rules import Degree
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.library import Library
 from workbench.recording.side_files import side_files_in_words
@@ -70,10 +71,14 @@ class StepIn:
         place: The pages, and the session that is open, if one is.
         make_session: Opens a task; gets what `Session` gets.
         clearances: Say what of the code that recordings name may run.
+        rules: As `TaskOptions.rules`.
     """
 
-    def __init__(self, place: Workplace, make_session: MakeSession, clearances: Clearances) -> None:
+    def __init__(
+        self, place: Workplace, make_session: MakeSession, clearances: Clearances, rules: Degree | None = None
+    ) -> None:
         self._place, self._make, self._clearances = place, make_session, clearances
+        self._base = TaskOptions(rules=rules)
         self._first = place.session
         self._lock = threading.Lock()
         self._own: tuple[Session, Path | None] | None = None
@@ -148,7 +153,7 @@ class StepIn:
                 if folder is not None:
                     shutil.rmtree(folder, ignore_errors=True)
                 return
-            session = self._open(reference, options_of(wanted.info, self._count()), folder)
+            session = self._open(reference, options_of(wanted.info, self._count(), self._base), folder)
         self._enter(session, clearing.run, wanted.info, clearing.state)
         self._cleared(clearing)
 
@@ -289,11 +294,12 @@ class Judging:
     Args:
         place: The pages.
         clearances: Say what of the code that recordings name may run.
+        rules: As `TaskOptions.rules`.
     """
 
-    def __init__(self, place: Workplace, clearances: Clearances) -> None:
+    def __init__(self, place: Workplace, clearances: Clearances, rules: Degree | None = None) -> None:
         self._place = place
-        self.rescorer = Rescorer(clearances)
+        self.rescorer = Rescorer(clearances, rules)
         self._choices = RescoreChoices()
         self._panel: RescorePanel | None = None
         self._server: viser.ViserServer | None = None
@@ -350,11 +356,12 @@ def _sentence(why: str) -> str:
 
 
 def offer_going_back_in(
-    place: Workplace, make_session: MakeSession, trust: bool = False
+    place: Workplace, make_session: MakeSession, rules: Degree | None = None, trust: bool = False
 ) -> Callable[[], None]:
     """Put both into what the review page offers.
 
     Args:
+        rules: Of tasks that are opened for it; as `TaskOptions.rules`.
         trust: Run what recordings name without asking.
 
     Returns:
@@ -362,7 +369,7 @@ def offer_going_back_in(
     """
     dialog = TrustDialog(place.server)
     clearances = Clearances(place.task_files, dialog.ask, all_trusted=trust)
-    step_in, judging = StepIn(place, make_session, clearances), Judging(place, clearances)
+    step_in, judging = StepIn(place, make_session, clearances, rules), Judging(place, clearances, rules)
 
     def add(_: Workplace, offers: ReviewOffers) -> ReviewOffers:
         return replace(

@@ -1,0 +1,232 @@
+"""Degrees of the rules, and what is kept of those that were broken."""
+
+# pyright: reportAttributeAccessIssue=false
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import Any, cast
+
+import mani_skill.envs  # noqa: F401  registers the ids
+import numpy as np
+import pytest
+import torch
+from mani_skill.utils.registration import REGISTERED_ENVS
+from mani_skill.utils.structs.pose import Pose
+
+from workbench.core.broken_rule import MOST_ROWS, BrokenRule, BrokenRules, RuleWarning
+from workbench.core.rules import RULES, Finding, degrees_of
+from workbench.core.task_env import EnvOptions, make_env
+
+PICK_CUBE: Any = REGISTERED_ENVS["PickCube-v1"].cls
+N = 3
+Hook = Callable[..., None]
+
+
+def test_only_what_overwrites_other_envs_stops_by_itself() -> None:
+    stops = {rule for rule, degree in degrees_of(None).items() if degree == "stop"}
+    assert stops == {"other-env-written", "stepped-in-reset", "apply-before-fetch", "rows-lost"}
+    assert {degree for rule, degree in degrees_of(None).items() if rule not in stops} == {"warn"}
+
+
+@pytest.mark.parametrize("choice", ["stop", "warn", "off"])
+def test_a_degree_that_is_chosen_is_that_of_all_rules(choice: Any) -> None:
+    assert degrees_of(choice) == dict.fromkeys(RULES, choice)
+
+
+def test_a_degree_that_is_none_is_refused() -> None:
+    with pytest.raises(ValueError, match="'stop', 'warn' or 'off', not 'strict'"):
+        EnvOptions(rules="strict")  # type: ignore[arg-type]
+
+
+def test_each_rule_says_what_it_asks_and_what_happens_otherwise() -> None:
+    for id, rule in RULES.items():
+        assert rule.id == id and rule.asks.endswith(".") and rule.otherwise.endswith(".")
+
+
+# --- a rule that warns changes nothing ------------------------------------------------------------------
+
+
+def _raised(env: Any) -> Pose:
+    pose = env.cube.pose.raw_pose.clone()
+    pose[:, 2] += 0.05
+    return Pose.create(pose)
+
+
+def lifts(env: Any, *args: Any) -> None:
+    env.cube.set_pose(_raised(env))
+
+
+def pushes_joints(env: Any, *args: Any) -> None:
+    env.agent.robot.set_qf(torch.ones((N, 9)))
+    env.agent.robot.set_qvel(torch.ones(9) * 0.1)
+
+
+def applies_late(env: Any, *args: Any) -> None:
+    lifts(env)
+    env.scene._gpu_apply_all()
+    env.scene._gpu_fetch_all()
+
+
+def moves_a_link(env: Any, *args: Any) -> None:
+    link = env.agent.robot.links_map["panda_hand"]
+    link.set_pose(Pose.create(cast(Any, link.pose).raw_pose + 0.1))
+
+
+def goes_behind(env: Any, *args: Any) -> None:
+    env.cube._objs[0].set_pose(
+        cast(Any, _raised(env).sp)[0] if len(env.cube._objs) == 1 else env.cube._objs[1].pose
+    )
+
+
+def writes_all(env: Any, env_idx: torch.Tensor, options: dict) -> None:
+    env.scene.px.cuda_rigid_body_data.torch()[env.cube._body_data_index, 2] += 0.1
+
+
+def steps_all(env: Any, env_idx: torch.Tensor, options: dict) -> None:
+    env.scene._gpu_apply_all()
+    env.scene.px.step()
+    env.scene._gpu_fetch_all()
+
+
+def draws_for_all(env: Any, env_idx: torch.Tensor, options: dict) -> None:
+    env.target = torch.rand((N, 2))
+
+
+@pytest.mark.parametrize(
+    ("hook", "fault", "rules"),
+    [
+        ("evaluate", lifts, {"not-applied", "applied-by-reset"}),
+        ("_before_control_step", lifts, {"not-applied"}),
+        ("_before_control_step", pushes_joints, {"not-applied", "applied-by-reset"}),
+        ("_after_control_step", applies_late, {"apply-before-fetch", "read-before-fetch"}),
+        ("_before_control_step", moves_a_link, {"link-pose-set"}),
+        ("_before_control_step", goes_behind, {"behind-the-tensors"}),
+        ("_initialize_episode", writes_all, {"other-env-written"}),
+        ("_initialize_episode", steps_all, {"stepped-in-reset"}),
+        ("_initialize_episode", draws_for_all, {"rows-rewritten"}),
+    ],
+)
+def test_what_only_warns_goes_on_to_the_same_bits_as_without_rules(
+    hook: str, fault: Hook, rules: set[str]
+) -> None:
+    def after(self: Any, *args: Any) -> Any:
+        made = getattr(PICK_CUBE, hook)(self, *args)
+        fault(self, *args)
+        return made
+
+    task = type("BreaksARule", (PICK_CUBE,), {hook: after})
+    states, found = {}, []
+    for choice in ("warn", "off"):
+        options = EnvOptions(
+            N, "cpu", render=False, rules=choice, on_finding=found.append, kwargs={"obs_mode": "none"}
+        )
+        env: Any = make_env(task, options)
+        env.reset(seed=[0, 1, 2])
+        states[choice] = []
+        for step in range(4):
+            env.step(np.full((N, 8), 0.3, np.float32))
+            states[choice].append(env.get_state())
+            if step == 1:
+                env.reset(seed=[3, 4, 5], options={"env_idx": torch.tensor([1])})
+                states[choice].append(env.get_state())
+        env.close()
+    assert {finding.rule for finding in found} == rules
+    assert torch.equal(torch.stack(states["warn"]), torch.stack(states["off"]))
+
+
+# --- what is kept -------------------------------------------------------------------------------------------
+
+
+def a_rule() -> BrokenRules:
+    return BrokenRules(degrees_of("warn"), lambda finding: None)
+
+
+def test_a_rule_broken_at_each_step_is_one_row_with_a_count() -> None:
+    rules = a_rule()
+    for rules.step in range(5):
+        rules.breaks("not-applied", f"lost in step {rules.step}", None, ("task.py", 7, "lift"))
+    (row,) = rules.rows
+    assert (row.count, row.first_step, row.message) == (5, 0, "lost in step 0")
+    assert (row.file, row.line, row.function) == ("task.py", 7, "lift")
+
+
+def test_rows_are_bounded_and_the_rest_is_counted() -> None:
+    rules, serial = a_rule(), 0
+    for line in range(3 * MOST_ROWS):
+        rules.breaks("not-applied", "lost", None, ("task.py", line, "lift"))
+        assert rules.serial > serial
+        serial = rules.serial
+    assert len(rules.rows) == MOST_ROWS and rules.more == 2 * MOST_ROWS
+
+
+def test_what_is_not_broken_again_at_the_same_occasion_leaves() -> None:
+    rules = a_rule()
+    with rules.during("step"):
+        rules.breaks("not-applied", "lost", None, ("task.py", 7, "lift"))
+    with rules.during("reset"):
+        rules.breaks("rows-rewritten", "drawn", None, ("task.py", 9, "draw"), subject="target")
+    rules.edited(lambda row: ("task.py", (row.line or 0) + 1))
+    assert [(row.rule, row.line) for row in rules.rows] == [("not-applied", 8), ("rows-rewritten", 10)]
+    with pytest.raises(ZeroDivisionError), rules.during("step"):
+        raise ZeroDivisionError  # a step that was left half done shows nothing
+    with rules.during("reset", confirms=False):
+        pass
+    assert len(rules.rows) == 2
+    with rules.during("step"):
+        pass
+    assert [row.rule for row in rules.rows] == ["rows-rewritten"]
+    with rules.during("reset"):
+        rules.breaks("rows-rewritten", "drawn", None, ("task.py", 10, "draw"), subject="target")
+    assert rules.rows[0].count == 2
+
+
+def test_of_several_things_lost_at_once_each_is_told() -> None:
+    def lose(self: Any) -> None:
+        self.cube.set_pose(_raised(self))
+        self.goal_site.set_pose(_raised(self))
+
+    found: list[Finding] = []
+    task = type("LosesTwo", (PICK_CUBE,), {"_before_control_step": lose})
+    env: Any = make_env(task, EnvOptions(N, "cpu", render=False, on_finding=found.append))
+    env.step(np.zeros((N, 8), np.float32))
+    env.close()
+    assert [("'cube'" in finding.message, "'goal_site'" in finding.message) for finding in found] == [
+        (True, False),
+        (False, True),
+    ]
+
+
+def test_make_stops_and_warns_by_rule_unless_told_otherwise() -> None:
+    import workbench
+
+    class Lifts(PICK_CUBE):
+        def _before_control_step(self) -> None:
+            lifts(self)
+
+    class Steps(PICK_CUBE):
+        def _initialize_episode(self, env_idx: torch.Tensor, options: dict) -> None:
+            super()._initialize_episode(env_idx, options)
+            steps_all(self, env_idx, options)
+
+    options: dict[str, Any] = {"backend": "cpu", "render_backend": "none"}
+    env = workbench.make(Lifts, 2, **options)
+    env.reset(seed=0)
+    with pytest.warns(RuleWarning, match="physics never sees it") as told:
+        env.step(env.action_space.sample())
+    assert [warning.filename for warning in told if warning.category is RuleWarning] == [__file__]
+    env.close()
+    env = workbench.make(Steps, 2, **options)
+    env.reset(seed=0)
+    with pytest.raises(BrokenRule, match="--rules warn"):
+        env.reset(options={"env_idx": torch.tensor([1])})
+    env.close()
+    for rules, caught in (("warn", 1), ("off", 0)):
+        env = workbench.make(Steps, 2, rules=cast(Any, rules), **options)
+        env.reset(seed=0)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            env.reset(options={"env_idx": torch.tensor([1])})
+        assert sum(warning.category is RuleWarning for warning in told) == caught
+        env.close()

@@ -1,0 +1,277 @@
+"""Rows of other envs, in what a task keeps on itself, that a partial reset changed, and the line that did it.
+
+A task that is reset in part must change the rows of ``env_idx`` only: of tensors, arrays, lists and Poses on itself, in
+dicts and in objects of its own (`task_members` finds them). Nothing raises when it does not:
+``self.target = torch.rand((self.num_envs, 2))`` gives every env another target in the middle of its episode.
+
+Values are compared before and after, so that what was computed anew and came out the same is no fault. Where they
+differ, the author must be told the assignment: the line after which they were others, found by looking at them after
+each line of the author's while the reset runs. That is done in the first partial reset of a class, and again after one
+that found something without a line; a debugger that is there already is left its place, and `assignments` then reads
+the line off the source.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from types import FrameType
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+
+from workbench.core.broken_rule import Frame, frames_of_the_task, is_installed
+from workbench.core.task_buffers import is_per_env, look_over_env, version_of
+from workbench.core.task_members import Walk
+
+MOST_LINES = 2000
+"""Lines of the author's after which values are looked at, in one reset."""
+_ROUNDED = 1e-5
+"""What is computed anew of the same poses differs by so much at most: 1e-7 of a rotation was seen."""
+_ITEM = re.compile(r"\[(\d+)\]")
+
+What = Literal["lost", "changed"]
+
+
+@dataclass(frozen=True)
+class RowsElsewhere:
+    """What a partial reset did to rows of envs that it did not reset."""
+
+    path: str
+    """As the task writes it, without ``self.``."""
+    what: What
+    envs: tuple[int, ...]
+    """That have other values now; none where the rows were lost."""
+    frames: tuple[Frame, ...]
+    """That led to the assignment, innermost first; none where it was not seen."""
+
+
+class KeptRows:
+    """What a task keeps for each env, as it is when this is made.
+
+    Args:
+        env: In the middle of an episode.
+        chosen: The envs that are about to be reset.
+        lines: Look for the lines, too, where nobody else traces.
+    """
+
+    def __init__(self, env: BaseEnv, chosen: Sequence[int], lines: bool) -> None:
+        self._env, self._count = env, len(chosen)
+        self._elsewhere = np.setdiff1d(np.arange(env.num_envs), np.asarray(chosen, dtype=np.int64))
+        self._single, self._groups = _paths(look_over_env(env), env.num_envs)
+        self._before = {path: _copy(value) for path, value in self._read().items()}
+        self._lines = _Lines(self, _files_of(env)) if lines and self._before else None
+
+    @property
+    def others(self) -> int:
+        """How many envs are not being reset."""
+        return len(self._elsewhere)
+
+    def start(self) -> None:
+        """Look for lines, where that was asked for, until `stop`."""
+        if self._lines is not None:
+            self._lines.start()
+
+    def stop(self) -> None:
+        if self._lines is not None:
+            self._lines.stop()
+
+    def changes(self) -> list[RowsElsewhere]:
+        """What became of the rows of other envs since."""
+        now, found = self._read(), []
+        for path, before in self._before.items():
+            what = self._difference(before, now.get(path))
+            if what is not None:
+                frames = self._lines.found.get(path, ()) if self._lines is not None else ()
+                found.append(RowsElsewhere(path, what[0], what[1], frames))
+        return found
+
+    def changed(self, seen: dict[str, tuple[Any, int, bool]]) -> set[str]:
+        """The paths whose rows elsewhere are others now.
+
+        Args:
+            seen: what was at each path the last time, which is brought up to date: the same tensor, not written
+                since, is not compared again.
+        """
+        now = self._read()
+        for path, before in self._before.items():
+            value = now.get(path)
+            version = (
+                version_of(value) if isinstance(value, torch.Tensor) and not value.is_inference() else -1
+            )
+            last = seen.get(path)
+            if version >= 0 and last is not None and last[0] is value and last[1] == version:
+                continue
+            seen[path] = value, version, self._difference(before, value) is not None
+        return {path for path, (_, _, differs) in seen.items() if differs}
+
+    def _read(self) -> dict[str, Any]:
+        """What is at the paths now; of what is an env's each, a list."""
+        now = {leaf.path: leaf.value for leaf in look_over_env(self._env).leaves}
+        read = {path: now[path] for path in self._single if path in now}
+        for path, each in self._groups.items():
+            if all(one in now for one in each):
+                read[path] = [now[one] for one in each]
+        return read
+
+    def _difference(self, before: Any, now: Any) -> tuple[What, tuple[int, ...]] | None:
+        if isinstance(before, list) and isinstance(now, list):
+            if len(now) == len(before):
+                differ = [i for i in self._elsewhere if not _same(before[i], now[i])]
+                return ("changed", tuple(int(i) for i in differ)) if differ else None
+            return ("lost", ()) if len(now) == self._count else None
+        if isinstance(before, torch.Tensor) and isinstance(now, torch.Tensor):
+            if now.shape == before.shape:
+                at = self._elsewhere
+                return self._named(_differ(_array(before)[at], _array(now)[at]))
+        elif isinstance(before, np.ndarray) and isinstance(now, np.ndarray):
+            if now.shape == before.shape:
+                return self._named(_differ(before[self._elsewhere], now[self._elsewhere]))
+        else:
+            return None  # another kind of thing has its name now
+        if now.ndim and len(now) == self._count and now.shape[1:] == before.shape[1:]:
+            return "lost", ()
+        return ("changed", tuple(int(i) for i in self._elsewhere)) if is_per_env(now, len(before)) else None
+
+    def _named(self, differs: np.ndarray) -> tuple[What, tuple[int, ...]] | None:
+        rows = differs.reshape(len(self._elsewhere), -1).any(axis=1)
+        return ("changed", tuple(int(i) for i in self._elsewhere[rows])) if rows.any() else None
+
+
+def rows_of_tensors(env: BaseEnv) -> dict[str, int]:
+    """How many rows each tensor, array and list has that the task keeps on itself, by path."""
+    leaves = look_over_env(env).leaves
+    return {
+        leaf.path: len(leaf.value)
+        for leaf in leaves
+        if _is_the_tasks(leaf.path)
+        and (isinstance(leaf.value, list) or getattr(leaf.value, "ndim", 0) > 0)
+        and isinstance(leaf.value, (torch.Tensor, np.ndarray, list))
+    }
+
+
+def _is_the_tasks(path: str) -> bool:
+    # What a robot and its controllers remember is ManiSkill's to reset (`partial_reset.KeptControllers`).
+    return path != "agent" and not path.startswith(("agent.", "agent["))
+
+
+def _paths(walk: Walk, num_envs: int) -> tuple[list[str], dict[str, list[str]]]:
+    """Of what has a row for each env; and of what is an env's each (a list of N tensors), by that of all of them."""
+    single, items = [], {}
+    for leaf in walk.leaves:
+        if not _is_the_tasks(leaf.path):
+            continue
+        if is_per_env(leaf.value, num_envs):
+            single.append(leaf.path)
+        elif isinstance(leaf.value, (torch.Tensor, np.ndarray)) and (item := _ITEM.search(leaf.path)):
+            around = leaf.path[: item.start()], leaf.path[item.end() :]
+            items.setdefault(around, {})[int(item[1])] = leaf.path
+    groups = {
+        f"{before}[i]{after}": [paths[i] for i in range(num_envs)]
+        for (before, after), paths in items.items()
+        if paths.keys() == set(range(num_envs))
+    }
+    return single, groups
+
+
+def _copy(value: Any) -> Any:
+    if isinstance(value, torch.Tensor):
+        return value.detach().clone()
+    if isinstance(value, list):
+        return [_copy(item) for item in value]
+    return value.copy() if isinstance(value, np.ndarray) else value
+
+
+def _array(tensor: torch.Tensor) -> np.ndarray:
+    tensor = tensor.detach()
+    return (tensor.float() if tensor.dtype == torch.bfloat16 else tensor).cpu().numpy()
+
+
+def _differ(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Where they do; NaN does not differ from itself."""
+    if a.dtype.kind in "fc" and b.dtype.kind in "fc":
+        return ~np.isclose(a, b, rtol=_ROUNDED, atol=_ROUNDED, equal_nan=True)
+    return np.asarray((a != b) & ~((a != a) & (b != b)))
+
+
+def _same(a: Any, b: Any) -> bool:
+    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
+        a, b = _array(a), _array(b)
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return a.shape == b.shape and not _differ(a, b).any()
+    return type(a) is type(b) and (a is b or bool(a == b) or bool(a != a and b != b))
+
+
+# --- lines -------------------------------------------------------------------------------------------
+
+
+def _files_of(env: BaseEnv) -> frozenset[str]:
+    """Installed files whose lines are the task's too."""
+    task: Any = getattr(env, "_workbench_task", type(env))
+    classes = [c for c in task.__mro__ if issubclass(c, BaseEnv) and c is not BaseEnv]
+    functions = [v for c in classes for v in vars(c).values() if hasattr(v, "__code__")]
+    return frozenset(function.__code__.co_filename for function in functions)
+
+
+class _Lines:
+    """Looks at the rows after each line of the author's, and remembers after which they were others."""
+
+    def __init__(self, rows: KeptRows, files: frozenset[str]) -> None:
+        self._rows, self._files = rows, files
+        self._left = MOST_LINES
+        self._seen: dict[str, tuple[Any, int, bool]] = {}
+        self._at: Frame | None = None
+        """The line that runs."""
+        self.found: dict[str, tuple[Frame, ...]] = {}
+
+    def start(self) -> None:
+        if sys.gettrace() is not None:
+            return  # a debugger's, or that of a measurement of coverage
+        frame: FrameType | None = sys._getframe(1)
+        while (
+            frame is not None
+        ):  # whoever called the reset and goes on after it, as the task's own `reset` does
+            if self._is_the_tasks(frame):
+                frame.f_trace = self._traced
+                self._at = self._at or (frame, frame.f_lasti, frame.f_lineno)
+            frame = frame.f_back
+        sys.settrace(self._called)
+
+    def stop(self) -> None:
+        if sys.gettrace() == self._called:
+            self._look()
+            sys.settrace(None)
+
+    def _is_the_tasks(self, frame: FrameType) -> bool:
+        file = frame.f_code.co_filename
+        return file in self._files or not is_installed(file)
+
+    def _called(self, frame: FrameType, event: str, argument: Any) -> Any:
+        return self._traced if self._is_the_tasks(frame) else None
+
+    def _traced(self, frame: FrameType, event: str, argument: Any) -> Any:
+        if event == "line":
+            self._look()
+            self._at = frame, frame.f_lasti, frame.f_lineno
+        elif event == "return":
+            self._look()
+            back = frame.f_back
+            while back is not None and back.f_trace != self._traced:
+                back = back.f_back
+            self._at = None if back is None else (back, back.f_lasti, back.f_lineno)
+        return self._traced
+
+    def _look(self) -> None:
+        if self._at is None or self._left == 0:
+            return
+        self._left -= 1
+        changed = self._rows.changed(self._seen)
+        frame = self._at[0]
+        for path in changed - self.found.keys():
+            self.found[path] = (self._at, *frames_of_the_task(frame.f_back))
+        for path in self.found.keys() - changed:
+            del self.found[path]

@@ -1,0 +1,162 @@
+"""The rules of GPU simulation, each with an id and a degree: what happens where a task breaks it.
+
+A rule that *stops* raises at the line that broke it. One that *warns* is told with that line, and the operation goes on
+as it does where no rule is checked, to the last bit. By default a rule stops where the state of other envs is
+overwritten, since every number after that is wrong, and warns everywhere else: what ManiSkill can run is run.
+
+The table imports nothing of the simulation, so commands and pages can read it without torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+Degree = Literal["stop", "warn", "off"]
+DEGREES: tuple[Degree, ...] = get_args(Degree)
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What a task must do to run on the GPU as it runs here."""
+
+    id: str
+    degree: Degree
+    """Unless a person chooses one for all rules."""
+    asks: str
+    """Of the task, in a sentence."""
+    otherwise: str
+    """What happens on the GPU where the task does not."""
+
+
+_TABLE = (
+    # --- the state of other envs is overwritten -----------------------------------------------------
+    Rule(
+        "other-env-written",
+        "stop",
+        "_initialize_episode(env_idx) writes the state of the envs in env_idx only.",
+        "The episodes of other envs change.",
+    ),
+    Rule(
+        "stepped-in-reset",
+        "stop",
+        "_initialize_episode does not call scene.step() while other envs are in the middle of an episode.",
+        "The episodes of other envs are moved on.",
+    ),
+    Rule(
+        "apply-before-fetch",
+        "stop",
+        "After a step, state is fetched before it is written and applied.",
+        "Every body of every env is put back to before the step.",
+    ),
+    Rule(
+        "rows-lost",
+        "stop",
+        "What a task keeps on itself has a row for each env after a partial reset too.",
+        "What was kept of other envs is lost; the next use of it fails, or takes the wrong row.",
+    ),
+    # --- the rest -------------------------------------------------------------------------------------
+    Rule(
+        "rows-rewritten",
+        "warn",
+        "_initialize_episode(env_idx) changes the rows of env_idx only in what a task keeps on itself.",
+        "Other envs go on with another target, counter or best value than they began with.",
+    ),
+    Rule(
+        "applied-by-reset",
+        "warn",
+        "State that is set outside _initialize_episode is applied before other envs are reset.",
+        "The reset of other envs applies it, at a moment that the task did not choose.",
+    ),
+    Rule(
+        "not-applied",
+        "warn",
+        "State that is set outside _initialize_episode is applied (scene._gpu_apply_all(), then "
+        "scene._gpu_fetch_all()) before the next fetch.",
+        "Physics never sees it; pictures do.",
+    ),
+    Rule(
+        "link-pose-set",
+        "warn",
+        "Links are moved by the qpos and the root pose of their articulation.",
+        "Physics never sees the pose of a link; pictures do.",
+    ),
+    Rule(
+        "read-before-fetch",
+        "warn",
+        "After a step, state is fetched before it is read.",
+        "A read gives the state before the step.",
+    ),
+    Rule(
+        "link-before-update",
+        "warn",
+        "After qpos or a root pose was set, links are read after gpu_update_articulation_kinematics().",
+        "The links are still where they were.",
+    ),
+    Rule(
+        "behind-the-tensors",
+        "warn",
+        "State is set through ManiSkill's objects, not through SAPIEN's.",
+        "Nothing: the GPU's simulation does not look there.",
+    ),
+    Rule(
+        "evaluate-rows",
+        "warn",
+        "evaluate() returns a row for each env.",
+        "It is broadcast over the envs, or fails far away.",
+    ),
+    Rule(
+        "reward-rows",
+        "warn",
+        "The reward is a floating tensor with a number for each env.",
+        "It is broadcast over the envs, into (N, N) in a trainer.",
+    ),
+    Rule(
+        "observation-rows",
+        "warn",
+        "Observations have a row for each env.",
+        "They are broadcast over the envs, or fail far away.",
+    ),
+)
+RULES: Mapping[str, Rule] = {rule.id: rule for rule in _TABLE}
+
+
+def degrees_of(choice: Degree | None) -> dict[str, Degree]:
+    """The degree of each rule: the chosen one for all, or each rule's own where none is chosen.
+
+    Raises:
+        ValueError: no such degree.
+    """
+    if choice is not None and choice not in DEGREES:
+        raise ValueError(f"rules must be 'stop', 'warn' or 'off', not {choice!r}")
+    return {rule.id: rule.degree if choice is None else choice for rule in _TABLE}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A rule that a task broke at one place, however often."""
+
+    rule: str
+    """Its id."""
+    degree: Degree
+    message: str
+    """What was done, what comes of it, and what to write instead; of the first time."""
+    file: str | None
+    """The author's file, or another that the line is in; None where none is known."""
+    line: int | None
+    """1-based line in `file`."""
+    code: str
+    """The text of that line, stripped."""
+    function: str
+    """The function or hook that the line is in."""
+    count: int
+    """How often."""
+    first_step: int
+    """Control steps of the batch that had been made, the first time; 0 in a reset before the first, and in the
+    reset and the step with which a page tries a version."""
+
+    @property
+    def key(self) -> tuple[str, str | None, str, str]:
+        """What stays the same while the lines around it move."""
+        return self.rule, self.file, self.function, self.code
