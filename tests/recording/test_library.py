@@ -561,3 +561,22 @@ def test_a_deletion_that_fails_leaves_the_recording_whole(tmp_path: Path, librar
     with pytest.raises(LibraryError, match="Not everything was deleted"):
         library.delete(["aaaa"])
     assert tree(tmp_path) == before and [row.id for row in library.rows()] == ["aaaa"]
+
+
+def test_a_trash_that_is_a_link_is_nobodys_trash(tmp_path: Path) -> None:
+    folder, other = tmp_path / "recordings", tmp_path / "other"
+    describe(folder, "a")
+    (other / "2026").mkdir(parents=True)
+    (other / "2026" / "precious.txt").write_text("mine")
+    (folder / ".trash").symlink_to(other)
+    library = Library(folder)
+    library.refresh()
+    try:
+        assert library.view().trash.files == 0
+        with pytest.raises(LibraryError, match="is a link"):
+            library.delete([row.id for row in library.rows()])
+        with pytest.raises(LibraryError):
+            library.empty_trash()
+        assert (folder / "a.json").exists() and (other / "2026" / "precious.txt").exists()
+    finally:
+        library.close()

@@ -30,6 +30,7 @@ from rich.table import Table
 from workbench.machine import DISTRIBUTION
 from workbench.machine.child_python import child_environment, python_command
 from workbench.machine.chromium import chromium_version, find_chromium, how_to_get_chromium
+from workbench.machine.confinement import landlock_version
 from workbench.machine.render_device import driver_files
 from workbench.machine.software_vulkan import ensure_render_device
 
@@ -67,6 +68,7 @@ def diagnose() -> list[Finding]:
         ("render device", _render_device),
         ("CUDA", _gpu),
         ("cores, memory", _cores_and_memory),
+        ("reading", _reading),
         ("page", _page_address),
         ("browser (tests)", _chromium),
     ]
@@ -218,6 +220,22 @@ def _cores_and_memory() -> list[Finding]:
         )
         return [Finding("cores, memory", None, what, advice)]
     return [Finding("cores, memory", True, what)]
+
+
+def _reading() -> list[Finding]:
+    """How far the processes are confined that read recordings."""
+    version = landlock_version()
+    if version:
+        what = f"recordings are read in processes that may read their folder and write nothing (Landlock {version})"
+        return [Finding("reading", True, what)]
+    return [
+        Finding(
+            "reading",
+            None,
+            "recordings are read in processes of their own, with limits on memory and time alone: this kernel has no Landlock",
+            "Linux 5.13 has it, where it is not turned off. Without it, open recordings of people you trust.",
+        )
+    ]
 
 
 def _page_address() -> list[Finding]:

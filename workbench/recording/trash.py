@@ -42,6 +42,8 @@ def put_into_trash(folder: Path, recordings: Sequence[Sequence[Path]]) -> str | 
     Raises:
         TrashError: some could not be moved; those before it were.
     """
+    if (folder / TRASH).is_symlink():
+        raise TrashError(f"{folder / TRASH} is a link, so nothing was moved there. Remove it.")
     now = datetime.datetime.now()
     batch = f"{now:%Y-%m-%dT%H-%M-%S.%f}-{uuid.uuid4().hex[:6]}"
     moved = False
@@ -74,6 +76,8 @@ def take_out_of_trash(folder: Path, batch: str) -> tuple[str, ...]:
 
 def look_into_trash(folder: Path) -> Trash:
     batches, files, size = [], 0, 0
+    if (folder / TRASH).is_symlink():
+        return Trash()  # another folder, which came with this one
     try:
         with os.scandir(folder / TRASH) as listed:
             batches = sorted(entry.name for entry in listed if entry.is_dir(follow_symlinks=False))

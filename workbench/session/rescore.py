@@ -24,6 +24,7 @@ from workbench.authoring.reference import TaskName
 from workbench.core.recorded_run import RecordedRun
 from workbench.recording.description import info_from
 from workbench.recording.episode import EpisodeInfo
+from workbench.recording.json_file import NotJson, read_json
 from workbench.recording.made_here import made_here
 from workbench.recording.read_episode import UnreadableRecording, trajectories
 from workbench.recording.side_files import side_files_in_words
@@ -224,8 +225,8 @@ def _episodes_in(file: Path) -> Iterator[EpisodeFile]:
 
 def _said(file: Path) -> dict[str, Any]:
     try:
-        said = json.loads(file.read_bytes())
-    except (OSError, ValueError):
+        said = read_json(file)
+    except (OSError, NotJson):
         return {}
     return said if isinstance(said, dict) else {}
 
