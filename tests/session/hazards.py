@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import pickle
 import re
 import shutil
 from pathlib import Path
 
 from tests.session.conftest import TASKS
+from workbench.session.messages import Stepped
 
 _MISCHIEF = """
 import ctypes as _ctypes, os as _os, signal as _signal, sys as _sys, threading as _threading, time as _time
@@ -80,16 +82,12 @@ def hazard(place):
         _os.write(_line_to_server(), b"print(1)\\n")
         _time.sleep(3600)
     if what == "wrong":
-        import pickle as _pickle
-
-        raw = _pickle.dumps({"not": "a message"})
+        raw = @WRONG@
         _os.write(_line_to_server(), len(raw).to_bytes(4, "big") + raw)
         _time.sleep(3600)
     if what == "misfit":
-        from multiprocessing.connection import Connection as _Connection
-        from workbench.session.messages import Stepped as _Stepped
-
-        _Connection(_os.dup(_line_to_server())).send(_Stepped(None, None))
+        raw = @MISFIT@
+        _os.write(_line_to_server(), len(raw).to_bytes(4, "big") + raw)
         _time.sleep(3600)
     if what == "half":
         _os.write(_line_to_server(), b"\\0\\0\\1\\0abc")
@@ -122,6 +120,9 @@ def hazard(place):
 
 
 """
+# As literals: code that imports pickle may reach anything, and a change to it is never patched in.
+for _place, _message in (("@WRONG@", {"not": "a message"}), ("@MISFIT@", Stepped(None, None))):  # type: ignore[arg-type]
+    _MISCHIEF = _MISCHIEF.replace(_place, repr(pickle.dumps(_message)))
 _HOOKS = {
     "build": "        build_ground(self.scene)\n",
     "reset": '        self.agent.reset(self.agent.keyframes["rest"].qpos)\n',

@@ -129,7 +129,7 @@ def test_keys_walk_over_the_pages(panel: LibraryPanel) -> None:
         panel._list.move(1)
     panel.draw()
     assert panel.selected() == tuple(newest(MOST_ROWS, MOST_ROWS + 1))
-    assert shown(panel) == newest(MOST_ROWS, COUNT) and "scrollIntoView" in panel._marks.content
+    assert shown(panel) == newest(MOST_ROWS, COUNT) and "wb.follow" in panel._marks.content
     panel._list.move(-1, RANGE)
     panel._list.move(-1, RANGE)
     assert panel.selected() == tuple(newest(MOST_ROWS - 2, MOST_ROWS + 1))

@@ -27,6 +27,8 @@ def main() -> None:
     begin_family(server)
     if niceness:
         os.nice(niceness)
+    # A server that a script has started in the background hands down that SIGINT is ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     _be_the_first_to_go()
     leave = os._exit
     _tell_where(stacks)
