@@ -15,10 +15,6 @@ import ctypes as _ctypes, os as _os, signal as _signal, sys as _sys, threading a
 from pathlib import Path as _Path
 
 
-class _Enough(BaseException):
-    pass
-
-
 def _raise_enough(*_):
     raise ValueError("enough")
 
@@ -106,7 +102,7 @@ def hazard(place):
     if what == "interrupt_main":
         _signal.raise_signal(_signal.SIGINT)
     if what == "own_base":
-        raise _Enough("of this")
+        raise GeneratorExit("of this")
     if what == "chdir":
         _os.chdir("/")
         file.unlink()

@@ -96,7 +96,7 @@ def test_a_message_that_stops_in_the_middle_is_a_hang_like_others(session: Sessi
         ("evaluate", "ctrl_c", "KeyboardInterrupt", "raise KeyboardInterrupt"),
         ("import", "ctrl_c", "KeyboardInterrupt", "raise KeyboardInterrupt"),
         ("reward", "interrupt_main", "KeyboardInterrupt", "_signal.raise_signal(_signal.SIGINT)"),
-        ("reset", "own_base", "_Enough: of this", 'raise _Enough("of this")'),
+        ("reset", "own_base", "GeneratorExit: of this", 'raise GeneratorExit("of this")'),
     ],
 )
 def test_what_is_no_ordinary_exception_is_named_with_its_line(
