@@ -49,6 +49,10 @@ def clean_process() -> Iterator[None]:
             loader = getattr(getattr(sys.modules[name], "__spec__", None), "loader", None)
             if type(loader).__name__ == "_AuthorLoader":
                 del sys.modules[name]
+    # A file of an installed package takes that package's modules away while it is open.
+    sys.modules.update(
+        {name: module for name, module in modules.items() if sys.modules.get(name) is not module}
+    )
     sys.meta_path[:], sys.path[:] = finders, path
     load._loads.clear()
     load._loads.update(loads)
