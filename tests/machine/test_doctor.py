@@ -26,6 +26,7 @@ def test_every_topic_is_answered_and_this_machine_runs_the_workbench(findings: d
         "cores, memory",
         "page",
         "browser (tests)",
+        "reading",
     }
     assert set(findings) == topics
     assert exit_code(list(findings.values())) == 0, findings
