@@ -69,4 +69,6 @@ def test_step_start_and_finish_are_one_substep(px: Any) -> None:
 def test_an_index_buffer_is_refused_in_words(px: Any, name: str) -> None:
     with pytest.raises(NotImplementedError, match="takes no index buffer"):
         getattr(px, name)(px.cuda_rigid_body_data)
+    for fetch in (member for member in MEMBERS if member.startswith("gpu_fetch_")):
+        getattr(px, fetch)()
     getattr(px, name)()

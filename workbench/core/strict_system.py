@@ -30,6 +30,7 @@ from workbench.core.broken_rule import BrokenRules, Place
 from workbench.core.contacts import CpuArray
 from workbench.core.cpu_system import BatchedCpuSystem
 from workbench.core.drive_targets import Setters
+from workbench.core.gpu_members import applies_everything
 from workbench.core.who_wrote import TENSORS, Group, Writes
 
 ENVS_NAMED = THINGS_NAMED = 8
@@ -227,11 +228,13 @@ class StrictCpuSystem(BatchedCpuSystem):
 
     # --- applies -------------------------------------------------------------------------------------
 
+    @applies_everything
     def gpu_apply_rigid_dynamic_data(self) -> None:
         self._refuse_stale_apply("bodies")
         with self._own_writes("bodies"):
             super().gpu_apply_rigid_dynamic_data()
 
+    @applies_everything
     def gpu_apply_articulation_root_pose(self) -> None:
         self._refuse_stale_apply("links")
         layout = self._laid_out
@@ -239,29 +242,35 @@ class StrictCpuSystem(BatchedCpuSystem):
         with self._own_writes("links"):
             super().gpu_apply_articulation_root_pose()
 
+    @applies_everything
     def gpu_apply_articulation_root_velocity(self) -> None:
         with self._own_writes("links"):
             super().gpu_apply_articulation_root_velocity()
 
+    @applies_everything
     def gpu_apply_articulation_qpos(self) -> None:
         self._refuse_stale_apply("joints")
         self._note_kinematics(self._qpos, self._qpos_seen)
         with self._own_writes("joints"):
             super().gpu_apply_articulation_qpos()
 
+    @applies_everything
     def gpu_apply_articulation_qvel(self) -> None:
         self._refuse_stale_apply("joints")
         with self._own_writes("joints"):
             super().gpu_apply_articulation_qvel()
 
+    @applies_everything
     def gpu_apply_articulation_qf(self) -> None:
         with self._own_writes("forces"):
             super().gpu_apply_articulation_qf()
 
+    @applies_everything
     def gpu_apply_articulation_target_position(self) -> None:
         with self._own_writes("targets"):
             super().gpu_apply_articulation_target_position()
 
+    @applies_everything
     def gpu_apply_articulation_target_velocity(self) -> None:
         with self._own_writes("targets"):
             super().gpu_apply_articulation_target_velocity()
