@@ -102,7 +102,7 @@ _TABLE = (
     ),
     Rule(
         "evaluate-rows",
-        "warn",
+        "stop",
         "evaluate() returns a row for each env.",
         "It is broadcast over the envs, or fails far away.",
     ),
