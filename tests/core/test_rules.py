@@ -24,9 +24,15 @@ N = 3
 Hook = Callable[..., None]
 
 
-def test_only_what_overwrites_other_envs_stops_by_itself() -> None:
+def test_what_overwrites_other_envs_and_a_success_without_rows_stop_by_themselves() -> None:
     stops = {rule for rule, degree in degrees_of(None).items() if degree == "stop"}
-    assert stops == {"other-env-written", "stepped-in-reset", "apply-before-fetch", "rows-lost"}
+    assert stops == {
+        "other-env-written",
+        "stepped-in-reset",
+        "apply-before-fetch",
+        "rows-lost",
+        "evaluate-rows",
+    }
     assert {degree for rule, degree in degrees_of(None).items() if rule not in stops} == {"warn"}
 
 
