@@ -26,6 +26,7 @@ from workbench import gym_env
 from workbench.authoring.problem import TaskError
 from workbench.core.assets import MissingAssets
 from workbench.core.backends import BackendUnavailable, why_no_gpu_simulation
+from workbench.core.broken_rule import WrongReturn
 from workbench.core.cpu_scene import SIM_BACKEND
 
 CPU = {"backend": "cpu", "render_backend": "none"}
@@ -206,9 +207,10 @@ def test_threads_and_strictness_are_the_cores() -> None:
         def evaluate(self) -> dict[str, Any]:
             return {"success": torch.tensor([True])}
 
-    workbench.make(Unbatched, 3, **CPU).close()
-    with pytest.raises(Exception, match="success"):
-        workbench.make(Unbatched, 3, rules="stop", **CPU)
+    workbench.make(Unbatched, 3, rules="off", **CPU).close()
+    for rules in ({}, {"rules": "stop"}):
+        with pytest.raises(WrongReturn, match="success"):
+            workbench.make(Unbatched, 3, **rules, **CPU)
     env = workbench.make("PushCube-v1", 3, threads=1, rules="stop", **CPU)
     env.reset(seed=0)
     env.step(env.action_space.sample())
