@@ -100,12 +100,14 @@ class CameraStudio:
         """Take the last step back."""
         with self._lock:
             step = self._cameras.placements.undo()
+            self._cameras.problem = ""
         self.ask_for([] if step is None else [step.key])
 
     def redo(self) -> None:
         """Make the step again that was taken back last."""
         with self._lock:
             step = self._cameras.placements.redo()
+            self._cameras.problem = ""
         self.ask_for([] if step is None else [step.key])
 
     def back_to_file(self, key: CameraKey) -> None:
@@ -201,8 +203,7 @@ class CameraStudio:
         """Two pictures of the shown env: the camera as it is placed, and as it would be with other settings."""
         with self._lock:
             why_not = self._cameras.refusal(key) or why_no_camera(other)
-            if why_not:
-                self._cameras.problem = f"{key[1]} is not compared: {why_not}."
+            self._cameras.problem = f"{key[1]} is not compared: {why_not}." if why_not else ""
         if not why_not:
             self._judging.compare(key, other, self._shown())
         self._note()

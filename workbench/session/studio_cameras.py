@@ -39,11 +39,10 @@ class StudioCameras:
         return next((info for info in infos if info.key == key), None)
 
     def known(self, key: CameraKey) -> bool:
-        """Whether there is such a camera; it is said if not."""
-        if self.info(key) is None:
-            self.problem = f"There is no {key[0]} camera {key[1]}."
-            return False
-        return True
+        """Whether there is such a camera; it is said if not. What went wrong before it was asked for is over."""
+        known = self.info(key) is not None
+        self.problem = "" if known else f"There is no {key[0]} camera {key[1]}."
+        return known
 
     def refusal(self, key: CameraKey) -> str | None:
         """Why a camera cannot be placed; None where it can."""
