@@ -57,7 +57,7 @@ def test_a_line_is_written_where_a_text_changes() -> None:
     states: list[Others] = [{}, {"a": said("x")}, {"a": said("x")}, {"a": said("y"), "b": said("z")}, {}]
     lines = [writer.news(state, others) for state, others in enumerate(states)]
     assert [len(found) for found in lines] == [0, 1, 0, 2, 2]
-    tracks = tracks_of([(line.number, line.value) for found in lines for line in found])
+    tracks = tracks_of([line for found in lines for line in found])
     assert tracks == {"a": ((1, said("x")), (3, said("y")), (4, None)), "b": ((3, said("z")), (4, None))}
     assert tracks_from(json.loads(json.dumps(tracks_words(tracks)))) == tracks
     assert [entry_at(tracks["a"], state) for state in range(5)] == [
@@ -75,8 +75,8 @@ def test_what_changes_too_often_is_named_and_not_kept_further() -> None:
         for state in range(5000)
         for line in writer.news(state, {"clock": said(f"{state:050}"), "a": said("x")})
     ]
-    assert sum(len(line.value) for line in lines) < MOST_BYTES + 400
-    tracks = tracks_of([(line.number, line.value) for line in lines])
+    assert sum(len(line[1]) for line in lines) < MOST_BYTES + 400
+    tracks = tracks_of(lines)
     last_state, last = tracks["clock"][-1]
     assert last is not None and last.texts == (CUT,) and not last.whole and 100 < last_state < 5000
     assert tracks["a"] == ((0, said("x")),)

@@ -266,9 +266,6 @@ print(tried(lambda: subprocess.run(["/bin/true"], check=True)), tried(lambda: op
     assert (folder / "inside").read_text() == "inside"
 
 
-@pytest.mark.xfail(
-    strict=False, reason="Two threads were seen once in a whole run, one alone; not understood"
-)
 def test_the_nursery_has_one_thread(tmp_path: Path) -> None:
     describe(tmp_path, "a")
     rows(tmp_path)

@@ -228,7 +228,9 @@ def test_the_target_that_the_file_gives_is_known(session: Session, task_file: Pa
     assert view.studio.camera(BASE).info.target == pytest.approx((0.08, 0, 0.2))
     task_file.write_text(good)
     wait_until(session, lambda v: v.studio.camera(BASE).info.target[2] == 0, "the first")
-    wait_until(session, said(lambda s: "stands where the file says" in s.problem), "that the placement is dropped")
+    wait_until(
+        session, said(lambda s: "stands where the file says" in s.problem), "that the placement is dropped"
+    )
     session.studio.undo()
     view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement again")
     assert view.studio.problem == "", "what was said before a person did something about it"

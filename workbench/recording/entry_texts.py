@@ -12,7 +12,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from workbench.core.step import OtherEntry
-from workbench.recording.journal import Entry
 
 KIND = "entry"
 """Of a line in a journal."""
@@ -21,6 +20,10 @@ MOST_BYTES = 64 << 10
 MOST_LINES = MOST_BYTES
 """A line has a byte at least; a recording with more was not written here."""
 CUT = "not recorded from here on: it changes too often"
+
+Line = tuple[int, bytes]
+"""The state from which on a text holds, and what a journal has of it. A plain pair, since a reader of rows must not
+import what writes journals: Arrow would start a thread in the process that forks."""
 
 TextTrack = tuple[tuple[int, OtherEntry | None], ...]
 """States, and what an entry was from each of them on; None where ``evaluate()`` did not return it, or as numbers."""
@@ -39,20 +42,20 @@ class TextWriter:
         """Whether the state before had no texts."""
         return not self._last
 
-    def news(self, state: int, others: Mapping[str, OtherEntry]) -> list[Entry]:
+    def news(self, state: int, others: Mapping[str, OtherEntry]) -> list[Line]:
         """Lines for what is another than in the state before; `others` as in an `EpisodeRow`."""
         if not others and not self._last:
             return []
         now = {name: entry for name, entry in others.items() if entry.numbers is None}
-        found: list[Entry] = []
+        found: list[Line] = []
         for name, entry in now.items():
             if name in self._cut or self._last.get(name) == entry:
                 continue
             line = _line(state, name, entry)
-            if len(line.value) > self._left:
+            if len(line[1]) > self._left:
                 self._cut.add(name)
                 line = _line(state, name, OtherEntry(entry.what, (CUT,), per_env=entry.per_env, whole=False))
-            self._left -= len(line.value)
+            self._left -= len(line[1])
             found.append(line)
         found += [
             _line(state, name, None) for name in self._last if name not in now and name not in self._cut
@@ -61,11 +64,11 @@ class TextWriter:
         return found
 
 
-def _line(state: int, name: str, entry: OtherEntry | None) -> Entry:
-    return Entry(KIND, state, json.dumps([name, _said(entry)]).encode())
+def _line(state: int, name: str, entry: OtherEntry | None) -> Line:
+    return state, json.dumps([name, _said(entry)]).encode()
 
 
-def tracks_of(lines: Sequence[tuple[int, bytes]]) -> dict[str, TextTrack]:
+def tracks_of(lines: Sequence[Line]) -> dict[str, TextTrack]:
     """The tracks of an episode whose journal has these lines."""
     found: dict[str, list[tuple[int, OtherEntry | None]]] = {}
     for state, value in lines:

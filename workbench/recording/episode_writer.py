@@ -23,6 +23,7 @@ from workbench.recording.batch_rows import Layout
 from workbench.recording.columns import RowPacker
 from workbench.recording.encode_soon import encode_soon
 from workbench.recording.encoded_pictures import MODALITIES, Modality
+from workbench.recording.entry_texts import KIND as TEXT
 from workbench.recording.entry_texts import TextWriter
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.journal import FOLDER, Entry, Journal
@@ -177,7 +178,7 @@ class EpisodeWriter:
 
     def texts(self, state: int, others: Mapping[str, OtherEntry]) -> list[JournalItem]:
         """What a state to come says in texts: for `append_steps`. `others` as in an `EpisodeRow`; states in order."""
-        return [*self._texts.news(state, others)]
+        return [Entry(TEXT, *line) for line in self._texts.news(state, others)]
 
     def append_packed(
         self,
@@ -218,7 +219,7 @@ class EpisodeWriter:
             if layout is not None:
                 self._packer.forget(number)
             raise
-        self._keep(number, packed, layout, [*items, *self._texts.news(self._states, others)])
+        self._keep(number, packed, layout, [*items, *self.texts(self._states, others)])
         self._given |= given
         self._states += 1
 
