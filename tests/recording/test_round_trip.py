@@ -119,9 +119,6 @@ def test_every_mesh_lies_under_its_body(written: tuple[Made, Path, Entities]) ->
                 assert pixels == visual.material.texture[..., :3].tobytes()
 
 
-@pytest.mark.xfail(
-    strict=False, reason="Hangs on what ran before it in the process; known since before, not understood"
-)
 def test_all_of_it_is_read_back(written: tuple[Made, Path, Entities], recorded: Any) -> None:
     made, path, _ = written
     found = read_episode(path)

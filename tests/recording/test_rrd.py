@@ -6,6 +6,7 @@ import dataclasses
 import errno
 import os
 import resource
+import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 from tests.recording.made import Made
 from tests.recording.verify_rrd import verify_rrd
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
+from workbench.machine.child_python import child_environment, python_command
 from workbench.recording import rrd
 from workbench.recording.blueprint_in_file import blueprint_stream
 from workbench.recording.read_episode import read_episode
@@ -116,6 +118,40 @@ def test_threads_that_write_episodes_of_one_scene_share_its_meshes(
         assert found.geometry is not None
         (visual,) = found.geometry.visuals
         assert visual.bodies.tolist() == [found.info.env_index]
+
+
+def test_a_material_of_whole_numbers_leaves_those_behind_it_as_they_are(tmp_path: Path) -> None:
+    # In a process of its own: rerun takes the type of the first value for all that follow.
+    program = """
+import sys
+from pathlib import Path
+import numpy as np
+from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
+from workbench.recording.episode import EpisodeInfo
+from workbench.recording.episode_writer import EpisodeWriter
+from workbench.recording.row import EpisodeRow
+mesh, zero = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.uint32)), np.zeros(1, np.int32)
+for seed, material in enumerate((Material((1, 0, 0, 1), 1, 0), Material((0.8, 0.5, 0.2, 1.0), 0.25, 0.5))):
+    visual = Visual("cube/0", mesh, material, zero, zero)
+    geometry = SceneGeometry(1, ("cube",), ("dynamic",), (False,), (visual,))
+    info = EpisodeInfo("Painted-v1", 0, seed, None, "", {}, 0.05, None, "cpu")
+    writer = EpisodeWriter(Path(sys.argv[1]), info, geometry, {}, (), ())
+    writer.append(EpisodeRow(np.array([[0, 0, 0, 1, 0, 0, 0]], np.float32), {}, {}, {}, None, 0.0))
+    writer.append(EpisodeRow(np.array([[0, 0, 0, 1, 0, 0, 0]], np.float32), {}, {}, {}, np.zeros(0, np.float32), 0.0))
+    print(writer.finish().rrd)
+"""
+    command = python_command("-c", program, str(tmp_path))
+    made = subprocess.run(command, env=child_environment(), capture_output=True, text=True, timeout=60)
+    paths = made.stdout.split()
+    assert len(paths) == 2, made.stderr
+    for path, color, numbers in zip(
+        paths, [(1, 0, 0, 1), (0.8, 0.5, 0.2, 1.0)], [(1, 0), (0.25, 0.5)], strict=True
+    ):
+        geometry = read_episode(Path(path)).geometry
+        assert geometry is not None
+        (visual,) = geometry.visuals
+        assert visual.material.base_color == color
+        assert (visual.material.metallic, visual.material.roughness) == numbers
 
 
 def test_a_blueprint_can_be_shown_before_the_recording(make_episode: Maker, tmp_path: Path) -> None:

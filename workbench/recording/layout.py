@@ -29,6 +29,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 
 import numpy as np
+import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
@@ -226,12 +227,14 @@ def _visual_chunk(visual: Visual, entity: str) -> Chunk | None:
     mesh = _mesh(visual.mesh, visual.material)
     if mesh is None:
         return None
-    # What rerun's mesh does not say, for whoever reads the scene back.
+    # What rerun's mesh does not say, for whoever reads the scene back. With types: rerun takes those of the first value in
+    # the process for all that follow, so behind a colour of whole numbers every other one would be cut down to 0 or 1.
+    material = visual.material
     said = rr.AnyValues(
         visual=visual.name,
-        base_color=list(visual.material.base_color),
-        metallic=visual.material.metallic,
-        roughness=visual.material.roughness,
+        base_color=pa.array(material.base_color, pa.float64()),
+        metallic=pa.array([material.metallic], pa.float64()),
+        roughness=pa.array([material.roughness], pa.float64()),
     )
     return static_chunk(entity, mesh, said)
 
