@@ -221,7 +221,7 @@ def test_the_same_thing_is_said_ever_more_rarely(monkeypatch):
     assert said[:2] == ["It happened.", "It happened. (59 more times since this was last said.)"]
     assert len(said) < 12
     told.happened("b", "Another\x1b[2J\nthing\u202e.")
-    assert said[-1] == "Another�[2J�thing�."
+    assert said[-1] == r"Another\x1b[2J\nthing\u202e."
 
 
 def test_no_program_is_named(door):

@@ -73,6 +73,13 @@ def plain_text(text: str, keep: str = "") -> str:
     return _SHOWN.sub(lambda found: found[0] if found[0] in keep else _escaped(found[0]), text)
 
 
+def short_line(text: str, longest: int) -> str:
+    """`text` on one line of about `longest` characters, as in `plain_text`; what is too long lacks its middle."""
+    if len(text) > longest:
+        text = f"{text[: longest // 2]} ... {text[-longest // 2 :]}"
+    return plain_text(text)
+
+
 def only_colours(text: str, keep: str = "\n\t") -> str:
     """`text` with its colours as they are and all else as in `plain_text`."""
     if not _SHOWN.search(text):

@@ -18,6 +18,7 @@ from typing import Any
 from workbench.authoring.reference import TaskName
 from workbench.authoring.task_content import CannotRead, TaskContent, content_of_texts, read_content
 from workbench.authoring.trust import TrustStore
+from workbench.machine.terminal_text import short_line
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.made_here import MadeHere, made_here
 from workbench.session.recorded_text import NoText, below_one_folder
@@ -253,9 +254,7 @@ def _as_recorded(content: TaskContent, info: EpisodeInfo) -> bool:
 
 
 def _printable(text: str) -> str:
-    """On one line, with nothing that moves the cursor or turns the direction of writing."""
-    plain = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
-    return plain if len(plain) <= LONGEST else f"{plain[: LONGEST // 2]} ... {plain[-LONGEST // 2 :]}"
+    return short_line(text, LONGEST)
 
 
 def _is_one_of(file: str, named: Iterable[Path]) -> bool:

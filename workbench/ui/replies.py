@@ -21,10 +21,10 @@ from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
+from workbench.machine.terminal_text import short_line
 from workbench.ui import gate, viser_seam
 from workbench.ui.file_reply import FileReply, send_file
 from workbench.ui.page_policy import EVERY_REPLY, PAGE_OF_OURS, page_policy
-from workbench.ui.told_rarely import printable
 from workbench.web_assets import web_assets_folder
 
 Handler = Callable[[str], "tuple[int, str, bytes] | FileReply"]
@@ -134,7 +134,7 @@ async def admitted_reply(
         try:
             made = handler(path[len(prefix) :])
         except Exception:
-            _log.exception("The route %s failed on %s.", prefix, printable(path))
+            _log.exception("The route %s failed on %s.", prefix, short_line(path, 300))
             made = 500, "text/plain; charset=utf-8", b"This went wrong; the terminal says how."
         if isinstance(made, FileReply):
             return made

@@ -7,6 +7,8 @@ import threading
 import time
 from collections.abc import Callable, Hashable
 
+from workbench.machine.terminal_text import short_line
+
 PAUSE = 60.0
 """Seconds in which the same thing is said once, at first."""
 LONGEST_PAUSE = 3600.0
@@ -36,7 +38,7 @@ class ToldRarely:
         """
         Args:
             kind: What counts as the same thing.
-            sentence: What is said, with a full stop; characters that a terminal would obey are taken out.
+            sentence: What is said, with a full stop; controls are shown escaped.
         """
         now = time.monotonic()
         with self._lock:
@@ -52,10 +54,4 @@ class ToldRarely:
             self._pauses[kind] = min(2 * pause, LONGEST_PAUSE)
             before = self._untold.pop(kind, 0)
         more = f" ({before} more times since this was last said.)" if before else ""
-        self._say(printable(sentence) + more)
-
-
-def printable(text: str) -> str:
-    """One line of bounded length without control or direction characters, for a terminal."""
-    short = text if len(text) <= LONGEST else f"{text[:LONGEST]}…"
-    return "".join(character if character.isprintable() else "�" for character in short)
+        self._say(short_line(sentence, LONGEST) + more)
