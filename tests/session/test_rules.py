@@ -140,7 +140,7 @@ def test_what_cannot_go_on_is_told_at_the_authors_line(
         ),
         (BEHIND, "behind-the-tensors", "goes behind the tensors"),
         (REWRITTEN, "rows-rewritten", "self.target is changed in envs 1, 2, 3, which are not being reset"),
-        (HIDES, "not-applied", "physics never sees it, pictures on the GPU do"),
+        (HIDES, "not-applied", "physics never sees it, pictures do, here and on the GPU"),
     ],
 )
 def test_what_the_task_can_live_with_is_a_row_and_the_task_opens(

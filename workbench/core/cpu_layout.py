@@ -48,9 +48,11 @@ class Layout:
     qvel_at: NDArray[np.int64]
     target_qpos_at: NDArray[np.int64]
     target_qvel_at: NDArray[np.int64]
-    link_pose_at: NDArray[np.int64]
-    """Within the poses of the link's own env; see `_pack_poses`."""
-    link_env: NDArray[np.int64]
+    entities: list[Any]
+    """(R,) of each row."""
+    pose_at: NDArray[np.int64]
+    """(R, 7) of each row, within the packed poses of its own env."""
+    env_of_row: NDArray[np.int64]
     row_of: dict[int, int]
     index_of: dict[int, int]
     row_count: int
@@ -61,8 +63,9 @@ def lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Sce
     links: list[Any] = []
     articulations: list[Any] = []
     body_rows, link_rows, root_rows, dofs = [], [], [], []
-    body_at, root_at, link_pose_at = [], [], []
-    link_env: list[int] = []
+    body_at, root_at, pose_at = [], [], []
+    row_entities: list[Any] = []
+    env_of_row: list[int] = []
     joint_at: list[tuple[int, int]] = []
     row = packed = 0
     for env, (system, scene) in enumerate(zip(systems, scenes, strict=True)):
@@ -71,6 +74,9 @@ def lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Sce
         for body in system.rigid_dynamic_components:
             bodies.append(body)
             body_rows.append(row)
+            row_entities.append(body.entity)
+            pose_at.append(entity_at[id(body.entity)] + _FROM_PACKED_POSE)
+            env_of_row.append(env)
             body_at.append(packed + _FROM_PACKEDBODY)
             row, packed = row + 1, packed + BODY
         seen: set[int] = set()
@@ -78,8 +84,9 @@ def lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Sce
         for link in system.articulation_link_components:
             links.append(link)
             link_rows.append(row)
-            link_pose_at.append(entity_at[id(link.entity)] + _FROM_PACKED_POSE)
-            link_env.append(env)
+            row_entities.append(link.entity)
+            pose_at.append(entity_at[id(link.entity)] + _FROM_PACKED_POSE)
+            env_of_row.append(env)
             articulation = link.articulation
             if id(articulation) not in seen:
                 seen.add(id(articulation))
@@ -120,8 +127,9 @@ def lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Sce
         qvel_at=joint_columns(lambda start, dof: start + dof + np.arange(dof)),
         target_qpos_at=joint_columns(lambda start, dof: start + 2 * dof + 2 * np.arange(dof)),
         target_qvel_at=joint_columns(lambda start, dof: start + 2 * dof + 2 * np.arange(dof) + 1),
-        link_pose_at=stacked(link_pose_at, 7),
-        link_env=np.array(link_env, dtype=np.int64),
+        entities=row_entities,
+        pose_at=stacked(pose_at, 7),
+        env_of_row=np.array(env_of_row, dtype=np.int64),
         row_of={id(b): r for b, r in zip(every_body, [*body_rows, *link_rows], strict=True)},
         index_of={id(a): i for i, a in enumerate(articulations)},
         row_count=row,

@@ -28,6 +28,7 @@ from mani_skill.render.utils import can_render
 from workbench.core.broken_rule import frames_of_the_task, in_brackets, place_of, warn_of
 from workbench.core.contacts import CpuArray
 from workbench.core.cpu_system import BatchedCpuSystem
+from workbench.core.drawn_poses import NOWHERE_ELSE, drawn_at
 from workbench.core.partial_reset import KeptControllers, others, told_whose_fault
 from workbench.core.rules import Degree, Finding, degrees_of
 from workbench.core.scene_limit import require_scenes
@@ -115,8 +116,14 @@ class BatchedCpuScene(ManiSkillScene):
                 if sensor.camera.camera_group is None:
                     group = CpuCameraGroup(sensor.camera._render_cameras)
                     sensor.camera.camera_group = self.camera_groups[name] = group  # type: ignore
-        for sub_scene in self.sub_scenes:
-            sub_scene.update_render()
+        px: BatchedCpuSystem = self.px  # type: ignore[assignment]
+        every = [*self.sensors.values(), *self.human_render_cameras.values()]
+        elsewhere = px.elsewhere(range(len(self.sub_scenes)))
+        for env, sub_scene in enumerate(self.sub_scenes):
+            components = (sensor.camera._render_cameras[env] for sensor in every)
+            with drawn_at(elsewhere.get(env, NOWHERE_ELSE), components) as move_bodies:
+                sub_scene.update_render()
+                move_bodies()
 
     def _gpu_apply_all(self) -> None:
         if self._needs_fetch:

@@ -31,6 +31,7 @@ from numpy.typing import NDArray
 
 from workbench.core.contacts import BodyImpulseQuery, ContactReader, CpuArray, PairImpulseQuery
 from workbench.core.cpu_layout import BODY, Layout, check_layout, lay_out
+from workbench.core.drawn_poses import Places, TensorPoses
 from workbench.core.drive_targets import DriveTargets, Setters, refuse_nan
 from workbench.core.gpu_members import applies_everything, uncommon_member
 from workbench.core.stepping import Stepper
@@ -159,6 +160,7 @@ class BatchedCpuSystem:
         self._qacc = np.zeros((len(layout.articulations), width), dtype=np.float32)
         most_links = max((len(a.links) for a in layout.articulations), default=0)
         self._joint_forces = np.zeros((len(layout.articulations), most_links, 6), dtype=np.float32)
+        self._tensor_poses = TensorPoses(self.scenes, layout, self._data)
         self._force = np.zeros((layout.row_count, 3), dtype=np.float32)
         self._torque = np.zeros((layout.row_count, 3), dtype=np.float32)
         env_of = {id(scene): env for env, scene in enumerate(self.scenes)}
@@ -292,7 +294,8 @@ class BatchedCpuSystem:
             if lengths != self._pose_lengths:
                 # Cameras are added after the scene is laid out: each makes its env's pack longer.
                 starts = np.cumsum([0, *lengths[:-1]])
-                self._link_pose_at = layout.link_pose_at + starts[layout.link_env][:, None]
+                rows = layout.link_rows
+                self._link_pose_at = layout.pose_at[rows] + starts[layout.env_of_row[rows]][:, None]
                 self._pose_lengths = lengths
             self._posed = np.frombuffer(b"".join(packs), dtype=np.float32)
         return self._posed[self._link_pose_at]
@@ -336,6 +339,11 @@ class BatchedCpuSystem:
         layout, packed = self._laid_out, self._pack()
         self._targets.fetched(packed[layout.target_qpos_at])
         self._velocity_targets.fetched(packed[layout.target_qvel_at])
+
+    def elsewhere(self, envs: Sequence[int]) -> dict[int, Places]:
+        """By env: bodies that the tensor has elsewhere than SAPIEN, and where it has them; see `drawn_poses`."""
+        self._catch_up()
+        return {} if self._layout is None else self._tensor_poses.elsewhere(envs)
 
     def replace(self, env: int, scene: sapien.Scene) -> None:
         """Another scene, over another system, has all entities of this env now, in the same order."""

@@ -18,6 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from workbench.core import seams
+from workbench.core.drawn_poses import NOWHERE_ELSE, Places, camera_pose
 from workbench.core.pictures import Picture
 from workbench.core.take_pictures import Request, cameras_of, take_pictures
 from workbench.core.task_env import TaskEnv
@@ -50,6 +51,7 @@ def observed_pictures(task: TaskEnv, requests: Sequence[Request]) -> list[Seen] 
     whoever encodes them can do without."""
     seen: list[Seen] = []
     cameras = cameras_of(task.env) if requests else {}
+    elsewhere = _elsewhere(task, range(task.num_envs)) if requests else {}
     for name, kind, modalities in requests:
         images = _images(task, name, kind, modalities)
         camera = cameras.get(("sensor", name))
@@ -60,7 +62,7 @@ def observed_pictures(task: TaskEnv, requests: Sequence[Request]) -> list[Seen] 
             return None
         components = seams.camera_components(camera)
         assert components is not None, "`cameras_of` names no others"
-        poses = [component.get_global_pose() for component in components]
+        poses = [camera_pose(c, elsewhere.get(env, NOWHERE_ELSE)) for env, c in enumerate(components)]
         held = {modality: image.numpy().copy() for modality, image in images.items()}
         seen.append(
             Seen(
@@ -99,7 +101,8 @@ def _observed(task: TaskEnv, env_index: int, request: Request) -> Picture | None
     scene: Any = task.env.scene
     if scene.gpu_sim_enabled:
         scene.px.sync_poses_gpu_to_cpu()
-    pose = components[env_index].get_global_pose()
+    places = _elsewhere(task, [env_index]).get(env_index, NOWHERE_ELSE)
+    pose = camera_pose(components[env_index], places)
     segmentation = rows.get("segmentation")
     return Picture(
         camera=name,
@@ -110,6 +113,11 @@ def _observed(task: TaskEnv, env_index: int, request: Request) -> Picture | None
         depth=None if depth is None else depth[..., 0].astype(np.float32) / np.float32(1000.0),
         segmentation=None if segmentation is None else segmentation[..., 0].astype(np.int32),
     )
+
+
+def _elsewhere(task: TaskEnv, envs: Sequence[int]) -> dict[int, Places]:
+    px = seams.batched_system(task.env.scene)
+    return {} if px is None else px.elsewhere(envs)
 
 
 def _row(images: torch.Tensor, env_index: int) -> NDArray:

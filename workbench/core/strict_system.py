@@ -209,7 +209,7 @@ class StrictCpuSystem(BatchedCpuSystem):
             now[rows] = seen[rows]
         for name, mine in _by_name(lost_rows, names):
             where, frames = envs_named(envs[mine]), self._writes.frames(group, mine)
-            seen_by = ", pictures on the GPU do" if what == "pose" else ""
+            seen_by = ", pictures do, here and on the GPU" if what == "pose" else ""
             if group == "links" and what == "pose" and not np.isin(mine, roots).any():
                 self.rules.breaks(
                     "link-pose-set",

@@ -13,7 +13,7 @@ give for the state: its own shaders and texture transforms make them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from workbench.core import seams
 from workbench.core.body_table import BodyTable, build_body_table
 from workbench.core.camera_configs import rows_of_pose, settings_of, target_of
+from workbench.core.drawn_poses import NOWHERE_ELSE, Places, drawn_at
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 
 _MODALITIES = ("rgb", "depth", "segmentation", "position", "normal", "albedo")
@@ -100,8 +101,8 @@ def take_pictures(
     """Render the cameras that are asked for, in env `env_index`; in the order asked.
 
     Args:
-        poses: (B, 7) where to draw the env's bodies, as `body_table.read_poses` gives them; None for where they
-            are. Only what is drawn moves, so a moment of the past can be looked at while the simulation is
+        poses: (B, 7) where to draw the env's bodies, as `body_table.read_poses` gives them; None for where the
+            tensors have them, applied or not (`drawn_poses`). Only what is drawn moves, so a moment of the past can be looked at while the simulation is
             elsewhere. A camera rides along with the body that it is mounted on; colours and lights are today's.
 
     Raises:
@@ -161,9 +162,10 @@ def begin_pictures(
     sub_scene = scene.sub_scenes[env_index]
     taken = []
     components = [_components(cameras[kind, name])[env_index] for name, kind, _ in requests]
+    places = places_to_draw(env, env_index, poses)
     with (
         hidden_objects(env, env_index, shown=kinds == {"human"}),
-        drawn_at(env, env_index, components, poses) as move_bodies,
+        drawn_at(places, components) as move_bodies,
     ):
         sub_scene.update_render()
         move_bodies()
@@ -175,41 +177,17 @@ def begin_pictures(
     return BegunPictures(tuple(taken))
 
 
-@contextmanager
-def drawn_at(
-    env: Any, env_index: int, components: Sequence[Any], poses: NDArray[np.float32] | None
-) -> Iterator[Callable[[], None]]:
-    """Draw the bodies of an env at `poses`, with the cameras on them, and leave the bodies where they are.
+def places_to_draw(env: Any, env_index: int, poses: NDArray[np.float32] | None) -> Places:
+    """Which entities of an env to draw elsewhere than they are; ask before anything is shown or hidden.
 
-    Gives the function that moves what is drawn, to be called after ``update_render``, which draws every body
-    where it is. Cameras are drawn by ``update_render``, so those on a body are moved before it.
+    Args:
+        poses: as in `take_pictures`.
     """
-    if poses is None:
-        yield lambda: None
-        return
-    row = build_body_table(env).entities[env_index]
-    then = {id(entity): pose for entity, pose in zip(row, poses, strict=True) if np.isfinite(pose).all()}
-    was: list[tuple[Any, sapien.Pose]] = []
-    for component in components:
-        pose = then.get(id(component.entity))
-        if pose is not None:
-            was.append((component, component.local_pose))
-            there = sapien.Pose(pose[:3], pose[3:])
-            component.local_pose = component.entity.pose.inv() * there * component.local_pose
-
-    def move_bodies() -> None:
-        for entity in row:
-            pose = then.get(id(entity))
-            for drawn in [] if pose is None else entity.components:
-                if pose is not None and isinstance(drawn, sapien.render.RenderBodyComponent):
-                    drawn._internal_node.set_position(pose[:3])
-                    drawn._internal_node.set_rotation(pose[3:])
-
-    try:
-        yield move_bodies
-    finally:
-        for component, local_pose in was:
-            component.local_pose = local_pose
+    if poses is not None:
+        each = zip(build_body_table(env).entities[env_index], poses, strict=True)
+        return {id(entity): (entity, pose) for entity, pose in each if np.isfinite(pose).all()}
+    px = seams.batched_system(env.scene)
+    return NOWHERE_ELSE if px is None else px.elsewhere([env_index]).get(env_index, NOWHERE_ELSE)
 
 
 def cameras_of(env: Any) -> dict[tuple[CameraKind, str], Any]:

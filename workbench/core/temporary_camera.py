@@ -23,8 +23,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from workbench.core import seams
 from workbench.core.camera_frames import checked_intrinsic
+from workbench.core.drawn_poses import drawn_at
 from workbench.core.pictures import CameraKind
-from workbench.core.take_pictures import depth_in_metres, drawn_at, hidden_objects
+from workbench.core.take_pictures import depth_in_metres, hidden_objects, places_to_draw
 
 _SHADER = PREBUILT_SHADER_CONFIGS["minimal"]
 _TEXTURE = "PositionSegmentation"
@@ -72,7 +73,7 @@ def temporary_camera(
         kind: sensors do not see what the task hides from them.
         size: width and height in pixels.
         intrinsic: (3, 3) in those pixels.
-        poses: (B, 7) where to draw the env's bodies; None for where they are (see `take_pictures`).
+        poses: (B, 7) where to draw the env's bodies; None for where the tensors have them.
 
     Raises:
         IndexError: there is no such env.
@@ -91,9 +92,10 @@ def temporary_camera(
         raise RuntimeError("the env was made without a render device, and so without cameras")
     if scene.gpu_sim_enabled:
         scene.px.sync_poses_gpu_to_cpu()
+    places = places_to_draw(env, env_index, poses)
     with ExitStack() as after:
         after.enter_context(hidden_objects(env, env_index, shown=kind == "human"))
-        move_bodies = after.enter_context(drawn_at(env, env_index, [], poses))
+        move_bodies = after.enter_context(drawn_at(places))
         beside = sapien.Scene([render_system])
         entity = sapien.Entity()
         with _minimal_shader(env):

@@ -162,7 +162,7 @@ def judge_camera(
     Args:
         settings: in the frame of the camera's mount, the same in all envs; None for each env's own camera.
         size: of the pictures that are judged, None for the camera's own; the view stays the same (`small_size`).
-        poses: (N, B, 7) where to draw the bodies, as `read_poses` gives them; None for where they are.
+        poses: (N, B, 7) where to draw the bodies, as `read_poses` gives them; None for where the tensors have them.
         table: the env's bodies; made anew if left out.
         cancelled: asked before each env; when it says yes, the report is of the envs that were judged until then.
 
