@@ -1,4 +1,4 @@
-"""From what a person names (a file, a class in it, a registered id) to the task class.
+"""From what a person names (a file, a class in it or in a module, a registered id) to the task class.
 
 A load is all or nothing. The file is executed afresh, with the modules beside it, and either gives
 a class, or the process is as it was: the last good version's modules stand in ``sys.modules``
@@ -15,7 +15,7 @@ import importlib
 import inspect
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -23,21 +23,25 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from workbench.authoring import registry
-from workbench.authoring.library_names import (
-    files_named_like_libraries,
-    named_like_library,
-    search_first,
-    stop_guarding,
-)
+from workbench.authoring.import_problems import import_problem, named_module_problem
+from workbench.authoring.library_names import named_like_library, search_first, stop_guarding
 from workbench.authoring.modules import (
     AuthorFinder,
+    ModuleName,
     SetAside,
     hidden_by_libraries,
     put_back,
     read_source,
     set_aside,
 )
-from workbench.authoring.problem import Problem, TaskError, problem_from_exception, shorten
+from workbench.authoring.named_modules import (
+    NamedModule,
+    find_module,
+    is_module_name,
+    not_found,
+    split_reference,
+)
+from workbench.authoring.problem import Problem, TaskError, shorten
 from workbench.authoring.reference import RecordedTask, TaskName
 
 if TYPE_CHECKING:
@@ -101,7 +105,7 @@ _loads: dict[Path, _Load] = {}
 
 
 def load_task(reference: TaskName, source: Mapping[str, str] | None = None) -> LoadedTask:
-    """Import the task that `reference` names: ``file.py``, ``file.py:ClassName`` or a registered id.
+    """Import the task that `reference` names: ``file.py``, ``file.py:ClassName``, ``package.module:ClassName`` or an id.
 
     What a recording names (`RecordedTask`) is a registered id, or texts that a person agreed to; no path out of a
     recording is followed.
@@ -112,10 +116,12 @@ def load_task(reference: TaskName, source: Mapping[str, str] | None = None) -> L
     """
     if isinstance(reference, RecordedTask):
         return _load_recorded(reference, source or {})
+    given = {str(_resolve(path)): text for path, text in (source or {}).items()}
+    if registry.environment(reference) is None and (named := split_reference(reference)) is not None:
+        return _load_named(*named, given)
     file, class_name = _parse(reference)
     if file is None:
         return _registered(reference)
-    given = {str(_resolve(path)): text for path, text in (source or {}).items()}
     if str(file) not in given:
         _check_file(file)
     return _load_file(file, class_name, given)
@@ -156,7 +162,7 @@ def _load_recorded(task: RecordedTask, source: Mapping[str, str]) -> LoadedTask:
         # A file that was asked about and not approved is not here; `env_id` may look like a path, and is none.
         if registry.environment(task.env_id) is None:
             raise _refused(
-                f"a recording names the task {task.env_id!r}, and no installed package registers one of that id"
+                f"a recording names the task {task.env_id!r}, and no installed package registers one of that id. {IMPORT_HINT}"
             )
         return _registered(task.env_id)
     if task.file is None or task.file not in task.approved:
@@ -164,11 +170,87 @@ def _load_recorded(task: RecordedTask, source: Mapping[str, str]) -> LoadedTask:
     return _load_file(Path(task.file), task.class_name, {**task.approved, **source}, only_given=True)
 
 
+def import_module(name: str) -> ModuleType:
+    """Import a module that a person named, as Python does it; see `named_modules` for where it is looked for.
+
+    Raises TaskError.
+    """
+    if name in sys.modules:
+        return sys.modules[name]
+    found = find_module(name)
+    if found is None:
+        raise _refused(not_found(name))
+    if found.search_folder is not None and str(found.search_folder) not in sys.path:
+        search_first(found.search_folder, for_good=True)
+    try:
+        return importlib.import_module(name)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as exc:
+        raise TaskError(named_module_problem(exc, found)) from exc
+
+
+def import_modules(names: Sequence[str]) -> None:
+    """Import what a person named with ``--import``, for the ids that it registers. Raises TaskError."""
+    for name in names:
+        import_module(name)
+
+
+def class_of_module(name: str, class_name: str) -> type[BaseEnv]:
+    """A task class of a module that is imported as Python does it. Raises TaskError."""
+    module = import_module(name)
+    cls = getattr(module, class_name, None)
+    if not isinstance(cls, type) or not registry.is_task(cls):
+        names = [value.__name__ for value in vars(module).values() if registry.is_task(value)]
+        raise _no_such_class(class_name, cls, name, Path(module.__file__ or name), names)
+    return cls
+
+
+def _load_named(name: str, class_name: str, given: dict[str, str]) -> LoadedTask:
+    """``package.module:ClassName``: as its file is loaded, with the package's modules beside it.
+
+    A library's module is imported as it is: nobody edits it, and others have its classes.
+    """
+    found = find_module(name)
+    if found is None:
+        raise _refused(not_found(name))
+    place = _place_of(found)
+    if place is None:
+        cls = class_of_module(name, class_name)
+        return dataclasses.replace(task_of_class(cls, registry.id_of(cls) or class_name), followed=False)
+    task = _load_file(found.file, class_name, given, named=place)
+    home = sys.modules[task.cls.__module__]
+    file = Path(home.__file__ or found.file)
+    if file == found.file or str(file) not in task.source:
+        return task
+    # A package imports its tasks from the modules in which they are written: there is what is edited and followed.
+    _revert(_loads[found.file])
+    return _load_file(
+        file, task.class_name, given, named=dataclasses.replace(place, name=task.cls.__module__)
+    )
+
+
+def _place_of(found: NamedModule) -> ModuleName | None:
+    if found.search_folder is None or found.own_folder is None:
+        return None
+    return ModuleName(found.name, found.search_folder, found.own_folder)
+
+
 def _load_file(
-    file: Path, class_name: str | None, given: dict[str, str], only_given: bool = False
+    file: Path,
+    class_name: str | None,
+    given: dict[str, str],
+    only_given: bool = False,
+    named: ModuleName | None = None,
 ) -> LoadedTask:
-    finder = AuthorFinder(file, given, only_given)
-    others = {load.finder.main for path, load in _loads.items() if path != file}
+    finder = AuthorFinder(file, given, only_given, named)
+    # Of a package that was named everything is read again, the module in which its task is written too.
+    package = None if named is None else named.own_folder
+    others = {
+        load.finder.main
+        for path, load in _loads.items()
+        if path != file and not (package is not None and path.is_relative_to(package))
+    }
     load = _begin(finder, set_aside(finder, others.__contains__))
     with registry.registering(finder.texts.__contains__, load.registrations):
         try:
@@ -176,7 +258,7 @@ def _load_file(
             task = _choose(module, class_name, finder, load.registrations)
         except BaseException as exc:
             # Before anything is put back: the problem's lines are those of the text that failed.
-            problem = None if isinstance(exc, KeyboardInterrupt) else _import_problem(exc, finder)
+            problem = None if isinstance(exc, KeyboardInterrupt) else import_problem(exc, finder)
             _revert(load)
             if problem is None:
                 raise
@@ -236,6 +318,8 @@ def _parse(reference: str) -> tuple[Path | None, str | None]:
         if not name.isidentifier():
             raise _refused(f"{reference!r}: after the colon comes the name of a class, as in push.py:PushEnv")
         return _resolve(match["file"]), name
+    if is_module_name(reference) and not _exists(reference) and find_module(reference) is not None:
+        raise _refused(f"{reference} is a module: name the class in it too, as in {reference}:MyTask")
     if _looks_like_path(reference):
         return _resolve(reference), None
     raise _unknown_id(reference)
@@ -298,7 +382,13 @@ def _unknown_id(env_id: str) -> TaskError:
     ids = {known.lower(): known for known in registry.environment_ids()}
     close = [ids[name] for name in difflib.get_close_matches(env_id.lower(), list(ids), n=3)]
     hint = f"did you mean {' or '.join(close)}?" if close else "give a .py file, or an id such as PickCube-v1"
-    return _refused(f"no task is registered as {env_id!r}, and there is no such file; {hint}")
+    return _refused(f"no task is registered as {env_id!r}, and there is no such file; {hint} {IMPORT_HINT}")
+
+
+IMPORT_HINT = (
+    "An id that a package of yours registers is known once that is imported: --import PACKAGE on the command line, "
+    "`import package` before workbench.make."
+)
 
 
 def _refused(message: str, file: Path | None = None) -> TaskError:
@@ -374,7 +464,8 @@ def _choose(
             (cls for cls in reversed(candidates) if cls.__name__ == wanted), getattr(module, wanted, None)
         )
         if not registry.is_task(cls):
-            raise _no_such_class(wanted, cls, finder, [cls.__name__ for cls in candidates])
+            names = [cls.__name__ for cls in candidates]
+            raise _no_such_class(wanted, cls, finder.file.name, finder.file, names)
     elif candidates:
         cls = candidates[-1]
     else:
@@ -392,7 +483,7 @@ def _choose(
         followed=True,
         others=tuple(other.__name__ for other in candidates if other is not cls),
         replaced_ids=registrations.replaced_names(),
-        named_like_libraries=hidden_by_libraries(finder.file),
+        named_like_libraries=hidden_by_libraries(finder.file, finder.search_folder),
         **_source_fields(finder),
     )
 
@@ -404,17 +495,16 @@ def _source_fields(finder: AuthorFinder) -> dict[str, Any]:
     return {
         "source_files": tuple(files),
         "source": {str(path): source[str(path)] for path in files},
-        "source_hash": source_hash(source, finder.file.parent),
+        "source_hash": source_hash(source, finder.own_folder),
     }
 
 
-def _no_such_class(wanted: str, found: object, finder: AuthorFinder, names: list[str]) -> TaskError:
-    name = finder.file.name
+def _no_such_class(wanted: str, found: object, name: str, file: Path, names: list[str]) -> TaskError:
     if found is not None:
-        return _refused(f"{wanted} in {name} is not a class that inherits BaseEnv", finder.file)
+        return _refused(f"{wanted} in {name} is not a class that inherits BaseEnv", file)
     close = difflib.get_close_matches(wanted, names, n=1)
     hint = f"did you mean {close[0]}?" if close else f"it has {', '.join(names) or 'no task class at all'}"
-    return _refused(f"there is no class {wanted} in {name}; {hint}", finder.file)
+    return _refused(f"there is no class {wanted} in {name}; {hint}", file)
 
 
 def _no_class(module: ModuleType, finder: AuthorFinder) -> TaskError:
@@ -431,57 +521,3 @@ def _no_class(module: ModuleType, finder: AuthorFinder) -> TaskError:
             "tasks/minimal.py"
         )
     return _refused(f"no class in {name} inherits BaseEnv; {hint}", finder.file)
-
-
-# --- what went wrong -----------------------------------------------------------------------------
-
-
-def _import_problem(exc: BaseException, finder: AuthorFinder) -> Problem:
-    if isinstance(exc, TaskError):
-        return exc.problem
-    problem = problem_from_exception(exc, "import", [Path(path) for path in finder.texts])
-    message = problem.message
-    if isinstance(exc, registry.DuplicateName):
-        message = str(exc)
-    elif isinstance(exc, SystemExit):
-        message = (
-            f"the file ended the program (SystemExit: {exc.code}) while being imported; what is only for "
-            'running it as a script belongs under `if __name__ == "__main__":`'
-        )
-    elif isinstance(exc, ModuleNotFoundError) and exc.name:
-        message = f"{message}; {_module_hint(exc.name, finder)}"
-    elif isinstance(exc, ImportError) and (file := _named_like(exc.name, finder)) is not None:
-        message = f"{message}; {named_like_library(file)}"
-    elif isinstance(exc, OSError) and exc.filename == str(finder.file) and problem.file is None:
-        message = f"{finder.file} cannot be read: {exc.strerror}; is it being written just now?"
-    if problem.file is None:
-        # Nothing of the author's ran yet, but it is this file that cannot be had.
-        problem = dataclasses.replace(problem, file=str(finder.file))
-    return dataclasses.replace(problem, message=message)
-
-
-def _named_like(name: str | None, finder: AuthorFinder) -> Path | None:
-    """The author's file that was meant, where a library has its name."""
-    top = (name or "").partition(".")[0]
-    return next((file for file in files_named_like_libraries(finder.search_folder) if file.stem == top), None)
-
-
-def _module_hint(name: str, finder: AuthorFinder) -> str:
-    if (file := _named_like(name, finder)) is not None:
-        return named_like_library(file)
-    top = name.partition(".")[0]
-    if Path(f"{top}.py").is_file() or Path(top, "__init__.py").is_file():
-        return (
-            f"there is one in the folder where the command was started, which is not searched: move {top} beside the "
-            "file, or name its folder in PYTHONPATH"
-        )
-    beside = [path.stem for path in finder.file.parent.glob("*.py") if path != finder.file]
-    if finder.only_given and name.rpartition(".")[2] in beside:
-        return (
-            f"{name} lies beside the file, but was not among what you were asked about; open {finder.file} by its name "
-            "to run it with all that lies beside it"
-        )
-    close = difflib.get_close_matches(name, beside, n=1)
-    if close:
-        return f"there is {close[0]}.py beside the file"
-    return f"neither beside the file nor installed for {sys.executable}"

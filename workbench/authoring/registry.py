@@ -93,6 +93,11 @@ def environment(env_id: str) -> EnvSpec | None:
     return REGISTERED_ENVS.get(env_id)
 
 
+def id_of(cls: type) -> str | None:
+    """The id that a class is registered under; None if it is under none."""
+    return next((name for name in environment_ids() if REGISTERED_ENVS[name].cls is cls), None)
+
+
 def environment_ids() -> list[str]:
     return sorted(REGISTERED_ENVS)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from workbench.authoring.problem import Problem
-from workbench.authoring.reference import RecordedTask, TaskName, named_file
+from workbench.authoring.reference import RecordedTask, TaskName, class_beside, followed_folder, named_file
 from workbench.core.inspection import Inspection
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.snapshot_bytes import WholeSnapshot
@@ -114,6 +114,8 @@ class LiveState:
         self.seed = self.options.seed
         self.own_file = named_file(self.reference)
         """The file that was named, whether or not it ever loaded; None for an env id."""
+        self.own_folder = followed_folder(self.reference)
+        """Modules in or below it are followed with the file; None where nothing is."""
 
     @property
     def timeline(self) -> Timeline | None:
@@ -280,15 +282,12 @@ class LiveState:
         """Ask for another task class of the same file. False if the file has no such class."""
         if self.task is None or self.own_file is None or name not in self.task.others:
             return False
-        if isinstance(self.reference, RecordedTask):
-            self.reference = replace(self.reference, class_name=name)
-        else:
-            self.reference = f"{self.own_file}:{name}"
+        self.reference = class_beside(self.reference, Path(self.task.file or self.own_file), name)
         return True
 
     def open_file(self, file: Path, class_name: str) -> None:
         """Ask for a class of another file."""
-        self.reference, self.own_file = f"{file}:{class_name}", file
+        self.reference, self.own_file, self.own_folder = f"{file}:{class_name}", file, file.parent
 
     def file_is_edited(self) -> None:
         """A file that a recording named is open live and is saved: from now on it is what is on disk that is open."""

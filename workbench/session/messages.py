@@ -54,6 +54,8 @@ class TaskOptions:
     """Further keyword arguments of the task class (``robot_uids``, ``obs_mode`` ...)."""
     rules: Degree | None = None
     """The degree of all rules of GPU simulation; None for each rule's own, see `core.rules`."""
+    imports: tuple[str, ...] = ()
+    """Modules that a person named on the command line, imported before the task is looked for: they register its id."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from workbench.authoring import registry
-from workbench.authoring.load import LoadedTask, load_task, take_back, with_late_imports
+from workbench.authoring.load import LoadedTask, import_modules, load_task, take_back, with_late_imports
 from workbench.authoring.problem import Problem, TaskError, problem_from_exception
 from workbench.authoring.reference import TaskName
 from workbench.authoring.returns import check_step_returns, problem_from_return
@@ -64,6 +64,7 @@ def open_task(
     """
     clock = Clock()
     on_activity(f"importing {str(reference).rsplit('/', 1)[-1]}")
+    import_modules(options.imports)
     loaded = load_task(reference)
     clock.lap("import")
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from workbench.authoring.changes import RESET_HOOKS, Change, find_change
 from workbench.authoring.inherited import inherited_by
-from workbench.authoring.load import LoadedTask, load_task, take_back, with_late_imports
+from workbench.authoring.load import LoadedTask, import_modules, load_task, take_back, with_late_imports
 from workbench.authoring.modules import read_source
 from workbench.authoring.problem import TaskError
 from workbench.authoring.same_function import line_in
@@ -80,6 +80,7 @@ def load_version(
     began, clock = perf_counter(), Clock()
     before = None if running is None else with_late_imports(running.opened.loaded)
     on_activity(f"importing {str(request.task).rsplit('/', 1)[-1]}")
+    import_modules(request.options.imports)
     loaded = load_task(request.task, source=request.source)
     clock.lap("import")
     try:
