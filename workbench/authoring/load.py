@@ -41,8 +41,15 @@ from workbench.authoring.named_modules import (
     not_found,
     split_reference,
 )
-from workbench.authoring.problem import Problem, TaskError, shorten
+from workbench.authoring.problem import TaskError, refused
 from workbench.authoring.reference import RecordedTask, TaskName
+from workbench.authoring.task_classes import (
+    ChosenTask,
+    Robot,
+    choose_task,
+    no_such_class,
+    shown_in_a_scene,
+)
 
 if TYPE_CHECKING:
     from mani_skill.envs.sapien_env import BaseEnv
@@ -70,7 +77,9 @@ class LoadedTask:
     followed: bool
     """True for a file that is to be followed; False for an id that was registered elsewhere."""
     others: tuple[str, ...] = ()
-    """Further task classes of the file, to be had as ``file.py:Name``."""
+    """Further task classes of the file, and robots if it has no task, to be had as ``file.py:Name``."""
+    robot: Robot | None = None
+    """Of a file that has no task: the one that is shown in a scene of ManiSkill's."""
     replaced_ids: tuple[str, ...] = ()
     """Ids that belonged to somebody else (``PickCube-v1``): plain ManiSkill would have skipped this
     file's class under them."""
@@ -78,9 +87,16 @@ class LoadedTask:
     """Files in the folder that it imports from, and that no import finds there."""
 
     @property
+    def chosen(self) -> str:
+        """The name in the file of what is open: a task class, or a robot's."""
+        return self.class_name if self.robot is None else self.robot.class_name
+
+    @property
     def notices(self) -> tuple[str, ...]:
         """What its author should know although it works, in sentences."""
         found = [named_like_library(file) for file in self.named_like_libraries]
+        if self.robot is not None and self.file is not None:
+            found.append(shown_in_a_scene(self.robot, self.file))
         if self.replaced_ids:
             ids = ", ".join(self.replaced_ids)
             found.append(
@@ -98,6 +114,7 @@ class _Load:
     """The load of the same file that this one replaced."""
     aside: SetAside | None
     """What stood in ``sys.modules`` before it; None once another load has built on this one."""
+    chosen: ChosenTask | None = None
 
 
 _loads: dict[Path, _Load] = {}
@@ -141,7 +158,7 @@ def take_back(task: LoadedTask) -> bool:
     load = None if task.file is None or not task.followed else _loads.get(task.file)
     if load is None or load.aside is None or sys.modules.get(load.finder.main) is None:
         return False
-    if vars(sys.modules[load.finder.main]).get(task.class_name) is not task.cls:
+    if load.chosen is None or load.chosen.cls is not task.cls:
         return False
     _revert(load)
     return True
@@ -161,12 +178,12 @@ def _load_recorded(task: RecordedTask, source: Mapping[str, str]) -> LoadedTask:
     if task.approved is None:
         # A file that was asked about and not approved is not here; `env_id` may look like a path, and is none.
         if registry.environment(task.env_id) is None:
-            raise _refused(
+            raise refused(
                 f"a recording names the task {task.env_id!r}, and no installed package registers one of that id. {IMPORT_HINT}"
             )
         return _registered(task.env_id)
     if task.file is None or task.file not in task.approved:
-        raise _refused(f"the texts that were agreed to do not hold the file of {task.env_id}")
+        raise refused(f"the texts that were agreed to do not hold the file of {task.env_id}")
     return _load_file(Path(task.file), task.class_name, {**task.approved, **source}, only_given=True)
 
 
@@ -179,7 +196,7 @@ def import_module(name: str) -> ModuleType:
         return sys.modules[name]
     found = find_module(name)
     if found is None:
-        raise _refused(not_found(name))
+        raise refused(not_found(name))
     if found.search_folder is not None and str(found.search_folder) not in sys.path:
         search_first(found.search_folder, for_good=True)
     try:
@@ -202,7 +219,7 @@ def class_of_module(name: str, class_name: str) -> type[BaseEnv]:
     cls = getattr(module, class_name, None)
     if not isinstance(cls, type) or not registry.is_task(cls):
         names = [value.__name__ for value in vars(module).values() if registry.is_task(value)]
-        raise _no_such_class(class_name, cls, name, Path(module.__file__ or name), names)
+        raise no_such_class(class_name, cls, name, Path(module.__file__ or name), names)
     return cls
 
 
@@ -213,7 +230,7 @@ def _load_named(name: str, class_name: str, given: dict[str, str]) -> LoadedTask
     """
     found = find_module(name)
     if found is None:
-        raise _refused(not_found(name))
+        raise refused(not_found(name))
     place = _place_of(found)
     if place is None:
         cls = class_of_module(name, class_name)
@@ -255,7 +272,7 @@ def _load_file(
     with registry.registering(finder.texts.__contains__, load.registrations):
         try:
             module = importlib.import_module(finder.main)
-            task = _choose(module, class_name, finder, load.registrations)
+            task = _task_in(module, class_name, load)
         except BaseException as exc:
             # Before anything is put back: the problem's lines are those of the text that failed.
             problem = None if isinstance(exc, KeyboardInterrupt) else import_problem(exc, finder)
@@ -307,7 +324,7 @@ def _revert(load: _Load) -> None:
 def _parse(reference: str) -> tuple[Path | None, str | None]:
     """File and class of `reference`; (None, None) for a registered id."""
     if not reference.strip():
-        raise _refused(
+        raise refused(
             "no task named; give a .py file, file.py:ClassName, or a registered id like PickCube-v1"
         )
     if registry.environment(reference) is not None:
@@ -316,10 +333,10 @@ def _parse(reference: str) -> tuple[Path | None, str | None]:
     if match is not None and not _exists(reference):
         name = match["cls"]
         if not name.isidentifier():
-            raise _refused(f"{reference!r}: after the colon comes the name of a class, as in push.py:PushEnv")
+            raise refused(f"{reference!r}: after the colon comes the name of a class, as in push.py:PushEnv")
         return _resolve(match["file"]), name
     if is_module_name(reference) and not _exists(reference) and find_module(reference) is not None:
-        raise _refused(f"{reference} is a module: name the class in it too, as in {reference}:MyTask")
+        raise refused(f"{reference} is a module: name the class in it too, as in {reference}:MyTask")
     if _looks_like_path(reference):
         return _resolve(reference), None
     raise _unknown_id(reference)
@@ -346,7 +363,7 @@ def _resolve(path: str | Path) -> Path:
     try:
         return Path(path).expanduser().resolve()
     except (OSError, RuntimeError, ValueError) as exc:  # no such user's home; a loop of links; a null byte
-        raise _refused(f"{str(path)!r} is not a path that can be opened: {exc}") from exc
+        raise refused(f"{str(path)!r} is not a path that can be opened: {exc}") from exc
 
 
 def _check_file(file: Path) -> None:
@@ -354,45 +371,41 @@ def _check_file(file: Path) -> None:
         if file.is_dir():
             names = sorted(path.name for path in file.glob("*.py"))[:5]
             inside = f", for example {' or '.join(names)}" if names else " (there is none in it)"
-            raise _refused(f"{file} is a folder; name a .py file in it{inside}")
+            raise refused(f"{file} is a folder; name a .py file in it{inside}")
         if not file.exists():
             raise _missing(file)
         if not file.is_file():
             # A pipe, say: reading it would wait for ever. A device, which a link may lead to, may have no end.
-            raise _refused(f"{file} is not an ordinary file")
+            raise refused(f"{file} is not an ordinary file")
         if file.suffix != ".py":
-            raise _refused(
+            raise refused(
                 f"{file} is not a .py file; a task is one Python file with a class that inherits BaseEnv"
             )
     except OSError as exc:
-        raise _refused(f"cannot look at the file ({exc.strerror}): {file}") from exc
+        raise refused(f"cannot look at the file ({exc.strerror}): {file}") from exc
 
 
 def _missing(file: Path) -> TaskError:
     if not file.parent.is_dir():
-        return _refused(f"{file} does not exist, nor does its folder {file.parent}")
+        return refused(f"{file} does not exist, nor does its folder {file.parent}")
     names = difflib.get_close_matches(file.name, [path.name for path in file.parent.glob("*.py")], n=3)
     hint = f"; did you mean {' or '.join(names)}?" if names else ""
-    return _refused(f"{file} does not exist{hint}")
+    return refused(f"{file} does not exist{hint}")
 
 
 def _unknown_id(env_id: str) -> TaskError:
     if registry.is_other_gymnasium_id(env_id):
-        return _refused(f"{env_id} is a gymnasium environment, but not one of ManiSkill's (no BaseEnv)")
+        return refused(f"{env_id} is a gymnasium environment, but not one of ManiSkill's (no BaseEnv)")
     ids = {known.lower(): known for known in registry.environment_ids()}
     close = [ids[name] for name in difflib.get_close_matches(env_id.lower(), list(ids), n=3)]
     hint = f"did you mean {' or '.join(close)}?" if close else "give a .py file, or an id such as PickCube-v1"
-    return _refused(f"no task is registered as {env_id!r}, and there is no such file; {hint} {IMPORT_HINT}")
+    return refused(f"no task is registered as {env_id!r}, and there is no such file; {hint} {IMPORT_HINT}")
 
 
 IMPORT_HINT = (
     "An id that a package of yours registers is known once that is imported: --import PACKAGE on the command line, "
     "`import package` before workbench.make."
 )
-
-
-def _refused(message: str, file: Path | None = None) -> TaskError:
-    return TaskError(Problem("import", shorten(message), None if file is None else str(file), None, None, ""))
 
 
 # --- the class -----------------------------------------------------------------------------------
@@ -444,45 +457,22 @@ def _registered(env_id: str) -> LoadedTask:
     return dataclasses.replace(task_of_class(spec.cls, env_id), followed=False)
 
 
-def _choose(
-    module: ModuleType, wanted: str | None, finder: AuthorFinder, registrations: registry.Registrations
-) -> LoadedTask:
-    """The wanted class, or the one defined last, registered classes before others."""
-    file = str(finder.file)
-    defined = [
-        value
-        for value in vars(module).values()
-        if registry.is_task(value) and value.__module__ == module.__name__
-    ]
-    registered = {
-        made.cls: made.name for made in registrations.made if made.file == file and registry.is_task(made.cls)
-    }
-    # Registered ones last, in the order of their registration: the last of all is the default.
-    candidates = [cls for cls in dict.fromkeys(defined) if cls not in registered] + list(registered)
-    if wanted is not None:
-        cls = next(
-            (cls for cls in reversed(candidates) if cls.__name__ == wanted), getattr(module, wanted, None)
-        )
-        if not registry.is_task(cls):
-            names = [cls.__name__ for cls in candidates]
-            raise _no_such_class(wanted, cls, finder.file.name, finder.file, names)
-    elif candidates:
-        cls = candidates[-1]
-    else:
-        raise _no_class(module, finder)
-    assert isinstance(cls, type)
-    env_id = registered.get(cls)
-    spec = None if env_id is None else registry.environment(env_id)
+def _task_in(module: ModuleType, wanted: str | None, load: _Load) -> LoadedTask:
+    finder = load.finder
+    text = finder.texts[str(finder.file)]
+    load.chosen = chosen = choose_task(module, wanted, finder.file, text, load.registrations)
+    spec = None if chosen.env_id is None else registry.environment(chosen.env_id)
     return LoadedTask(
-        cls=cls,
-        env_id=env_id or cls.__name__,
-        class_name=cls.__name__,
+        cls=chosen.cls,
+        env_id=chosen.env_id or chosen.cls.__name__,
+        class_name=chosen.cls.__name__,
         file=finder.file,
         max_episode_steps=None if spec is None else spec.max_episode_steps,
-        default_kwargs={} if spec is None else dict(spec.default_kwargs),
+        default_kwargs={**({} if spec is None else spec.default_kwargs), **chosen.kwargs},
         followed=True,
-        others=tuple(other.__name__ for other in candidates if other is not cls),
-        replaced_ids=registrations.replaced_names(),
+        others=chosen.others,
+        robot=chosen.robot,
+        replaced_ids=load.registrations.replaced_names(),
         named_like_libraries=hidden_by_libraries(finder.file, finder.search_folder),
         **_source_fields(finder),
     )
@@ -497,27 +487,3 @@ def _source_fields(finder: AuthorFinder) -> dict[str, Any]:
         "source": {str(path): source[str(path)] for path in files},
         "source_hash": source_hash(source, finder.own_folder),
     }
-
-
-def _no_such_class(wanted: str, found: object, name: str, file: Path, names: list[str]) -> TaskError:
-    if found is not None:
-        return _refused(f"{wanted} in {name} is not a class that inherits BaseEnv", file)
-    close = difflib.get_close_matches(wanted, names, n=1)
-    hint = f"did you mean {close[0]}?" if close else f"it has {', '.join(names) or 'no task class at all'}"
-    return _refused(f"there is no class {wanted} in {name}; {hint}", file)
-
-
-def _no_class(module: ModuleType, finder: AuthorFinder) -> TaskError:
-    name = finder.file.name
-    if not finder.texts[str(finder.file)].strip():
-        return _refused(f"{name} is empty; a task is a class that inherits BaseEnv", finder.file)
-    imported = [value for value in vars(module).values() if registry.is_task(value)]
-    if imported:
-        cls = imported[-1]
-        hint = f"{cls.__name__} is imported from {cls.__module__}: name that file, or inherit from it here"
-    else:
-        hint = (
-            "write `class MyTask(BaseEnv):` with BaseEnv from mani_skill.envs.sapien_env, or begin from "
-            "tasks/minimal.py"
-        )
-    return _refused(f"no class in {name} inherits BaseEnv; {hint}", finder.file)

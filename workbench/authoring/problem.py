@@ -90,6 +90,11 @@ class TaskError(Exception):
         return place + self.problem.message
 
 
+def refused(message: str, file: Path | None = None) -> TaskError:
+    """A task that cannot be had for a reason that no line of its author's raised."""
+    return TaskError(Problem("import", shorten(message), None if file is None else str(file), None, None, ""))
+
+
 def problem_from_exception(
     exc: BaseException, stage: str, own_files: Collection[Path], cls: type | None = None
 ) -> Problem:

@@ -30,6 +30,7 @@ import mani_skill.envs  # noqa: F401  (registers the built-in tasks, which a fil
 from gymnasium.envs.registration import registry as gymnasium_registry
 from mani_skill import agents
 from mani_skill.agents import registration as agent_registration
+from mani_skill.agents.base_agent import BaseAgent
 from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.envs.sapien_env import BaseEnv
 
@@ -109,6 +110,10 @@ def is_other_gymnasium_id(env_id: str) -> bool:
 
 def is_task(value: object) -> bool:
     return isinstance(value, type) and issubclass(value, BaseEnv) and value is not BaseEnv
+
+
+def is_robot(value: object) -> bool:
+    return isinstance(value, type) and issubclass(value, BaseAgent) and value is not BaseAgent
 
 
 @contextmanager

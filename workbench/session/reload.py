@@ -112,16 +112,18 @@ def _what_changed(
         return Change("rebuilt", "")
     if not loaded.followed:
         return Change("rebuilt", "it was asked for")
-    if (before.file, before.class_name, before.env_id) != (loaded.file, loaded.class_name, loaded.env_id):
+    if (before.file, before.chosen, before.env_id) != (loaded.file, loaded.chosen, loaded.env_id):
         if loaded.file is not None and before.file != loaded.file:
-            return Change("rebuilt", f"{loaded.file.name} was opened in place of {before.class_name}")
-        return Change("rebuilt", f"{loaded.class_name} is another task than {before.class_name}")
+            return Change("rebuilt", f"{loaded.file.name} was opened in place of {before.chosen}")
+        return Change("rebuilt", f"{loaded.chosen} is another task than {before.chosen}")
     if replace(running.request.options, seed=0) != replace(request.options, seed=0):
         return Change("rebuilt", "the options changed")
     files = {*before.source, *loaded.source}
     inherited = inherited_by(loaded.cls, files)
     texts = {**_still_there(before, request), **loaded.source}
     change = find_change(before.source, texts, str(loaded.file), loaded.class_name, inherited)
+    if loaded.robot is not None and change.level != "same":
+        return Change("rebuilt", f"a robot is part of the scene ({change.reason})")
     if request.level in ("auto", change.level):
         return change
     said = f"{request.level} was asked for"
@@ -262,7 +264,7 @@ def _moment(request: Load, running: Running | None, loaded: LoadedTask) -> Snaps
     """What is to be shown after the build; None for a fresh episode."""
     if request.snapshot is not None:
         return pickle.loads(request.snapshot)
-    if running is None or running.opened.loaded.class_name != loaded.class_name:
+    if running is None or running.opened.loaded.chosen != loaded.chosen:
         return None
     return running.opened.env.snapshot()
 
