@@ -58,7 +58,7 @@ def open_page(
     Args:
         task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
         num_envs: environments to run at once.
-        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (gpu if it works).
+        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto: cpu, while no test of gpu has passed anywhere.
         seed: seed of the first reset; env i gets seed + i.
         host: address to listen on; anything but this machine's own needs the token.
         port: port of the page; 0 takes any free one.
@@ -133,7 +133,7 @@ def record(
         out: folder for the files.
         pictures: record what every camera sees (--no-pictures is much faster).
         max_steps: longest episode; else the task's own limit.
-        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (gpu if it works).
+        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto: cpu, while no test of gpu has passed anywhere.
         rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
             given, what writes over the state of other envs stops, all else is a warning.
         env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
@@ -232,7 +232,7 @@ def rescore(
         recorded_source: judge each by the text that it was recorded with.
         use_env_states: put every recorded state in after its step, so that nothing drifts from the record.
         num_envs: episodes to run at once.
-        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (gpu if it works).
+        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto: cpu, while no test of gpu has passed anywhere.
         rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
             given, what writes over the state of other envs stops, all else is a warning.
         csv: also write the table to this file, as CSV.

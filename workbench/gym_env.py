@@ -72,8 +72,9 @@ def make(
             (``lab.tasks:PushEnv``) or a class that inherits BaseEnv. A file is executed anew with each call, as the
             page does; an id that it registers is then known to ``gym.make`` too. A module is imported as by ``import``.
         num_envs: how many envs stand in the batch.
-        backend: ``cpu``: batched on the CPU. ``gpu``: ManiSkill's GPU simulation. ``auto``: the GPU where
-            CUDA and PhysX's GPU library are there, else the CPU. Takes the place of ``sim_backend``.
+        backend: ``cpu``: batched on the CPU. ``gpu``: ManiSkill's GPU simulation, which needs CUDA and PhysX's GPU
+            library. ``auto``: the CPU, also where there is a GPU, since the tests of GPU simulation have passed
+            nowhere so far. Takes the place of ``sim_backend``.
         max_episode_steps: the time limit; None for the registered one, -1 for none.
         threads: how many step the envs on the CPU; None for one on each core that the process may use.
         rules: of GPU simulation, checked on the CPU: ``stop`` raises where one is broken, ``warn`` warns, ``off``

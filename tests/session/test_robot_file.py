@@ -39,7 +39,7 @@ def test_a_robot_stands_in_the_scene_and_is_built_anew_by_a_save(tmp_path: Path)
         again, report = load_version(request, Running(request, opened, last))
         try:
             assert report is not None and report.level == "rebuilt" and "robot" in report.reason
-            assert again.env.env.agent.arm_stiffness == 5e2
+            assert again.env.env.agent.arm_stiffness == 5e2  # pyright: ignore[reportAttributeAccessIssue]
             np.testing.assert_allclose(again.first.poses, last.poses, atol=1e-6)
         finally:
             again.env.close()

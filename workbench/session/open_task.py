@@ -22,7 +22,7 @@ from workbench.authoring.problem import Problem, TaskError, problem_from_excepti
 from workbench.authoring.reference import TaskName
 from workbench.authoring.returns import check_step_returns, problem_from_return
 from workbench.core import actions
-from workbench.core.backends import find_renderer
+from workbench.core.backends import find_renderer, gpu_left_alone
 from workbench.core.broken_rule import BrokenRule, WrongReturn, class_is_installed, warn_of
 from workbench.core.env_kwargs import env_kwargs
 from workbench.core.rules import Degree, Finding
@@ -113,6 +113,7 @@ def build_task(
         on_activity("reading the shapes")
         loaded = with_late_imports(loaded)
         description = describe(loaded, task, options.env_kwargs, loaded.max_episode_steps)
+        description = replace(description, notices=notices_of(loaded, options))
         clock.lap("geometry")
     except BaseException:
         env.close()
@@ -191,8 +192,13 @@ def describe(
         others=loaded.others if loaded.followed else (),
         env_kwargs=env_kwargs(env, {**loaded.default_kwargs, **given}),
         objects=objects_to_see(env, task.table),
-        notices=loaded.notices if loaded.followed else (),
     )
+
+
+def notices_of(loaded: LoadedTask, options: TaskOptions) -> tuple[str, ...]:
+    """What whoever opens it should know although it works, in sentences."""
+    gpu = gpu_left_alone(options.backend)
+    return (*(loaded.notices if loaded.followed else ()), *(() if gpu is None else (gpu,)))
 
 
 def returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, Any], Any], None]:

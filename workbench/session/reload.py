@@ -43,6 +43,7 @@ from workbench.session.open_task import (
     OpenedTask,
     blamed,
     build_task,
+    notices_of,
     reset_checked,
     returns_check,
 )
@@ -192,7 +193,7 @@ def _exchange(
         source=dict(loaded.source),
         max_episode_steps=loaded.max_episode_steps,
         others=loaded.others,
-        notices=loaded.notices,
+        notices=notices_of(loaded, running.request.options),
     )
     if change.level == "cameras":
         description = replace(description, cameras=list_cameras(env, task.table))
