@@ -58,6 +58,14 @@ _FILE_AND_CLASS = re.compile(r"(?P<file>.+\.py):(?P<cls>[^/\\]*)", re.DOTALL)
 
 
 @dataclass(frozen=True)
+class Refused:
+    """A class of the file that could not be opened."""
+
+    name: str
+    why: str
+
+
+@dataclass(frozen=True)
 class LoadedTask:
     cls: type[BaseEnv]
     env_id: str
@@ -78,6 +86,10 @@ class LoadedTask:
     """True for a file that is to be followed; False for an id that was registered elsewhere."""
     others: tuple[str, ...] = ()
     """Further task classes of the file, and robots if it has no task, to be had as ``file.py:Name``."""
+    alternatives: tuple[str, ...] = ()
+    """Those that may be opened in its place if it fails, in the order of trying; none where a class was named."""
+    in_place_of: Refused | None = None
+    """What was tried first, and failed."""
     robot: Robot | None = None
     """Of a file that has no task: the one that is shown in a scene of ManiSkill's."""
     replaced_ids: tuple[str, ...] = ()
@@ -95,6 +107,9 @@ class LoadedTask:
     def notices(self) -> tuple[str, ...]:
         """What its author should know although it works, in sentences."""
         found = [named_like_library(file) for file in self.named_like_libraries]
+        if self.in_place_of is not None:
+            name, why = self.in_place_of.name, self.in_place_of.why
+            found.append(f"{name} was tried first and failed ({why}): {self.chosen} is open in its place.")
         if self.robot is not None and self.file is not None:
             found.append(shown_in_a_scene(self.robot, self.file))
         if self.replaced_ids:
@@ -471,6 +486,7 @@ def _task_in(module: ModuleType, wanted: str | None, load: _Load) -> LoadedTask:
         default_kwargs={**({} if spec is None else spec.default_kwargs), **chosen.kwargs},
         followed=True,
         others=chosen.others,
+        alternatives=chosen.alternatives,
         robot=chosen.robot,
         replaced_ids=load.registrations.replaced_names(),
         named_like_libraries=hidden_by_libraries(finder.file, finder.search_folder),

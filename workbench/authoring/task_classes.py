@@ -7,6 +7,7 @@ for that (``Empty-v1``), in which it stands alone.
 from __future__ import annotations
 
 import difflib
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
@@ -38,6 +39,8 @@ class ChosenTask:
     """None for a class that is not registered."""
     others: tuple[str, ...]
     """What else of the file can be named."""
+    alternatives: tuple[str, ...] = ()
+    """Those of them that may be opened in its place where none was named and it fails, in the order of trying."""
     kwargs: dict[str, Any] = field(default_factory=dict)
     """For the constructor, besides those of the registration."""
     robot: Robot | None = None
@@ -87,7 +90,18 @@ def choose_task(
             raise no_such_class(wanted, cls, file.name, file, names or list(robots))
     assert isinstance(cls, type)
     others = tuple(other.__name__ for other in candidates if other is not cls)
-    return ChosenTask(cls, registered.get(cls), others)
+    return ChosenTask(
+        cls, registered.get(cls), others, () if wanted else _alternatives(cls, candidates, registered)
+    )
+
+
+def _alternatives(cls: type, candidates: list[type], registered: Collection[type]) -> tuple[str, ...]:
+    """Not what the tasks of a file have in common: a base class may open, and shows nothing."""
+    return tuple(
+        other.__name__
+        for other in reversed(candidates)
+        if other is not cls and not issubclass(cls, other) and (other in registered) == (cls in registered)
+    )
 
 
 def _in_a_scene(module: ModuleType, class_name: str, robots: dict[str, registry.Registration]) -> ChosenTask:
@@ -97,7 +111,7 @@ def _in_a_scene(module: ModuleType, class_name: str, robots: dict[str, registry.
     cls = type(spec.cls.__name__, (spec.cls,), {"__module__": module.__name__})
     uid = robots[class_name].name
     others = tuple(name for name in robots if name != class_name)
-    return ChosenTask(cls, _SCENE, others, {"robot_uids": uid}, Robot(class_name, uid))
+    return ChosenTask(cls, _SCENE, others, kwargs={"robot_uids": uid}, robot=Robot(class_name, uid))
 
 
 def shown_in_a_scene(robot: Robot, file: Path) -> str:

@@ -18,7 +18,13 @@ from typing import Any
 
 from workbench.authoring import registry
 from workbench.authoring.load import LoadedTask, import_modules, load_task, take_back, with_late_imports
-from workbench.authoring.problem import Problem, TaskError, problem_from_exception
+from workbench.authoring.problem import (
+    MESSAGE_LIMIT,
+    Problem,
+    TaskError,
+    problem_from_exception,
+    shorten,
+)
 from workbench.authoring.reference import TaskName
 from workbench.authoring.returns import check_step_returns, problem_from_return
 from workbench.core import actions
@@ -70,11 +76,27 @@ def open_task(
 
     try:
         return build_task(loaded, options, clock, on_activity, on_finding)
+    except TaskError as error:
+        take_back(loaded)
+        raise with_classes(error, loaded) from error.__cause__
     except BaseException:
         # The class imported and cannot be used: without this the last good version would go on with
         # the new version's helper modules and registrations behind its back.
         take_back(loaded)
         raise
+
+
+def with_classes(error: TaskError, loaded: LoadedTask) -> TaskError:
+    """Of a task that failed: also what else of its file can be opened."""
+    if not loaded.others or loaded.file is None:
+        return error
+    problem, file = error.problem, loaded.file.name
+    more = f"{loaded.chosen} of {file} was tried, which also has {', '.join(loaded.others)}: name one, as in {file}:{loaded.others[0]}"
+    room = MESSAGE_LIMIT - len(more) - 3
+    message = shorten(problem.message, max(room, MESSAGE_LIMIT // 2))
+    return TaskError(
+        replace(problem, message=shorten(f"{message} ({more})")), (loaded.chosen, *loaded.others)
+    )
 
 
 def build_task(
@@ -189,7 +211,9 @@ def describe(
         cameras=list_cameras(env, task.table),
         segmentation=segmentation_names(env, task.table),
         can_render=can_render,
+        chosen=loaded.chosen,
         others=loaded.others if loaded.followed else (),
+        in_place_of=None if loaded.in_place_of is None else loaded.in_place_of.name,
         env_kwargs=env_kwargs(env, {**loaded.default_kwargs, **given}),
         objects=objects_to_see(env, task.table),
     )
