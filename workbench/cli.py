@@ -20,12 +20,15 @@ import tyro
 from workbench.exit_codes import Exit
 from workbench.machine.guarded_terminal import guard_terminal
 from workbench.machine.software_vulkan import use_private_driver
-from workbench.task_arguments import Backend, Rules, history_bytes, task_options
+from workbench.task_arguments import Backend, Rules, history_bytes, imported, task_options
 from workbench.terminal import err, print_finding, print_problem, refuse
 from workbench.terminal import out as terminal
 
 Task = Annotated[str, tyro.conf.Positional]
-"""A task file, ``file.py:ClassName``, or a registered env id such as ``PickCube-v1``."""
+"""A task file, ``file.py:ClassName``, ``package.module:ClassName``, or a registered env id such as ``PickCube-v1``."""
+
+Imports = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="import")]
+"""Modules that register tasks."""
 
 app = tyro.extras.SubcommandApp()
 
@@ -48,13 +51,14 @@ def open_page(
     trust: bool = False,
     rules: Rules = None,
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    imports: Imports = (),
 ) -> int:
     """Open a task in a browser page that follows its file.
 
     Args:
-        task: a task file, file.py:ClassName, or a registered env id such as PickCube-v1.
+        task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
         num_envs: environments to run at once.
-        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (gpu if it works).
+        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto: cpu, while no test of gpu has passed anywhere.
         seed: seed of the first reset; env i gets seed + i.
         host: address to listen on; anything but this machine's own needs the token.
         port: port of the page; 0 takes any free one.
@@ -71,19 +75,20 @@ def open_page(
         rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
             given, what writes over the state of other envs stops, all else is a warning.
         env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
+        imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
+            repeatable.
     """
-    from workbench.authoring.reference import named_file
+    from workbench.authoring.reference import why_not_there
 
-    file = named_file(task)
-    if file is not None and not file.is_file():
-        return refuse(f"there is no file {file}")
+    if (why := why_not_there(task)) is not None:
+        return refuse(why)
     from workbench.page_command import open_in_terminal
     from workbench.session.kept_worker import WorkerOptions
     from workbench.session.memory_limit import parse_memory
     from workbench.ui.door import DoorOptions
 
     try:
-        options = task_options(num_envs, backend, seed, env, rules)
+        options = task_options(num_envs, backend, seed, env, rules, imports)
         past = history_bytes(history)
         worker = WorkerOptions(parse_memory(memory_limit), spare)
         at = DoorOptions(host=host, port=port, socket=socket, token=token)
@@ -110,11 +115,12 @@ def record(
     backend: Backend = "auto",
     rules: Rules = None,
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
+    imports: Imports = (),
 ) -> int:
     """Record episodes of a task without a page: for each an .rrd, and ManiSkill's own .h5 with its .json.
 
     Args:
-        task: a task file, file.py:ClassName, or a registered env id such as PickCube-v1.
+        task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
         episodes: how many, over all envs; 4, or as many as a file of actions has.
         successes: go on until so many episodes succeeded, and keep no others.
         tries: give up after so many episodes where successes are wanted; 100 for each.
@@ -127,17 +133,19 @@ def record(
         out: folder for the files.
         pictures: record what every camera sees (--no-pictures is much faster).
         max_steps: longest episode; else the task's own limit.
-        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (gpu if it works).
+        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto: cpu, while no test of gpu has passed anywhere.
         rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
             given, what writes over the state of other envs stops, all else is a warning.
         env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
+        imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
+            repeatable.
     """
     use_private_driver()
     from workbench.record_command import record_in_terminal
     from workbench.session.record import RecordOptions
 
     try:
-        options = task_options(num_envs, backend, seed, env, rules)
+        options = task_options(num_envs, backend, seed, env, rules, imports)
     except ValueError as error:
         return refuse(str(error))
     what = RecordOptions(
@@ -156,6 +164,7 @@ def review(
     token: bool = True,
     rules: Rules = None,
     task: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = (),
+    imports: Imports = (),
     trust: bool = False,
 ) -> int:
     """Look through a folder of recordings in a browser page: play, compare, share. No task file is needed.
@@ -172,6 +181,8 @@ def review(
             to check none. If not given, what writes over the state of other envs stops, all else is a warning.
         task: a task file in which the envs of ManiSkill's recordings may be found; repeatable. Envs that ManiSkill
             itself has need none.
+        imports: a module that registers ids that recordings name, such as lab.tasks, imported in the processes that
+            run their tasks; repeatable.
         trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it.
     """
     if not folder.is_dir():
@@ -186,13 +197,15 @@ def review(
     from workbench.page_command import review_in_terminal
     from workbench.session.kept_worker import WorkerOptions
     from workbench.session.memory_limit import parse_memory
+    from workbench.session.messages import TaskOptions
     from workbench.ui.door import DoorOptions
 
     try:
         at = DoorOptions(host=host, port=port, socket=socket, token=token)
+        base = TaskOptions(rules=rules, imports=imported(imports))
     except ValueError as error:
         return refuse(str(error))
-    return review_in_terminal(folder, task, at, WorkerOptions(parse_memory("auto")), rules, trust)
+    return review_in_terminal(folder, task, at, WorkerOptions(parse_memory("auto")), base, trust)
 
 
 @app.command
@@ -207,21 +220,25 @@ def rescore(
     rules: Rules = None,
     csv: Path | None = None,
     json: Path | None = None,
+    imports: Imports = (),
     trust: bool = False,
 ) -> int:
     """Judge recorded episodes again with today's reward and evaluate, and say what is otherwise (on the page: Judge again).
 
     Args:
         places: recordings (.json, .h5 or .rrd of the workbench, .h5 of ManiSkill's RecordEpisode) and folders of them.
-        task: a task file, file.py:ClassName or id to judge all of them with, in place of the one each names.
+        task: a task file, file.py:ClassName, package.module:ClassName or id to judge all of them with, in place of the
+            one each names.
         recorded_source: judge each by the text that it was recorded with.
         use_env_states: put every recorded state in after its step, so that nothing drifts from the record.
         num_envs: episodes to run at once.
-        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto (gpu if it works).
+        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto: cpu, while no test of gpu has passed anywhere.
         rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
             given, what writes over the state of other envs stops, all else is a warning.
         csv: also write the table to this file, as CSV.
         json: also write the table to this file, as JSON.
+        imports: a module that registers ids that recordings name, such as lab.tasks, imported in the processes that
+            run their tasks; repeatable.
         trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it. Without
             it, and without a terminal to ask in, nothing is run and the exit code is 4.
     """
@@ -233,7 +250,7 @@ def rescore(
         if table is not None and not table.resolve().parent.is_dir():
             return refuse(f"there is no folder {table.resolve().parent} to write {table.name} into")
     try:
-        base = task_options(num_envs, backend, 0, (), rules)
+        base = task_options(num_envs, backend, 0, (), rules, imports)
     except ValueError as error:
         return refuse(str(error))
     use_private_driver()

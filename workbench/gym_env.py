@@ -32,7 +32,8 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.observations import CameraObsTextures
 
 from workbench.authoring import registry
-from workbench.authoring.load import load_task
+from workbench.authoring.load import class_of_module, load_task
+from workbench.authoring.named_modules import split_reference
 from workbench.core.backends import BackendUnavailable, find_renderer
 from workbench.core.broken_rule import class_is_installed
 from workbench.core.rules import Degree
@@ -67,12 +68,13 @@ def make(
     """A gymnasium env of `num_envs` envs, as ``gym.make`` gives it for a GPU.
 
     Args:
-        task: a registered id (``PickCube-v1``), a file (``push.py``, ``push.py:PushEnv``) or a class that
-            inherits BaseEnv. A file is executed anew with each call, as the page does; an id that it
-            registers is then known to ``gym.make`` too.
+        task: a registered id (``PickCube-v1``), a file (``push.py``, ``push.py:PushEnv``), a class of a module
+            (``lab.tasks:PushEnv``) or a class that inherits BaseEnv. A file is executed anew with each call, as the
+            page does; an id that it registers is then known to ``gym.make`` too. A module is imported as by ``import``.
         num_envs: how many envs stand in the batch.
-        backend: ``cpu``: batched on the CPU. ``gpu``: ManiSkill's GPU simulation. ``auto``: the GPU where
-            CUDA and PhysX's GPU library are there, else the CPU. Takes the place of ``sim_backend``.
+        backend: ``cpu``: batched on the CPU. ``gpu``: ManiSkill's GPU simulation, which needs CUDA and PhysX's GPU
+            library. ``auto``: the CPU, also where there is a GPU, since the tests of GPU simulation have passed
+            nowhere so far. Takes the place of ``sim_backend``.
         max_episode_steps: the time limit; None for the registered one, -1 for none.
         threads: how many step the envs on the CPU; None for one on each core that the process may use.
         rules: of GPU simulation, checked on the CPU: ``stop`` raises where one is broken, ``warn`` warns, ``off``
@@ -185,7 +187,11 @@ def _find(task: str | Path | type[BaseEnv]) -> _Found:
         raise TypeError(
             f"make() takes a registered id, a file or a class that inherits BaseEnv, not {type(task).__name__}"
         )
-    loaded = load_task(str(task))
+    task = str(task)
+    named = None if registry.environment(task) is not None else split_reference(task)
+    if named is not None:
+        return _registered_class(class_of_module(*named))
+    loaded = load_task(task)
     for notice in loaded.notices:
         warnings.warn(notice, stacklevel=3)
     spec = registry.environment(loaded.env_id)
@@ -203,9 +209,8 @@ def _find(task: str | Path | type[BaseEnv]) -> _Found:
 def _registered_class(cls: type) -> _Found:
     if not registry.is_task(cls):
         raise TypeError(f"{cls.__name__} does not inherit mani_skill.envs.sapien_env.BaseEnv")
-    for env_id in registry.environment_ids():
-        spec = registry.environment(env_id)
-        if spec is not None and spec.cls is cls:
-            limit, assets = spec.max_episode_steps, spec.asset_download_ids or ()
-            return _Found(cls, env_id, limit, dict(spec.default_kwargs), assets, class_is_installed(cls))
+    env_id = registry.id_of(cls)
+    if env_id is not None and (spec := registry.environment(env_id)) is not None:
+        limit, assets = spec.max_episode_steps, spec.asset_download_ids or ()
+        return _Found(cls, env_id, limit, dict(spec.default_kwargs), assets, class_is_installed(cls))
     return _Found(cls, cls.__name__, None, {}, (), class_is_installed(cls))

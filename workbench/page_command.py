@@ -22,7 +22,6 @@ from workbench.recording.reading import start_reading
 from workbench.session.kept_worker import WorkerOptions
 from workbench.session.messages import Event, Failed, Loaded, TaskOptions
 from workbench.session.session import Session
-from workbench.task_arguments import Rules
 from workbench.terminal import out, print_event, print_line, refuse, say, warn
 from workbench.ui.commands import Command
 from workbench.ui.door import Door, DoorError, DoorOptions, open_door
@@ -71,10 +70,11 @@ def open_in_terminal(
         on_line=print_line,
         on_notice=warn,
     )
-    place = Workplace(door.server, recordings, session, on_notice=warn)
+    place = Workplace(door.server, recordings, session, imports=options.imports, on_notice=warn)
     what = f"{task}, {options.num_envs} envs"
     beside = WorkerOptions(worker.memory_limit)
-    _serve(door, place, "live", what, recordings, beside, options.rules, end, session.close, trust)
+    base = TaskOptions(rules=options.rules, imports=options.imports)
+    _serve(door, place, "live", what, recordings, beside, base, end, session.close, trust)
 
 
 def review_in_terminal(
@@ -82,21 +82,21 @@ def review_in_terminal(
     tasks: tuple[Path, ...],
     at: DoorOptions,
     worker: WorkerOptions,
-    rules: Rules,
+    base: TaskOptions,
     trust: bool = False,
 ) -> int:
     """Serve the page of a folder of recordings; returns only where the door cannot be opened.
 
     Args:
-        worker, rules: Of tasks that are opened from there.
+        worker, base: Of tasks that are opened from there.
         trust: Run what recordings name without asking.
     """
     door = _opened(at, "Recordings")
     if isinstance(door, int):
         return door
-    place = Workplace(door.server, folder, tasks=tasks, on_notice=warn)
+    place = Workplace(door.server, folder, tasks=tasks, imports=base.imports, on_notice=warn)
     _serve(
-        door, place, "review", f"recordings in {folder}", folder, worker, rules, _End(), lambda: None, trust
+        door, place, "review", f"recordings in {folder}", folder, worker, base, _End(), lambda: None, trust
     )
 
 
@@ -120,7 +120,7 @@ def _serve(
     what: str,
     recordings: Path,
     worker: WorkerOptions,
-    rules: Rules,
+    base: TaskOptions,
     end: _End,
     close_session: Callable[[], None],
     trust: bool,
@@ -140,7 +140,7 @@ def _serve(
     place.offer(sharing.offer)
     if door.options.token:
         place.commands = (Command("Renew the token and close every page", end.renew),)
-    close_others = offer_going_back_in(place, open_task, rules, trust)
+    close_others = offer_going_back_in(place, open_task, base, trust)
     end.at_signals()
     try:
         place.pages.start(first)

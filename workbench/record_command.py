@@ -25,6 +25,7 @@ from workbench.authoring.library_names import named_like_library
 from workbench.authoring.modules import hidden_by_libraries
 from workbench.authoring.problem import Problem, TaskError
 from workbench.authoring.reference import named_file
+from workbench.core.backends import gpu_left_alone
 from workbench.core.rules import Finding
 from workbench.recording.landing import try_folder
 from workbench.recording.mend import mend
@@ -79,6 +80,8 @@ def record_in_terminal(
         file = named_file(what.task)
         for hidden in () if file is None else hidden_by_libraries(file.resolve()):
             console.print(f"[yellow]{escape(named_like_library(hidden))}[/]", soft_wrap=True)
+        if (left_alone := gpu_left_alone(what.options.backend)) is not None:
+            console.print(f"[yellow]{escape(left_alone)}[/]", soft_wrap=True)
         with Bar(*columns, console=console) as bar:
             row = bar.add_task("opening", total=asked.successes or asked.episodes)
             with _StopAtInterrupt(lambda words: bar.update(row, description=words)) as interrupt:

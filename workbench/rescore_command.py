@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsed
 from rich.progress import Progress as Bar
 from rich.table import Table
 
+from workbench.core.backends import gpu_left_alone
 from workbench.core.rules import Finding
 from workbench.exit_codes import Exit
 from workbench.machine.current_folder import CurrentFolder
@@ -36,6 +37,8 @@ def run_rescore(
 ) -> int:
     """Judge, print, write the tables that are asked for; raises as `rescore_all`, and OSError for a table."""
     here = CurrentFolder()  # a task may go to another
+    if (left_alone := gpu_left_alone(what.base.backend)) is not None:
+        err.print(f"[yellow]{escape(left_alone)}[/]", soft_wrap=True)
     asks = can_ask()  # before the bar takes the terminal
     columns = (
         TextColumn("{task.description}", markup=False),

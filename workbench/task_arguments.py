@@ -18,16 +18,35 @@ Rules = Literal["stop", "warn", "off"] | None
 
 
 def task_options(
-    num_envs: int, backend: Backend, seed: int, env: Sequence[str], rules: Rules = None
+    num_envs: int,
+    backend: Backend,
+    seed: int,
+    env: Sequence[str],
+    rules: Rules = None,
+    imports: Sequence[str] = (),
 ) -> TaskOptions:
-    """Of ``--num-envs``, ``--backend``, ``--seed``, each ``--env`` and ``--rules``."""
+    """Of ``--num-envs``, ``--backend``, ``--seed``, each ``--env``, ``--rules`` and each ``--import``."""
     from workbench.session.messages import TaskOptions
 
     if not 1 <= num_envs <= 4096:
         raise ValueError(f"--num-envs must be from 1 to 4096, not {num_envs}")
     if not 0 <= seed < 2**31:
         raise ValueError(f"--seed must be from 0 to {2**31 - 1}, not {seed}")
-    return TaskOptions(num_envs, backend, seed, dict(_env_argument(pair) for pair in env), rules)
+    return TaskOptions(
+        num_envs, backend, seed, dict(_env_argument(pair) for pair in env), rules, imported(imports)
+    )
+
+
+def imported(names: Sequence[str]) -> tuple[str, ...]:
+    """Of each ``--import``: modules, which are not imported here."""
+    from workbench.authoring.named_modules import find_module, is_module_name, not_found
+
+    for name in names:
+        if not is_module_name(name):
+            raise ValueError(f"--import takes the name of a module, as in --import lab.tasks; got {name!r}")
+        if find_module(name) is None:
+            raise ValueError(f"--import {name}: {not_found(name)}")
+    return tuple(names)
 
 
 def _env_argument(pair: str) -> tuple[str, Any]:

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import get_args
 
 import gymnasium as gym
 import mani_skill.envs  # noqa: F401  registers the ids
@@ -16,7 +17,7 @@ from hypothesis import strategies as st
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 
-from workbench.core import actions
+from workbench.core import actions, backends
 from workbench.core.assets import MissingAssets
 from workbench.core.backends import BackendUnavailable, choose_backend, why_no_gpu_simulation
 from workbench.core.task_env import EnvOptions, TaskEnv, default_reward_mode, make_env
@@ -191,6 +192,18 @@ def test_gpu_simulation_is_refused_with_the_reason_where_it_cannot_be() -> None:
     assert choose_backend("auto", render=False).simulation == "cpu"
     with pytest.raises(BackendUnavailable, match="--backend cpu"):
         choose_backend("gpu", render=False)
+
+
+def test_a_gpu_is_simulated_on_only_where_it_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No test of GPU simulation has passed anywhere: whoever takes it is to know."""
+    monkeypatch.setattr(backends, "why_no_gpu_simulation", lambda: None)
+    taken = {wanted: choose_backend(wanted, render=False).simulation for wanted in get_args(backends.Backend)}
+    assert taken == {"auto": "cpu", "cpu": "cpu", "gpu": "gpu"}
+    told = backends.gpu_left_alone("auto")
+    assert told is not None and "--backend gpu" in told and "passed its tests on no machine" in told
+    assert backends.gpu_left_alone("cpu") is backends.gpu_left_alone("gpu") is None
+    monkeypatch.setattr(backends, "why_no_gpu_simulation", lambda: "there is none")
+    assert backends.gpu_left_alone("auto") is None
 
 
 def test_a_number_of_envs_below_one_is_refused() -> None:

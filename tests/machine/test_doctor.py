@@ -46,6 +46,15 @@ def test_gpu_physics_is_looked_for_without_fetching_it(
     assert not list(tmp_path.rglob("*PhysX*"))
 
 
+def test_a_gpu_that_works_is_not_taken_unasked(monkeypatch: pytest.MonkeyPatch) -> None:
+    answer = '{"built": "12.8", "cuda": ["A card"], "why_not": null, "library": "/lib/PhysXGpu.so"}'
+    monkeypatch.setattr(doctor, "GPU_QUESTIONS", f"print('{answer}')")
+    cuda, physics = doctor._gpu()
+    assert cuda.ok and "A card" in cuda.what
+    assert "on the CPU core, unless you say --backend gpu" in physics.what
+    assert physics.advice and "--backend auto does not take it" in physics.advice
+
+
 def test_a_taken_port_is_said_with_the_option_to_change_it(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

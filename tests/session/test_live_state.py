@@ -191,12 +191,34 @@ def test_a_load_asks_for_the_class_and_the_seed_that_the_page_chose() -> None:
     assert not state.choose_class("Other")
     task = state.task
     assert task is not None
-    state.task = replace(task, others=("Other",))
+    state.task, state.choices = replace(task, others=("Other",)), ("PushEnv", "Other")
     assert state.choose_class("Other")
     state.seed = 7
     load = state.load_request(Wanted(None, b"moment"), "rebuilt")
     assert str(load.task).endswith("push.py:Other") and load.options == TaskOptions(seed=7)
     assert (load.source, load.level, load.snapshot) == (None, "rebuilt", b"moment")
+
+
+def test_the_version_that_ran_is_brought_back_although_another_class_is_asked_for() -> None:
+    state = running()
+    assert state.task is not None and state.step is not None
+    task = replace(
+        state.task, chosen="One", others=("Two",), file="/work/push.py", source_files=("/work/push.py",)
+    )
+    state.reference, state.own_file = "/work/push.py", Path("/work/push.py")
+    state.loaded(Loaded(task, state.step, {}), restored=False, stale=False)
+    assert state.choices == ("One", "Two")
+    assert state.choose_class("Two") and state.choices == ("Two", "One")
+    assert state.load_request(Wanted(None, None)).task == "/work/push.py:Two"
+    assert state.load_request(Wanted({"/work/push.py": "text"}, None)).task == "/work/push.py:One"
+    state.loaded(Loaded(task, state.step, {}), restored=True, stale=True)
+    assert state.choices == ("Two", "One"), "it is still what saves bring in"
+    assert state.choose_class("One")
+
+    tried = replace(task, in_place_of="Two")
+    state.reference = "/work/push.py"
+    state.loaded(Loaded(tried, state.step, {}), restored=False, stale=False)
+    assert state.load_request(Wanted(None, None)).task == "/work/push.py:One"
 
 
 def test_a_file_that_a_recording_named_is_what_was_agreed_to_until_it_is_saved() -> None:

@@ -19,7 +19,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from workbench.authoring.problem import TaskError
-from workbench.core import actions
+from workbench.core import actions, backends
 from workbench.core.seams import task_class
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import take_pictures
@@ -114,6 +114,16 @@ def test_an_edited_reward_is_computed_anew_for_this_moment_and_nothing_else_happ
     np.testing.assert_array_equal(now.poses, before.poses)
     np.testing.assert_array_equal(now.elapsed_steps, before.elapsed_steps)
     assert desk.step().elapsed_steps[0] == before.elapsed_steps[0] + 1
+
+
+def test_a_gpu_that_is_left_alone_is_told_of_in_every_version(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(backends, "why_no_gpu_simulation", lambda: None)
+    desk.edit("return reward\n", "return reward + 1\n")
+    assert "--backend gpu" in desk.running.opened.description.notices[-1]
+    desk.save(desk.good, "rebuilt")
+    assert "--backend gpu" in desk.running.opened.description.notices[-1]
 
 
 def test_right_after_a_reset_there_is_no_reward_yet(desk: Desk) -> None:

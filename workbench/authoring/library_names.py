@@ -38,6 +38,8 @@ _IMPORTED_BY_NOBODY = {"docs", "example", "examples", "scripts", "test", "tests"
 
 _author_folders: set[str] = set()
 """All that was ever put on ``sys.path`` for an author."""
+_guarded_for_good = False
+"""One of them stays there."""
 
 
 def is_own_file(path: str, folder: Path) -> bool:
@@ -89,8 +91,14 @@ def named_like_library(file: Path) -> str:
     )
 
 
-def search_first(folder: Path) -> None:
-    """Put an author's folder first on ``sys.path``, but for the names of libraries."""
+def search_first(folder: Path, for_good: bool = False) -> None:
+    """Put an author's folder first on ``sys.path``, but for the names of libraries.
+
+    Args:
+        for_good: It stays there, and `stop_guarding` does nothing any more.
+    """
+    global _guarded_for_good
+    _guarded_for_good = _guarded_for_good or for_good
     name = str(folder)
     # A file of an installed package is opened with the folder of all packages: that stays the libraries'.
     if folder.name not in _LIBRARY_FOLDERS and is_own_file(os.path.join(name, "x.py"), folder):
@@ -115,7 +123,9 @@ def searched_first(folder: Path) -> Iterator[None]:
 
 
 def stop_guarding() -> None:
-    """No author's folder is on ``sys.path`` any more."""
+    """No author's folder is on ``sys.path`` any more, unless one is there for good."""
+    if _guarded_for_good:
+        return
     sys.meta_path[:] = [finder for finder in sys.meta_path if not isinstance(finder, LibraryFinder)]
 
 

@@ -1,4 +1,4 @@
-"""From what a person names (a file, a class in it, a registered id) to the task class.
+"""From what a person names (a file, a class in it or in a module, a registered id) to the task class.
 
 A load is all or nothing. The file is executed afresh, with the modules beside it, and either gives
 a class, or the process is as it was: the last good version's modules stand in ``sys.modules``
@@ -15,7 +15,7 @@ import importlib
 import inspect
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -23,27 +23,46 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from workbench.authoring import registry
-from workbench.authoring.library_names import (
-    files_named_like_libraries,
-    named_like_library,
-    search_first,
-    stop_guarding,
-)
+from workbench.authoring.import_problems import import_problem, named_module_problem
+from workbench.authoring.library_names import named_like_library, search_first, stop_guarding
 from workbench.authoring.modules import (
     AuthorFinder,
+    ModuleName,
     SetAside,
     hidden_by_libraries,
     put_back,
     read_source,
     set_aside,
 )
-from workbench.authoring.problem import Problem, TaskError, problem_from_exception, shorten
+from workbench.authoring.named_modules import (
+    NamedModule,
+    find_module,
+    is_module_name,
+    not_found,
+    split_reference,
+)
+from workbench.authoring.problem import TaskError, refused
 from workbench.authoring.reference import RecordedTask, TaskName
+from workbench.authoring.task_classes import (
+    ChosenTask,
+    Robot,
+    choose_task,
+    no_such_class,
+    shown_in_a_scene,
+)
 
 if TYPE_CHECKING:
     from mani_skill.envs.sapien_env import BaseEnv
 
 _FILE_AND_CLASS = re.compile(r"(?P<file>.+\.py):(?P<cls>[^/\\]*)", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A class of the file that could not be opened."""
+
+    name: str
+    why: str
 
 
 @dataclass(frozen=True)
@@ -66,7 +85,13 @@ class LoadedTask:
     followed: bool
     """True for a file that is to be followed; False for an id that was registered elsewhere."""
     others: tuple[str, ...] = ()
-    """Further task classes of the file, to be had as ``file.py:Name``."""
+    """Further task classes of the file, and robots if it has no task, to be had as ``file.py:Name``."""
+    alternatives: tuple[str, ...] = ()
+    """Those that may be opened in its place if it fails, in the order of trying; none where a class was named."""
+    in_place_of: Refused | None = None
+    """What was tried first, and failed."""
+    robot: Robot | None = None
+    """Of a file that has no task: the one that is shown in a scene of ManiSkill's."""
     replaced_ids: tuple[str, ...] = ()
     """Ids that belonged to somebody else (``PickCube-v1``): plain ManiSkill would have skipped this
     file's class under them."""
@@ -74,9 +99,19 @@ class LoadedTask:
     """Files in the folder that it imports from, and that no import finds there."""
 
     @property
+    def chosen(self) -> str:
+        """The name in the file of what is open: a task class, or a robot's."""
+        return self.class_name if self.robot is None else self.robot.class_name
+
+    @property
     def notices(self) -> tuple[str, ...]:
         """What its author should know although it works, in sentences."""
         found = [named_like_library(file) for file in self.named_like_libraries]
+        if self.in_place_of is not None:
+            name, why = self.in_place_of.name, self.in_place_of.why
+            found.append(f"{name} was tried first and failed ({why}): {self.chosen} is open in its place.")
+        if self.robot is not None and self.file is not None:
+            found.append(shown_in_a_scene(self.robot, self.file))
         if self.replaced_ids:
             ids = ", ".join(self.replaced_ids)
             found.append(
@@ -94,6 +129,7 @@ class _Load:
     """The load of the same file that this one replaced."""
     aside: SetAside | None
     """What stood in ``sys.modules`` before it; None once another load has built on this one."""
+    chosen: ChosenTask | None = None
 
 
 _loads: dict[Path, _Load] = {}
@@ -101,7 +137,7 @@ _loads: dict[Path, _Load] = {}
 
 
 def load_task(reference: TaskName, source: Mapping[str, str] | None = None) -> LoadedTask:
-    """Import the task that `reference` names: ``file.py``, ``file.py:ClassName`` or a registered id.
+    """Import the task that `reference` names: ``file.py``, ``file.py:ClassName``, ``package.module:ClassName`` or an id.
 
     What a recording names (`RecordedTask`) is a registered id, or texts that a person agreed to; no path out of a
     recording is followed.
@@ -112,10 +148,12 @@ def load_task(reference: TaskName, source: Mapping[str, str] | None = None) -> L
     """
     if isinstance(reference, RecordedTask):
         return _load_recorded(reference, source or {})
+    given = {str(_resolve(path)): text for path, text in (source or {}).items()}
+    if registry.environment(reference) is None and (named := split_reference(reference)) is not None:
+        return _load_named(*named, given)
     file, class_name = _parse(reference)
     if file is None:
         return _registered(reference)
-    given = {str(_resolve(path)): text for path, text in (source or {}).items()}
     if str(file) not in given:
         _check_file(file)
     return _load_file(file, class_name, given)
@@ -135,7 +173,7 @@ def take_back(task: LoadedTask) -> bool:
     load = None if task.file is None or not task.followed else _loads.get(task.file)
     if load is None or load.aside is None or sys.modules.get(load.finder.main) is None:
         return False
-    if vars(sys.modules[load.finder.main]).get(task.class_name) is not task.cls:
+    if load.chosen is None or load.chosen.cls is not task.cls:
         return False
     _revert(load)
     return True
@@ -155,28 +193,104 @@ def _load_recorded(task: RecordedTask, source: Mapping[str, str]) -> LoadedTask:
     if task.approved is None:
         # A file that was asked about and not approved is not here; `env_id` may look like a path, and is none.
         if registry.environment(task.env_id) is None:
-            raise _refused(
-                f"a recording names the task {task.env_id!r}, and no installed package registers one of that id"
+            raise refused(
+                f"a recording names the task {task.env_id!r}, and no installed package registers one of that id. {IMPORT_HINT}"
             )
         return _registered(task.env_id)
     if task.file is None or task.file not in task.approved:
-        raise _refused(f"the texts that were agreed to do not hold the file of {task.env_id}")
+        raise refused(f"the texts that were agreed to do not hold the file of {task.env_id}")
     return _load_file(Path(task.file), task.class_name, {**task.approved, **source}, only_given=True)
 
 
+def import_module(name: str) -> ModuleType:
+    """Import a module that a person named, as Python does it; see `named_modules` for where it is looked for.
+
+    Raises TaskError.
+    """
+    if name in sys.modules:
+        return sys.modules[name]
+    found = find_module(name)
+    if found is None:
+        raise refused(not_found(name))
+    if found.search_folder is not None and str(found.search_folder) not in sys.path:
+        search_first(found.search_folder, for_good=True)
+    try:
+        return importlib.import_module(name)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as exc:
+        raise TaskError(named_module_problem(exc, found)) from exc
+
+
+def import_modules(names: Sequence[str]) -> None:
+    """Import what a person named with ``--import``, for the ids that it registers. Raises TaskError."""
+    for name in names:
+        import_module(name)
+
+
+def class_of_module(name: str, class_name: str) -> type[BaseEnv]:
+    """A task class of a module that is imported as Python does it. Raises TaskError."""
+    module = import_module(name)
+    cls = getattr(module, class_name, None)
+    if not isinstance(cls, type) or not registry.is_task(cls):
+        names = [value.__name__ for value in vars(module).values() if registry.is_task(value)]
+        raise no_such_class(class_name, cls, name, Path(module.__file__ or name), names)
+    return cls
+
+
+def _load_named(name: str, class_name: str, given: dict[str, str]) -> LoadedTask:
+    """``package.module:ClassName``: as its file is loaded, with the package's modules beside it.
+
+    A library's module is imported as it is: nobody edits it, and others have its classes.
+    """
+    found = find_module(name)
+    if found is None:
+        raise refused(not_found(name))
+    place = _place_of(found)
+    if place is None:
+        cls = class_of_module(name, class_name)
+        return dataclasses.replace(task_of_class(cls, registry.id_of(cls) or class_name), followed=False)
+    task = _load_file(found.file, class_name, given, named=place)
+    home = sys.modules[task.cls.__module__]
+    file = Path(home.__file__ or found.file)
+    if file == found.file or str(file) not in task.source:
+        return task
+    # A package imports its tasks from the modules in which they are written: there is what is edited and followed.
+    _revert(_loads[found.file])
+    return _load_file(
+        file, task.class_name, given, named=dataclasses.replace(place, name=task.cls.__module__)
+    )
+
+
+def _place_of(found: NamedModule) -> ModuleName | None:
+    if found.search_folder is None or found.own_folder is None:
+        return None
+    return ModuleName(found.name, found.search_folder, found.own_folder)
+
+
 def _load_file(
-    file: Path, class_name: str | None, given: dict[str, str], only_given: bool = False
+    file: Path,
+    class_name: str | None,
+    given: dict[str, str],
+    only_given: bool = False,
+    named: ModuleName | None = None,
 ) -> LoadedTask:
-    finder = AuthorFinder(file, given, only_given)
-    others = {load.finder.main for path, load in _loads.items() if path != file}
+    finder = AuthorFinder(file, given, only_given, named)
+    # Of a package that was named everything is read again, the module in which its task is written too.
+    package = None if named is None else named.own_folder
+    others = {
+        load.finder.main
+        for path, load in _loads.items()
+        if path != file and not (package is not None and path.is_relative_to(package))
+    }
     load = _begin(finder, set_aside(finder, others.__contains__))
     with registry.registering(finder.texts.__contains__, load.registrations):
         try:
             module = importlib.import_module(finder.main)
-            task = _choose(module, class_name, finder, load.registrations)
+            task = _task_in(module, class_name, load)
         except BaseException as exc:
             # Before anything is put back: the problem's lines are those of the text that failed.
-            problem = None if isinstance(exc, KeyboardInterrupt) else _import_problem(exc, finder)
+            problem = None if isinstance(exc, KeyboardInterrupt) else import_problem(exc, finder)
             _revert(load)
             if problem is None:
                 raise
@@ -225,7 +339,7 @@ def _revert(load: _Load) -> None:
 def _parse(reference: str) -> tuple[Path | None, str | None]:
     """File and class of `reference`; (None, None) for a registered id."""
     if not reference.strip():
-        raise _refused(
+        raise refused(
             "no task named; give a .py file, file.py:ClassName, or a registered id like PickCube-v1"
         )
     if registry.environment(reference) is not None:
@@ -234,8 +348,10 @@ def _parse(reference: str) -> tuple[Path | None, str | None]:
     if match is not None and not _exists(reference):
         name = match["cls"]
         if not name.isidentifier():
-            raise _refused(f"{reference!r}: after the colon comes the name of a class, as in push.py:PushEnv")
+            raise refused(f"{reference!r}: after the colon comes the name of a class, as in push.py:PushEnv")
         return _resolve(match["file"]), name
+    if is_module_name(reference) and not _exists(reference) and find_module(reference) is not None:
+        raise refused(f"{reference} is a module: name the class in it too, as in {reference}:MyTask")
     if _looks_like_path(reference):
         return _resolve(reference), None
     raise _unknown_id(reference)
@@ -262,7 +378,7 @@ def _resolve(path: str | Path) -> Path:
     try:
         return Path(path).expanduser().resolve()
     except (OSError, RuntimeError, ValueError) as exc:  # no such user's home; a loop of links; a null byte
-        raise _refused(f"{str(path)!r} is not a path that can be opened: {exc}") from exc
+        raise refused(f"{str(path)!r} is not a path that can be opened: {exc}") from exc
 
 
 def _check_file(file: Path) -> None:
@@ -270,39 +386,41 @@ def _check_file(file: Path) -> None:
         if file.is_dir():
             names = sorted(path.name for path in file.glob("*.py"))[:5]
             inside = f", for example {' or '.join(names)}" if names else " (there is none in it)"
-            raise _refused(f"{file} is a folder; name a .py file in it{inside}")
+            raise refused(f"{file} is a folder; name a .py file in it{inside}")
         if not file.exists():
             raise _missing(file)
         if not file.is_file():
             # A pipe, say: reading it would wait for ever. A device, which a link may lead to, may have no end.
-            raise _refused(f"{file} is not an ordinary file")
+            raise refused(f"{file} is not an ordinary file")
         if file.suffix != ".py":
-            raise _refused(
+            raise refused(
                 f"{file} is not a .py file; a task is one Python file with a class that inherits BaseEnv"
             )
     except OSError as exc:
-        raise _refused(f"cannot look at the file ({exc.strerror}): {file}") from exc
+        raise refused(f"cannot look at the file ({exc.strerror}): {file}") from exc
 
 
 def _missing(file: Path) -> TaskError:
     if not file.parent.is_dir():
-        return _refused(f"{file} does not exist, nor does its folder {file.parent}")
+        return refused(f"{file} does not exist, nor does its folder {file.parent}")
     names = difflib.get_close_matches(file.name, [path.name for path in file.parent.glob("*.py")], n=3)
     hint = f"; did you mean {' or '.join(names)}?" if names else ""
-    return _refused(f"{file} does not exist{hint}")
+    return refused(f"{file} does not exist{hint}")
 
 
 def _unknown_id(env_id: str) -> TaskError:
     if registry.is_other_gymnasium_id(env_id):
-        return _refused(f"{env_id} is a gymnasium environment, but not one of ManiSkill's (no BaseEnv)")
+        return refused(f"{env_id} is a gymnasium environment, but not one of ManiSkill's (no BaseEnv)")
     ids = {known.lower(): known for known in registry.environment_ids()}
     close = [ids[name] for name in difflib.get_close_matches(env_id.lower(), list(ids), n=3)]
     hint = f"did you mean {' or '.join(close)}?" if close else "give a .py file, or an id such as PickCube-v1"
-    return _refused(f"no task is registered as {env_id!r}, and there is no such file; {hint}")
+    return refused(f"no task is registered as {env_id!r}, and there is no such file; {hint} {IMPORT_HINT}")
 
 
-def _refused(message: str, file: Path | None = None) -> TaskError:
-    return TaskError(Problem("import", shorten(message), None if file is None else str(file), None, None, ""))
+IMPORT_HINT = (
+    "An id that a package of yours registers is known once that is imported: --import PACKAGE on the command line, "
+    "`import package` before workbench.make."
+)
 
 
 # --- the class -----------------------------------------------------------------------------------
@@ -354,45 +472,24 @@ def _registered(env_id: str) -> LoadedTask:
     return dataclasses.replace(task_of_class(spec.cls, env_id), followed=False)
 
 
-def _choose(
-    module: ModuleType, wanted: str | None, finder: AuthorFinder, registrations: registry.Registrations
-) -> LoadedTask:
-    """The wanted class, or the one defined last, registered classes before others."""
-    file = str(finder.file)
-    defined = [
-        value
-        for value in vars(module).values()
-        if registry.is_task(value) and value.__module__ == module.__name__
-    ]
-    registered = {
-        made.cls: made.name for made in registrations.made if made.file == file and registry.is_task(made.cls)
-    }
-    # Registered ones last, in the order of their registration: the last of all is the default.
-    candidates = [cls for cls in dict.fromkeys(defined) if cls not in registered] + list(registered)
-    if wanted is not None:
-        cls = next(
-            (cls for cls in reversed(candidates) if cls.__name__ == wanted), getattr(module, wanted, None)
-        )
-        if not registry.is_task(cls):
-            raise _no_such_class(wanted, cls, finder, [cls.__name__ for cls in candidates])
-    elif candidates:
-        cls = candidates[-1]
-    else:
-        raise _no_class(module, finder)
-    assert isinstance(cls, type)
-    env_id = registered.get(cls)
-    spec = None if env_id is None else registry.environment(env_id)
+def _task_in(module: ModuleType, wanted: str | None, load: _Load) -> LoadedTask:
+    finder = load.finder
+    text = finder.texts[str(finder.file)]
+    load.chosen = chosen = choose_task(module, wanted, finder.file, text, load.registrations)
+    spec = None if chosen.env_id is None else registry.environment(chosen.env_id)
     return LoadedTask(
-        cls=cls,
-        env_id=env_id or cls.__name__,
-        class_name=cls.__name__,
+        cls=chosen.cls,
+        env_id=chosen.env_id or chosen.cls.__name__,
+        class_name=chosen.cls.__name__,
         file=finder.file,
         max_episode_steps=None if spec is None else spec.max_episode_steps,
-        default_kwargs={} if spec is None else dict(spec.default_kwargs),
+        default_kwargs={**({} if spec is None else spec.default_kwargs), **chosen.kwargs},
         followed=True,
-        others=tuple(other.__name__ for other in candidates if other is not cls),
-        replaced_ids=registrations.replaced_names(),
-        named_like_libraries=hidden_by_libraries(finder.file),
+        others=chosen.others,
+        alternatives=chosen.alternatives,
+        robot=chosen.robot,
+        replaced_ids=load.registrations.replaced_names(),
+        named_like_libraries=hidden_by_libraries(finder.file, finder.search_folder),
         **_source_fields(finder),
     )
 
@@ -404,84 +501,5 @@ def _source_fields(finder: AuthorFinder) -> dict[str, Any]:
     return {
         "source_files": tuple(files),
         "source": {str(path): source[str(path)] for path in files},
-        "source_hash": source_hash(source, finder.file.parent),
+        "source_hash": source_hash(source, finder.own_folder),
     }
-
-
-def _no_such_class(wanted: str, found: object, finder: AuthorFinder, names: list[str]) -> TaskError:
-    name = finder.file.name
-    if found is not None:
-        return _refused(f"{wanted} in {name} is not a class that inherits BaseEnv", finder.file)
-    close = difflib.get_close_matches(wanted, names, n=1)
-    hint = f"did you mean {close[0]}?" if close else f"it has {', '.join(names) or 'no task class at all'}"
-    return _refused(f"there is no class {wanted} in {name}; {hint}", finder.file)
-
-
-def _no_class(module: ModuleType, finder: AuthorFinder) -> TaskError:
-    name = finder.file.name
-    if not finder.texts[str(finder.file)].strip():
-        return _refused(f"{name} is empty; a task is a class that inherits BaseEnv", finder.file)
-    imported = [value for value in vars(module).values() if registry.is_task(value)]
-    if imported:
-        cls = imported[-1]
-        hint = f"{cls.__name__} is imported from {cls.__module__}: name that file, or inherit from it here"
-    else:
-        hint = (
-            "write `class MyTask(BaseEnv):` with BaseEnv from mani_skill.envs.sapien_env, or begin from "
-            "tasks/minimal.py"
-        )
-    return _refused(f"no class in {name} inherits BaseEnv; {hint}", finder.file)
-
-
-# --- what went wrong -----------------------------------------------------------------------------
-
-
-def _import_problem(exc: BaseException, finder: AuthorFinder) -> Problem:
-    if isinstance(exc, TaskError):
-        return exc.problem
-    problem = problem_from_exception(exc, "import", [Path(path) for path in finder.texts])
-    message = problem.message
-    if isinstance(exc, registry.DuplicateName):
-        message = str(exc)
-    elif isinstance(exc, SystemExit):
-        message = (
-            f"the file ended the program (SystemExit: {exc.code}) while being imported; what is only for "
-            'running it as a script belongs under `if __name__ == "__main__":`'
-        )
-    elif isinstance(exc, ModuleNotFoundError) and exc.name:
-        message = f"{message}; {_module_hint(exc.name, finder)}"
-    elif isinstance(exc, ImportError) and (file := _named_like(exc.name, finder)) is not None:
-        message = f"{message}; {named_like_library(file)}"
-    elif isinstance(exc, OSError) and exc.filename == str(finder.file) and problem.file is None:
-        message = f"{finder.file} cannot be read: {exc.strerror}; is it being written just now?"
-    if problem.file is None:
-        # Nothing of the author's ran yet, but it is this file that cannot be had.
-        problem = dataclasses.replace(problem, file=str(finder.file))
-    return dataclasses.replace(problem, message=message)
-
-
-def _named_like(name: str | None, finder: AuthorFinder) -> Path | None:
-    """The author's file that was meant, where a library has its name."""
-    top = (name or "").partition(".")[0]
-    return next((file for file in files_named_like_libraries(finder.search_folder) if file.stem == top), None)
-
-
-def _module_hint(name: str, finder: AuthorFinder) -> str:
-    if (file := _named_like(name, finder)) is not None:
-        return named_like_library(file)
-    top = name.partition(".")[0]
-    if Path(f"{top}.py").is_file() or Path(top, "__init__.py").is_file():
-        return (
-            f"there is one in the folder where the command was started, which is not searched: move {top} beside the "
-            "file, or name its folder in PYTHONPATH"
-        )
-    beside = [path.stem for path in finder.file.parent.glob("*.py") if path != finder.file]
-    if finder.only_given and name.rpartition(".")[2] in beside:
-        return (
-            f"{name} lies beside the file, but was not among what you were asked about; open {finder.file} by its name "
-            "to run it with all that lies beside it"
-        )
-    close = difflib.get_close_matches(name, beside, n=1)
-    if close:
-        return f"there is {close[0]}.py beside the file"
-    return f"neither beside the file nor installed for {sys.executable}"

@@ -44,6 +44,8 @@ class ModuleName:
 
     name: str
     search_folder: Path
+    own_folder: Path
+    """What is in or below it is its author's, and comes in with it."""
 
 
 def module_name(file: Path) -> ModuleName:
@@ -57,24 +59,34 @@ def module_name(file: Path) -> ModuleName:
         while (folder / "__init__.py").is_file() and folder.name.isidentifier():
             parts.insert(0, folder.name)
             folder = folder.parent
-        return ModuleName(".".join(parts), folder)
+        return ModuleName(".".join(parts), folder, file.parent)
     stem = re.sub(r"\W", "_", file.stem)
-    return ModuleName(f"{_MODULE_PREFIX}{stem}_{sha256(str(file).encode()).hexdigest()[:8]}", file.parent)
+    name = f"{_MODULE_PREFIX}{stem}_{sha256(str(file).encode()).hexdigest()[:8]}"
+    return ModuleName(name, file.parent, file.parent)
 
 
-def hidden_by_libraries(file: Path) -> tuple[Path, ...]:
+def hidden_by_libraries(file: Path, search_folder: Path | None = None) -> tuple[Path, ...]:
     """Files beside the task `file` that it cannot import; the task's own file may have any name."""
-    return tuple(
-        found for found in files_named_like_libraries(module_name(file).search_folder) if found != file
-    )
+    folder = search_folder or module_name(file).search_folder
+    return tuple(found for found in files_named_like_libraries(folder) if found != file)
 
 
 class AuthorFinder(MetaPathFinder):
     """Finds and executes the modules of one task: its file, and what lies in the folder beside it."""
 
-    def __init__(self, file: Path, given: Mapping[str, str], only_given: bool = False) -> None:
+    def __init__(
+        self,
+        file: Path,
+        given: Mapping[str, str],
+        only_given: bool = False,
+        named: ModuleName | None = None,
+    ) -> None:
+        """`named` is how a person named the module; else its name follows from where the file lies."""
         self.file = file
-        self.main, self.search_folder = module_name(file).name, module_name(file).search_folder
+        place = named or module_name(file)
+        self.main, self.search_folder, self.own_folder = place.name, place.search_folder, place.own_folder
+        self.goes_by_stem = named is None
+        """A helper may import the task by its file's name."""
         self.given = given
         """Path to text that is used in place of what is on disk."""
         self.only_given = only_given
@@ -112,7 +124,7 @@ class AuthorFinder(MetaPathFinder):
             or not isinstance(found.loader, importlib.machinery.SourceFileLoader)
         ):
             return None
-        if not is_own_file(found.origin, self.file.parent):
+        if not is_own_file(found.origin, self.own_folder):
             return None
         return self._spec(fullname, found.origin, found.submodule_search_locations is not None)
 
@@ -203,7 +215,8 @@ class _AuthorLoader(importlib.machinery.SourceFileLoader):
         name = module.__name__
         self.finder.names.append(name)
         stem = self.finder.file.stem
-        if name == self.finder.main and stem not in sys.modules and not is_library(stem):
+        is_main = name == self.finder.main and self.finder.goes_by_stem
+        if is_main and stem not in sys.modules and not is_library(stem):
             # A helper that imports the task by its file's name must get this module: executed a
             # second time under another name, it would register its ids twice.
             sys.modules[stem] = module
@@ -262,7 +275,7 @@ def set_aside(finder: AuthorFinder, is_other_task: Callable[[str], bool]) -> Set
     ``helper`` of this one. Main modules of other tasks stay (`is_other_task` of their name): nothing
     imports them by name, and their classes may be in use.
     """
-    folder = finder.file.parent
+    folder = finder.own_folder
     aside: dict[str, ModuleType] = {}
     for name, module in list(sys.modules.items()):
         if name in ("__main__", "__mp_main__") or is_other_task(name):

@@ -79,15 +79,24 @@ class Problem:
 
 
 class TaskError(Exception):
-    """The author's task cannot be had; `problem` says why in the author's terms."""
+    """The author's task cannot be had; `problem` says why in the author's terms.
 
-    def __init__(self, problem: Problem) -> None:
+    Args:
+        classes: What can be chosen in the task's file, this one first; empty where it has nothing else.
+    """
+
+    def __init__(self, problem: Problem, classes: tuple[str, ...] = ()) -> None:
         super().__init__(problem)
-        self.problem = problem
+        self.problem, self.classes = problem, classes
 
     def __str__(self) -> str:
         place = "" if self.problem.file is None else f"{self.problem.file}:{self.problem.line or 1}: "
         return place + self.problem.message
+
+
+def refused(message: str, file: Path | None = None) -> TaskError:
+    """A task that cannot be had for a reason that no line of its author's raised."""
+    return TaskError(Problem("import", shorten(message), None if file is None else str(file), None, None, ""))
 
 
 def problem_from_exception(

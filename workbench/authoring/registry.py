@@ -30,6 +30,7 @@ import mani_skill.envs  # noqa: F401  (registers the built-in tasks, which a fil
 from gymnasium.envs.registration import registry as gymnasium_registry
 from mani_skill import agents
 from mani_skill.agents import registration as agent_registration
+from mani_skill.agents.base_agent import BaseAgent
 from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.envs.sapien_env import BaseEnv
 
@@ -93,6 +94,11 @@ def environment(env_id: str) -> EnvSpec | None:
     return REGISTERED_ENVS.get(env_id)
 
 
+def id_of(cls: type) -> str | None:
+    """The id that a class is registered under; None if it is under none."""
+    return next((name for name in environment_ids() if REGISTERED_ENVS[name].cls is cls), None)
+
+
 def environment_ids() -> list[str]:
     return sorted(REGISTERED_ENVS)
 
@@ -104,6 +110,10 @@ def is_other_gymnasium_id(env_id: str) -> bool:
 
 def is_task(value: object) -> bool:
     return isinstance(value, type) and issubclass(value, BaseEnv) and value is not BaseEnv
+
+
+def is_robot(value: object) -> bool:
+    return isinstance(value, type) and issubclass(value, BaseAgent) and value is not BaseAgent
 
 
 @contextmanager

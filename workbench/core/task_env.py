@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from workbench.core import actions
 from workbench.core.assets import refuse_downloads, require_assets, robots_of
-from workbench.core.backends import choose_backend
+from workbench.core.backends import Backend, choose_backend
 from workbench.core.body_table import BodyTable, build_body_table, read_poses
 from workbench.core.broken_rule import BrokenRules, warn_of
 from workbench.core.contact_list import Contact, list_contacts
@@ -44,8 +44,6 @@ from workbench.core.snapshot import (
     take_snapshot,
 )
 from workbench.core.step import StepResult
-
-Backend = Literal["auto", "cpu", "gpu"]
 
 
 @dataclass(frozen=True)

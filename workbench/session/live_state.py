@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from workbench.authoring.problem import Problem
-from workbench.authoring.reference import RecordedTask, TaskName, named_file
+from workbench.authoring.reference import RecordedTask, TaskName, class_beside, followed_folder, named_file
 from workbench.core.inspection import Inspection
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.snapshot_bytes import WholeSnapshot
@@ -84,6 +84,8 @@ class LiveState:
     rules: RulesBroken | None = None
     """What the version that runs has broken of the rules; None while nothing."""
     rules_serial: int = 0
+    choices: tuple[str, ...] = ()
+    """What can be chosen in the file, the one that was asked for first."""
     # --- the batch ---
     chronicle: Chronicle | None = None
     """None before a task is loaded."""
@@ -114,6 +116,10 @@ class LiveState:
         self.seed = self.options.seed
         self.own_file = named_file(self.reference)
         """The file that was named, whether or not it ever loaded; None for an env id."""
+        self.own_folder = followed_folder(self.reference)
+        """Modules in or below it are followed with the file; None where nothing is."""
+        self.running_reference = self.reference
+        """The task that runs."""
 
     @property
     def timeline(self) -> Timeline | None:
@@ -148,6 +154,15 @@ class LiveState:
             self.pictures_serial += 1
             if not scene_kept(event):
                 self.pictures = {}
+        if not (restored and self.choices):  # else another may have been asked for since
+            self.choices = (task.chosen, *task.others) if task.others else ()
+        if task.others and task.source_files and task.file is not None:
+            self.running_reference = class_beside(self.reference, Path(task.file), task.chosen)
+            if task.in_place_of is not None:
+                # Saves bring in what is open; the other is to be chosen when it is mended.
+                self.reference = self.running_reference
+        else:
+            self.running_reference = self.reference
         self.activity = ""
         self.stale = stale
         if not restored:  # else what killed the worker still stands
@@ -182,6 +197,7 @@ class LiveState:
             self.activity = ""
             self.set_problem(event.problem)
             self.problem_at_run = self.state != "loading"
+            self.choices = event.classes or self.choices
             self.state = "error"
             self.stale = self.stale or not self.problem_at_run
         elif isinstance(event, RulesBroken):
@@ -278,17 +294,17 @@ class LiveState:
 
     def choose_class(self, name: str) -> bool:
         """Ask for another task class of the same file. False if the file has no such class."""
-        if self.task is None or self.own_file is None or name not in self.task.others:
+        if self.own_file is None or name not in self.choices:
             return False
-        if isinstance(self.reference, RecordedTask):
-            self.reference = replace(self.reference, class_name=name)
-        else:
-            self.reference = f"{self.own_file}:{name}"
+        file = self.own_file if self.task is None or self.task.file is None else Path(self.task.file)
+        self.reference = class_beside(self.reference, file, name)
+        self.choices = (name, *(other for other in self.choices if other != name))
         return True
 
     def open_file(self, file: Path, class_name: str) -> None:
         """Ask for a class of another file."""
-        self.reference, self.own_file = f"{file}:{class_name}", file
+        self.reference, self.own_file, self.own_folder = f"{file}:{class_name}", file, file.parent
+        self.choices = ()
 
     def file_is_edited(self) -> None:
         """A file that a recording named is open live and is saved: from now on it is what is on disk that is open."""
@@ -313,7 +329,10 @@ class LiveState:
 
     def load_request(self, wanted: Wanted, level: LoadLevel = "auto") -> Load:
         options = replace(self.options, seed=self.seed)
-        return Load(self.reference, options, wanted.source, level, wanted.snapshot)
+        # The version that ran is brought back although another class of the file was asked for since.
+        reference = self.reference if wanted.source is None else self.running_reference
+        any_task = self.task is None and isinstance(reference, str)
+        return Load(reference, options, wanted.source, level, wanted.snapshot, any_task)
 
     def settings(self) -> list[Request]:
         """What has been chosen, for a worker that knows nothing of it; the cameras are told last (`watch_request`)."""
@@ -401,6 +420,7 @@ class LiveState:
             picture_milliseconds=self.picture_milliseconds,
             problem=self.problem,
             problem_serial=self.problem_serial,
+            choices=self.choices,
             refused=self.problem if self.stale and not self.problem_at_run else None,
             curves=None if self.chronicle is None else self.chronicle.curves(),
             selected_env=self.selected_env,

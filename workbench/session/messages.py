@@ -54,6 +54,8 @@ class TaskOptions:
     """Further keyword arguments of the task class (``robot_uids``, ``obs_mode`` ...)."""
     rules: Degree | None = None
     """The degree of all rules of GPU simulation; None for each rule's own, see `core.rules`."""
+    imports: tuple[str, ...] = ()
+    """Modules that a person named on the command line, imported before the task is looked for: they register its id."""
 
 
 @dataclass(frozen=True)
@@ -98,8 +100,12 @@ class TaskDescription:
     segmentation: dict[int, str]
     """Segmentation id to body name."""
     can_render: bool
+    chosen: str = ""
+    """Its name in the file: the class, or a robot that is shown in a scene."""
     others: tuple[str, ...] = ()
-    """Further task classes in the file."""
+    """What else can be chosen in the file."""
+    in_place_of: str | None = None
+    """The class of the file that was tried first, and failed."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keywords of ``gym.make`` that make such an env, as far as JSON can say them."""
     objects: tuple[ObjectToSee, ...] = ()
@@ -124,6 +130,8 @@ class Load:
     """What is done if a version of the same task runs; a level that is named is taken as asked."""
     snapshot: bytes | None = None
     """Pickled `core.snapshot.Snapshot` of the moment to be shown after a build, by name, where shapes match."""
+    any_task: bool = False
+    """If no class is named and the one that is taken fails, another task of the file may be opened."""
 
 
 @dataclass(frozen=True)
@@ -341,6 +349,8 @@ class Failed:
 
     problem: Problem
     kept: bool
+    classes: tuple[str, ...] = ()
+    """What can be chosen in the file, the one that was tried first; empty where the file has one or none was tried."""
 
 
 NO_MOMENT = -1

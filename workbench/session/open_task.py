@@ -17,12 +17,18 @@ from pathlib import Path
 from typing import Any
 
 from workbench.authoring import registry
-from workbench.authoring.load import LoadedTask, load_task, take_back, with_late_imports
-from workbench.authoring.problem import Problem, TaskError, problem_from_exception
+from workbench.authoring.load import LoadedTask, import_modules, load_task, take_back, with_late_imports
+from workbench.authoring.problem import (
+    MESSAGE_LIMIT,
+    Problem,
+    TaskError,
+    problem_from_exception,
+    shorten,
+)
 from workbench.authoring.reference import TaskName
 from workbench.authoring.returns import check_step_returns, problem_from_return
 from workbench.core import actions
-from workbench.core.backends import find_renderer
+from workbench.core.backends import find_renderer, gpu_left_alone
 from workbench.core.broken_rule import BrokenRule, WrongReturn, class_is_installed, warn_of
 from workbench.core.env_kwargs import env_kwargs
 from workbench.core.rules import Degree, Finding
@@ -64,16 +70,33 @@ def open_task(
     """
     clock = Clock()
     on_activity(f"importing {str(reference).rsplit('/', 1)[-1]}")
+    import_modules(options.imports)
     loaded = load_task(reference)
     clock.lap("import")
 
     try:
         return build_task(loaded, options, clock, on_activity, on_finding)
+    except TaskError as error:
+        take_back(loaded)
+        raise with_classes(error, loaded) from error.__cause__
     except BaseException:
         # The class imported and cannot be used: without this the last good version would go on with
         # the new version's helper modules and registrations behind its back.
         take_back(loaded)
         raise
+
+
+def with_classes(error: TaskError, loaded: LoadedTask) -> TaskError:
+    """Of a task that failed: also what else of its file can be opened."""
+    if not loaded.others or loaded.file is None:
+        return error
+    problem, file = error.problem, loaded.file.name
+    more = f"{loaded.chosen} of {file} was tried, which also has {', '.join(loaded.others)}: name one, as in {file}:{loaded.others[0]}"
+    room = MESSAGE_LIMIT - len(more) - 3
+    message = shorten(problem.message, max(room, MESSAGE_LIMIT // 2))
+    return TaskError(
+        replace(problem, message=shorten(f"{message} ({more})")), (loaded.chosen, *loaded.others)
+    )
 
 
 def build_task(
@@ -112,6 +135,7 @@ def build_task(
         on_activity("reading the shapes")
         loaded = with_late_imports(loaded)
         description = describe(loaded, task, options.env_kwargs, loaded.max_episode_steps)
+        description = replace(description, notices=notices_of(loaded, options))
         clock.lap("geometry")
     except BaseException:
         env.close()
@@ -187,11 +211,18 @@ def describe(
         cameras=list_cameras(env, task.table),
         segmentation=segmentation_names(env, task.table),
         can_render=can_render,
+        chosen=loaded.chosen,
         others=loaded.others if loaded.followed else (),
+        in_place_of=None if loaded.in_place_of is None else loaded.in_place_of.name,
         env_kwargs=env_kwargs(env, {**loaded.default_kwargs, **given}),
         objects=objects_to_see(env, task.table),
-        notices=loaded.notices if loaded.followed else (),
     )
+
+
+def notices_of(loaded: LoadedTask, options: TaskOptions) -> tuple[str, ...]:
+    """What whoever opens it should know although it works, in sentences."""
+    gpu = gpu_left_alone(options.backend)
+    return (*(loaded.notices if loaded.followed else ()), *(() if gpu is None else (gpu,)))
 
 
 def returns_check(loaded: LoadedTask, num_envs: int) -> Callable[[Mapping[str, Any], Any], None]:

@@ -55,6 +55,8 @@ class SceneWanted:
     reset_options: dict[str, Any]
     env_states: dict[str, NDArray]
     """(T + 1, D) by name."""
+    imports: tuple[str, ...] = ()
+    """As `TaskOptions.imports`."""
 
 
 @dataclass(frozen=True)
@@ -79,11 +81,13 @@ class SceneFailed:
 class SceneProcess:
     """Makes scenes; see `workbench.session.review.SceneMaker`."""
 
-    def __init__(self, files: Sequence[Path] = ()) -> None:
+    def __init__(self, files: Sequence[Path] = (), imports: tuple[str, ...] = ()) -> None:
         """
         Args:
             files: Task files in which the envs of recordings may be found.
+            imports: As `TaskOptions.imports`.
         """
+        self._imports = imports
         self._files = tuple(str(Path(file).absolute()) for file in files)
 
     def __call__(
@@ -157,7 +161,13 @@ class SceneProcess:
             )
         kwargs = {name: value for name, value in info.env_kwargs.items() if name not in _NOT_PASSED_ON}
         wanted = SceneWanted(
-            info.task, self._files, kwargs, info.seed, dict(info.reset_options), dict(episode.env_states)
+            info.task,
+            self._files,
+            kwargs,
+            info.seed,
+            dict(info.reset_options),
+            dict(episode.env_states),
+            self._imports,
         )
         try:
             connection.send(wanted)

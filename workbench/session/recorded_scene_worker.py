@@ -60,11 +60,15 @@ def main(socket: str) -> None:
 
 def make(wanted: SceneWanted) -> TaskEnv:
     """One env of the recorded task, as it was made for the recording."""
-    from workbench.authoring.load import load_task
+    from workbench.authoring.load import import_modules, load_task
     from workbench.authoring.problem import TaskError
     from workbench.authoring.reference import RecordedTask
     from workbench.core.task_env import EnvOptions, TaskEnv, make_env
 
+    try:
+        import_modules(wanted.imports)
+    except TaskError as error:
+        raise _CannotMake(error.problem.message) from error
     loaded = None
     for file in wanted.files:
         try:
@@ -80,7 +84,8 @@ def make(wanted: SceneWanted) -> TaskEnv:
         except TaskError as error:
             raise _CannotMake(
                 f"There is no env {wanted.task} here to make the scene with, so there are numbers and curves only. If it "
-                "is yours, say which file it is in: workbench review --task FILE."
+                "is yours, say which file it is in (workbench review --task FILE), or which package registers it "
+                "(workbench review --import PACKAGE)."
             ) from error
     try:
         env = make_env(

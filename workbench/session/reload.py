@@ -18,9 +18,17 @@ import numpy as np
 
 from workbench.authoring.changes import RESET_HOOKS, Change, find_change
 from workbench.authoring.inherited import inherited_by
-from workbench.authoring.load import LoadedTask, load_task, take_back, with_late_imports
+from workbench.authoring.load import (
+    LoadedTask,
+    Refused,
+    import_modules,
+    load_task,
+    take_back,
+    with_late_imports,
+)
 from workbench.authoring.modules import read_source
 from workbench.authoring.problem import TaskError
+from workbench.authoring.reference import class_beside
 from workbench.authoring.same_function import line_in
 from workbench.core import actions
 from workbench.core.broken_rule import BrokenRules, warn_of
@@ -37,14 +45,17 @@ from workbench.core.snapshot import RestoreReport, Snapshot, restore_snapshot
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import list_cameras
 from workbench.core.task_env import TaskEnv
+from workbench.session.interrupts import Interrupted
 from workbench.session.messages import Load, ReloadReport
 from workbench.session.open_task import (
     Clock,
     OpenedTask,
     blamed,
     build_task,
+    notices_of,
     reset_checked,
     returns_check,
+    with_classes,
 )
 
 
@@ -80,8 +91,57 @@ def load_version(
     began, clock = perf_counter(), Clock()
     before = None if running is None else with_late_imports(running.opened.loaded)
     on_activity(f"importing {str(request.task).rsplit('/', 1)[-1]}")
+    import_modules(request.options.imports)
     loaded = load_task(request.task, source=request.source)
     clock.lap("import")
+    try:
+        return _bring_in(request, running, before, loaded, began, clock, on_activity, on_finding)
+    except TaskError as error:
+        if running is None:
+            found = _another(request, loaded, error, on_activity, on_finding)
+            if found is not None:
+                return found, None
+        elif running.opened.loaded.chosen == loaded.chosen:
+            raise  # its author knows what else is in the file
+        raise with_classes(error, loaded) from error.__cause__
+
+
+def _another(
+    request: Load,
+    tried: LoadedTask,
+    error: TaskError,
+    on_activity: Callable[[str], None],
+    on_finding: Callable[[Finding], None],
+) -> OpenedTask | None:
+    """The first other task of a file that opens, where any will do; None if there is none."""
+    if not request.any_task or isinstance(error.__cause__, Interrupted) or tried.file is None:
+        return None
+    for name in tried.alternatives:
+        on_activity(f"trying {name}")
+        loaded = load_task(class_beside(request.task, tried.file, name), source=request.source)
+        loaded = replace(loaded, in_place_of=Refused(tried.chosen, str(error)))
+        try:
+            return build_task(loaded, request.options, Clock(), on_activity, on_finding)
+        except TaskError as further:
+            take_back(loaded)
+            if isinstance(further.__cause__, Interrupted):
+                raise
+        except BaseException:
+            take_back(loaded)
+            raise
+    return None
+
+
+def _bring_in(
+    request: Load,
+    running: Running | None,
+    before: LoadedTask | None,
+    loaded: LoadedTask,
+    began: float,
+    clock: Clock,
+    on_activity: Callable[[str], None],
+    on_finding: Callable[[Finding], None],
+) -> tuple[OpenedTask, ReloadReport | None]:
     try:
         change = _what_changed(request, running, before, loaded)
         if running is not None and change.level != "rebuilt":
@@ -111,16 +171,18 @@ def _what_changed(
         return Change("rebuilt", "")
     if not loaded.followed:
         return Change("rebuilt", "it was asked for")
-    if (before.file, before.class_name, before.env_id) != (loaded.file, loaded.class_name, loaded.env_id):
+    if (before.file, before.chosen, before.env_id) != (loaded.file, loaded.chosen, loaded.env_id):
         if loaded.file is not None and before.file != loaded.file:
-            return Change("rebuilt", f"{loaded.file.name} was opened in place of {before.class_name}")
-        return Change("rebuilt", f"{loaded.class_name} is another task than {before.class_name}")
+            return Change("rebuilt", f"{loaded.file.name} was opened in place of {before.chosen}")
+        return Change("rebuilt", f"{loaded.chosen} is another task than {before.chosen}")
     if replace(running.request.options, seed=0) != replace(request.options, seed=0):
         return Change("rebuilt", "the options changed")
     files = {*before.source, *loaded.source}
     inherited = inherited_by(loaded.cls, files)
     texts = {**_still_there(before, request), **loaded.source}
     change = find_change(before.source, texts, str(loaded.file), loaded.class_name, inherited)
+    if loaded.robot is not None and change.level != "same":
+        return Change("rebuilt", f"a robot is part of the scene ({change.reason})")
     if request.level in ("auto", change.level):
         return change
     said = f"{request.level} was asked for"
@@ -188,8 +250,10 @@ def _exchange(
         source_hash=loaded.source_hash,
         source=dict(loaded.source),
         max_episode_steps=loaded.max_episode_steps,
+        chosen=loaded.chosen,
         others=loaded.others,
-        notices=loaded.notices,
+        in_place_of=None,
+        notices=notices_of(loaded, running.request.options),
     )
     if change.level == "cameras":
         description = replace(description, cameras=list_cameras(env, task.table))
@@ -261,7 +325,7 @@ def _moment(request: Load, running: Running | None, loaded: LoadedTask) -> Snaps
     """What is to be shown after the build; None for a fresh episode."""
     if request.snapshot is not None:
         return pickle.loads(request.snapshot)
-    if running is None or running.opened.loaded.class_name != loaded.class_name:
+    if running is None or running.opened.loaded.chosen != loaded.chosen:
         return None
     return running.opened.env.snapshot()
 

@@ -17,7 +17,6 @@ from typing import Literal
 
 from workbench.authoring.problem import Problem
 from workbench.authoring.reference import TaskName, named_file
-from workbench.core.rules import Degree
 from workbench.session.background import BackgroundProcess
 from workbench.session.clearance import Clearances, NotCleared
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
@@ -73,14 +72,14 @@ class _Asked:
 class Rescorer:
     """One judgement at a time; a new one takes the place of the one before. All methods return at once."""
 
-    def __init__(self, clearances: Clearances | None = None, rules: Degree | None = None) -> None:
+    def __init__(self, clearances: Clearances | None = None, base: TaskOptions | None = None) -> None:
         """
         Args:
             clearances: says what of the code that recordings name may run; None asks nobody.
-            rules: as `TaskOptions.rules`.
+            base: what is the same for all that is opened.
         """
         self._clearances = clearances or Clearances()
-        self._base = TaskOptions(rules=rules)
+        self._base = base or TaskOptions()
         self._lock = threading.Lock()
         """Of `view`: what a job that was stopped still has to say is not heard."""
         self._view = RescoreView()

@@ -14,6 +14,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -106,7 +107,7 @@ def options_of(info: EpisodeInfo, num_envs: int, base: TaskOptions | None = None
     for name in ("num_envs", "sim_backend", "render_backend", "render_mode", "human_render_camera_configs"):
         kwargs.pop(name, None)  # how it is run, and not what it is
     base = base or TaskOptions()
-    return TaskOptions(num_envs, base.backend, max(info.seed, 0), kwargs, base.rules)
+    return replace(base, num_envs=num_envs, seed=max(info.seed, 0), env_kwargs=kwargs)
 
 
 @contextmanager

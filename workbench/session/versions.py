@@ -156,10 +156,10 @@ class Versions:
 
     def _follow(self, paths: Iterable[str], texts: Mapping[str, str]) -> None:
         """The task's own file, whether or not it ever loaded, and `paths` beside it."""
-        own_file = self._shared.state.own_file
-        if own_file is None:
+        own_file, folder = self._shared.state.own_file, self._shared.state.own_folder
+        if own_file is None or folder is None:
             return
-        beside = [Path(p) for p in paths if Path(p).is_relative_to(own_file.parent)]
+        beside = [Path(p) for p in paths if Path(p).is_relative_to(folder)]
         self._watcher.follow({own_file, *beside}, texts)
 
 

@@ -124,5 +124,7 @@ class SessionView:
     """What the new code says of the episodes that were run with the old."""
     refused: Problem | None = None
     """Why what the file holds does not run, while another version does or none."""
+    choices: tuple[str, ...] = ()
+    """What can be chosen in the file, where it has several tasks: the one that was asked for first."""
     studio: StudioView = StudioView()
     """Cameras, as they are placed by hand."""

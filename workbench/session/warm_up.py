@@ -27,7 +27,7 @@ def warm_up(options: TaskOptions, goes_on: Callable[[], bool]) -> None:
     It can only fail where the author's own load would (no renderer, no GPU), which then says so better.
     """
     try:
-        opened = open_task(_TASK, replace(options, num_envs=1, env_kwargs={}))
+        opened = open_task(_TASK, replace(options, num_envs=1, env_kwargs={}, imports=()))
     except TaskError:
         return
     try:

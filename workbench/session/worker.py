@@ -191,7 +191,7 @@ class Worker:
         except TaskError as error:
             self._cameras.put_back()  # trying new cameras took the old ones away
             self._held.drop_steps_if_left(error)
-            self._line.send(Failed(error.problem, kept=self._held.opened is not None))
+            self._line.send(Failed(error.problem, self._held.opened is not None, error.classes))
             return
         # From here on it is one thing: an interrupt in the middle would leave the page with another task than ours.
         with self._interrupts.shielded():

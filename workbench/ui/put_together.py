@@ -49,6 +49,7 @@ class Workplace:
         recordings: The folder that is recorded to and reviewed.
         session: The live env, if there is one.
         tasks: Task files in which envs of foreign recordings may be found.
+        imports: Modules that register such envs.
         on_notice: Called, on any thread, with a sentence that is to be seen in the terminal too.
     """
 
@@ -58,9 +59,11 @@ class Workplace:
         recordings: Path,
         session: Session | None = None,
         tasks: tuple[Path, ...] = (),
+        imports: tuple[str, ...] = (),
         on_notice: Callable[[str], None] = lambda words: None,
     ) -> None:
         self._server, self._recordings, self._tasks = server, recordings, tasks
+        self._imports = imports
         self._on_notice = on_notice
         self._shelf: Shelf | None = None
         self._lock = threading.Lock()
@@ -86,7 +89,7 @@ class Workplace:
                 library = Library(self._recordings)
                 library.watch()
                 read = functools.partial(read_row, folder=library.folder)
-                self._shelf = Shelf(library, Review(library, read, SceneProcess(self._tasks)))
+                self._shelf = Shelf(library, Review(library, read, SceneProcess(self._tasks, self._imports)))
                 if self.session is None:
                     # A live env's recorder has done it, and is writing.
                     self._mending = threading.Thread(

@@ -17,7 +17,6 @@ import viser
 
 from workbench.authoring.reference import RecordedTask, TaskName
 from workbench.core.recorded_run import RecordedRun
-from workbench.core.rules import Degree
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.library import Library
 from workbench.recording.side_files import side_files_in_words
@@ -71,14 +70,18 @@ class StepIn:
         place: The pages, and the session that is open, if one is.
         make_session: Opens a task; gets what `Session` gets.
         clearances: Say what of the code that recordings name may run.
-        rules: As `TaskOptions.rules`.
+        base: What is the same for all that is opened.
     """
 
     def __init__(
-        self, place: Workplace, make_session: MakeSession, clearances: Clearances, rules: Degree | None = None
+        self,
+        place: Workplace,
+        make_session: MakeSession,
+        clearances: Clearances,
+        base: TaskOptions | None = None,
     ) -> None:
         self._place, self._make, self._clearances = place, make_session, clearances
-        self._base = TaskOptions(rules=rules)
+        self._base = base or TaskOptions()
         self._first = place.session
         self._lock = threading.Lock()
         self._own: tuple[Session, Path | None] | None = None
@@ -294,12 +297,12 @@ class Judging:
     Args:
         place: The pages.
         clearances: Say what of the code that recordings name may run.
-        rules: As `TaskOptions.rules`.
+        base: What is the same for all that is opened.
     """
 
-    def __init__(self, place: Workplace, clearances: Clearances, rules: Degree | None = None) -> None:
+    def __init__(self, place: Workplace, clearances: Clearances, base: TaskOptions | None = None) -> None:
         self._place = place
-        self.rescorer = Rescorer(clearances, rules)
+        self.rescorer = Rescorer(clearances, base)
         self._choices = RescoreChoices()
         self._panel: RescorePanel | None = None
         self._server: viser.ViserServer | None = None
@@ -356,12 +359,12 @@ def _sentence(why: str) -> str:
 
 
 def offer_going_back_in(
-    place: Workplace, make_session: MakeSession, rules: Degree | None = None, trust: bool = False
+    place: Workplace, make_session: MakeSession, base: TaskOptions | None = None, trust: bool = False
 ) -> Callable[[], None]:
     """Put both into what the review page offers.
 
     Args:
-        rules: Of tasks that are opened for it; as `TaskOptions.rules`.
+        base: What is the same for all tasks that are opened for it.
         trust: Run what recordings name without asking.
 
     Returns:
@@ -369,7 +372,7 @@ def offer_going_back_in(
     """
     dialog = TrustDialog(place.server)
     clearances = Clearances(place.task_files, dialog.ask, all_trusted=trust)
-    step_in, judging = StepIn(place, make_session, clearances, rules), Judging(place, clearances, rules)
+    step_in, judging = StepIn(place, make_session, clearances, base), Judging(place, clearances, base)
 
     def add(_: Workplace, offers: ReviewOffers) -> ReviewOffers:
         return replace(

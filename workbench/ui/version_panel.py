@@ -60,14 +60,13 @@ class VersionPanel:
         task = view.task
         can_load = view.state != "stopped"
         show(self._again, can_load)
-        names = () if task is None else (task.class_name, *task.others)
-        if len(names) > 1:
+        if len(view.choices) > 1:
             # In one order, whichever of them is shown.
-            if tuple(sorted(names)) != self._names:
-                self._names = tuple(sorted(names))
+            if tuple(sorted(view.choices)) != self._names:
+                self._names = tuple(sorted(view.choices))
                 self._task.handle.options = self._names
-            self._task.show(names[0])
-        show(self._task.handle, len(names) > 1)
+            self._task.show(view.choices[0])
+        show(self._task.handle, len(view.choices) > 1)
         notices = () if task is None else task.notices
         refused = view.refused if view.state not in ("starting", "loading") else None
         wanted = (view.reload, refused, task is None, notices)
