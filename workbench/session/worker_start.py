@@ -36,7 +36,9 @@ def main() -> None:
 
     pulse = PulseWriter(pulse_fd)
     pulse.begin("starting")
+    from workbench.session.breakpoints import OPEN_WITH_DEBUG, refuse_breakpoints
 
+    refuse_breakpoints(OPEN_WITH_DEBUG)
     code = 0
     try:
         from workbench.session.worker import work
