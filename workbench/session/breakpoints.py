@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import pdb  # noqa: T100  its prompt is what is replaced
+import pdb
 import sys
 from typing import Any, NoReturn
 
@@ -33,3 +33,12 @@ def refuse_breakpoints(advice: str) -> None:
     if os.environ.get("PYTHONBREAKPOINT", "") in ("", "pdb.set_trace"):
         sys.breakpointhook = refuse_breakpoint
     pdb.set_trace = refuse_breakpoint
+
+
+def pass_breakpoints() -> None:
+    """From now on both do nothing, in this process: nobody debugs what is done in the background."""
+
+    def pass_breakpoint(*arguments: Any, **keywords: Any) -> None:
+        pass
+
+    sys.breakpointhook = pdb.set_trace = pass_breakpoint
