@@ -21,7 +21,7 @@ from workbench.exit_codes import Exit
 from workbench.machine.guarded_terminal import guard_terminal
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.task_arguments import Backend, Rules, history_bytes, imported, task_options
-from workbench.terminal import err, print_finding, print_problem, refuse
+from workbench.terminal import err, print_finding, print_problem, refuse, say
 from workbench.terminal import out as terminal
 
 Task = Annotated[str, tyro.conf.Positional]
@@ -50,6 +50,9 @@ def open_page(
     spare: bool = True,
     trust: bool = False,
     rules: Rules = None,
+    debug: bool = False,
+    debug_port: int | None = None,
+    debug_wait: bool = False,
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     imports: Imports = (),
 ) -> int:
@@ -74,6 +77,10 @@ def open_page(
         trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it.
         rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
             given, what writes over the state of other envs stops, all else is a warning.
+        debug: let a debugger (debugpy, as of VS Code) attach to the task's process, from this machine only; breakpoint()
+            stops for it. Whoever else can log in to this machine can attach as well.
+        debug_port: port for the debugger; 5678 if it is free, else any. Means --debug.
+        debug_wait: load the task only when a debugger has attached. Means --debug.
         env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
         imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
             repeatable.
@@ -83,6 +90,7 @@ def open_page(
     if (why := why_not_there(task)) is not None:
         return refuse(why)
     from workbench.page_command import open_in_terminal
+    from workbench.session.debugger_words import port_for_debugger
     from workbench.session.kept_worker import WorkerOptions
     from workbench.session.memory_limit import parse_memory
     from workbench.ui.door import DoorOptions
@@ -90,7 +98,14 @@ def open_page(
     try:
         options = task_options(num_envs, backend, seed, env, rules, imports)
         past = history_bytes(history)
-        worker = WorkerOptions(parse_memory(memory_limit), spare)
+        debug = debug or debug_wait or debug_port is not None
+        if debug and socket is not None:
+            raise ValueError(
+                "--debug opens a port that every user of this machine can connect to, which --socket is there to avoid: "
+                "leave one of them out"
+            )
+        at_port = port_for_debugger(debug_port) if debug else None
+        worker = WorkerOptions(parse_memory(memory_limit), spare, at_port, debug_wait)
         at = DoorOptions(host=host, port=port, socket=socket, token=token)
     except ValueError as error:
         return refuse(str(error))
@@ -114,6 +129,7 @@ def record(
     max_steps: int | None = None,
     backend: Backend = "auto",
     rules: Rules = None,
+    debug: bool = False,
     env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
     imports: Imports = (),
 ) -> int:
@@ -136,16 +152,23 @@ def record(
         backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto: cpu, while no test of gpu has passed anywhere.
         rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
             given, what writes over the state of other envs stops, all else is a warning.
+        debug: wait for a debugger (debugpy, as of VS Code) before the task is loaded, with one worker; breakpoint() stops for
+            it. Whoever else can log in to this machine can attach as well.
         env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
         imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
             repeatable.
     """
     use_private_driver()
     from workbench.record_command import record_in_terminal
+    from workbench.session.debugger import debug_here
     from workbench.session.record import RecordOptions
 
     try:
         options = task_options(num_envs, backend, seed, env, rules, imports)
+        if debug and workers > 1:
+            raise ValueError("--debug is for one process: leave out --workers")
+        if debug:
+            debug_here(say)
     except ValueError as error:
         return refuse(str(error))
     what = RecordOptions(

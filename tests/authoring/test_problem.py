@@ -192,3 +192,16 @@ def test_a_shortened_text_is_one_line_of_bounded_length(text: str, limit: int) -
     assert len(short.splitlines()) <= 1
     if len(text) <= limit and text == " ".join(text.split()):
         assert short == text
+
+
+def test_a_prompt_that_nobody_answers_says_what_to_do(write: Write) -> None:
+    text = "import io, pdb\n\ndef stop():\n    pdb.Pdb(stdin=io.StringIO(''), stdout=io.StringIO()).set_trace()\n    return 1\n"
+    file = write("prompts.py", text)
+    names: dict = {}
+    exec(compile(text, str(file), "exec"), names)
+    problem = caught(names["stop"], (file,))
+    assert (problem.file, problem.line) == (str(file), 5)
+    assert (
+        problem.message.startswith("BdbQuit: ")
+        and "just before this line: remove the call" in problem.message
+    )

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from workbench.authoring.load import LoadedTask, load_task
 from workbench.authoring.problem import Problem
 from workbench.authoring.returns import check_step_returns
+from workbench.core.returns import wrong_reward
 
 Write = Callable[..., Path]
 N = 4
@@ -56,6 +57,9 @@ def check(task: LoadedTask, evaluate: object, reward: object = None, num_envs: i
         ({"success": YES}, torch.zeros(N, dtype=torch.float64)),
         ({"success": YES, "fail": ~YES, "distance": torch.rand(N, 3)}, torch.ones(N)),
         ({"success": YES}, YES.clone()),  # ManiSkill's own sparse reward
+        # Told by a rule, and no reason not to show it.
+        ({"success": YES}, ~YES),
+        ({}, torch.ones(N, dtype=torch.int64)),
         ({"parts": {"arm": torch.zeros(N, 2)}, "instruction": "push"}, None),
         # Only success and fail are asked for a row for each env.
         ({"best": None, "stage": 2, "distance": 0.5, "progress": torch.tensor(0.5)}, None),
@@ -101,8 +105,7 @@ def test_a_wrong_evaluate_is_told_at_its_def(evaluate: object, words: str, task:
         (torch.zeros(N, 1), "shape (4, 1)"),
         (torch.zeros(N, N), "shape (4, 4)"),
         (np.zeros(N), "numpy float64 array"),
-        (torch.zeros(N, dtype=torch.int64), "int64"),
-        (~YES, "bool tensor"),
+        (torch.zeros(N, dtype=torch.complex64), "complex64"),
     ],
 )
 def test_a_wrong_reward_is_told_at_its_def(reward: object, words: str, task: LoadedTask) -> None:
@@ -152,4 +155,6 @@ def test_exactly_the_batched_shapes_pass(shape: tuple[int, ...], dtype: torch.dt
     }
     assert passes == {"success": a_row_each and dtype == torch.bool, "other": True}
     reward = check_step_returns(object, num_envs, {}, value, ()) is None
-    assert reward == (a_row_each and dtype.is_floating_point)
+    assert reward == a_row_each
+    told = wrong_reward(value, num_envs, {}) is not None
+    assert told == (not a_row_each or not dtype.is_floating_point)

@@ -62,10 +62,14 @@ BROKEN = [
     ("_load_scene", "self.nothing_there", "build", "nothing_there"),
     ("_initialize_episode", "raise KeyError('cube')", "reset", "cube"),
     ("_get_obs_extra", "assert False, 'obs'", "observation", "obs"),
+    ("_initialize_episode", "breakpoint()", "reset", "remove this line, or open with --debug"),
+    ("evaluate", "import pdb; pdb.set_trace()", "evaluate", "remove this line, or open with --debug"),
 ]
 
 
-@pytest.mark.parametrize(("hook", "line", "stage", "says"), BROKEN, ids=[b[0] for b in BROKEN])
+@pytest.mark.parametrize(
+    ("hook", "line", "stage", "says"), BROKEN, ids=[f"{b[0]}-{b[1][:12]}" for b in BROKEN]
+)
 def test_a_hook_that_raises_is_shown_with_its_line_and_the_last_good_version_runs_on(
     session: Session, task_file: Path, good: str, hook: str, line: str, stage: str, says: str
 ) -> None:

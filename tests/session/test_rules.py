@@ -16,8 +16,10 @@ from mani_skill.utils.structs.pose import Pose
 from workbench.authoring.problem import Problem, TaskError
 from workbench.core.actions import hold_action
 from workbench.core.rules import Finding
+from workbench.recording.read_episode import read_episode
 from workbench.session.messages import Event, Load, RulesBroken, TaskOptions
 from workbench.session.open_task import OpenedTask, open_task, reset_checked, step_checked
+from workbench.session.record import RecordOptions, record
 from workbench.session.reload import Running, load_version
 from workbench.session.session import Session
 
@@ -74,6 +76,10 @@ REWRITTEN = """
 REWARD = """
     def compute_dense_reward(self, obs, action, info):  # the fault
         return super().compute_dense_reward(obs, action, info)[:, None]
+"""
+STANDS = """
+    def compute_normalized_dense_reward(self, obs, action, info):  # the fault
+        return {reward}
 """
 OBSERVATION = """
     def _get_obs_extra(self, info):  # the fault
@@ -156,6 +162,33 @@ def test_what_the_task_can_live_with_is_a_row_and_the_task_opens(
         assert row.file == file and "# the fault" in row.code and row.first_step == 0
         assert [finding.message for finding in told] == [row.message for row in rules.rows]
         assert row.count > 1 or rule == "rows-rewritten", "a rule broken at each step is one row"
+
+
+@pytest.mark.parametrize(
+    ("reward", "kind"),
+    [
+        # As UnitreeG1Stand-v1 in its sparse mode.
+        ("torch.arange(self.num_envs) % 2 == 1", "bool"),
+        ("torch.arange(self.num_envs) % 2", "int64"),
+        ("(torch.arange(self.num_envs) % 2).to(torch.uint8)", "uint8"),
+    ],
+)
+def test_a_reward_of_whole_numbers_opens_is_told_and_is_recorded(
+    reward: str, kind: str, tmp_path: Path
+) -> None:
+    """Stock ManiSkill hands it on, and so does `workbench.make`."""
+    file, told = write(STANDS.format(reward=reward), tmp_path), []
+    options = TaskOptions(num_envs=2, backend="cpu", env_kwargs=KWARGS)
+    wanted = RecordOptions(file, tmp_path / "out", 2, pictures=False, max_steps=3, options=options)
+    recorded = record(wanted, on_finding=told.append)
+    (finding,) = told
+    assert (finding.rule, finding.degree, finding.file) == ("reward-rows", "warn", file)
+    assert "# the fault" in finding.code and f"a {kind} tensor of shape (2,)" in finding.message
+    assert ".float()" in finding.message, "what to write instead"
+    episodes = [read_episode(episode.path) for episode in recorded.written]
+    assert [episode.reward.tolist() for episode in episodes] == [[0.0] * 3, [1.0] * 3]
+    with pytest.raises(TaskError, match=rf"returned a {kind} tensor"):
+        next(opened(file, rules="stop"))
 
 
 @pytest.mark.parametrize("body", [LOST, BEHIND, REWRITTEN])
@@ -291,7 +324,8 @@ def test_a_scene_that_is_built_anew_has_its_own_rows(desk: Desk) -> None:
 
 def test_the_page_keeps_the_mark_until_the_file_is_mended(tmp_path: Path) -> None:
     file, events = tmp_path / "task.py", []
-    file.write_text(TASK.format(body=LOST))
+    counts = STANDS.format(reward="torch.arange(self.num_envs) % 2 == 1")
+    file.write_text(TASK.format(body=LOST + counts))
 
     def note(event: Event) -> None:
         if isinstance(event, RulesBroken):
@@ -307,13 +341,17 @@ def test_the_page_keeps_the_mark_until_the_file_is_mended(tmp_path: Path) -> Non
         view = wait_until(session, lambda view: view.rules is not None, "the mark")
         assert view.task is not None and view.problem is None, "the task is open"
         assert view.rules is not None
-        (row,) = view.rules.rows
+        row, reward = view.rules.rows
         assert row.rule == "not-applied" and Path(row.file or "").name == "task.py"
+        assert reward.rule == "reward-rows"
         count = row.count
         session.play()
         wait_until(session, lambda view: bool(view.rules and view.rules.rows[0].count > count + 3), "a count")
         session.pause()
-        assert [finding.rule for event in events for finding in event.new] == ["not-applied"], "told once"
+        told = [finding.rule for event in events for finding in event.new]
+        assert told == ["not-applied", "reward-rows"], "told once"
+        curves = session.view().curves
+        assert curves is not None and set(curves.reward[:, 1].tolist()) == {1.0}, "a truth is drawn as 1"
         assert not any(re.search("RuleWarning", text) for text in session.view().printed.texts)
         file.write_text(TASK.format(body=LOST.replace("self.cube.set_pose", "len")))
         wait_until(session, lambda view: view.rules is None and view.task_serial == 2, "the end of the mark")

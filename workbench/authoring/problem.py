@@ -14,6 +14,7 @@ import inspect
 import linecache
 import re
 import traceback as tracebacks
+from bdb import BdbQuit
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -206,6 +207,8 @@ def _message(exc: BaseException) -> str:
         text = str(exc)
     except Exception as failure:  # an author's own __str__ may be what is broken
         text = f"<its __str__ raised {type(failure).__qualname__}>"
+    if isinstance(exc, BdbQuit) and not text:
+        text = "a debugger's prompt was left, or had no terminal to ask in; it was called just before this line: remove the call"
     return shorten(f"{name}: {text}" if text.strip() else name)
 
 

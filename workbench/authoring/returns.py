@@ -17,10 +17,9 @@ from __future__ import annotations
 import linecache
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any
 
 from workbench.authoring.problem import Problem, hook_definition
-from workbench.core.returns import wrong_evaluate, wrong_reward
+from workbench.core.returns import no_reward, wrong_evaluate
 
 _REWARD_HOOKS = ("compute_dense_reward", "compute_normalized_dense_reward", "compute_sparse_reward")
 
@@ -35,15 +34,14 @@ def check_step_returns(
     """The first thing wrong with what one step of `num_envs` envs of `cls` gave, or None.
 
     `evaluate` is what ``evaluate()`` returned: a dict in which ``success`` and ``fail`` are bool tensors of shape
-    (N,), and the other entries whatever the author likes. `reward` is (N,) and floating; None where no reward was
-    computed. With one env both may be of shape () too. Tensors may be on any device. A problem's stage is ``returns``; its
+    (N,), and the other entries whatever the author likes. `reward` is (N,): real numbers, or truths, which the rule
+    `reward-rows` tells of and ManiSkill hands on; None where no reward was computed. With one env both may be of shape () too. Tensors may be on any device. A problem's stage is ``returns``; its
     place is in `source_files`, or None where the hook is inherited.
     """
     message = wrong_evaluate(evaluate, num_envs)
     if message is not None:
         return problem_from_return(cls, "evaluate", message, source_files)
-    entries: Any = evaluate
-    message = None if reward is None else wrong_reward(reward, num_envs, entries)
+    message = None if reward is None else no_reward(reward, num_envs)
     if message is not None:
         return problem_from_return(cls, _REWARD_HOOKS[0], message, source_files)
     return None

@@ -26,6 +26,7 @@ from mani_skill.envs.utils.system.backend import BackendInfo
 from mani_skill.render.utils import can_render
 
 from workbench.core.broken_rule import frames_of_the_task, in_brackets, place_of, warn_of
+from workbench.core.constructors import refuse_unbuilt_agent, refuse_unbuilt_env
 from workbench.core.contacts import CpuArray
 from workbench.core.cpu_system import BatchedCpuSystem
 from workbench.core.drawn_poses import NOWHERE_ELSE, drawn_at
@@ -154,6 +155,7 @@ class BatchedCpuMixin:
     _sim_steps_per_control: int
     _set_scene_config: Any
     sim_config: Any
+    agent: Any
     device: torch.device
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -166,6 +168,7 @@ class BatchedCpuMixin:
             raise ValueError(_NO_WINDOW)
         kwargs["sim_backend"] = "physx_cpu"
         super().__init__(*args, **kwargs)
+        refuse_unbuilt_env(self, self._workbench_task, kwargs.get("num_envs", 1))  # type: ignore[arg-type]
         note_constructed(self)  # type: ignore[arg-type]
 
     @property
@@ -204,6 +207,10 @@ class BatchedCpuMixin:
             raise
         finally:
             self._kept_controllers = None
+
+    def _load_agent(self, *args: Any, **kwargs: Any) -> None:
+        super()._load_agent(*args, **kwargs)  # type: ignore[misc]
+        refuse_unbuilt_agent(self.agent)
 
     def _after_reconfigure(self, options: dict[str, Any]) -> None:
         super()._after_reconfigure(options)  # type: ignore[misc]

@@ -198,6 +198,11 @@ class BatchedCpuSystem:
         return self._laid_out.index_of[id(articulation)]
 
     @property
+    def laid_out(self) -> bool:
+        """Whether the scene is complete; before that nothing has a row."""
+        return self._layout is not None
+
+    @property
     def _laid_out(self) -> Layout:
         self._catch_up()
         if self._layout is None:

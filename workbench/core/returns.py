@@ -37,16 +37,25 @@ def wrong_reward(reward: object, num_envs: int, evaluate: Mapping[str, Any]) -> 
     What is in it is the task's own affair: a NaN in one env is a value, to be seen in that env's row and on its
     timeline while the others go on, and no wrong shape.
     """
-    expected = f"expected a floating tensor of shape ({num_envs},)"
-    if not isinstance(reward, torch.Tensor) or not _a_row_each(reward, num_envs):
-        return f"returned {_describe(reward)}; {expected}"
-    if not reward.dtype.is_floating_point:
-        # ManiSkill's own sparse reward is `success` itself where a task has no `fail`.
-        success = evaluate.get("success")
-        if isinstance(success, torch.Tensor) and reward.dtype == torch.bool and torch.equal(reward, success):
-            return None
-        return f"returned {_describe(reward)}; {expected}"
+    said = no_reward(reward, num_envs)
+    if said is not None or not isinstance(reward, torch.Tensor) or reward.dtype.is_floating_point:
+        return said
+    # ManiSkill's own sparse reward is `success` itself where a task has no `fail`.
+    success = evaluate.get("success")
+    if isinstance(success, torch.Tensor) and reward.dtype == torch.bool and torch.equal(reward, success):
+        return None
+    return f"returned {_describe(reward)}; {_floating(num_envs)}: write .float() behind it"
+
+
+def no_reward(reward: object, num_envs: int) -> str | None:
+    """Said of what is no real number for each env, and can be neither drawn nor recorded; truths are 0 and 1."""
+    if not isinstance(reward, torch.Tensor) or not _a_row_each(reward, num_envs) or reward.dtype.is_complex:
+        return f"returned {_describe(reward)}; {_floating(num_envs)}"
     return None
+
+
+def _floating(num_envs: int) -> str:
+    return f"expected a floating tensor of shape ({num_envs},)"
 
 
 def _a_row_each(value: torch.Tensor, num_envs: int) -> bool:

@@ -86,11 +86,6 @@ class StrictCpuSystem(BatchedCpuSystem):
         articulations = self._laid_out.articulations
         return [[_unguarded(joint, method) for joint in a.active_joints] for a in articulations]
 
-    @property
-    def laid_out(self) -> bool:
-        """Whether the scene is complete; before that nothing has a row."""
-        return self._layout is not None
-
     # --- what ManiSkill's setters and getters tell (see struct_access) -------------------------------
 
     def about_to_write(self, struct: Any, group: Group, index: torch.Tensor) -> None:

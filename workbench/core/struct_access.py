@@ -107,12 +107,16 @@ def _told_writes(stock: Callable[[Any, Any], None], name: str, group: Group) -> 
                 f"'{self.name}' is static: on the GPU, and here, a static actor cannot be moved once the scene "
                 "is built. Give it its initial_pose before build_static(), or build it with build_kinematic()."
             )
+        if group == "targets" and not system.laid_out:
+            raise RuntimeError(_targets_too_early(self.articulation.name))
         strict = _strict(system)
         if strict is not None and strict.laid_out and not (group == "bodies" and self.hidden):
             strict.about_to_write(self, group, _rows(self, group)[_mask(self)])
         try:
             stock(self, value)
         except (RuntimeError, IndexError) as error:
+            if group == "targets":
+                _explain_single_joint(self, name, error)
             _explain(self, value, name, error)
             raise
 
@@ -124,8 +128,10 @@ def _told_targets(stock: Callable[..., None]) -> Callable[..., None]:
         system = batched_system(self.scene)
         if system is None:
             return stock(self, targets, joints, joint_indices)
+        if not system.laid_out:
+            raise RuntimeError(_targets_too_early(self.name))
         strict = _strict(system)
-        if strict is not None and strict.laid_out:
+        if strict is not None:
             strict.about_to_write(self, "targets", self._data_index[_mask(self)])
         try:
             stock(self, targets, joints, joint_indices)
@@ -139,6 +145,27 @@ def _told_targets(stock: Callable[..., None]) -> Callable[..., None]:
 def _mask(struct: Any) -> torch.Tensor:
     """(M,) which of the objects behind `struct` a setter writes now."""
     return struct.scene._reset_mask[struct._scene_idxs.long()]
+
+
+def _targets_too_early(name: str) -> str:
+    return (
+        f"A drive target of '{name}' was set before the simulation is initialised: in _load_agent and _load_scene it has "
+        "none yet, on the GPU or here. Set one that stays in _after_reconfigure(self, options), and one of each episode in "
+        "_initialize_episode, with articulation.set_joint_drive_targets(targets, joints=[...])."
+    )
+
+
+def _explain_single_joint(joint: ArticulationJoint, name: str, error: Exception) -> None:
+    """Raise in better words if it was ManiSkill's own index of a joint that `error` stopped at."""
+    wanted, every = int(_mask(joint).sum()), len(joint._objs)
+    if not 1 < wanted < every:
+        return
+    setter = "set_joint_drive_targets" if name == "drive_target" else "set_joint_drive_velocity_targets"
+    raise RuntimeError(
+        f"ManiSkill's own fault, not yours: joint.set_{name}() of '{joint.name}' fails where {wanted} of {every} envs are "
+        f"reset, on the GPU as here (it puts the rows of {wanted} envs together with the joints of {every}). Set it through "
+        f"the articulation instead: joint.articulation.{setter}(targets, joints=[joint]) with targets of shape ({wanted}, 1)."
+    ) from error
 
 
 def _explain(struct: Any, value: Any, name: str, error: Exception) -> None:

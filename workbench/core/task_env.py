@@ -22,6 +22,7 @@ from workbench.core.assets import refuse_downloads, require_assets, robots_of
 from workbench.core.backends import Backend, choose_backend
 from workbench.core.body_table import BodyTable, build_body_table, read_poses
 from workbench.core.broken_rule import BrokenRules, warn_of
+from workbench.core.constructors import refuse_unbuilt_env
 from workbench.core.contact_list import Contact, list_contacts
 from workbench.core.cpu_scene import batched_class
 from workbench.core.entries import FLAGS, split_entries
@@ -116,7 +117,9 @@ def build_env(
         keep_render_device(kwargs["render_backend"])
     with refuse_downloads(task.__name__):
         if backend.simulation == "gpu":
-            return task(sim_backend="physx_cuda", **kwargs)
+            env = task(sim_backend="physx_cuda", **kwargs)
+            refuse_unbuilt_env(env, task, options.num_envs)
+            return env
         return batched_class(task, options.threads, options.rules, options.on_finding)(**kwargs)
 
 

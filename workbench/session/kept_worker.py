@@ -6,7 +6,8 @@ why and takes the next, from the warm spare if there is one.
 
 It ends a worker by itself for two reasons only: more memory than allowed; and a load that waits behind
 something that cannot be interrupted, since a mended file must not wait behind a worker that hangs. One that is
-merely busy is never ended unasked, as it may only be slow: that it is busy, with what and where, is told.
+merely busy is never ended unasked, as it may only be slow: that it is busy, with what and where, is told. While a
+debugger makes it stand still, no time passes for it.
 """
 
 from __future__ import annotations
@@ -21,7 +22,16 @@ from workbench.machine.watched_thread import say_failure
 from workbench.session.last_words import Busy, busy_at, fatal_error
 from workbench.session.memory_limit import in_words
 from workbench.session.message_reader import Unreadable
-from workbench.session.messages import Event, Load, Loaded, Loading, Request, WarmedUp, WarmUp
+from workbench.session.messages import (
+    Event,
+    ListenForDebugger,
+    Load,
+    Loaded,
+    Loading,
+    Request,
+    WarmedUp,
+    WarmUp,
+)
 from workbench.session.process import Output, WorkerProcess, describe_exit
 from workbench.session.pulse import Beat, Doing
 from workbench.session.spare import SpareWorker
@@ -54,6 +64,10 @@ class WorkerOptions:
     """Bytes that the worker and what it started may have in memory; None sets no limit."""
     spare: bool = False
     """Keep a second worker, warmed up, to take the place of one that dies."""
+    debug_port: int | None = None
+    """Every worker listens there, on this machine only, for a debugger; None for none."""
+    debug_wait: bool = False
+    """The first worker loads nothing until one has attached."""
 
 
 @dataclass(frozen=True)
@@ -121,6 +135,7 @@ class KeptWorker:
         self._closing = False
         self._deaths = 0
         self._interrupted: tuple[int, float] | None = None
+        self._lives = 0
         self._thread = threading.Thread(target=self._run, name="session", daemon=True)
 
     def start(self) -> None:
@@ -154,12 +169,13 @@ class KeptWorker:
             worker.send(request)
 
     def interrupt(self) -> None:
-        """Have the author's code left where it is, if it is at work and Python runs it."""
+        """Have the author's code left where it is, if it is at work and Python runs it, and no debugger holds it."""
         with self._condition:
             worker = self._worker
         if worker is not None:
             beat = worker.beat()
-            if beat.seconds > 0:
+            # What runs while it is held is the debugger's own code.
+            if beat.seconds > 0 and not beat.held:
                 self._interrupted = beat.number, time.monotonic()
                 worker.interrupt()
 
@@ -223,6 +239,10 @@ class KeptWorker:
         with self._condition:
             self._worker, self._load_sent, self._replace_asked = worker, None, False
             self._interrupted = None
+        if self._options.debug_port is not None:
+            first = self._lives == 0
+            worker.send(ListenForDebugger(self._options.debug_port, self._options.debug_wait and first))
+        self._lives += 1
         for request in self._greet():
             worker.send(request)
         life = _Life()
@@ -306,8 +326,12 @@ class KeptWorker:
             life.why = "was ended because its main thread had ended and left another thread running,"
             self._end(worker, life)
         self._look_at_memory(worker, life)
-        if self._load_sent is not None and beat.doing not in _LONG and beat.since < self._load_sent:
-            waited = now - self._load_sent
+        if beat.held != life.held:
+            # Told at once, and counted from here on: the time that a debugger held it is nobody's fault.
+            life.held, life.turned, life.told = beat.held, now, 0.0
+        load_sent = self._load_sent
+        if load_sent is not None and not beat.held and beat.doing not in _LONG and beat.since < load_sent:
+            waited = now - max(load_sent, life.turned)
             # Counted from the interrupt: leaving a load means to close what it had built.
             ignored = self._since_interrupt(beat)
             if waited > _LOAD_WAITS and ignored is None:
@@ -316,7 +340,8 @@ class KeptWorker:
                 life.why = f"did not answer for {waited:.0f} s"
                 life.file_waits = True
                 self._end(worker, life)
-        if beat.seconds < _LONG.get(beat.doing, _BUSY):
+        seconds = min(beat.seconds, now - life.turned)
+        if not beat.held and seconds < _LONG.get(beat.doing, _BUSY):
             if life.told is not None:
                 life.told = None
                 self._on_busy(None)
@@ -324,7 +349,7 @@ class KeptWorker:
             life.told = now
             self._look_where(worker, life, beat)
             deaf = (self._since_interrupt(beat) or 0.0) > _DEAF
-            self._on_busy(busy_at(beat.seconds, beat.doing, life.stack, self._own_files(), deaf))
+            self._on_busy(busy_at(seconds, beat.doing, life.stack, self._own_files(), deaf, beat.held))
 
     def _look_at_memory(self, worker: WorkerProcess, life: _Life) -> None:
         limit = self._options.memory_limit
@@ -371,6 +396,10 @@ class _Life:
     """When it was first seen without its main thread."""
     told: float | None = None
     """When it was last told that the worker is busy."""
+    held: bool = False
+    """A debugger held it at the last look."""
+    turned: float = 0.0
+    """When that last changed."""
 
 
 def _doing(beat: Beat) -> str | None:

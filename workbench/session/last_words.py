@@ -49,6 +49,10 @@ class Busy:
     """A new worker imports and compiles; no line of the author's is at work."""
     deaf: bool = False
     """It was interrupted and went on all the same."""
+    held: bool = False
+    """A debugger makes it stand still, or is waited for: it does not hang, and goes on when that says so."""
+    awaited: bool = False
+    """Nothing is done until a debugger attaches."""
 
 
 def parse_stack(dump: str) -> list[Frame]:
@@ -116,8 +120,10 @@ def code_of(file: str, line: int, texts: Mapping[str, str] | None = None) -> str
     return lines[line - 1].strip() or None if 0 < line <= len(lines) else None
 
 
-def busy_at(seconds: float, doing: str, dump: str, own_files: Iterable[str], deaf: bool) -> Busy:
-    """What a look at a worker at work showed; `dump` may be empty."""
+def busy_at(
+    seconds: float, doing: str, dump: str, own_files: Iterable[str], deaf: bool, held: bool = False
+) -> Busy:
+    """What a look at a worker at work showed; `dump` may be empty. Other arguments are as of `Busy`."""
     frames = parse_stack(dump)
     hook, place = hook_of(frames), author_frame(frames, own_files)
     return Busy(
@@ -130,6 +136,8 @@ def busy_at(seconds: float, doing: str, dump: str, own_files: Iterable[str], dea
         drawing=doing == "drawing" and hook is None,
         getting_ready=doing in ("starting", "warming up") and hook is None,
         deaf=deaf,
+        held=held,
+        awaited=held and doing == "waiting for a debugger",
     )
 
 

@@ -266,6 +266,15 @@ class WarmUp:
 
 
 @dataclass(frozen=True)
+class ListenForDebugger:
+    """Have debugpy listen on this machine; answered with `DebuggerListens`."""
+
+    port: int
+    wait: bool = False
+    """Do nothing else until one has attached."""
+
+
+@dataclass(frozen=True)
 class Inspect:
     """Read one env out, once; answered with an `Inspection`, between two control steps."""
 
@@ -295,6 +304,7 @@ Request = (
     | StepBack
     | DrawPast
     | WarmUp
+    | ListenForDebugger
     | Inspect
     | JudgeMoments
     | Rescore
@@ -464,6 +474,17 @@ class WarmedUp:
     seconds: float
 
 
+@dataclass(frozen=True)
+class DebuggerListens:
+    """The answer to `ListenForDebugger`."""
+
+    port: int
+    waits: bool = False
+    """Nothing is done until a debugger attaches."""
+    why_not: str = ""
+    """Why none can attach; empty where one can."""
+
+
 Event = (
     Loading
     | Loaded
@@ -481,4 +502,5 @@ Event = (
     | Status
     | RulesBroken
     | WarmedUp
+    | DebuggerListens
 )

@@ -30,6 +30,7 @@ from workbench.authoring.returns import check_step_returns, problem_from_return
 from workbench.core import actions
 from workbench.core.backends import find_renderer, gpu_left_alone
 from workbench.core.broken_rule import BrokenRule, WrongReturn, class_is_installed, warn_of
+from workbench.core.constructors import ForgottenInit
 from workbench.core.env_kwargs import env_kwargs
 from workbench.core.rules import Degree, Finding
 from workbench.core.scene_geometry import read_geometry
@@ -272,8 +273,8 @@ class blamed:
         if isinstance(error, WrongReturn):
             return problem_from_return(loaded.cls, error.hook, error.said, loaded.source_files)
         env = self._task.env if self._task is not None else _env_on_traceback(error, loaded.cls)
-        if isinstance(error, BrokenRule):
-            return _problem_of_rule(error, self._stage, loaded)
+        if isinstance(error, (BrokenRule, ForgottenInit)):
+            return _problem_at_its_place(error, self._stage, loaded)
         known = _raised_in(error, loaded.source_files)
         if env is not None and not known:
             # Raised in ManiSkill's own code, most often over what evaluate() returned; the last line of
@@ -290,8 +291,8 @@ class blamed:
         return problem_from_exception(error, self._stage, loaded.source_files, loaded.cls)
 
 
-def _problem_of_rule(error: BrokenRule, stage: str, loaded: LoadedTask) -> Problem:
-    """At the line that broke it, also where that was over before it showed, and is on no traceback."""
+def _problem_at_its_place(error: BrokenRule | ForgottenInit, stage: str, loaded: LoadedTask) -> Problem:
+    """At the line that is at fault, also where that was over before it showed, and is on no traceback."""
     problem = problem_from_exception(error, stage, loaded.source_files, loaded.cls)
     if error.place is None or Path(error.place[0]) not in loaded.source_files:
         return problem

@@ -16,13 +16,23 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 Doing = Literal[
-    "starting", "idle", "warming up", "loading", "stepping", "resetting", "drawing", "importing the policy"
+    "starting",
+    "idle",
+    "warming up",
+    "loading",
+    "stepping",
+    "resetting",
+    "drawing",
+    "importing the policy",
+    "waiting for a debugger",
 ]
 _DOINGS: tuple[Doing, ...] = get_args(Doing)
 _LAYOUT = struct.Struct("=QdB")
 """Number of the piece of work, its beginning in seconds, index into `_DOINGS`."""
 _PID, _PID_AT = struct.Struct("=I"), 64
 """Of the worker; 0 until it has begun."""
+_HELD_AT = 128
+"""A byte: 1 while a debugger holds it."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +44,8 @@ class Beat:
     doing: Doing
     since: float
     """``time.monotonic()`` of its beginning."""
+    held: bool = False
+    """A debugger makes it stand still, or is waited for."""
 
     @property
     def seconds(self) -> float:
@@ -60,6 +72,10 @@ class PulseWriter:
         self._number += 1
         _LAYOUT.pack_into(self._memory, 0, self._number, time.monotonic(), _DOINGS.index(doing))
 
+    def hold(self, held: bool) -> None:
+        """A debugger makes the worker stand still, or lets it go on."""
+        self._memory[_HELD_AT] = held
+
 
 class PulseReader:
     """The server's side."""
@@ -79,4 +95,4 @@ class PulseReader:
             if first == self._memory[: _LAYOUT.size]:
                 break
         number, since, doing = _LAYOUT.unpack(first)
-        return Beat(number, _DOINGS[min(doing, len(_DOINGS) - 1)], since)
+        return Beat(number, _DOINGS[min(doing, len(_DOINGS) - 1)], since, self._memory[_HELD_AT] == 1)

@@ -12,6 +12,7 @@ from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
 from workbench.machine.guarded_terminal import guard_terminal
+from workbench.session.breakpoints import ONE_PROCESS, refuse_breakpoints
 from workbench.session.family import begin_family
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ def main() -> None:
     connection, parent = map(int, sys.argv[1:3])
     begin_family(parent)
     guard_terminal()
+    refuse_breakpoints(ONE_PROCESS)
     try:
         _work(Connection(connection))
     except (EOFError, BrokenPipeError, ConnectionResetError):

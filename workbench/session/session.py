@@ -23,6 +23,7 @@ from workbench.core.recorded_run import RecordedRun
 from workbench.machine.watched_thread import listen, stop_listening
 from workbench.session.camera_messages import CameraAnswer
 from workbench.session.camera_studio import CameraStudio
+from workbench.session.debugger_words import listening_for_a_debugger
 from workbench.session.env_table import EnvRows
 from workbench.session.judge import FILE_SAVED, Judge, what_a_load_means
 from workbench.session.judgement import JudgedCurve, Judgement
@@ -33,6 +34,7 @@ from workbench.session.live_state import LiveState, scene_kept
 from workbench.session.messages import (
     ActionSource,
     CameraRequest,
+    DebuggerListens,
     EpisodeEnd,
     Event,
     Failed,
@@ -386,6 +388,8 @@ class Session:
             self._on_loaded(event)
         elif isinstance(event, Stepped):
             self._on_stepped(event)
+        elif isinstance(event, DebuggerListens):
+            self._say(listening_for_a_debugger(event))
         else:
             with self._lock:
                 self._state.take(event)
@@ -458,7 +462,11 @@ class Session:
             self._print(line)
 
     def _say_failure(self, text: str) -> None:
-        """Of the workbench itself; in the log on the page and in the terminal."""
+        """Of the workbench itself."""
+        self._say(text)
+
+    def _say(self, text: str) -> None:
+        """In the log on the page and in the terminal."""
         for line in text.splitlines():
             self._printed.feed("stderr", f"workbench: {line}\n".encode(errors="replace"))
 

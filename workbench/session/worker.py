@@ -41,15 +41,18 @@ from workbench.session.camera_messages import (
     JudgeCamera,
     SuggestCameras,
 )
+from workbench.session.debugger import CannotDebug, listen_for_debugger, wait_for_debugger
 from workbench.session.held_task import HeldTask
 from workbench.session.interrupts import Interrupts
 from workbench.session.judge_moments import judge_moments
 from workbench.session.messages import (
     SCENE_KEPT,
+    DebuggerListens,
     DrawPast,
     EpisodeEnd,
     Failed,
     Inspect,
+    ListenForDebugger,
     Load,
     Loaded,
     Loading,
@@ -134,6 +137,7 @@ class Worker:
             StepBack: self._step_back,
             DrawPast: self._cameras.draw_past,
             WarmUp: self._warm_up,
+            ListenForDebugger: self._listen_for_debugger,
             Inspect: self._inspect,
             JudgeMoments: self._judge_moments,
             Rescore: self._rescore,
@@ -228,6 +232,17 @@ class Worker:
         began = time.monotonic()
         warm_up(request.options, lambda: not self._line.waits())
         self._line.send(WarmedUp(time.monotonic() - began))
+
+    def _listen_for_debugger(self, request: ListenForDebugger) -> None:
+        try:
+            listen_for_debugger(request.port, self._pulse.hold)
+        except CannotDebug as error:
+            self._line.send(DebuggerListens(request.port, why_not=str(error)))
+            return
+        self._line.send(DebuggerListens(request.port, request.wait))
+        if request.wait:
+            self._pulse.begin("waiting for a debugger")
+            wait_for_debugger(self._pulse.hold)
 
     def _play(self, request: Play) -> None:
         self._playing = request.playing and self._held.opened is not None
@@ -441,6 +456,7 @@ _DOING: dict[type, Doing] = {
     StepBack: "resetting",
     SetActionSource: "importing the policy",
     WarmUp: "warming up",
+    ListenForDebugger: "starting",
 }
 """The requests that may run the author's code, or take long for other reasons."""
 

@@ -36,7 +36,12 @@ def main() -> None:
 
     pulse = PulseWriter(pulse_fd)
     pulse.begin("starting")
+    from workbench.session.breakpoints import OPEN_WITH_DEBUG, pass_breakpoints, refuse_breakpoints
 
+    if niceness:  # it works in the background, with a version that is being debugged elsewhere
+        pass_breakpoints()
+    else:
+        refuse_breakpoints(OPEN_WITH_DEBUG)
     code = 0
     try:
         from workbench.session.worker import work

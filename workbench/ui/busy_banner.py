@@ -27,9 +27,10 @@ def is_shown(view: SessionView) -> bool:
     """Whether the banner stands over the view; it goes before that of a problem.
 
     Not for a worker that gets ready: nothing of the author's is at work then, and why the one before is gone
-    must stay in sight.
+    must stay in sight. Nor for one that a debugger holds, which the status line says.
     """
-    return view.busy is not None and view.busy.seconds >= SHOWN_AFTER and not view.busy.getting_ready
+    busy = view.busy
+    return busy is not None and busy.seconds >= SHOWN_AFTER and not (busy.getting_ready or busy.held)
 
 
 class BusyBanner:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import viser
@@ -32,6 +33,8 @@ WORDS = {
     "error": "error",
     "stopped": "worker stopped",
     "busy": "busy",
+    "held": "held",
+    "awaited": "waiting",
 }
 
 
@@ -123,7 +126,7 @@ def status_values(view: SessionView, fresh: bool = False, marked: bool = False) 
     moving = view.playing and view.state in ("running", "error") and task is not None and busy is None
     return {
         "state": view.state if busy is None else "loading",
-        "word": WORDS[view.state if busy is None or busy.getting_ready else "busy"],
+        "word": WORDS[_state(view, busy)],
         "problem": view.problem is not None,
         "stale": view.stale and task is not None and view.state not in ("starting", "loading"),
         "ago": None if view.timeline.shown is None else view.timeline.last - view.timeline.shown,
@@ -146,7 +149,20 @@ def status_values(view: SessionView, fresh: bool = False, marked: bool = False) 
     }
 
 
+def _state(view: SessionView, busy: Busy | None) -> str:
+    if busy is None:
+        return view.state
+    if busy.held:
+        return "awaited" if busy.awaited else "held"
+    return view.state if busy.getting_ready else "busy"
+
+
 def _doing(busy: Busy) -> str:
+    if busy.awaited:
+        return f"for a debugger to attach, {busy.seconds:.0f} s; the log says where"
+    if busy.held:
+        place = "" if busy.file is None else f" at {Path(busy.file).name}:{busy.line}"
+        return f"by a debugger{place} for {busy.seconds:.0f} s; it goes on from there, not from this page"
     if busy.getting_ready:
         return f"a new worker is getting ready (shaders are compiled once a process), {busy.seconds:.0f} s"
     return f"{busy.doing} for {busy.seconds:.0f} s"
