@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +37,8 @@ class Lived:
             self.snapshots.append(task.snapshot())
 
     def packed(self) -> list[bytes]:
-        return list(self.opened.env.env.scene.px.packs())
+        scene: Any = self.opened.env.env.scene
+        return list(scene.px.packs())
 
     def step(self, action: np.ndarray) -> None:
         step_checked(self.opened.env, self.opened.loaded, action)
