@@ -170,7 +170,9 @@ def measure(kind: Kind, options: Options) -> Iterator[str]:
     task.close()
     for way, distances in found.items():
         cells = [f"{state:.1e} / {qpos:.1e}" for state, qpos in distances.values()]
-        yield f"| {kind.name} | {kind.env_id} | {way} | " + " | ".join(cells) + f" | {1e3 * seconds[way]:.0f} |"
+        yield (
+            f"| {kind.name} | {kind.env_id} | {way} | " + " | ".join(cells) + f" | {1e3 * seconds[way]:.0f} |"
+        )
 
 
 def worst(a: NDArray[Any], b: NDArray[Any]) -> float:

@@ -12,7 +12,7 @@ from workbench.core.step import StepResult
 from workbench.session.episode_moments import moments_of_episode
 from workbench.session.history import FAIL, NOT_A_NUMBER, RESET, SUCCESS, TRUNCATED, WENT_BACK, History
 from workbench.session.judgement import Judgement
-from workbench.session.messages import PastPictures, Pictures, Restored, Stepped
+from workbench.session.messages import NO_MOMENT, PastPictures, Pictures, Restored, Stepped
 
 N, BODIES = 3, 4
 
@@ -221,3 +221,30 @@ def test_the_moments_of_an_episode_are_its_steps_through_what_it_was_put_back_to
     assert [moment.serial for moment in moments_of_episode(history, 0, 7, 3)] == [0, 2, 9]
     assert [moment.serial for moment in moments_of_episode(history, 1, 2, 100)] == [*range(6), 7, 9]
     assert [moment.serial for moment in moments_of_episode(history, 2, 9, 100)] == [8, 9]
+
+
+def test_the_way_to_a_moment_begins_at_the_last_exact_point() -> None:
+    history = filled(6)  # a reset and steps 1 to 5
+    assert way(history, 0, 5) == (0, 0, 5)
+    assert history.way_to(0, 0, 100) is None, "the reset itself is put there"
+    history.add(stepped(6, jumped=(0,), restored=Restored((0,), (1,), 3, None, {})), 6)
+    history.add(stepped(7), 7)
+    assert way(history, 0, 7) == (6, 0, 1), "a moment that was put there is an exact point"
+    assert way(history, 1, 7) == (0, 1, 6)
+    lived = Restored((0,), (1,), 3, None, {}, lived_through=(0,))
+    history.add(stepped(8, jumped=(0,), restored=lived), 8)
+    history.add(stepped(9), 9)
+    assert way(history, 0, 9) == (0, 1, 4), "one that was lived up to is none: on from where it began"
+    assert history.way_to(0, 9, 3) is None, "more steps than may be made"
+    history.add(
+        stepped(10, jumped=(0,), restored=Restored((0,), (0,), NO_MOMENT, None, {}, "a recording")), 10
+    )
+    history.add(stepped(11), 11)
+    assert history.way_to(0, 11, 100) is None and way(history, 2, 11) == (0, 2, 8)
+
+
+def way(history: History, env: int, serial: int) -> tuple[int, int, int]:
+    """Its beginning, the env then, and how many steps it has."""
+    found = history.way_to(env, serial, 100)
+    assert found is not None
+    return found.start, found.source, len(found.actions)

@@ -101,7 +101,7 @@ def test_a_step_or_play_shows_what_is_live_again(session: Session) -> None:
     assert view.timeline.shown is None and view.step.elapsed_steps[0] == 3
 
 
-def test_two_branches_from_one_moment_are_equal_to_the_last_bit(session: Session) -> None:
+def test_branches_from_one_moment_are_what_was_to_the_last_bit(session: Session) -> None:
     start = fresh(session)
     run(session, 8)
     branches = []
@@ -115,8 +115,8 @@ def test_two_branches_from_one_moment_are_equal_to_the_last_bit(session: Session
         branches.append(np.stack([poses(session, serial) for serial in range(last - 4, last + 1)]))
     assert np.array_equal(branches[0], branches[1], equal_nan=True)
     first_run = np.stack([poses(session, serial) for serial in range(start + 4, start + 9)])
-    # PhysX keeps contact caches to itself (see core.snapshot): in free motion the rest is about 1e-5.
-    assert np.nanmax(np.abs(branches[0] - first_run)) < 1e-3
+    # Though PhysX does not give out its contacts: the steps up to the moment were made again.
+    assert np.array_equal(branches[0], first_run, equal_nan=True)
 
 
 def test_one_env_goes_back_alone(session: Session) -> None:

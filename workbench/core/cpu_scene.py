@@ -34,6 +34,7 @@ from workbench.core.partial_reset import KeptControllers, others, told_whose_fau
 from workbench.core.rules import Degree, Finding, degrees_of
 from workbench.core.scene_limit import require_scenes
 from workbench.core.seams import asks_for_a_gpu, install_index_seams, substeps_are_unwatched
+from workbench.core.snapshot import begin_anew
 from workbench.core.strict import StrictMixin
 from workbench.core.struct_access import install_struct_access
 from workbench.core.task_buffers import note_constructed, note_scene
@@ -151,6 +152,10 @@ class BatchedCpuMixin:
     _workbench_threads: int | None
     """How many threads step the envs; None for all cores."""
     _kept_controllers: KeptControllers | None = None
+    begins_anew = False
+    """Whether each reset is an exact point, from which an episode can be had again to the last bit."""
+    _to_begin: list[int] | None = None
+    """While in a reset: the envs that were initialised and are to begin anew."""
     _sim_freq: int
     _sim_steps_per_control: int
     _set_scene_config: Any
@@ -199,6 +204,7 @@ class BatchedCpuMixin:
     def reset(self, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
         untouched = others(self, options)
         self._kept_controllers = KeptControllers(self, untouched) if untouched else None
+        self._to_begin = [] if self.begins_anew else None
         try:
             with told_whose_fault(self, untouched):
                 return super().reset(seed=seed, options=options)  # type: ignore[misc]
@@ -206,7 +212,12 @@ class BatchedCpuMixin:
             self.drop_writes()
             raise
         finally:
-            self._kept_controllers = None
+            self._kept_controllers = self._to_begin = None
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
+        super()._initialize_episode(env_idx, options)  # type: ignore[misc]
+        if self._to_begin is not None:
+            self._to_begin = env_idx.tolist()
 
     def _load_agent(self, *args: Any, **kwargs: Any) -> None:
         super()._load_agent(*args, **kwargs)  # type: ignore[misc]
@@ -220,6 +231,10 @@ class BatchedCpuMixin:
         # In a reset BaseEnv asks for this right after it reset the controllers, of all envs.
         if self._kept_controllers is not None:
             self._kept_controllers.put_back()
+        if self._to_begin and not self.scene._needs_fetch:
+            # Now, when what the reset wrote is applied and fetched, and before `evaluate` writes anything.
+            begin_anew(self, self._to_begin)
+            self._to_begin = None
         return super().get_info()  # type: ignore[misc]
 
     def _step_action(self, action: Any) -> Any:

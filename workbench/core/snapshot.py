@@ -35,6 +35,7 @@ from workbench.core import seams
 from workbench.core.cpu_state import (
     CpuEnvState,
     CpuStatePlan,
+    begin_cpu_state_anew,
     plan_cpu_state,
     read_cpu_state,
     write_cpu_state,
@@ -160,6 +161,26 @@ def restore_snapshot(
     )
     more, less = restore_memory(env, snapshot.memory, targets, positions, whole)
     return RestoreReport((*carried, *more), {**missed, **less})
+
+
+def begin_anew(env: Any, env_idx: list[int]) -> None:
+    """Make now an exact point of these envs: PhysX forgets what was before, and their state is one that it gives back.
+
+    From an exact point a snapshot and the same actions give the same bits as the run that was not interrupted.
+    """
+    begin_cpu_state_anew(env, _plan(env), env_idx)
+
+
+def in_this_state(env: Any, env_idx: int, snapshot: Snapshot, source: int) -> bool:
+    """Whether an env is where env `source` of the snapshot was, to the last byte of what PhysX gives out."""
+    wanted = snapshot.simulation[snapshot.env_idx.index(source)]
+    return _essence(read_cpu_state(env, _plan(env), [env_idx])[0]) == _essence(wanted)
+
+
+def _essence(state: Any) -> tuple[Any, ...] | None:
+    if not isinstance(state, CpuEnvState):
+        return None
+    return state.contents, state.packed, state.asleep, state.qf.tobytes(), state.driven.tobytes()
 
 
 def take_memory(env: BaseEnv, env_idx: list[int]) -> Memory:

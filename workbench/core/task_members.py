@@ -300,6 +300,8 @@ def base_env_members() -> frozenset[str]:
     }
     ours = {
         "_kept_controllers",
+        "_to_begin",
+        "begins_anew",
         _LAST_LOOK,
         "observation_space",
         "single_observation_space",

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.snapshot_bytes import WholeSnapshot
 from workbench.core.step import StepResult
-from workbench.session.messages import NO_MOMENT, PastPictures, Pictures, Restored, Stepped
+from workbench.session.messages import NO_MOMENT, PastPictures, Pictures, Restored, Stepped, WayBack
 from workbench.session.moment_rows import MomentRows
 from workbench.session.shared_parts import PartSet, SharedParts
 from workbench.session.standing import Standing
@@ -300,6 +300,30 @@ class History:
                 at = moment.restored.origin
                 env = moment.restored.source[moment.restored.env_idx.index(env)]
             moment = self.at(at)
+
+    def way_to(self, env: int, serial: int, most: int) -> WayBack | None:
+        """How this env came to a moment from the last exact point, by at most so many steps; None if it is not known.
+
+        Exact points are resets and moments that were put there: from them on the same actions give the same bits.
+        """
+        moment = self.at(serial)
+        rows: list[NDArray[np.float32]] = []
+        while moment is not None and len(rows) <= most:
+            at, jump = moment.serial - 1, moment.restored
+            if not moment.jumped.any():
+                if moment.step.action is None:
+                    return None
+                rows.append(moment.step.action[env])
+            elif moment.jumped[env]:
+                if jump is None or (env not in jump.lived_through and jump.origin != NO_MOMENT):
+                    if not moment.snapshot or not rows:
+                        return None
+                    return WayBack(moment.serial, env, np.stack(rows[::-1]).astype(np.float32))
+                if jump.origin == NO_MOMENT:
+                    return None
+                at, env = jump.origin, jump.source[jump.env_idx.index(env)]
+            moment = self.at(at)
+        return None
 
     def rewards_until(self, env: int, serial: int, most: int) -> NDArray[np.float32]:
         """(K,) rewards of the episode of this env up to a moment, oldest first; at most so many, the newest."""

@@ -218,6 +218,18 @@ class SetCapture:
 
 
 @dataclass(frozen=True)
+class WayBack:
+    """How an env came to a moment: from the state at an exact point, by actions."""
+
+    start: int
+    """The server's number of the exact point's moment; its snapshot is among `Restore.starts`."""
+    source: int
+    """Which env it was then."""
+    actions: NDArray[np.float32]
+    """(T, A)"""
+
+
+@dataclass(frozen=True)
 class Restore:
     """Put envs back to a moment of the past; the answer is a `Stepped` with `Stepped.restored`."""
 
@@ -231,6 +243,10 @@ class Restore:
     """The server's number of that moment; comes back as it is."""
     undoes: int | None = None
     """The server's number of the jump that this takes back, if it takes one back; comes back as it is."""
+    ways: Mapping[int, WayBack] = field(default_factory=dict)
+    """Of those of `env_idx` that can live up to the moment again."""
+    starts: Mapping[int, bytes] = field(default_factory=dict)
+    """Pickled snapshots of the whole batch at the beginnings of `ways`, by number of the moment."""
 
 
 @dataclass(frozen=True)
@@ -380,7 +396,10 @@ class Restored:
     recording: str = ""
     """Of a `StepBack`: the episode and the state, in words. Its `origin` is `NO_MOMENT`."""
     how: str = ""
-    """Of a `StepBack`: how the state was come to, in a sentence."""
+    """How the state was come to, in a sentence; empty where it was put there."""
+    lived_through: tuple[int, ...] = ()
+    """The envs that came there by the steps that led to it. For them it is no exact point, as a state that is put there
+    is, from which the same actions give the same bits."""
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ from workbench.core import actions
 from workbench.core.backends import find_renderer, gpu_left_alone
 from workbench.core.broken_rule import BrokenRule, WrongReturn, class_is_installed, warn_of
 from workbench.core.constructors import ForgottenInit
+from workbench.core.cpu_scene import BatchedCpuMixin
 from workbench.core.env_kwargs import env_kwargs
 from workbench.core.rules import Degree, Finding
 from workbench.core.scene_geometry import read_geometry
@@ -106,8 +107,13 @@ def build_task(
     clock: Clock,
     on_activity: Callable[[str], None],
     on_finding: Callable[[Finding], None],
+    begins_anew: bool = False,
 ) -> OpenedTask:
-    """The second half of `open_task`; raises as it does, and leaves taking back `loaded` to the caller."""
+    """The second half of `open_task`; raises as it does, and leaves taking back `loaded` to the caller.
+
+    Args:
+        begins_anew: whether each reset is an exact point (`BatchedCpuMixin.begins_anew`), for a session that goes back.
+    """
     on_activity(f"building {options.num_envs} {'env' if options.num_envs == 1 else 'envs'}")
     with blamed("build", loaded):
         env = make_env(
@@ -123,6 +129,8 @@ def build_task(
             default_kwargs=loaded.default_kwargs,
         )
     clock.lap("build")
+    if begins_anew and isinstance(env, BatchedCpuMixin):
+        env.begins_anew = True
     try:
         with blamed("build", loaded):
             task = TaskEnv(env, loaded.max_episode_steps, check=returns_check(loaded, options.num_envs))

@@ -300,7 +300,7 @@ def _build(
     on_finding: Callable[[Finding], None],
 ) -> tuple[OpenedTask, ReloadReport | None]:
     snapshot = _moment(request, running, loaded)
-    opened = build_task(loaded, request.options, clock, on_activity, on_finding)
+    opened = build_task(loaded, request.options, clock, on_activity, on_finding, begins_anew=True)
     if snapshot is None:
         report = ReloadReport("rebuilt", change.reason, 0.0) if running is not None else None
         return opened, report

@@ -21,6 +21,8 @@ from workbench.session.messages import CameraRequest, DrawPast, PastPictures, Pi
 Scope = Literal["this", "all", "into all"]
 """Who goes back: the selected env; every env, each to its own; or every env to the selected env's moment."""
 _MOST_EVENTS = 400
+MOST_STEPS = 400
+"""Control steps that are made again, at the most, to go back to a moment."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +194,7 @@ class Timeline:
         envs = (env,) if scope == "this" else tuple(range(self._num_envs))
         source = (env,) * len(envs) if scope == "into all" else envs
         self._shown = None
-        return Restore(snapshot, envs, source, moment.serial)
+        return self._restore(snapshot, envs, source, moment.serial)
 
     def undo(self, env: int) -> Restore | None:
         """Ask to take back this env's last jump, in all envs that it brought where they are; None if there is none."""
@@ -204,7 +206,22 @@ class Timeline:
             return None
         envs = self.history.moved_last_by(jump)
         self._shown = None
-        return Restore(snapshot, envs, envs, jump.serial - 1, undoes=jump.serial)
+        return self._restore(snapshot, envs, envs, jump.serial - 1, undoes=jump.serial)
+
+    def _restore(
+        self,
+        snapshot: bytes,
+        envs: tuple[int, ...],
+        source: tuple[int, ...],
+        origin: int,
+        undoes: int | None = None,
+    ) -> Restore:
+        found = {i: self.history.way_to(of, origin, MOST_STEPS) for i, of in zip(envs, source, strict=True)}
+        ways = {i: way for i, way in found.items() if way is not None}
+        starts = {start: self.history.snapshot_at(start) for start in {way.start for way in ways.values()}}
+        known = {start: taken for start, taken in starts.items() if taken is not None}
+        ways = {i: way for i, way in ways.items() if way.start in known}
+        return Restore(snapshot, envs, source, origin, undoes, ways, known)
 
     def draw(self, env: int, cameras: tuple[CameraRequest, ...]) -> DrawPast | None:
         """Ask for the pictures that the shown moment lacks; once for each moment, env and choice of cameras."""

@@ -16,7 +16,6 @@ the author's code is called, and left, in `held_task`.
 from __future__ import annotations
 
 import gc
-import pickle
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -42,6 +41,7 @@ from workbench.session.camera_messages import (
     SuggestCameras,
 )
 from workbench.session.debugger import CannotDebug, listen_for_debugger, wait_for_debugger
+from workbench.session.go_back import go_back, going_back
 from workbench.session.held_task import HeldTask
 from workbench.session.interrupts import Interrupts
 from workbench.session.judge_moments import judge_moments
@@ -77,7 +77,7 @@ from workbench.session.messages import (
     WatchCameras,
 )
 from workbench.session.moment_messages import CaptureMoments, JudgeMoments
-from workbench.session.open_task import OpenedTask, reset_checked, restore_checked, step_checked
+from workbench.session.open_task import OpenedTask, reset_checked, step_checked
 from workbench.session.pacing import Pacer, Rate
 from workbench.session.pulse import Doing, PulseWriter
 from workbench.session.reload import Running, load_version
@@ -363,26 +363,19 @@ class Worker:
         return step
 
     def _restore_envs(self, opened: OpenedTask, request: Restore) -> None:
-        self._cameras.finish_picture()  # the envs get new scenes, with the same entities
-        snapshot = pickle.loads(request.snapshot)
-        step, report = restore_checked(opened.env, opened.loaded, snapshot, request.env_idx, request.source)
+        self._cameras.settle()  # the envs get new scenes, with the same entities, and may make steps
+        step, restored = go_back(opened, request, self._tell_now_and_then(going_back))
         mask = np.zeros(opened.env.num_envs, bool)
         mask[list(request.env_idx)] = True
-        did = Restored(request.env_idx, request.source, request.origin, request.undoes, report.not_carried)
-        self._send_step(step, mask, opened.env.episode_seeds, did)
+        self._send_step(step, mask, opened.env.episode_seeds, restored)
+        self._send_status(None)
 
     def _into_recording(self, opened: OpenedTask, request: StepBack) -> None:
         self._cameras.settle()
-        told = time.monotonic()
-
-        def tell(done: int) -> None:
-            nonlocal told
-            if time.monotonic() - told > _STATUS_PERIOD:
-                told = time.monotonic()
-                self._send_status(None, going_there(request, done))
-
         try:
-            step, restored = step_back(opened, request, tell)
+            step, restored = step_back(
+                opened, request, self._tell_now_and_then(partial(going_there, request))
+            )
         except TaskError:
             self._held.back_to_the_moment()
             raise
@@ -392,6 +385,18 @@ class Worker:
         mask[list(request.env_idx)] = True
         self._send_step(step, mask, opened.env.episode_seeds, restored)
         self._send_status(None)
+
+    def _tell_now_and_then(self, words: Callable[..., str]) -> Callable[..., None]:
+        """What tells how far a long way is, in `words` of its arguments."""
+        told = time.monotonic()
+
+        def tell(*done: int) -> None:
+            nonlocal told
+            if time.monotonic() - told > _STATUS_PERIOD:
+                told = time.monotonic()
+                self._send_status(None, words(*done))
+
+        return tell
 
     def _send_step(
         self,
