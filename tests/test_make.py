@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import traceback
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -320,6 +321,49 @@ def test_what_cannot_be_is_refused_with_a_word_on_what_to_do(
 ) -> None:
     with pytest.raises(error, match=says):
         workbench.make(task, num_envs, **kwargs)
+
+
+IN_THE_CONSTRUCTOR = """
+import torch
+from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
+
+class Mine(PushCubeEnv):
+    def __init__(self, *args, size=1, **kwargs):
+        super().__init__(*args, **kwargs)
+
+    def _load_scene(self, options):
+        self.size = torch.zeros(1, 2) + "3"
+
+class Plain(PushCubeEnv):
+    def __init__(self, num_envs, render_backend):
+        pass
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "kwargs", "line"),
+    [
+        ("Mine", {}, 'self.size = torch.zeros(1, 2) + "3"'),
+        ("Mine", {"colour": 3}, "super().__init__(*args, **kwargs)"),
+        ("Plain", {"colour": 3}, "def __init__(self, num_envs, render_backend):"),
+    ],
+)
+def test_a_type_error_in_a_constructor_has_its_authors_frame_and_line(
+    name: str, kwargs: dict[str, Any], line: str, tmp_path: Path, tables_as_before: None
+) -> None:
+    """gymnasium makes another exception of it, which begins in gymnasium."""
+    file = tmp_path / "mine.py"
+    file.write_text(IN_THE_CONSTRUCTOR)
+    with pytest.raises(TypeError) as caught:
+        workbench.make(f"{file}:{name}", 2, **CPU, **kwargs)
+    number = (
+        IN_THE_CONSTRUCTOR.splitlines().index(next(x for x in IN_THE_CONSTRUCTOR.splitlines() if line in x))
+        + 1
+    )
+    assert f"{file}:{number}: {line}" in caught.value.__notes__
+    assert "raised from the environment creator" not in str(caught.value)
+    frames = [(frame.filename, frame.lineno) for frame in traceback.extract_tb(caught.value.__traceback__)]
+    assert name == "Plain" or (str(file), number) in frames
 
 
 def test_a_gpu_that_is_not_there_is_refused() -> None:

@@ -19,6 +19,8 @@ Where this differs from ``gym.make``, it is where stock would fail:
 
 from __future__ import annotations
 
+import linecache
+import traceback
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -34,8 +36,9 @@ from mani_skill.envs.utils.observations import CameraObsTextures
 from workbench.authoring import registry
 from workbench.authoring.load import class_of_module, load_task
 from workbench.authoring.named_modules import split_reference
+from workbench.authoring.problem import definition_line
 from workbench.core.backends import BackendUnavailable, find_renderer
-from workbench.core.broken_rule import class_is_installed
+from workbench.core.broken_rule import class_is_installed, is_installed
 from workbench.core.rules import Degree
 from workbench.core.task_env import Backend, EnvOptions, build_env, default_reward_mode
 
@@ -116,10 +119,39 @@ def make(
         kwargs=dict(found.default_kwargs),
         additional_wrappers=limits,
     )
-    return gym.make(spec, max_episode_steps=max_episode_steps, num_envs=int(num_envs), **kwargs)
+    try:
+        return gym.make(spec, max_episode_steps=max_episode_steps, num_envs=int(num_envs), **kwargs)
+    except _RaisedInConstructor as raised:
+        raise raised.error from raised.error.__cause__
+
+
+class _RaisedInConstructor(Exception):
+    """A TypeError on its way past gymnasium, which makes another of it, without the frames of whoever raised it."""
+
+    def __init__(self, error: TypeError) -> None:
+        super().__init__(error)
+        self.error = error
 
 
 def _build(
+    cls: type[BaseEnv], asset_ids: Sequence[str], options: EnvOptions, num_envs: int, **kwargs: Any
+) -> BaseEnv:
+    try:
+        return _built(cls, asset_ids, options, num_envs, **kwargs)
+    except TypeError as error:
+        if (place := _place_in(cls, error)) is not None:
+            error.add_note(f"{place[0]}:{place[1]}: {linecache.getline(*place).strip()}")
+        raise _RaisedInConstructor(error) from error
+
+
+def _place_in(cls: type[BaseEnv], error: TypeError) -> tuple[str, int] | None:
+    """The author's line that raised it; where none did, as for an unknown keyword, the constructor's."""
+    lines = [(frame.filename, frame.lineno or 1) for frame in traceback.extract_tb(error.__traceback__)]
+    raised_at = next((line for line in reversed(lines) if not is_installed(line[0])), None)
+    return raised_at or definition_line(cls.__init__)
+
+
+def _built(
     cls: type[BaseEnv], asset_ids: Sequence[str], options: EnvOptions, num_envs: int, **kwargs: Any
 ) -> BaseEnv:
     if "render_backend" not in kwargs and find_renderer() is None:

@@ -99,6 +99,20 @@ def state_of(task: TaskEnv) -> list[bytes]:
     return [state.packed for state in task.snapshot().simulation]  # type: ignore[union-attr]
 
 
+def test_a_registration_that_comes_and_goes_is_said(desk: Desk) -> None:
+    (line,) = [line for line in desk.good.splitlines() if line.startswith("@register_env")]
+    report = desk.edit(f"{line}\n", "")
+    assert report.level == "rebuilt" and report.carried
+    assert (
+        report.reason
+        == "PushCubeEnv is not registered as WorkbenchPushCube-v1 any more, and so has no time limit"
+    )
+    report = desk.edit('"WorkbenchPushCube-v1"', '"Another-v1"')
+    assert report.reason == "PushCubeEnv is registered as Another-v1 now"
+    report = desk.save(desk.good)
+    assert report.reason == "PushCubeEnv is registered as WorkbenchPushCube-v1 now, and not as Another-v1"
+
+
 # --- patched ---------------------------------------------------------------------------------------
 
 

@@ -28,7 +28,8 @@ from workbench.authoring.problem import (
 from workbench.authoring.reference import TaskName
 from workbench.authoring.returns import check_step_returns, problem_from_return
 from workbench.core import actions
-from workbench.core.backends import find_renderer, gpu_left_alone
+from workbench.core.assets import MissingAssets
+from workbench.core.backends import BackendUnavailable, find_renderer, gpu_left_alone
 from workbench.core.broken_rule import BrokenRule, WrongReturn, class_is_installed, warn_of
 from workbench.core.constructors import ForgottenInit
 from workbench.core.cpu_scene import BatchedCpuMixin
@@ -80,7 +81,7 @@ def open_task(
         return build_task(loaded, options, clock, on_activity, on_finding)
     except TaskError as error:
         take_back(loaded)
-        raise with_classes(error, loaded) from error.__cause__
+        raise with_advice(error, loaded, options, lambda: load_task(reference)) from error.__cause__
     except BaseException:
         # The class imported and cannot be used: without this the last good version would go on with
         # the new version's helper modules and registrations behind its back.
@@ -88,17 +89,55 @@ def open_task(
         raise
 
 
-def with_classes(error: TaskError, loaded: LoadedTask) -> TaskError:
-    """Of a task that failed: also what else of its file can be opened."""
-    if not loaded.others or loaded.file is None:
+def with_advice(
+    error: TaskError, loaded: LoadedTask, options: TaskOptions, again: Callable[[], LoadedTask]
+) -> TaskError:
+    """Of a task that could not be opened: also what would open in its place.
+
+    Args:
+        again: imports it once more; the failed one was taken back.
+    """
+    advice: list[str] = []
+    if (
+        options.num_envs > 1
+        and not isinstance(error.__cause__, _NOT_OF_THE_BATCH)
+        and _runs_alone(again, options)
+    ):
+        advice.append(f"it fails with {options.num_envs} envs and runs with one: --num-envs 1")
+    if loaded.others and loaded.file is not None:
+        file = loaded.file.name
+        advice.append(
+            f"{loaded.chosen} of {file} was tried, which also has {', '.join(loaded.others)}: name one, as in "
+            f"{file}:{loaded.others[0]}"
+        )
+    if not advice:
         return error
-    problem, file = error.problem, loaded.file.name
-    more = f"{loaded.chosen} of {file} was tried, which also has {', '.join(loaded.others)}: name one, as in {file}:{loaded.others[0]}"
-    room = MESSAGE_LIMIT - len(more) - 3
-    message = shorten(problem.message, max(room, MESSAGE_LIMIT // 2))
-    return TaskError(
-        replace(problem, message=shorten(f"{message} ({more})")), (loaded.chosen, *loaded.others)
-    )
+    more = shorten("; ".join(advice), MESSAGE_LIMIT // 2)
+    message = f"{shorten(error.problem.message, MESSAGE_LIMIT - len(more) - 3)} ({more})"
+    classes = (loaded.chosen, *loaded.others) if loaded.others else ()
+    return TaskError(replace(error.problem, message=message), classes)
+
+
+_NOT_OF_THE_BATCH = (Interrupted, BrokenRule, MissingAssets, BackendUnavailable)
+"""Causes that say already what to do, or that one env has as well."""
+
+
+def _runs_alone(again: Callable[[], LoadedTask], options: TaskOptions) -> bool:
+    """Whether one env of the task passes what a batch failed in: it may be written for one."""
+    try:
+        loaded = again()
+    except TaskError:
+        return False
+    try:
+        alone = replace(options, num_envs=1)
+        build_task(loaded, alone, Clock(), lambda activity: None, lambda finding: None).env.close()
+    except TaskError as error:
+        if isinstance(error.__cause__, Interrupted):
+            raise
+        return False
+    finally:
+        take_back(loaded)
+    return True
 
 
 def build_task(

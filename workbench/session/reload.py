@@ -55,7 +55,7 @@ from workbench.session.open_task import (
     notices_of,
     reset_checked,
     returns_check,
-    with_classes,
+    with_advice,
 )
 
 
@@ -103,7 +103,9 @@ def load_version(
                 return found, None
         elif running.opened.loaded.chosen == loaded.chosen:
             raise  # its author knows what else is in the file
-        raise with_classes(error, loaded) from error.__cause__
+        raise with_advice(
+            error, loaded, request.options, lambda: load_task(request.task, source=request.source)
+        ) from error.__cause__
 
 
 def _another(
@@ -171,10 +173,12 @@ def _what_changed(
         return Change("rebuilt", "")
     if not loaded.followed:
         return Change("rebuilt", "it was asked for")
-    if (before.file, before.chosen, before.env_id) != (loaded.file, loaded.chosen, loaded.env_id):
-        if loaded.file is not None and before.file != loaded.file:
-            return Change("rebuilt", f"{loaded.file.name} was opened in place of {before.chosen}")
+    if loaded.file is not None and before.file != loaded.file:
+        return Change("rebuilt", f"{loaded.file.name} was opened in place of {before.chosen}")
+    if before.chosen != loaded.chosen:
         return Change("rebuilt", f"{loaded.chosen} is another task than {before.chosen}")
+    if before.env_id != loaded.env_id:
+        return Change("rebuilt", _registered_otherwise(before, loaded))
     if replace(running.request.options, seed=0) != replace(request.options, seed=0):
         return Change("rebuilt", "the options changed")
     files = {*before.source, *loaded.source}
@@ -191,6 +195,16 @@ def _what_changed(
     # What was not found safe is tried as if everything had changed.
     hooks = change.hooks if change.level in ("patched", "cameras") else RESET_HOOKS
     return Change(request.level, said, hooks)
+
+
+def _registered_otherwise(before: LoadedTask, loaded: LoadedTask) -> str:
+    """Of one class with another id; an unregistered one goes by its own name."""
+    if loaded.env_id == loaded.class_name:
+        lost = "" if before.max_episode_steps is None else ", and so has no time limit"
+        return f"{loaded.chosen} is not registered as {before.env_id} any more{lost}"
+    if before.env_id == before.class_name:
+        return f"{loaded.chosen} is registered as {loaded.env_id} now"
+    return f"{loaded.chosen} is registered as {loaded.env_id} now, and not as {before.env_id}"
 
 
 def _still_there(before: LoadedTask, request: Load) -> dict[str, str]:
