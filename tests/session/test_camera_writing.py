@@ -151,6 +151,62 @@ def test_a_camera_that_the_robot_brings_is_in_no_copy_of_the_task(session: Sessi
         assert 'mount=self.robot.links_map["camera_link"],' in found.refusal.snippet
 
 
+def test_an_inherited_camera_gets_a_hook_that_keeps_the_parents_others(tmp_path: Path) -> None:
+    file = tmp_path / "task.py"
+    text = """from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
+from mani_skill.utils.registration import register_env
+
+
+class Far(PushCubeEnv):
+    @property
+    def _default_sensor_configs(self):
+        from mani_skill.sensors.camera import CameraConfig
+        import sapien
+
+        return [*super()._default_sensor_configs, CameraConfig("far", sapien.Pose(), 32, 32, 1.0, 0.01, 10)]
+
+
+@register_env("InheritsACamera-v1", max_episode_steps=50, override=True)
+class Inherits(PushCubeEnv):
+    NEAR = 1
+"""
+    file.write_text(text)
+    options = TaskOptions(num_envs=1, backend="cpu")
+    session = Session(f"{file}:Inherits", options, recordings=tmp_path / "recordings")
+    try:
+        before = wait_until(session, lambda v: v.task is not None, "the first load").task
+        info = camera(session, BASE).info
+        wanted = replace(info.settings, position=(0.4, 0.1, 0.9), fov=1.2)
+
+        # A class with such a hook of its own is told whose the camera is, and gets the text for it.
+        refused = plan(replace(before, class_name="Far"), info, Wish("edit", BASE, wanted))
+        assert refused.stage == "refused" and "base_camera is made by PushCubeEnv" in refused.message
+        assert "the _default_sensor_configs of Far (task.py) hands it on" in refused.message
+        assert refused.refusal.snippet.startswith("CameraConfig(")
+        # An installed task is not written: the whole hook is there to be copied.
+        installed = replace(before, source_files=(), file="/site-packages/their_task.py")
+        refused = plan(installed, info, Wish("edit", BASE, wanted))
+        assert refused.stage == "refused" and "it is made by PushCubeEnv" in refused.message
+        assert "def _default_sensor_configs(self):" in refused.refusal.snippet
+        assert 'cameras["base_camera"] = CameraConfig(' in refused.refusal.snippet
+
+        session.studio.place(BASE, wanted)
+        session.studio.file.plan_write(BASE)
+        notes = planned(session).edit.notes
+        assert "base_camera is made by PushCubeEnv, from which Inherits inherits" in notes[0]
+        assert written(session).message == "base_camera is written to task.py, and the new env has it."
+        assert not differences(there(session, BASE), wanted, close=3e-4)
+        task = session.view().task
+        assert {c.key: c.settings for c in before.cameras if c.key != BASE} == {
+            c.key: c.settings for c in task.cameras if c.key != BASE
+        }
+        # From now on it is the task's own, and changed where it stands.
+        again = plan(task, camera(session, BASE).info, Wish("edit", BASE, replace(wanted, fov=0.8)))
+        assert again.stage == "planned" and again.edit.diff.count("\n+ ") == 1, again.message
+    finally:
+        session.close()
+
+
 def test_a_change_is_not_taken_back_out_of_a_file_that_moved_on(session: Session, task_file: Path) -> None:
     studio, before = session.studio, task_file.read_text()
     studio.place(BASE, replace(there(session, BASE), fov=0.9))

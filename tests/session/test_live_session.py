@@ -117,7 +117,12 @@ def test_a_policy_from_a_file_is_called_with_the_observation(session: Session, t
     ("text", "reference", "says", "line"),
     [
         ("def act(obs):\n    return 1 / 0\n", "act", "ZeroDivisionError", 2),
-        ("\ndef act(obs):\n    return obs[:, :3]\n", "act", "expected (2, 8)", 2),
+        (
+            "\ndef act(obs):\n    return obs[:, :3]\n",
+            "act",
+            "it is 3 wide, and the control mode pd_joint_delta_pos takes 8",
+            2,
+        ),
         ("def act(obs):\n    return obs[:, :8] * float('nan')\n", "act", "NaN", 1),
         ("def act(obs):\n    return None\n", "missing", "no function missing", None),
         ("def act(obs):\n    return obs[\n", "act", "SyntaxError", 2),
@@ -135,6 +140,8 @@ def test_a_policy_that_fails_says_so_and_the_session_goes_on(
         session.step()
     view = wait_until(session, lambda v: v.problem is not None, "a problem")
     assert view.problem.stage == "policy" and says in view.problem.message
+    if "wide" in says:
+        assert f"what {policy}:act returned has shape (2, 3), expected (2, 8)" in view.problem.message
     assert (view.problem.file, view.problem.line) == (None if line is None else str(policy), line)
     # No other action takes its place: whoever plays or steps hears the same.
     for again in (session.play, session.step):
@@ -147,6 +154,39 @@ def test_a_policy_that_fails_says_so_and_the_session_goes_on(
     session.set_action_source("random")
     session.step()
     wait_until(session, lambda v: v.problem is None, "the problem's end")
+
+
+def test_a_policy_is_taken_when_its_file_is_saved_and_a_mended_one_plays_on(
+    session: Session, tmp_path: Path
+) -> None:
+    settle(session)
+    policy, text = tmp_path / "policy.py", "def act(obs):\n    return obs[:, :8] * 0 + {}\n"
+    policy.write_text(text.format("0.50"))
+    session.set_action_source("policy", f"{policy}:act")
+    session.play()
+    wait_until(session, lambda v: v.step.action is not None and np.allclose(v.step.action, 0.5), "its action")
+    # Of the same length and in the same second as the one before.
+    for action in ("0.25", "0.75"):
+        policy.write_text(text.format(action))
+        wait_until(session, lambda v, a=float(action): np.allclose(v.step.action, a), "the new one's action")
+    policy.write_text(text.format("0.25 +"))
+    view = wait_until(session, lambda v: v.problem is not None and not v.playing, "the problem")
+    assert (view.problem.stage, view.problem.file, view.problem.line) == ("policy", str(policy), 2)
+    session.wait(-1, 0.5)
+    assert session.view().problem is not None, "it stands for as long as the file is broken"
+    policy.write_text(text.format("0.10"))
+    view = wait_until(session, lambda v: v.playing and np.allclose(v.step.action, 0.1), "the mended one")
+    assert view.problem is None
+    # Somebody who has paused is left alone.
+    session.pause()
+    wait_until(session, lambda v: not v.playing, "the pause")
+    policy.write_text(text.format("0.30 +"))
+    wait_until(session, lambda v: v.problem is not None, "the problem while paused")
+    policy.write_text(text.format("0.30"))
+    wait_until(session, lambda v: v.problem is None, "its end")
+    session.step()
+    view = wait_until(session, lambda v: np.allclose(v.step.action, 0.3), "a step")
+    assert not view.playing and view.problem is None
 
 
 def test_a_policy_that_is_not_named_does_not_step(session: Session) -> None:

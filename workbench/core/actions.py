@@ -94,8 +94,13 @@ def to_env_action(env: BaseEnv, parts: tuple[ActionPart, ...], flat: NDArray[np.
     return {r: torch.cat([s for p, s in zip(parts, split, strict=True) if p.robot == r], 1) for r in robots}
 
 
-def to_flat_action(env: BaseEnv, parts: tuple[ActionPart, ...], action: Any) -> NDArray[np.float32]:
+def to_flat_action(
+    env: BaseEnv, parts: tuple[ActionPart, ...], action: Any, whose: str = "the action"
+) -> NDArray[np.float32]:
     """(N, A) from whatever a policy returned: array or tensor, (A,) or (N, A), or a dict of robots.
+
+    Args:
+        whose: what is wrong is said of this.
 
     Raises:
         ValueError: the shape does not fit, or a value is not finite.
@@ -108,11 +113,23 @@ def to_flat_action(env: BaseEnv, parts: tuple[ActionPart, ...], action: Any) -> 
     if flat.shape == expected[1:]:
         flat = np.broadcast_to(flat, expected)
     if flat.shape != expected:
-        raise ValueError(f"the action has shape {flat.shape}, expected {expected} (envs, dimensions)")
+        raise ValueError(_wrong_shape(whose, flat.shape, expected, env.control_mode))
     # The sum is quick, and may be infinite where no number is.
     if not math.isfinite(np.add.reduce(flat, axis=None)) and not np.isfinite(flat).all():
-        raise ValueError("the action holds NaN or infinity")
+        raise ValueError(f"{whose} holds NaN or infinity")
     return np.array(flat)
+
+
+def _wrong_shape(whose: str, shape: tuple[int, ...], expected: tuple[int, int], mode: Any) -> str:
+    said = f"{whose} has shape {shape}, expected {expected} (envs, dimensions)"
+    if not shape or shape[-1] == expected[1]:
+        return said
+    # Several robots have a mode each.
+    modes = ", ".join(f"{one}" for one in mode.values()) if isinstance(mode, dict) else str(mode)
+    return (
+        f"{said}: it is {shape[-1]} wide, and the control mode {modes} takes {expected[1]}. Name the one that it is written "
+        "for with --env control_mode=..., or return as many"
+    )
 
 
 def _numpy(values: Any) -> NDArray[np.float32]:

@@ -89,7 +89,8 @@ class Acting:
                 if self._policy is None:
                     with self._folder.again():
                         self._policy = load_policy(self._policy_name, self._beside)
-                return actions.to_flat_action(task.env, task.parts, self._policy(task.obs))
+                whose = f"what {self._policy_name} returned"
+                return actions.to_flat_action(task.env, task.parts, self._policy(task.obs), whose)
             except BaseException as error:
                 if isinstance(error, self._leaves):
                     raise

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
     Plan = SourceEdit | Refusal
 
+PARENTS_HOOKS = ("_default_sensor_configs", "_default_human_render_camera_configs")
+"""What a task's class can take over from its parent."""
 MADE = ("written", "checked", "mismatch")
 """Stages in which the change is in the file."""
 
@@ -62,9 +64,10 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish) -> Writing:
     made: Plan
     texts, unread = _texts(task)
     elsewhere = "" if wish.what == "add" or info is None else _made_elsewhere(task, info)
-    if elsewhere and info is not None:
-        text = "" if wish.settings is None else _with_mount(info, wish)
-        made = camera_source.Refusal(elsewhere, text)
+    if unread:
+        made = camera_source.Refusal(unread)
+    elif elsewhere and info is not None:
+        made = _made_of_a_parents(task, texts, info, wish, elsewhere)
     elif not task.source_files:
         text = "" if wish.settings is None else camera_source.snippet(wish.result[1], wish.settings)
         where = "" if task.file is None else f" ({task.file})"
@@ -73,8 +76,6 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish) -> Writing:
             "folder of your own",
             text,
         )
-    elif unread:
-        made = camera_source.Refusal(unread)
     else:
         made = _made(task, texts, info, wish)
     if isinstance(made, camera_source.SourceEdit):
@@ -87,7 +88,8 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish) -> Writing:
     if isinstance(made, camera_source.Refusal):
         can_copy = not elsewhere and _could_be_copied(task)
         ways = " You can copy the text below into the file yourself." if made.snippet and not can_copy else ""
-        ways = " The text below is for a class of your own that inherits from it." if elsewhere else ways
+        if elsewhere and info is not None and (not task.source_files or _is_a_robots(info)):
+            ways = " The text below is for a class of your own that inherits from it."
         message = f"Not written: {made.reason}.{ways}"
         return Writing("refused", wish.result, wish.what, None, made, message, can_copy)
     message = f"{_intended(wish, made.names)} Nothing is written yet."
@@ -121,21 +123,41 @@ def _made_elsewhere(task: TaskDescription, info: CameraInfo) -> str:
     own = {Path(file).resolve() for file in (task.file, *task.source_files) if file is not None}
     if info.site is None or Path(info.site.file).resolve() in own:
         return ""
-    return (
-        f"{info.name} is not the task's own: the robot, or else what the task is made of, brings it "
-        f"({info.site.file}, line {info.site.line})"
-    )
+    owner = info.site.function.rpartition(".")[0] or "another file"
+    brings = "the robot brings it, by" if _is_a_robots(info) else "it is made by"
+    return f"{info.name} is not the task's own: {brings} {owner} ({info.site.file}, line {info.site.line})"
 
 
-def _with_mount(info: CameraInfo, wish: Wish) -> str:
+def _is_a_robots(info: CameraInfo) -> bool:
+    return info.site is not None and info.site.function.rpartition(".")[2] == "_sensor_configs"
+
+
+def _made_of_a_parents(
+    task: TaskDescription, texts: dict[str, str], info: CameraInfo, wish: Wish, elsewhere: str
+) -> Plan:
+    """A hook that puts another camera in place of a parent's, in the task's own class or to be copied."""
     from workbench.authoring import camera_source
 
-    assert wish.settings is not None
+    if wish.settings is None:
+        return camera_source.Refusal(elsewhere)
+    (kind, _), (_, uid), site = wish.key, wish.result, info.site
+    assert site is not None
     link = (info.mount or "").partition("/")[2]
-    hook = "" if info.site is None else info.site.function.rpartition(".")[2]
-    robot = "self.robot" if hook == "_sensor_configs" else "self.agent.robot"  # an agent's hook, or a task's
+    robot = "self.robot" if _is_a_robots(info) else "self.agent.robot"
     more = [f'mount={robot}.links_map["{link}"]'] if link else []
-    return camera_source.snippet(wish.result[1], wish.settings, more=more)
+    if site.function.rpartition(".")[2] not in PARENTS_HOOKS:
+        return camera_source.Refusal(elsewhere, camera_source.snippet(uid, wish.settings, more=more))
+    whole = camera_source.override_text(kind, uid, wish.settings, more)
+    if wish.what != "edit" or task.file is None or task.file not in texts:
+        return camera_source.Refusal(elsewhere, whole)
+    if info.varies:
+        reason = (
+            f"{elsewhere}; the task's own code moves it besides, so one pose in the file would not place it"
+        )
+        return camera_source.Refusal(reason, whole)
+    return camera_source.plan_override(
+        texts, task.file, task.class_name, kind, uid, wish.settings, site, more
+    )
 
 
 def _could_be_copied(task: TaskDescription) -> bool:

@@ -342,10 +342,23 @@ class LiveState:
             self.action_request(),
         ]
 
+    @property
+    def folder(self) -> Path | None:
+        """Of the task's own file, where a policy's may lie too."""
+        return None if self.own_file is None else self.own_file.parent
+
     def action_request(self) -> SetActionSource:
-        """Where the actions come from; a policy's file may also lie beside the task's."""
-        beside = None if self.own_file is None else str(self.own_file.parent)
+        """Where the actions come from."""
+        beside = None if self.folder is None else str(self.folder)
         return SetActionSource(self.action_source, self.policy, beside)
+
+    def policy_saved(self) -> SetActionSource:
+        """What was wrong with it before is past; what it stopped goes on, if it is well now."""
+        mended = self.problem is not None and self.problem.stage == "policy"
+        if mended:
+            self.set_problem(None)
+            self._runs()
+        return replace(self.action_request(), play=mended and self.wants_play)
 
     def watch_request(self) -> WatchCameras:
         """The pictures that somebody looks at; none while no page is open."""

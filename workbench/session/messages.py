@@ -170,6 +170,8 @@ class SetActionSource:
     """``module:function`` or ``file.py:function`` when `source` is ``policy``; None while none is named."""
     beside: str | None = None
     """The folder in which a policy's file is looked for when it is not in the current one."""
+    play: bool = False
+    """Play on, once it can be taken."""
 
 
 @dataclass(frozen=True)

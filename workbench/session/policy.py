@@ -13,7 +13,7 @@ import importlib.util
 import linecache
 import sys
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -88,6 +88,10 @@ class _Loader(importlib.machinery.SourceFileLoader):
 
     def get_data(self, path: str) -> bytes:
         return read_regular_file(path, MOST_SOURCE_BYTES)
+
+    def path_stats(self, path: str) -> Mapping[str, Any]:
+        # Python's own cache tells two versions apart by length and whole seconds: a second save would not be seen.
+        raise OSError("no bytecode is kept")
 
 
 def problem_of(

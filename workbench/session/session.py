@@ -55,6 +55,7 @@ from workbench.session.messages import (
     TaskOptions,
     WarmUp,
 )
+from workbench.session.policy_file import PolicyFile
 from workbench.session.printed import PrintedLine, PrintedLog
 from workbench.session.record_live import LiveRecorder
 from workbench.session.reward_terms import TermCurves
@@ -119,6 +120,7 @@ class Session:
         )
         self._keeper = PastKeeper(recordings, self._recorder.finisher, self._note)
         self._judge = Judge(self._note)
+        self._policy_file = PolicyFile(self._on_policy_saved)
         self.past = TimeTravel(self._shared, self._send, self.pause)
         """What the batch lived through."""
         self.studio = CameraStudio(
@@ -233,6 +235,13 @@ class Session:
     def set_action_source(self, source: ActionSource, policy: str | None = None) -> None:
         self._shared.set(action_source=source, policy=policy)
         self._send(self._state.action_request())
+        self._policy_file.follow(policy if source == "policy" else None, self._state.folder)
+
+    def _on_policy_saved(self) -> None:
+        with self._lock:
+            request = self._state.policy_saved()
+        self._note()
+        self._send(request)
 
     def set_sliders(self, action: tuple[float, ...]) -> None:
         """The action (A,) that every env gets while the action source is ``sliders``."""
@@ -358,6 +367,7 @@ class Session:
         stop_listening(self._say_failure)
         self._shared.close()
         self._versions.close()
+        self._policy_file.close()
         self._worker.stop()
         self._judge.close()
         self.studio.close()

@@ -276,6 +276,9 @@ class Worker:
             # Before a task is loaded it would pass for a failure of the load; the first step says it.
             if self._held.opened is not None:
                 self._held.fail(error.problem)
+            return
+        if request.play and not self._playing:
+            self._play(Play(True))
 
     def _set_sliders(self, request: SetSliders) -> None:
         self._acting.sliders = request.action

@@ -7,6 +7,7 @@ the reason and a snippet to copy.
 
 from workbench.authoring.camera_source.disk import apply, not_writable, revert
 from workbench.authoring.camera_source.members import plan_add, plan_duplicate, plan_remove, plan_rename
+from workbench.authoring.camera_source.override import override_text, plan_override
 from workbench.authoring.camera_source.plan import plan_edit
 from workbench.authoring.camera_source.result import Refusal, SourceEdit
 from workbench.authoring.camera_source.snippet import snippet
@@ -16,9 +17,11 @@ __all__ = [
     "SourceEdit",
     "apply",
     "not_writable",
+    "override_text",
     "plan_add",
     "plan_duplicate",
     "plan_edit",
+    "plan_override",
     "plan_remove",
     "plan_rename",
     "revert",

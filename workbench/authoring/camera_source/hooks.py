@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import libcst as cst
@@ -27,9 +27,14 @@ _CONFIG = "from mani_skill.sensors.camera import CameraConfig\n"
 
 
 def needed_imports(
-    project: Project, file: SourceFile, settings: CameraSettings, with_sapien: bool = True
+    project: Project,
+    file: SourceFile,
+    settings: CameraSettings,
+    with_sapien: bool = True,
+    more: Sequence[tuple[str, str]] = (),
 ) -> tuple[list[Replacement], list[str]]:
-    wanted = [("CameraConfig", _CONFIG)]
+    """What is missing at the top of the file; `more` are names, each with its line."""
+    wanted = [("CameraConfig", _CONFIG), *more]
     if with_sapien:
         wanted.append(("sapien", "import sapien\n"))
     if settings.intrinsic is not None:
@@ -148,8 +153,6 @@ def new_hook(
     project: Project, file: SourceFile, cls: cst.ClassDef, hook: Hook, text: Callable[[str], str]
 ) -> list[Replacement]:
     """The hook, which returns the one camera that `text(indent)` is."""
-    if not isinstance(cls.body, cst.IndentedBlock) or not cls.body.body:
-        raise Refused(f"the class {cls.name.value} has no body to add {hook} to")
     for where, parent in project.above(file, cls, []):
         if hook in project.bindings(where, parent):
             raise Refused(
@@ -161,16 +164,28 @@ def new_hook(
                 raise Refused(
                     f"{parent.name.value} inherits from {name}, whose cameras a {hook} of its own would take away"
                 )
+
+    def whole(indent: str) -> str:
+        inner = indent + "    "
+        return (
+            f"{indent}@property\n{indent}def {hook}(self):\n{inner}return [\n"
+            f"{inner}    {text(inner + '    ')},\n{inner}]\n"
+        )
+
+    return [at_end_of_class(file, cls, hook, whole)]
+
+
+def at_end_of_class(
+    file: SourceFile, cls: cst.ClassDef, hook: Hook, text: Callable[[str], str]
+) -> Replacement:
+    """`text(indent)`, the whole hook, as the last of the class."""
+    if not isinstance(cls.body, cst.IndentedBlock) or not cls.body.body:
+        raise Refused(f"the class {cls.name.value} has no body to add {hook} to")
     first = cls.body.body[0]
     line = file.line_text(file.line(first))
     indent = line[: len(line) - len(line.lstrip())]
-    inner = indent + "    "
     end = file.span(cls.body.body[-1])[1]
     end = file.text.find("\n", end)
     at = len(file.text) if end < 0 else end + 1
     lead = "\n" if end >= 0 else "\n\n"
-    new = (
-        f"{lead}{indent}@property\n{indent}def {hook}(self):\n{inner}return [\n"
-        f"{inner}    {text(inner + '    ')},\n{inner}]\n"
-    )
-    return [Replacement(at, at, new)]
+    return Replacement(at, at, f"{lead}{text(indent)}")

@@ -97,7 +97,7 @@ def plan_rename(
         elsewhere = len(re.findall(rf"[\"']{re.escape(uid)}[\"']", new_text))
         if elsewhere:
             notes.append(f"{uid!r} still stands in {elsewhere} other place(s) of {call.file.name}")
-        _check(project, call.file, call, new_text, new_uid)
+        checked(project, call.file, call, new_text, new_uid)
         return SourceEdit(call.file.path, call.file.text, new_text, tuple(notes), settings)
     except Refused as refused:
         return Refusal(refused.reason, snippet(new_uid, settings))
@@ -193,8 +193,8 @@ def _add(
     else:
         replacement = new_hook(project, file, cls, hook, text)
     new_text = file.replaced([*imports, *replacement])
-    found = _check(project, file, None, new_text, uid)
-    return SourceEdit(file.path, file.text, new_text, tuple(notes), _as_written(found, settings))
+    found = checked(project, file, None, new_text, uid)
+    return SourceEdit(file.path, file.text, new_text, tuple(notes), as_written(found, settings))
 
 
 def _siblings_look_at(project: Project, file: SourceFile, hook: str) -> str:
@@ -238,8 +238,8 @@ def _insert_beside(
         )
 
     new_text = file.replaced(appended(file, value, uid, indented))
-    found = _check(project, file, None, new_text, uid)
-    return SourceEdit(file.path, file.text, new_text, (), _as_written(found, settings))
+    found = checked(project, file, None, new_text, uid)
+    return SourceEdit(file.path, file.text, new_text, (), as_written(found, settings))
 
 
 # --- renaming ------------------------------------------------------------------------------------
@@ -296,7 +296,7 @@ def _remove(project: Project, call: CameraCall, uid: str) -> SourceEdit:
             f"the camera is made at {call.where} and used elsewhere under a name; take it out by hand"
         )
     new_text = file.replaced([replacement])
-    _check(project, file, call, new_text, None)
+    checked(project, file, call, new_text, None)
     pose = call.arguments.get("pose")
     notes = []
     if pose is not None and isinstance(pose.value, cst.Name):
@@ -338,7 +338,7 @@ def _without(file: SourceFile, elements: list, index: int, is_tuple: bool) -> Re
 # --- is it right ---------------------------------------------------------------------------------
 
 
-def _check(
+def checked(
     project: Project, file: SourceFile, without: CameraCall | None, new_text: str, uid: str | None
 ) -> list[ReadCamera]:
     """Read the new text again: the cameras of before but `without` one, and one more if it has a `uid`.
@@ -365,7 +365,7 @@ def _check(
     return list(readings(changed, more[0])) if more else []
 
 
-def _as_written(found: list[ReadCamera], settings: CameraSettings) -> CameraSettings:
+def as_written(found: list[ReadCamera], settings: CameraSettings) -> CameraSettings:
     """`settings` as the text has them, rounded; of several branches the one that is closest."""
 
     def apart(read: ReadCamera) -> int:
