@@ -9,7 +9,9 @@ not interrupted: of any number of the state (velocities included), and of any jo
     warmed          put there some steps earlier, the steps made again, then put at the moment quickly
     lived through   the run's first moment put there, and every action up to the moment made again
 
-The run begins as a live page's does: a reset, and its own snapshot put back at once.
+The run begins as a live page's does: a reset that is an exact point (`core.snapshot.begin_anew`). A page goes back in the
+last way (`session.go_back`), and in the first where that does not come out to the last byte, takes too long, or begins
+before what is kept.
 """
 
 # ManiSkill annotates an env's members as the widest thing they may be in any task.
@@ -34,7 +36,7 @@ from numpy.typing import NDArray
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from workbench.core import actions
-from workbench.core.snapshot import Snapshot
+from workbench.core.snapshot import Snapshot, begin_anew
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env
 
 AFTER = (1, 5, 20)
@@ -65,7 +67,7 @@ KINDS = (
     Kind("a hopper", "MS-HopperHop-v1"),
     Kind("an ant", "MS-AntWalk-v1"),
     Kind("a humanoid", "MS-HumanoidStand-v1"),
-    Kind("a valve in a hand", "RotateValveLevel0-v1"),
+    Kind("three fingers and a cube", "TriFingerRotateCubeLevel0-v1"),
     Kind("a drawer", "OpenCabinetDrawer-v1"),
 )
 
@@ -107,7 +109,7 @@ def make_run(task: TaskEnv, kind: Kind, steps: int) -> Run:
         held.set_pose(pose)
         env.scene._gpu_apply_all()
         env.scene._gpu_fetch_all()
-    task.restore(task.snapshot())
+    begin_anew(env, list(range(task.num_envs)))
     run = Run([task.snapshot()], [], [state_of(task)], [qpos_of(task)])
     for _ in range(steps):
         action = actions.random_action(task.parts, task.num_envs, rng)

@@ -11,11 +11,12 @@ to exactly restores each snapshot right after it was taken. *A restore goes on a
 for what PhysX keeps to itself: contact caches, the order in which it solves contacts, and the last bit of an
 articulation's root, which it holds by its centre of mass and rounds when it is set. Nothing else is missing: an
 uninterrupted run whose bodies are moved into a new scene, with no number written, goes on as the restored one does
-(tested). Measured over all 46 tasks that ship with ManiSkill, five control steps after a restore, as the largest
-difference of any number of the state (velocities included): nothing for a cart-pole, about 1e-7 in free motion
-(PushT 6e-6, PickCube 1e-5), 1e-4 to 5e-3 where bodies press on each other, up to 9e-2 for hands and legged robots
-in full contact. The worst that was met: a cube struck by a finger that was being pressed into the table spun
-at 10.9 rad/s in place of 11.8, one step later. ``web_assets/docs/task_ids.md`` has every task's figures.
+(tested). How far that goes hangs on what touches, five steps later: nothing for a cart-pole, 1e-3 rad of a joint where a
+hand holds or pushes, 2e-2 rad for a humanoid that lies, and no bound where a fall or a slip hangs on it (``tests/benchmarks/restore_distance.py`` measures it by kind of task,
+``web_assets/docs/task_ids.md`` has every task's figures). Writing the state some steps earlier and making those
+steps again before it is written does not help: what is written takes the contacts with it. What helps is to write only
+at an *exact point* (`begin_anew`, or right after a restore), and to make every step since then again: that gives
+the moment to the last bit. The session goes back so (`session.go_back`).
 """
 
 from __future__ import annotations
