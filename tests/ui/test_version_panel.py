@@ -76,3 +76,15 @@ def test_what_the_author_should_know_stands_there_before_and_after_a_reload() ->
             and "And 2 more." in html
             and "<b>file" not in html
         )
+
+
+def test_the_tasks_of_a_file_can_be_chosen_while_the_one_that_was_asked_for_fails(
+    server: viser.ViserServer,
+) -> None:
+    panel = VersionPanel(server, cast(Any, StillSession()))
+    panel.draw(running(4))
+    assert not panel._task.handle.visible
+    failed = running(4, task=None, state="error", refused=problem(), choices=("TwoEnv", "OneEnv"))
+    panel.draw(failed)
+    assert panel._task.handle.visible and panel._task.handle.value == "TwoEnv"
+    assert panel._task.handle.options == ("OneEnv", "TwoEnv")

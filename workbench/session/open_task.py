@@ -108,7 +108,7 @@ def with_advice(
         file = loaded.file.name
         advice.append(
             f"{loaded.chosen} of {file} was tried, which also has {', '.join(loaded.others)}: name one, as in "
-            f"{file}:{loaded.others[0]}"
+            f"{file}:{loaded.others[-1]}, or choose it as Task on the page"
         )
     if not advice:
         return error
