@@ -6,6 +6,7 @@ import inspect
 from typing import Any
 
 from mani_skill.agents.base_agent import BaseAgent
+from mani_skill.agents.multi_agent import MultiAgent
 from mani_skill.envs.sapien_env import BaseEnv
 
 from workbench.core.broken_rule import Place, in_brackets
@@ -47,13 +48,14 @@ def refuse_unbuilt_agent(agent: Any) -> None:
     Raises:
         ForgottenInit: ``BaseAgent.__init__`` was not called.
     """
-    if isinstance(agent, BaseAgent) and not hasattr(agent, "robot"):
-        cls, place = _culprit(type(agent), BaseAgent)
-        raise ForgottenInit(
-            f"{cls.__name__}.__init__ ends without super().__init__(*args, **kwargs), so the robot was not loaded"
-            f"{in_brackets(place)}. Call it there.",
-            place,
-        )
+    for robot in agent.agents if isinstance(agent, MultiAgent) else [agent]:
+        if isinstance(robot, BaseAgent) and not hasattr(robot, "robot"):
+            cls, place = _culprit(type(robot), BaseAgent)
+            raise ForgottenInit(
+                f"{cls.__name__}.__init__ ends without super().__init__(*args, **kwargs), so the robot was not loaded"
+                f"{in_brackets(place)}. Call it there.",
+                place,
+            )
 
 
 def _culprit(cls: type, base: type) -> tuple[type, Place | None]:
