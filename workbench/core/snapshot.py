@@ -168,7 +168,11 @@ def begin_anew(env: Any, env_idx: list[int]) -> None:
     """Make now an exact point of these envs: PhysX forgets what was before, and their state is one that it gives back.
 
     From an exact point a snapshot and the same actions give the same bits as the run that was not interrupted.
+
+    Args:
+        env: batched on the CPU and reset at least once; wrappers are looked through.
     """
+    env = open_env(env)
     begin_cpu_state_anew(env, _plan(env), env_idx)
 
 
