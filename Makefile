@@ -15,6 +15,7 @@ TASK ?= tasks/push_cube.py
 ARGS ?=
 # Processes that run the tests, a file of tests each: half of the time goes into waiting for a browser or a worker.
 # More would not help two cores, and each compiles the renderer's shaders for itself.
+# The files keep their order: by number of tests, as xdist has it, those of one long test come last and leave a core idle.
 WORKERS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
@@ -45,11 +46,11 @@ open: set-up
 
 test: lint
 	@env_lines=$$($(BIN)/python -m workbench.machine.software_vulkan --export); eval "$$env_lines"; \
-	$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-all: lint
 	@env_lines=$$($(BIN)/python -m workbench.machine.software_vulkan --export); eval "$$env_lines"; \
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 lint: set-up-test
 	$(BIN)/ruff check .
