@@ -16,7 +16,11 @@ from workbench.machine.own_path import without_current_folder
 
 PACKAGE = Path(__file__).parents[2] / "workbench"
 ITSELF = PACKAGE / "machine" / "child_python.py"
-SHOWN = {PACKAGE / "machine" / "doctor.py", PACKAGE / "authoring" / "load.py"}
+SHOWN = {
+    PACKAGE / "machine" / "doctor.py",
+    PACKAGE / "authoring" / "import_problems.py",
+    PACKAGE / "authoring" / "named_modules.py",
+}
 """They tell a person which interpreter this is."""
 STARTERS = {
     ("sys", "executable"),

@@ -107,7 +107,7 @@ def test_a_registration_that_comes_and_goes_is_said(desk: Desk) -> None:
         report.reason
         == "PushCubeEnv is not registered as WorkbenchPushCube-v1 any more, and so has no time limit"
     )
-    report = desk.edit('"WorkbenchPushCube-v1"', '"Another-v1"')
+    report = desk.edit('@register_env("WorkbenchPushCube-v1"', '@register_env("Another-v1"')
     assert report.reason == "PushCubeEnv is registered as Another-v1 now"
     report = desk.save(desk.good)
     assert report.reason == "PushCubeEnv is registered as WorkbenchPushCube-v1 now, and not as Another-v1"

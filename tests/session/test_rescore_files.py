@@ -23,6 +23,7 @@ from workbench.cli import main
 from workbench.core.recorded_state import apart, read_states
 from workbench.recording.read_episode import UnreadableRecording, read_episode, read_maniskill
 from workbench.session import rescore_words as words
+from workbench.session.given_actions import read_given
 from workbench.session.messages import TaskOptions
 from workbench.session.record import RecordOptions, record
 from workbench.session.relive import arrive
@@ -83,6 +84,18 @@ def foreign(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def edit(author: Path, old: str, new: str) -> None:
     assert old in TEXT
     (author / "push_cube.py").write_text(TEXT.replace(old, new))
+
+
+def test_no_recording_is_opened_in_this_process(
+    author: Path, foreign: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(path: Path) -> None:
+        raise AssertionError(f"{path} was opened here")
+
+    for module in ("read_maniskill", "read_episode"):
+        monkeypatch.setattr(f"workbench.recording.{module}.open_h5", refuse)
+    assert len(rescore_all(RescoreOptions((foreign, author / "recordings")))[0]) == 5
+    assert [len(one.actions) for one in read_given(foreign).episodes] == [STEPS, STEPS]
 
 
 def test_todays_file_is_found_and_says_what_was_recorded(author: Path) -> None:

@@ -136,13 +136,12 @@ def read_recording(
 
 def find_sources(path: Path) -> list[tuple[Path, str | None]]:
     """Path and part of the recordings that a file is or a folder holds. Raises as `read_recording`."""
-    path = Path(path).absolute()
-    reader = _reader(path if path.is_dir() else path.parent, episodes=True)
-    reader.allow(_beyond([path]))
-    answer = _asked(reader, Sources(bytes_of(path)), path.name).answer
-    if not isinstance(answer, SourcesFound):
-        raise UnreadableRecording(f"{path.name} gave {type(answer).__name__}.")
-    return [(path_of(found), part) for found, part in answer.sources]
+    return _found(path, trajectories=False)
+
+
+def find_trajectories(path: Path) -> list[str]:
+    """Names of the episodes in an ``.h5`` of ManiSkill's, in the order of their numbers. Raises as `read_recording`."""
+    return [part for _, part in _found(path, trajectories=True) if part is not None]
 
 
 def told_rerun(path: Path) -> tuple[str | None, bytes | None]:
@@ -154,6 +153,16 @@ def told_rerun(path: Path) -> tuple[str | None, bytes | None]:
     if not isinstance(answer, ToldRerun):
         raise UnreadableRecording(f"{path.name} gave {type(answer).__name__}.")
     return answer.store, answer.blueprint
+
+
+def _found(path: Path, trajectories: bool) -> list[tuple[Path, str | None]]:
+    path = Path(path).absolute()
+    reader = _reader(path if path.is_dir() else path.parent, episodes=True)
+    reader.allow(_beyond([path]))
+    answer = _asked(reader, Sources(bytes_of(path), trajectories), path.name).answer
+    if not isinstance(answer, SourcesFound):
+        raise UnreadableRecording(f"{path.name} gave {type(answer).__name__}.")
+    return [(path_of(found), part) for found, part in answer.sources]
 
 
 def _reader(folder: Path, episodes: bool) -> Reader:

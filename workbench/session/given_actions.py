@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.machine.regular_file import open_regular_file
-from workbench.recording.read_episode import read_maniskill, trajectories
+from workbench.recording.reading import find_trajectories, read_recording
 
 MOST_BYTES = 2**30
 """Of a NumPy file, also unpacked: 20 million steps of a Panda."""
@@ -125,8 +125,8 @@ def _array(file: IO[bytes], size: int) -> NDArray:
 
 def _demonstrations(path: Path) -> GivenEpisodes:
     episodes, kwargs = [], {}
-    for name in trajectories(path):
-        episode = read_maniskill(path, name)
+    for name in find_trajectories(path):
+        episode = read_recording("maniskill", path, name)
         if episode.length == 0:
             continue
         seed = episode.info.seed if episode.info.seed >= 0 else None

@@ -26,8 +26,9 @@ from workbench.recording.description import info_from
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.json_file import NotJson, read_json
 from workbench.recording.made_here import made_here
-from workbench.recording.read_episode import UnreadableRecording, trajectories
+from workbench.recording.reading import find_trajectories
 from workbench.recording.side_files import side_files_in_words
+from workbench.recording.unreadable import UnreadableRecording
 from workbench.session.clearance import Wanted, recorded_content
 from workbench.session.judgement import SAME_REWARD
 from workbench.session.messages import TaskOptions
@@ -215,7 +216,7 @@ def _episodes_in(file: Path) -> Iterator[EpisodeFile]:
         yield EpisodeFile(id, file.stem, file.with_suffix(".json"))
     elif "episodes" in said and file.with_suffix(".h5").is_file():
         data = file.with_suffix(".h5")
-        for name in trajectories(data):
+        for name in find_trajectories(data):
             yield EpisodeFile(f"{data.resolve()}#{name}", f"{file.stem}#{name}", data, name)
     elif file.suffix == ".rrd":
         yield EpisodeFile(str(file.resolve()), file.stem, file)

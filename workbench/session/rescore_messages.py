@@ -27,13 +27,13 @@ class EpisodeFile:
     """Of a file of ManiSkill's, which may hold several."""
 
     def read(self) -> Episode:
-        """Raises as `read_episode`."""
+        """Raises as `read_recording`."""
         # Not at the top: every worker knows these messages, and few read a recording.
-        from workbench.recording.read_episode import read_episode, read_maniskill
+        from workbench.recording.reading import read_recording
 
-        if self.trajectory is None:
-            return read_episode(self.path)
-        return read_maniskill(self.path, self.trajectory)
+        return read_recording(
+            "ours" if self.trajectory is None else "maniskill", self.path, self.trajectory or ""
+        )
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,8 @@ class Sources(msgspec.Struct, frozen=True, tag=True):
     """Which recordings a file is, or a folder holds; answered by `SourcesFound`."""
 
     path: PathBytes
+    trajectories: bool = False
+    """It is an ``.h5`` and is read as ManiSkill's, whatever lies beside it."""
 
 
 class ForRerun(msgspec.Struct, frozen=True, tag=True):

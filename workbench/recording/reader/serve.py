@@ -95,10 +95,7 @@ class _Reader:
         if isinstance(wanted, PictureAt):
             return self._picture(wanted)
         if isinstance(wanted, Sources):
-            from workbench.recording.source_files import sources_in
-
-            found = [(bytes_of(path), part) for path, part in sources_in(path_of(wanted.path))]
-            return SourcesFound(found), None
+            return _sources(wanted), None
         assert isinstance(wanted, ForRerun)
         return _told_rerun(wanted), None
 
@@ -134,6 +131,15 @@ class _Reader:
             return PictureRead(None, pictures.blob(wanted.index)), None
         arrays = ArrayPacker()
         return PictureRead(arrays.ref(pictures[wanted.index]), None), arrays
+
+
+def _sources(wanted: Sources) -> SourcesFound:
+    from workbench.recording.read_maniskill import trajectories
+    from workbench.recording.source_files import sources_in
+
+    path = path_of(wanted.path)
+    found = ((path, name) for name in trajectories(path)) if wanted.trajectories else sources_in(path)
+    return SourcesFound([(bytes_of(path), part) for path, part in found])
 
 
 def _told_rerun(wanted: ForRerun) -> ToldRerun:
