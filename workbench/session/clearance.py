@@ -220,7 +220,7 @@ class Clearances:
             elif not one.recorded_text and not _is_as_it_was(its.content):
                 cleared.append(
                     NotCleared(
-                        f"the code of {its.content.main} was changed while you were asked about it; try it again"
+                        f"the code of {_printable(its.content.main)} was changed while you were asked about it; try it again"
                     )
                 )
             else:
