@@ -8,9 +8,10 @@ from contextlib import AbstractContextManager
 
 from rich.console import Console
 from rich.markup import escape
+from rich.text import Text
 
 from workbench.machine.terminal_text import plain_text
-from workbench.session.clearance import FOLLOWED, Answer, AskedFile, NotTrusted, Question, Since, in_words
+from workbench.session.clearance import Answer, AskedFile, NotTrusted, Question, Since, in_words
 
 MOST_NAMED = 20
 """Questions that are listed where nobody can answer them."""
@@ -92,8 +93,6 @@ def print_question(question: Question, out: Console) -> None:
         out.print(f"[yellow]{escape(plain_text(what))}[/]", soft_wrap=True)
     for what in question.unseen:
         out.print(f"[yellow]{escape(plain_text(what))}[/]", soft_wrap=True)
-    if question.followed:
-        out.print(FOLLOWED, soft_wrap=True)
     out.print(
         "It can read and change all that you can. The digits are the first that sha256sum says of each file."
     )
@@ -104,7 +103,8 @@ def print_texts(question: Question, out: Console) -> None:
     for file in question.files:
         out.print(f"[bold]{escape(plain_text(file.name))}[/]  {file.hash}", soft_wrap=True)
         for number, line in enumerate(file.text.split("\n"), 1):
-            out.print(f"[dim]{number:5}[/] {escape(plain_text(line, TAB))}", soft_wrap=True)
+            # Not as markup, in which `:x:` would be a picture.
+            out.print(Text.assemble((f"{number:5} ", "dim"), plain_text(line, TAB)), soft_wrap=True)
 
 
 def not_trusted(error: NotTrusted) -> list[str]:
