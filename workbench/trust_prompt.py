@@ -76,7 +76,7 @@ def print_question(question: Question, out: Console) -> None:
         f"    [bold]{escape(plain_text(question.file))}[/]  {_marks(question.files[0])}", soft_wrap=True
     )
     if question.computed and question.modules:
-        out.print("It computes names of what it imports, so it may import all that lies beside it:")
+        out.print("What it imports cannot be told by reading it, so it may import all that lies beside it:")
     elif question.modules:
         out.print("It imports from beside it:")
     for module in question.modules:

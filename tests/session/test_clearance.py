@@ -161,9 +161,11 @@ def test_an_answer_is_kept_by_what_the_texts_say(foreign: Path, tmp_path: Path) 
     helper.write_text("A = 2\n")
     assert since(foreign) == {"push.py": Since.SAME, "helper.py": Since.CHANGED}
     helper.write_text("A = 1\n")
-    file.write_text(f"{TEXT}import further\n")
-    (file.parent / "further.py").write_text("")
-    assert since(foreign) == {"push.py": Since.CHANGED, "helper.py": Since.SAME, "further.py": Since.NEW}
+    (file.parent / "zebra.py").write_text("")
+    file.write_text(f"{TEXT}import zebra\n")
+    found = since(foreign)
+    assert found == {"push.py": Since.CHANGED, "helper.py": Since.SAME, "zebra.py": Since.NEW}
+    assert list(found) == ["push.py", "zebra.py", "helper.py"], "what is new first"
     file.write_text("class Push: ...\n")
     assert since(foreign) == {"push.py": Since.CHANGED} and asked(todays(foreign))[0].gone == ("helper.py",)
     file.write_text(TEXT)

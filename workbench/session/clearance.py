@@ -287,7 +287,7 @@ class Clearances:
 
 
 def asked_files(content: TaskContent, before: Mapping[str, str] | None = None) -> tuple[AskedFile, ...]:
-    """What would run, file by file.
+    """What would run, file by file: the task's own first, then the modules, those that changed before the others.
 
     Args:
         before: `TaskContent.file_sums` of what was trusted before, if anything was; empty where that is not known.
@@ -300,7 +300,8 @@ def asked_files(content: TaskContent, before: Mapping[str, str] | None = None) -
             since = Since.CHANGED if name in before else Since.NEW
         shown = content.main if paths[name] == content.main else name
         files.append(AskedFile(_printable(shown), found[:SHORT_HASH], content.texts[paths[name]], since))
-    return tuple(files)
+    # What is new to a person is not to be looked for in a long list.
+    return (*files[:1], *sorted(files[1:], key=lambda file: file.since is Since.SAME))
 
 
 def _registered(reference: RecordedTask) -> TaskName | NotCleared:
