@@ -75,10 +75,8 @@ def print_question(question: Question, out: Console) -> None:
     out.print(
         f"    [bold]{escape(plain_text(question.file))}[/]  {_marks(question.files[0])}", soft_wrap=True
     )
-    if question.computed and question.modules:
-        out.print("What it imports cannot be told by reading it, so it may import all that lies beside it:")
-    elif question.modules:
-        out.print("It imports from beside it:")
+    if question.modules:
+        out.print(_about_modules(question), soft_wrap=True)
     for module in question.modules:
         out.print(f"    {escape(plain_text(module.name))}  {_marks(module)}", soft_wrap=True)
     if question.nothing_known:
@@ -94,7 +92,8 @@ def print_question(question: Question, out: Console) -> None:
     for what in question.unseen:
         out.print(f"[yellow]{escape(plain_text(what))}[/]", soft_wrap=True)
     out.print(
-        "It can read and change all that you can. The digits are the first that sha256sum says of each file."
+        "It can read and change all that you can. The digits are the first that sha256sum says of each file.",
+        soft_wrap=True,
     )
 
 
@@ -131,6 +130,14 @@ def not_trusted(error: NotTrusted) -> list[str]:
         "Read it. Then run the command in a terminal, where you are asked, and where show prints the text; or add --trust, which "
         "agrees for this run; or name your own task file with --task.",
     ]
+
+
+def _about_modules(question: Question) -> str:
+    if question.recorded_text:
+        return "Beside it they hold what it may import:"
+    if question.computed:
+        return "What it imports cannot be told by reading it, so it may import all that lies beside it:"
+    return "It imports from beside it:"
 
 
 def _marks(file: AskedFile) -> str:
