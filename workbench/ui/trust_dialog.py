@@ -100,7 +100,6 @@ class TrustDialog:
             with self._server.atomic():
                 self._window = Window(self._server, TITLE, lambda: None)
                 with self._window.modal:
-                    gui.add_html(question_html(question))
                     # The first has the focus: Enter must not run anything.
                     self._add_button(DO_NOT, None, viser.Icon.X, pending, Answer.NO)
                     if question.more:
@@ -108,6 +107,8 @@ class TrustDialog:
                         self._add_button(label, "gray", viser.Icon.X, pending, Answer.NONE)
                     self._add_button(ONCE, "gray", viser.Icon.PLAYER_PLAY, pending, Answer.ONCE)
                     self._add_button(ALWAYS, "gray", viser.Icon.SHIELD_CHECK, pending, Answer.ALWAYS)
+                    # After them, so that no name in it has the focus; page.css puts it above them.
+                    gui.add_html(question_html(question))
                 self._escape = gui.add_command(DO_NOT, hotkey="escape")
                 self._escape.on_trigger(lambda _: pending.take(Answer.NO))
             self._asking(True)
