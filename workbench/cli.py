@@ -286,7 +286,7 @@ def rescore(
     try:
         return run_rescore(what, terminal, err, csv, json, print_finding, trust)
     except NotTrusted as error:
-        for line in not_trusted(error.questions):
+        for line in not_trusted(error):
             refuse(line)
         return Exit.NOT_TRUSTED
     except TaskError as error:

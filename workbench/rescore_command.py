@@ -67,6 +67,7 @@ def run_rescore(
             tell,
             say_finding,
             Clearances(ask=ask, all_trusted=trust),
+            lambda notice: err.print(f"[yellow]{escape(plain_text(notice))}[/]", soft_wrap=True),
         )
         bar.update(row, total=len(verdicts), completed=len(verdicts), description="judged")
     for path, text in ((csv, words.as_csv), (json, words.as_json)):

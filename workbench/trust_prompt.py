@@ -8,11 +8,15 @@ from contextlib import AbstractContextManager
 
 from rich.console import Console
 from rich.markup import escape
+from rich.text import Text
 
 from workbench.machine.terminal_text import plain_text
-from workbench.session.clearance import Answer, Question, in_words
+from workbench.session.clearance import Answer, AskedFile, NotTrusted, Question, Since, in_words
 
 MOST_NAMED = 20
+"""Questions that are listed where nobody can answer them."""
+TAB = "\t"
+_SHOW = ("s", "show")
 _ANSWERS = {
     "y": Answer.ONCE,
     "yes": Answer.ONCE,
@@ -40,14 +44,20 @@ class TerminalPrompt:
     def ask(self, question: Question, stopped: Callable[[], bool]) -> Answer:
         with self._quiet():
             print_question(question, self._out)
-            choices = "y: run it, and ask again next time; a: run it, and trust this text from now on; n: do not run it"
+            choices = (
+                "show: print the text first; y: run it, and ask again next time; a: run it, and trust this text from now on; "
+                "n: do not run it"
+            )
             choices += f"; q: nor the {question.more} more" if question.more else ""
-            self._out.print(f"[bold]Run it?[/] ({choices}) \\[n] ", end="", soft_wrap=True)
-            try:
-                typed = input()
-            except EOFError:
-                return Answer.NO
-        return _ANSWERS.get(typed.strip().lower(), Answer.NO)
+            while True:
+                self._out.print(f"[bold]Run it?[/] ({choices}) \\[n] ", end="", soft_wrap=True)
+                try:
+                    typed = input().strip().lower()
+                except EOFError:
+                    return Answer.NO
+                if typed not in _SHOW:
+                    return _ANSWERS.get(typed, Answer.NO)
+                print_texts(question, self._out)
 
 
 def print_question(question: Question, out: Console) -> None:
@@ -62,28 +72,73 @@ def print_question(question: Question, out: Console) -> None:
             f"Recordings of {escape(plain_text(question.task))} that were not made by this installation name this file:",
             soft_wrap=True,
         )
-    out.print(f"    [bold]{escape(plain_text(question.file))}[/]  {question.hash}", soft_wrap=True)
-    for name in question.modules[:MOST_NAMED]:
-        out.print(f"    and beside it {escape(plain_text(name))}", soft_wrap=True)
-    if len(question.modules) > MOST_NAMED:
-        out.print(f"    and {len(question.modules) - MOST_NAMED} more beside it")
-    if question.changed:
-        out.print("[yellow]You trusted another text of this file before; it has changed since.[/]")
-    for what in question.unseen[:MOST_NAMED]:
+    out.print(
+        f"    [bold]{escape(plain_text(question.file))}[/]  {_marks(question.files[0])}", soft_wrap=True
+    )
+    if question.modules:
+        out.print(_about_modules(question), soft_wrap=True)
+    for module in question.modules:
+        out.print(f"    {escape(plain_text(module.name))}  {_marks(module)}", soft_wrap=True)
+    if question.nothing_known:
+        out.print(
+            "[yellow]You trusted another version of this file and the modules beside it before. Which of them has changed "
+            "since is not known.[/]",
+            soft_wrap=True,
+        )
+    elif question.trusted_before:
+        gone = f"; gone since: {', '.join(question.gone)}" if question.gone else ""
+        what = f"You trusted another version of this before. What has changed since is marked{gone}."
         out.print(f"[yellow]{escape(plain_text(what))}[/]", soft_wrap=True)
-    out.print("It can read and change all that you can.")
+    for what in question.unseen:
+        out.print(f"[yellow]{escape(plain_text(what))}[/]", soft_wrap=True)
+    out.print(
+        "It can read and change all that you can. The digits are the first that sha256sum says of each file.",
+        soft_wrap=True,
+    )
 
 
-def not_trusted(questions: tuple[Question, ...]) -> list[str]:
+def print_texts(question: Question, out: Console) -> None:
+    """The texts that would run, with nothing in them that a terminal takes for more than text."""
+    for file in question.files:
+        out.print(f"[bold]{escape(plain_text(file.name))}[/]  {file.hash}", soft_wrap=True)
+        for number, line in enumerate(file.text.split("\n"), 1):
+            # Not as markup, in which `:x:` would be a picture.
+            out.print(Text.assemble((f"{number:5} ", "dim"), plain_text(line, TAB)), soft_wrap=True)
+
+
+def not_trusted(error: NotTrusted) -> list[str]:
     """Why nothing was run, and what to do; a line each."""
+    said = [
+        f"Nothing was run: {reason}. Add it, which agrees to all in this run, if you know where the recording comes from."
+        for reason in error.reasons
+    ]
+    questions = error.questions
+    if not questions:
+        return said
     if can_ask():
-        return ["Nothing was run: you agreed to none of it."]
-    named = [f"    {in_words(question)}" for question in questions[:MOST_NAMED]]
+        return [*said, "Nothing was run: you agreed to none of it."]
+    named: list[str] = []
+    for question in questions[:MOST_NAMED]:
+        named.append(f"    {in_words(question)}")
+        named += [f"        with {module.name} ({module.hash})" for module in question.modules]
     if len(questions) > MOST_NAMED:
         named.append(f"    and {len(questions) - MOST_NAMED} more")
     return [
+        *said,
         "Nothing was run: the recordings were not made by this installation, and nobody has agreed to the code that they name:",
         *named,
-        "Read it. Then run the command in a terminal, where you are asked; or add --trust, which agrees for this run; or "
-        "name your own task file with --task.",
+        "Read it. Then run the command in a terminal, where you are asked, and where show prints the text; or add --trust, which "
+        "agrees for this run; or name your own task file with --task.",
     ]
+
+
+def _about_modules(question: Question) -> str:
+    if question.recorded_text:
+        return "Beside it they hold what it may import:"
+    if question.computed:
+        return "What it imports cannot be told by reading it, so it may import all that lies beside it:"
+    return "It imports from beside it:"
+
+
+def _marks(file: AskedFile) -> str:
+    return file.hash if file.since is Since.SAME else f"{file.hash}  [yellow]{file.since.value} since[/]"

@@ -12,6 +12,7 @@ from playwright.sync_api import expect, sync_playwright
 from tests.browser.opened import TASK, launch, new_page, open_workbench
 from workbench.session.messages import TaskOptions
 from workbench.session.record import RecordOptions, record
+from workbench.ui.trust_dialog import DO_NOT, ONCE
 
 pytestmark = pytest.mark.browser
 PATIENT = 120_000
@@ -41,7 +42,7 @@ def test_code_of_a_recording_from_elsewhere_runs_when_a_person_says_so(
         judge.click()
         window = page.get_by_role("dialog")
         expect(window).to_contain_text(str(file), timeout=PATIENT)
-        expect(window).to_contain_text("marks.py")
+        expect(window.get_by_role("button", name=DO_NOT)).to_be_focused()
         if screenshot := os.environ.get("TRUST_SCREENSHOT"):
             page.screenshot(path=screenshot)
         # Enter is pressed on what has the focus, and opens nothing behind the window.
@@ -55,12 +56,19 @@ def test_code_of_a_recording_from_elsewhere_runs_when_a_person_says_so(
         # A page that comes later, or again, has the question too.
         page.reload(wait_until="commit")
         expect(window).to_contain_text(str(file), timeout=PATIENT)
+        text = window.get_by_text("open(__file__")
+        expect(text).to_be_hidden()
+        expect(window.get_by_role("button", name=DO_NOT)).to_be_focused()
+        page.keyboard.press("Shift+Tab")  # names of files come after the buttons: the last of all
+        page.keyboard.press("Enter")
+        expect(text).to_be_visible()
         page.keyboard.press("Escape")
         expect(window).to_be_hidden(timeout=PATIENT)
         assert not mark.exists()
 
         live.click()
-        page.get_by_role("button", name="Run it, and ask again next time").click()
+        expect(window).to_contain_text("every save of this file")
+        page.get_by_role("button", name=ONCE).click()
         expect(page.get_by_text("every body is where it was")).to_be_visible(timeout=PATIENT)
         assert mark.exists()
         assert not [error for error in errors if "non-existent component" not in error]

@@ -25,7 +25,7 @@ from workbench.recording.episode import EpisodeInfo
 from workbench.recording.made_here import KEY_FILE, MadeHere, made_here
 from workbench.recording.read_episode import read_episode
 from workbench.recording.recover import recover
-from workbench.session.clearance import Answer, Clearances, NotCleared, Question, Wanted
+from workbench.session.clearance import Answer, Clearances, NotCleared, Question, Since, Wanted
 from workbench.session.recorded_scene import SceneError, SceneProcess
 from workbench.session.step_back import recorded_source, reference_of
 
@@ -116,8 +116,14 @@ def test_what_was_recorded_here_is_not_asked_about_also_with_another_text_today(
 def test_what_was_recorded_elsewhere_is_asked_about_with_file_hash_and_modules(foreign: Path) -> None:
     file = foreign.parents[1] / "push.py"
     (question,) = asked(todays(foreign))
-    assert question.file == str(file) and question.modules == ("helper.py",) and not question.changed
-    assert read_content(file).hash.startswith(question.hash) and len(question.hash) == 12
+    assert question.file == str(file) and not question.trusted_before and not question.followed
+    assert [one.name for one in question.modules] == ["helper.py"]
+    assert [one.text for one in question.files] == [TEXT, "A = 1\n"]
+    file.write_bytes(TEXT.replace("\n", "\r\n").encode())  # the same text, and other bytes
+    (question,) = asked(todays(foreign))
+    paths = (file, file.with_name("helper.py"))
+    said = subprocess.run(["sha256sum", *paths], capture_output=True, text=True, check=True).stdout
+    assert [one.hash for one in question.files] == [line[:12] for line in said.splitlines()]
     (question,) = asked(as_recorded(foreign))
     assert (question.file, question.task, question.recorded_text) == ("push.py", "Push-v1", True)
 
@@ -153,12 +159,62 @@ def test_an_answer_is_kept_by_what_the_texts_say(foreign: Path, tmp_path: Path) 
     shutil.copytree(file.parent, copy)
     assert asked(todays(copy / "recordings" / foreign.name)) == [], "the same texts elsewhere"
     helper.write_text("A = 2\n")
-    assert [question.changed for question in asked(todays(foreign))] == [True]
+    assert since(foreign) == {"push.py": Since.SAME, "helper.py": Since.CHANGED}
     helper.write_text("A = 1\n")
-    file.write_text(f"{TEXT}import further\n")
-    assert [question.changed for question in asked(todays(foreign))] == [True]
+    (file.parent / "zebra.py").write_text("")
+    file.write_text(f"{TEXT}import zebra\n")
+    found = since(foreign)
+    assert found == {"push.py": Since.CHANGED, "helper.py": Since.SAME, "zebra.py": Since.NEW}
+    assert list(found) == ["push.py", "zebra.py", "helper.py"], "what is new first"
+    file.write_text("class Push: ...\n")
+    assert since(foreign) == {"push.py": Since.CHANGED} and asked(todays(foreign))[0].gone == ("helper.py",)
     file.write_text(TEXT)
     assert asked(todays(foreign)) == []
+
+
+def since(recording: Path) -> dict[str, Since]:
+    """What became of each file since it was trusted, as the only question about it says."""
+    (question,) = asked(todays(recording))
+    assert question.trusted_before and not question.nothing_known
+    return {Path(one.name).name: one.since for one in question.files}
+
+
+def test_that_a_file_is_followed_is_a_question_of_its_own(foreign: Path, tmp_path: Path) -> None:
+    live = replace(todays(foreign), followed=True)
+    (question,) = asked(todays(foreign), Answer.ALWAYS)
+    assert not question.followed and not question.agreed
+    (question,) = asked(live)
+    assert question.followed and question.agreed and not question.trusted_before
+    person = Person(Answer.ONCE)
+    clearances = Clearances(ask=person)
+    assert isinstance(clearances.clear(live), RecordedTask) and clearances.clear(live)
+    assert len(person.asked) == 1, "until the program ends"
+    assert len(asked(live, Answer.ALWAYS)) == 1 and asked(live) == []
+    copy = tmp_path / "copy"
+    shutil.copytree(foreign.parents[1], copy)
+    there = todays(copy / "recordings" / foreign.name)
+    assert asked(there) == [] and len(asked(replace(there, followed=True))) == 1, "its saves are others"
+    assert Clearances(all_trusted=True).clear(live)
+
+
+def test_an_answer_to_a_file_that_has_changed_meanwhile_runs_nothing(foreign: Path) -> None:
+    file = foreign.parents[1] / "push.py"
+
+    def ask(question: Question, stopped: Callable[[], bool]) -> Answer:
+        file.with_name("helper.py").write_text("A = 3\n")
+        return Answer.ONCE
+
+    with pytest.raises(NotCleared, match="changed while you were asked about it; try it again"):
+        Clearances(ask=ask).clear(todays(foreign))
+
+
+@pytest.mark.parametrize(
+    "env_id", ["/w/evil.py", "/w/evil.py:Evil", "./evil.py", "evil.py", "~/evil", "..\\evil"]
+)
+def test_a_path_in_place_of_an_id_is_never_opened_and_what_to_do_is_said(foreign: Path, env_id: str) -> None:
+    wanted = Wanted(RecordedTask(env_id), info_of(foreign))
+    with pytest.raises(NotCleared, match="never opened: .* with --task FILE"):
+        Clearances(all_trusted=True).clear(wanted)
 
 
 @pytest.mark.parametrize(
@@ -179,8 +235,9 @@ def test_arguments_from_elsewhere_name_no_files(
     file = foreign.parents[1] / "push.py"
     edit(foreign, **values)
     for wanted in (todays(foreign), as_recorded(foreign), Wanted(str(file), info_of(foreign))):
-        with pytest.raises(NotCleared, match="names files for its env to read"):
+        with pytest.raises(NotCleared, match="names files for its env to read .* --trust") as refused:
             Clearances(ask=Person(Answer.ALWAYS)).clear(wanted)
+        assert refused.value.trust_helps
         Clearances(all_trusted=True).clear(wanted)
     with pytest.raises(SceneError, match="numbers and curves only"):
         SceneProcess()._one(None, None, None, read_episode(foreign), lambda: False, print)  # type: ignore[arg-type]
@@ -310,7 +367,16 @@ def test_without_its_key_a_recording_is_anybodys_and_the_next_has_a_new_one(
 
 
 @pytest.mark.parametrize(
-    "store", ["", "{", "[]", '{"trusted": [1]}', '{"trusted": [{"hash": 1}]}', "[" * 100_000]
+    "store",
+    [
+        "",
+        "{",
+        "[]",
+        '{"trusted": [1]}',
+        '{"trusted": [{"hash": 1}]}',
+        '{"trusted": [{"hash": "1", "file": "", "when": "", "files": [1]}]}',
+        "[" * 100_000,
+    ],
 )
 def test_a_broken_store_trusts_nothing_is_told_once_and_is_kept_aside(
     foreign: Path, store: str, caplog: pytest.LogCaptureFixture
@@ -320,10 +386,26 @@ def test_a_broken_store_trusts_nothing_is_told_once_and_is_kept_aside(
     (user_folder() / STORE_FILE).write_text(store)
     kept = TrustStore()
     assert not kept.trusts(content) and not kept.trusts(content)
-    assert len([record for record in caplog.records if "broken" in record.message]) == 1
+    (said,) = [record.message for record in caplog.records if "broken" in record.message]
+    assert str(user_folder() / STORE_FILE) in said
     kept.trust(content)
     assert TrustStore().trusts(content)
     assert (user_folder() / f"{STORE_FILE}.broken").read_text() == store
+
+
+def test_a_store_of_an_earlier_version_is_read_and_what_it_lacks_is_not_guessed(foreign: Path) -> None:
+    file = foreign.parents[1] / "push.py"
+    content = read_content(file)
+    TrustStore().trust(content)
+    store = user_folder() / STORE_FILE
+    document = json.loads(store.read_bytes())
+    for entry in document["trusted"]:
+        del entry["files"], entry["followed"]
+    store.write_text(json.dumps(document))
+    assert TrustStore().trusts(content) and not TrustStore().follows(content)
+    file.write_text(f"{TEXT}# edited since\n")
+    (question,) = asked(todays(foreign))
+    assert question.trusted_before and question.nothing_known
 
 
 def test_a_store_that_others_may_write_to_trusts_nothing(

@@ -11,6 +11,7 @@ import select
 import shutil
 import sys
 import time
+from html import unescape
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from workbench.session.rescore import find_episodes
 from workbench.session.rescore_all import RescoreOptions, rescore_all
 from workbench.session.rescorer import Rescorer, RescoreView
 from workbench.session.review import Review
+from workbench.ui.rescore_panel import status_html
 
 PATIENCE = 120.0
 TEXT = (Path(__file__).parents[2] / "tasks" / "push_cube.py").read_text()
@@ -75,18 +77,36 @@ def ran(folder: Path) -> bool:
 # --- opening a row -----------------------------------------------------------------------------------
 
 
-def test_a_path_in_place_of_an_id_is_not_loaded_when_its_row_is_opened(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def made_by_maniskill(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("stock")
     env: Any = gym.make("PickCube-v1", obs_mode="state", render_backend="none")
-    env = RecordEpisode(env, str(tmp_path), save_video=False, trajectory_name="demos", source_type="test")
+    env = RecordEpisode(env, str(folder), save_video=False, trajectory_name="demos", source_type="test")
     env.reset(seed=1)
     for _ in range(2):
         env.step(np.zeros(8, np.float32))
     env.close()
+    return folder
+
+
+@pytest.fixture
+def stock(made_by_maniskill: Path, tmp_path: Path) -> Path:
+    """The .json of a pair of ManiSkill's own; beside it a file that leaves a mark when it runs."""
+    for name in ("demos.h5", "demos.json"):
+        shutil.copy(made_by_maniskill / name, tmp_path)
+    (tmp_path / "evil.py").write_text(f"open({str(tmp_path / 'evil_ran')!r}, 'w').write('ran')\n")
+    return tmp_path / "demos.json"
+
+
+def name_evil(pair: Path) -> None:
+    document = json.loads(pair.read_text())
+    document["env_info"]["env_id"] = str(pair.parent / "evil.py")
+    pair.write_text(json.dumps(document))
+
+
+def test_a_path_in_place_of_an_id_is_not_loaded_when_its_row_is_opened(stock: Path, tmp_path: Path) -> None:
+    name_evil(stock)
     mark = tmp_path / "evil_ran"
-    (tmp_path / "evil.py").write_text(f"open({str(mark)!r}, 'w').write('ran')\n")
-    document = json.loads((tmp_path / "demos.json").read_text())
-    document["env_info"]["env_id"] = str(tmp_path / "evil.py")
-    (tmp_path / "demos.json").write_text(json.dumps(document))
     library = Library(tmp_path)
     review = Review(library, make_scene=SceneProcess())
     try:
@@ -151,9 +171,35 @@ def test_without_a_terminal_it_is_refused_with_an_exit_code_that_is_its_own(
         code, told = run([recordings, *more], capfd)
         assert code == Exit.NOT_TRUSTED == 4 and not ran(foreign)
         assert "--trust" in told and "push_cube.py" in told
-    assert run([recordings, "--trust"], capfd)[0] == 0 and ran(foreign)
+    (foreign / "numpy.py").write_text("A = 1\n")
+    code, told = run([recordings, "--trust"], capfd)
+    assert code == 0 and ran(foreign)
+    assert told.count(f"{foreign / 'numpy.py'} has the name of a library") == 1
     assert run([recordings], capfd)[0] == Exit.NOT_TRUSTED, "--trust is for one run"
     assert run([recordings, "--task", str(foreign / "push_cube.py")], capfd)[0] == 0 and ran(foreign)
+
+
+def test_an_env_that_is_to_read_files_is_made_with_trust_only(
+    stock: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    document = json.loads(stock.read_text())
+    document["episodes"][0]["reset_kwargs"]["options"] = {"layout": "../layout.json"}
+    stock.write_text(json.dumps(document))
+    pair = str(stock.with_suffix(".h5"))
+    code, told = run([pair], capfd)
+    assert code == Exit.NOT_TRUSTED and "--trust" in told and "../layout.json" in told
+    assert run([pair, "--trust"], capfd)[0] == Exit.DONE
+
+
+def test_a_path_in_place_of_an_id_is_not_judged_with_and_the_way_out_is_said(
+    stock: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    name_evil(stock)
+    pair = str(stock.with_suffix(".h5"))
+    for more in ([], ["--trust"]):
+        code, told = run([pair, *more], capfd)
+        assert code == Exit.REFUSED and "never opened" in told and "--task FILE" in told
+        assert "import failed" not in told and not (tmp_path / "evil_ran").exists()
 
 
 def test_in_a_terminal_it_is_asked_and_the_answer_is_kept(
@@ -179,13 +225,19 @@ def test_in_a_terminal_it_is_asked_and_the_answer_is_kept(
         code, told = judged(no)
         assert code == Exit.NOT_TRUSTED and not ran(foreign)
     assert "marks.py" in told and str(foreign / "push_cube.py") in told and "Run it?" in told
+    assert HELPER.strip() not in told
+    code, told = judged("show\nn")
+    assert code == Exit.NOT_TRUSTED and not ran(foreign) and HELPER.strip() in told
     code, told = judged("a")
     assert code == 0 and ran(foreign) and "Run it?" in told
     code, told = judged("n")
     assert code == 0 and ran(foreign) and "Run it?" not in told
     (foreign / "marks.py").write_text(HELPER + "# changed\n")
     code, told = judged("n")
-    assert code == Exit.NOT_TRUSTED and not ran(foreign) and "has changed since" in told
+    assert code == Exit.NOT_TRUSTED and not ran(foreign)
+    changed = next(line for line in told.splitlines() if "marks.py" in line)
+    unchanged = next(line for line in told.splitlines() if "push_cube.py" in line)
+    assert "changed since" in changed and "changed since" not in unchanged
     os.close(keyboard)
     os.close(terminal)
 
@@ -198,6 +250,7 @@ def test_on_a_page_it_is_asked_and_a_no_leaves_the_others(foreign: Path, recorde
         asked.append(question)
         return next(answers)
 
+    (foreign / "numpy.py").write_text("A = 1\n")
     rescorer = Rescorer(Clearances(ask=ask))
     try:
         rescorer.start(find_episodes((foreign / "recordings",)))
@@ -206,7 +259,11 @@ def test_on_a_page_it_is_asked_and_a_no_leaves_the_others(foreign: Path, recorde
         rescorer.start(find_episodes((foreign / "recordings",)))
         view = until(rescorer, "done", "failed")
         assert view.state == "done" and len(view.verdicts) == 2, view
-        assert ran(foreign) and [question.modules for question in asked] == [("marks.py",)] * 2
+        (said,) = view.hidden
+        assert f"{foreign / 'numpy.py'} has the name of a library" in said and said in unescape(
+            status_html(view)
+        )
+        assert ran(foreign) and [[one.name for one in q.modules] for q in asked] == [["marks.py"]] * 2
     finally:
         rescorer.close()
 

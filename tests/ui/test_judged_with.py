@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from workbench.authoring.task_content import source_hash
 from workbench.recording.episode import EpisodeInfo
 from workbench.ui.judged_with import RECORDED, TODAYS, codes_for
 
@@ -26,7 +27,7 @@ def recorded(file: Path | None, task: str = "Push-v1") -> EpisodeInfo:
         seed=1,
         source_file=None if file is None else str(file),
         source_hash="0a1b2c",
-        source={},
+        source={} if file is None else {str(file): file.read_text()},
         control_dt=0.05,
         control_mode=None,
         backend="cpu",
@@ -36,7 +37,9 @@ def recorded(file: Path | None, task: str = "Push-v1") -> EpisodeInfo:
 def test_the_file_that_a_recording_names_is_named(file: Path) -> None:
     todays, text = codes_for([recorded(file)], [file])
     assert (todays.label, text.label) == (TODAYS, RECORDED)
-    assert f"{file}" in todays.told and todays.file is None and "0a1b2c" in text.told and text.recorded
+    assert f"{file}" in todays.told and todays.file is None and text.recorded
+    held = source_hash({file.name: file.read_text()}, Path())
+    assert f"(version {held})" in text.told, "of the text that it holds, whatever it says of it"
     assert "Push-v1 as it is installed" in codes_for([recorded(None)], [])[0].told
 
 

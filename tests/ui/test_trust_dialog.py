@@ -12,10 +12,17 @@ from typing import Any
 import pytest
 import viser
 
-from workbench.session.clearance import Answer, Question
+from workbench.session.clearance import Answer, AskedFile, Question, Since
+from workbench.ui import trust_dialog
 from workbench.ui.trust_dialog import ALWAYS, DO_NOT, ONCE, TrustDialog, question_html
 
-PLAIN = Question("/work/push.py", "Push-v1", False, "0123456789ab", ("helper.py",), (), False)
+PUSH = AskedFile("/work/push.py", "0123456789ab", "import helper\n")
+HELPER = AskedFile("helper.py", "ba9876543210", "A = 1\n")
+PLAIN = Question("Push-v1", False, (PUSH, HELPER))
+
+
+def about(name: str) -> Question:
+    return replace(PLAIN, files=(replace(PUSH, name=name),))
 
 
 def asked(
@@ -81,7 +88,7 @@ def test_only_the_first_answer_counts_and_none_comes_before_its_question(
     press(old[DO_NOT])
     press(old[ALWAYS])
     assert future.result(20) is Answer.NO
-    second = asked(dialog, replace(PLAIN, file="/work/other.py"))
+    second = asked(dialog, about("/work/other.py"))
     window_with(server, "/work/other.py")
     press(old[ALWAYS])
     assert not second.done()
@@ -99,7 +106,7 @@ def test_escape_is_a_no(dialog: TrustDialog, server: viser.ViserServer) -> None:
 
 
 def test_questions_come_one_after_the_other(dialog: TrustDialog, server: viser.ViserServer) -> None:
-    futures = {name: asked(dialog, replace(PLAIN, file=name)) for name in ("a.py", "b.py", "c.py")}
+    futures = {name: asked(dialog, about(name)) for name in ("a.py", "b.py", "c.py")}
     order = []
     for _ in futures:
         deadline = time.monotonic() + 20
@@ -139,18 +146,46 @@ def test_what_is_withdrawn_and_what_is_asked_at_the_end_is_a_no(
 
 
 def test_the_window_says_what_would_run_and_escapes_it() -> None:
-    question = Question(
-        "/w/<script>.py",
-        "Push-v1",
-        False,
-        "0123456789ab",
-        tuple(f"m{k}.py" for k in range(12)),
-        ("<b>",),
-        True,
-    )
-    said = question_html(question)
+    many = tuple(AskedFile(f"m{k}.py", f"{k:012}", f"# {k}\n") for k in range(300))
+    evil = AskedFile("/w/<script>.py", "0123456789ab", "x = '</pre><script>alert(1)</script>\u202e'\n")
+    said = question_html(Question("Push-v1", False, (evil, *many), ("<b>",)))
     assert "<script>" not in said and "<b><" not in said and "&lt;script&gt;.py" in said
-    assert "m7.py" in said and "m8.py" not in said and "and 4 more" in said
-    assert "0123456789ab" in said and "trusted another text of this file before" in said
-    said = question_html(Question("push.py", "<i>Push</i>-v1", True, "0" * 12, (), (), False))
+    assert "&lt;/pre&gt;" in said and "\\u202e" in said, "the text, escaped"
+    assert all(one.name in said and one.hash in said and one.text in said for one in many)
+    assert "It imports from beside it (300)" in said and "trusted" not in said and "every save" not in said
+    held = (AskedFile("push.py", "0" * 12, ""), HELPER)
+    said = question_html(Question("<i>Push</i>-v1", True, held))
     assert "&lt;i&gt;Push" in said and "hold the text of their task" in said
+    assert "what it may import (1)" in said and "It imports" not in said
+
+
+def test_what_changed_since_it_was_trusted_is_marked_file_by_file() -> None:
+    other = AskedFile("new.py", "1" * 12, "", Since.NEW)
+    files = (PUSH, replace(HELPER, since=Since.CHANGED), other)
+    said = question_html(replace(PLAIN, files=files, trusted_before=True, gone=("old.py",)))
+    main, helper, new = said.split("<details>")[1:]
+    assert "wb-tag" not in main and ">changed<" in helper and ">new<" in new
+    assert "What has changed since is marked; gone since: old.py" in said
+    said = question_html(replace(PLAIN, trusted_before=True))
+    assert "Which of them has changed since is not known" in said
+
+
+def test_what_going_live_means_is_said_before() -> None:
+    said = question_html(replace(PLAIN, followed=True))
+    assert "every save of this file and of the modules beside it runs without asking" in said
+    assert "Judge again takes the file as it is" in said
+    assert "Its text may run already" in question_html(replace(PLAIN, followed=True, agreed=True))
+    assert "until the workbench ends" in ONCE
+
+
+def test_where_imports_are_computed_no_module_is_said_to_be_imported() -> None:
+    assert "it may import all that lies beside it (1)" in question_html(replace(PLAIN, computed=True))
+
+
+def test_what_of_a_text_is_not_shown_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trust_dialog, "MOST_OF_ONE", 10)
+    monkeypatch.setattr(trust_dialog, "MOST_OF_ALL", 12)
+    said = question_html(PLAIN)
+    assert "The last 4 characters are not shown here: read the file itself" in said
+    assert "import hel" in said and "import help" not in said and "read the recording" not in said
+    assert "read the recording's .json" in question_html(replace(PLAIN, recorded_text=True))

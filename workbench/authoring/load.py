@@ -17,7 +17,6 @@ import re
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -50,6 +49,7 @@ from workbench.authoring.task_classes import (
     no_such_class,
     shown_in_a_scene,
 )
+from workbench.authoring.task_content import source_hash
 
 if TYPE_CHECKING:
     from mani_skill.envs.sapien_env import BaseEnv
@@ -177,16 +177,6 @@ def take_back(task: LoadedTask) -> bool:
         return False
     _revert(load)
     return True
-
-
-def source_hash(source: Mapping[str, str], folder: Path) -> str:
-    """sha256 over names relative to `folder` and texts, 12 hex digits."""
-    digest = sha256()
-    for path in sorted(source):
-        name = Path(path).relative_to(folder).as_posix() if Path(path).is_relative_to(folder) else path
-        for part in (name.encode(), source[path].encode("utf-8", "surrogatepass")):
-            digest.update(len(part).to_bytes(8, "big") + part)
-    return digest.hexdigest()[:12]
 
 
 def _load_recorded(task: RecordedTask, source: Mapping[str, str]) -> LoadedTask:

@@ -57,6 +57,11 @@ def named_file(reference: TaskName) -> Path | None:
     return None if match is None else Path(match["file"]).expanduser().resolve()
 
 
+def is_like_a_file(env_id: str) -> bool:
+    """Whether what stands in place of an id is the form of a path to a task, whether or not it is there."""
+    return _FILE.fullmatch(env_id) is not None or env_id.startswith(("/", "./", "../", "~")) or "\\" in env_id
+
+
 def followed_folder(reference: TaskName) -> Path | None:
     """The folder whose modules are followed with the task's file; None where no file is followed."""
     if isinstance(reference, str) and (named := split_reference(reference)) is not None:

@@ -11,12 +11,13 @@ from __future__ import annotations
 import ast
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
 
 from workbench.authoring.library_names import is_library, is_own_file
-from workbench.authoring.modules import module_name, read_source
+from workbench.authoring.modules import MOST_SOURCE_BYTES, decode, module_name
+from workbench.machine.regular_file import read_regular_file
 
 MOST_MODULES = 300
 _DYNAMIC = frozenset(
@@ -40,25 +41,36 @@ class TaskContent:
     """Path to text; the task's own file first."""
     unseen: tuple[str, ...] = ()
     """What may run and is not among them, a sentence each."""
+    computed: bool = False
+    """A text imports by computed names, so that all that lies beside it is among the texts."""
+    sums: Mapping[str, str] = field(default_factory=dict)
+    """Path to the sha256 of the file's bytes, which its text does not tell (line ends, coding)."""
 
     @property
     def modules(self) -> tuple[str, ...]:
         """The other texts, as seen from the task's folder."""
-        return tuple(sorted(self._name(path) for path in self.texts if path != self.main))
+        return tuple(sorted(self.name(path) for path in self.texts if path != self.main))
+
+    @property
+    def file_sums(self) -> dict[str, str]:
+        """Name, as seen from the task's folder, to what ``sha256sum`` says of the file; the task's own file first."""
+        paths = [self.main, *sorted(path for path in self.texts if path != self.main)]
+        return {self.name(path): self.sums.get(path) or text_sum(self.texts[path]) for path in paths}
 
     @property
     def hash(self) -> str:
         """sha256 over names and texts; the same wherever the files lie."""
         digest = sha256()
-        parts = [self._name(self.main)]
-        for path in sorted(self.texts, key=self._name):
-            parts += [self._name(path), self.texts[path]]
+        parts = [self.name(self.main)]
+        for path in sorted(self.texts, key=self.name):
+            parts += [self.name(path), self.texts[path]]
         for part in parts:
             content = part.encode("utf-8", "surrogatepass")
             digest.update(len(content).to_bytes(8, "big") + content)
         return digest.hexdigest()
 
-    def _name(self, path: str) -> str:
+    def name(self, path: str) -> str:
+        """As seen from the task's folder."""
         return Path(os.path.relpath(path, os.path.dirname(self.main) or ".")).as_posix()
 
 
@@ -76,6 +88,8 @@ class _Reading:
     def __init__(self, file: Path) -> None:
         self._file, self._root = file, module_name(file).search_folder
         self._texts: dict[str, str] = {}
+        self._sums: dict[str, str] = {}
+        self._computed = False
         self._unseen: dict[str, None] = {}
         self._waiting: list[Path] = []
 
@@ -91,7 +105,7 @@ class _Reading:
                 self._unseen[f"{self._short(path)} is no Python that can be read."] = None
                 continue
             self._follow(path, tree)
-        return TaskContent(str(self._file), self._texts, tuple(self._unseen))
+        return TaskContent(str(self._file), self._texts, tuple(self._unseen), self._computed, self._sums)
 
     def _packages_above(self) -> Iterator[Path]:
         """Of a file in a package the packages run first."""
@@ -106,7 +120,7 @@ class _Reading:
             return
         if len(self._texts) >= MOST_MODULES:
             raise CannotRead(f"{self._file} has more than {MOST_MODULES} modules beside it.")
-        self._texts[name] = read_text(path)
+        self._texts[name], self._sums[name] = _read(path)
         self._waiting.append(path)
 
     def _follow(self, path: Path, tree: ast.AST) -> None:
@@ -154,6 +168,7 @@ class _Reading:
                 self._unseen[f"{self._short(path)} is compiled and is not loaded."] = None
 
     def _add_all(self) -> None:
+        self._computed = True
         for root, folders, names in os.walk(self._file.parent):
             folders[:] = sorted(
                 folder
@@ -175,8 +190,29 @@ def read_text(path: Path) -> str:
     Raises:
         CannotRead: it cannot be read, is none, or is too long.
     """
+    return _read(path)[0]
+
+
+def text_sum(text: str) -> str:
+    """What ``sha256sum`` says of a file with this text."""
+    return sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def source_hash(source: Mapping[str, str], folder: Path) -> str:
+    """sha256 over names relative to `folder` and texts, 12 hex digits."""
+    digest = sha256()
+    for path in sorted(source):
+        name = Path(path).relative_to(folder).as_posix() if Path(path).is_relative_to(folder) else path
+        for part in (name.encode("utf-8", "surrogatepass"), source[path].encode("utf-8", "surrogatepass")):
+            digest.update(len(part).to_bytes(8, "big") + part)
+    return digest.hexdigest()[:12]
+
+
+def _read(path: Path) -> tuple[str, str]:
+    """The text, and the sha256 of the bytes that it was read from."""
     try:
-        return read_source(path)
+        raw = read_regular_file(path, MOST_SOURCE_BYTES)
+        return decode(str(path), raw), sha256(raw).hexdigest()
     except SyntaxError as error:
         raise CannotRead(f"{path} is no Python text: {error.msg}") from error
     except OSError as error:

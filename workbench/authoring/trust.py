@@ -10,17 +10,20 @@ import datetime
 import json
 import logging
 import threading
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 from workbench.authoring.task_content import TaskContent
-from workbench.machine.user_folder import locked, read_private, set_aside, write_private
+from workbench.machine.user_folder import locked, read_private, set_aside, user_folder, write_private
 
 log = logging.getLogger(__name__)
 
 STORE_FILE = "trusted_tasks.json"
 MOST_KEPT = 5000
 """Answers; the oldest go first."""
+MOST_WITH_FILES = 200
+"""Of them, the newest, that say which files they were for: 300 modules take 30 kB."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,10 @@ class _Entry:
     file: str
     """Where it lay when it was asked about; for people, and to say that a text has changed."""
     when: str
+    followed: bool = False
+    """Its saves may run too, where it lay then."""
+    files: Mapping[str, str] = field(default_factory=dict)
+    """`TaskContent.file_sums`, to say which of them has changed; empty where an earlier version wrote it."""
 
 
 class TrustStore:
@@ -37,6 +44,7 @@ class TrustStore:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._of_this_run: set[str] = set()
+        self._followed_in_this_run: set[tuple[str, str]] = set()
         self._told: set[str] = set()
 
     def trusts(self, content: TaskContent) -> bool:
@@ -44,28 +52,45 @@ class TrustStore:
         with self._lock:
             return content.hash in self._of_this_run or any(e.hash == content.hash for e in self._read())
 
-    def trusted_before(self, content: TaskContent) -> bool:
-        """Whether another text of the same file may run."""
+    def follows(self, content: TaskContent) -> bool:
+        """Whether what is saved to this file, beginning with this text, may run too."""
+        key = content.hash, content.main
         with self._lock:
-            return any(e.file == content.main and e.hash != content.hash for e in self._read())
+            return key in self._followed_in_this_run or any(
+                (e.hash, e.file) == key and e.followed for e in self._read()
+            )
 
-    def trust_once(self, content: TaskContent) -> None:
+    def trusted_before(self, content: TaskContent) -> Mapping[str, str] | None:
+        """The `TaskContent.file_sums` of another text of the same file that was trusted last; None if none was.
+
+        Empty where it is not known any more.
+        """
+        with self._lock:
+            others = [e for e in self._read() if e.file == content.main and e.hash != content.hash]
+        return others[-1].files if others else None
+
+    def trust_once(self, content: TaskContent, followed: bool = False) -> None:
         """Until the program ends."""
         with self._lock:
-            self._of_this_run.add(content.hash)
+            self._add_to_this_run(content, followed)
 
-    def trust(self, content: TaskContent) -> None:
+    def trust(self, content: TaskContent, followed: bool = False) -> None:
         """From now on, in every run."""
         now = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
-        entry = _Entry(content.hash, content.main, now)
+        entry = _Entry(content.hash, content.main, now, followed, content.file_sums)
         with self._lock:
-            self._of_this_run.add(content.hash)
+            self._add_to_this_run(content, followed)
             try:
                 with locked(STORE_FILE):
                     kept = [known for known in self._read(mend=True) if known.hash != entry.hash]
                     self._write([*kept, entry][-MOST_KEPT:])
             except OSError as error:
                 self._tell(f"What you trust cannot be kept, and is asked again in the next run: {error}")
+
+    def _add_to_this_run(self, content: TaskContent, followed: bool) -> None:
+        self._of_this_run.add(content.hash)
+        if followed:
+            self._followed_in_this_run.add((content.hash, content.main))
 
     def _read(self, mend: bool = False) -> list[_Entry]:
         try:
@@ -78,13 +103,16 @@ class TrustStore:
         try:
             return _entries(json.loads(content))
         except (ValueError, TypeError, KeyError, RecursionError) as error:
-            self._tell(f"{STORE_FILE} in the configuration folder is broken, so nothing is trusted: {error}")
+            self._tell(f"{user_folder() / STORE_FILE} is broken, so nothing is trusted: {error}")
             if mend:
                 self._tell(f"The broken one is {set_aside(STORE_FILE)} now.")
             return []
 
-    def _write(self, entries: list[_Entry]) -> None:
-        document = {"format": 1, "trusted": [vars(entry) for entry in entries]}
+    def _write(self, entries: Sequence[_Entry]) -> None:
+        said: list[dict[str, Any]] = [dict(vars(entry)) for entry in entries]
+        for one in said[:-MOST_WITH_FILES]:
+            one["files"] = {}
+        document = {"format": 1, "trusted": said}
         write_private(STORE_FILE, json.dumps(document, indent=1).encode())
 
     def _tell(self, what: str) -> None:
@@ -94,4 +122,13 @@ class TrustStore:
 
 
 def _entries(document: Any) -> list[_Entry]:
-    return [_Entry(str(one["hash"]), str(one["file"]), str(one["when"])) for one in document["trusted"]]
+    return [
+        _Entry(
+            str(one["hash"]),
+            str(one["file"]),
+            str(one["when"]),
+            one.get("followed") is True,
+            {str(name): str(found) for name, found in dict(one.get("files", {})).items()},
+        )
+        for one in document["trusted"]
+    ]

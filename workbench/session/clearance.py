@@ -3,19 +3,20 @@
 A recording is somebody else's file until its seal says that it was made here. What it names is opened without a question
 if it is an id of an installed package, a file that a person named (on the command line, or that is open live), or the file
 that this installation had open when it recorded. Of anything else the texts are read, not run, and a person is asked about
-these very texts; the answer is kept by what they say. What was agreed to is what runs, whatever becomes of the file.
+these very texts; the answer is kept by what they say. What was agreed to is what runs, whatever becomes of the file:
+but where the file is to be followed, as by going live, its saves run too, and that is a question of its own.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from workbench.authoring.reference import TaskName
+from workbench.authoring.reference import RecordedTask, TaskName, is_like_a_file
 from workbench.authoring.task_content import CannotRead, TaskContent, content_of_texts, read_content
 from workbench.authoring.trust import TrustStore
 from workbench.machine.terminal_text import short_line
@@ -26,6 +27,11 @@ from workbench.session.recorded_text import NoText, below_one_folder
 SHORT_HASH = 12
 LONGEST = 400
 """Characters of a name that is shown."""
+FOLLOWED = (
+    "From then on, for as long as it is open live, every save of this file and of the modules beside it runs without asking, "
+    "whoever saves it, and Judge again takes the file as it is."
+)
+"""What going live means for a file that a recording names."""
 
 
 class Answer(Enum):
@@ -37,41 +43,90 @@ class Answer(Enum):
     ALWAYS = "always"
 
 
+class Since(Enum):
+    """What became of a file since another version of it and the files beside it was trusted."""
+
+    SAME = "same"
+    CHANGED = "changed"
+    NEW = "new"
+
+
+@dataclass(frozen=True)
+class AskedFile:
+    """One of the texts that would run."""
+
+    name: str
+    """The path of the task's own file; of a module as seen from there."""
+    hash: str
+    """The first digits of what ``sha256sum`` says of it."""
+    text: str
+    """As it is: whoever shows it has to escape it."""
+    since: Since = Since.SAME
+
+
 @dataclass(frozen=True)
 class Question:
     """What a person is to be asked. Texts out of recordings are printable, and not escaped."""
 
-    file: str
-    """What would run: a path, or the name of a file that a recording holds."""
     task: str
     """Of the recording that wants it."""
     recorded_text: bool
-    """The text is the one that the recording holds, and not a file on the disk."""
-    hash: str
-    """The first digits."""
-    modules: tuple[str, ...]
-    """Further files that would run."""
-    unseen: tuple[str, ...]
-    changed: bool
-    """Another text of this file was trusted before."""
+    """The texts are those that the recording holds, and not files on the disk."""
+    files: tuple[AskedFile, ...]
+    """What would run; the task's own file first."""
+    unseen: tuple[str, ...] = ()
+    """What may run and is not among them."""
+    computed: bool = False
+    """The modules are all that lie beside the file, since it cannot be told which of them it imports."""
+    trusted_before: bool = False
+    """Another version of the same files was trusted; `AskedFile.since` says what changed, unless nothing is known of it."""
+    gone: tuple[str, ...] = ()
+    """Modules of that version that are not there any more."""
+    followed: bool = False
+    """Whatever is saved to these files runs from then on."""
+    agreed: bool = False
+    """These very texts may run already; that they are followed is new."""
     more: int = 0
     """Questions that follow this one."""
 
+    @property
+    def file(self) -> str:
+        """A path, or the name of a file that a recording holds."""
+        return self.files[0].name
+
+    @property
+    def hash(self) -> str:
+        """Of the task's own file."""
+        return self.files[0].hash
+
+    @property
+    def modules(self) -> tuple[AskedFile, ...]:
+        """The files besides the task's own."""
+        return self.files[1:]
+
+    @property
+    def nothing_known(self) -> bool:
+        """What was trusted before is not known file by file."""
+        return self.trusted_before and not self.gone and all(one.since is Since.SAME for one in self.files)
+
 
 class NotCleared(Exception):
-    """Code is not to run; the message is the reason, `question` what would have to be agreed to, if that would help."""
+    """Code is not to run; the message is the reason, `question` what would have to be agreed to, if that would help.
 
-    def __init__(self, why: str, question: Question | None = None) -> None:
+    Where `trust_helps`, nobody is asked, but ``--trust`` agrees.
+    """
+
+    def __init__(self, why: str, question: Question | None = None, trust_helps: bool = False) -> None:
         super().__init__(why)
-        self.question = question
+        self.question, self.trust_helps = question, trust_helps
 
 
 class NotTrusted(Exception):
-    """Nothing was run, because there is code that nobody agreed to."""
+    """Nothing was run, because there is code that nobody agreed to, or, for these `reasons`, without ``--trust``."""
 
-    def __init__(self, questions: Sequence[Question]) -> None:
-        super().__init__("; ".join(map(in_words, questions)))
-        self.questions = tuple(questions)
+    def __init__(self, questions: Sequence[Question], reasons: Sequence[str] = ()) -> None:
+        super().__init__("; ".join((*map(in_words, questions), *reasons)))
+        self.questions, self.reasons = tuple(questions), tuple(reasons)
 
 
 Ask = Callable[[Question, Callable[[], bool]], Answer]
@@ -87,6 +142,17 @@ class Wanted:
     info: EpisodeInfo
     """Of the recording that wants it."""
     recorded_text: bool = False
+    followed: bool = False
+    """What is saved to the file runs from then on."""
+
+
+@dataclass(frozen=True)
+class _Open:
+    """Texts that a person has to be asked about."""
+
+    content: TaskContent
+    agreed: bool
+    """They may run, but not be followed."""
 
 
 class Clearances:
@@ -127,14 +193,14 @@ class Clearances:
     ) -> list[TaskName | NotCleared]:
         """The same for several; each text is asked about once."""
         found = [self._without_asking(one) for one in wanted]
-        open_ones = {one.hash: one for one in found if isinstance(one, TaskContent)}
+        open_ones: dict[str, tuple[Wanted, _Open]] = {}
+        for one, its in zip(wanted, found):
+            if isinstance(its, _Open):
+                open_ones.setdefault(its.content.hash, (one, its))
         refused: dict[str, NotCleared] = {}
         none_of_them = False
-        for place, (hash, content) in enumerate(open_ones.items()):
-            about = next(
-                one for one, its in zip(wanted, found) if isinstance(its, TaskContent) and its.hash == hash
-            )
-            question = replace(self._question(about, content), more=len(open_ones) - place - 1)
+        for place, (hash, (about, its)) in enumerate(open_ones.items()):
+            question = replace(self._question(about, its), more=len(open_ones) - place - 1)
             answer = (
                 Answer.NO if none_of_them or self._ask is None or stopped() else self._ask(question, stopped)
             )
@@ -142,17 +208,23 @@ class Clearances:
             if answer in (Answer.NO, Answer.NONE):
                 refused[hash] = NotCleared(f"{in_words(question)} is not trusted", question)
             elif answer is Answer.ALWAYS:
-                self._store.trust(content)
+                self._store.trust(its.content, about.followed)
             else:
-                self._store.trust_once(content)
+                self._store.trust_once(its.content, about.followed)
         cleared: list[TaskName | NotCleared] = []
         for one, its in zip(wanted, found):
-            if not isinstance(its, TaskContent):
+            if not isinstance(its, _Open):
                 cleared.append(its)
-            elif its.hash in refused:
-                cleared.append(refused[its.hash])
+            elif its.content.hash in refused:
+                cleared.append(refused[its.content.hash])
+            elif not one.recorded_text and not _is_as_it_was(its.content):
+                cleared.append(
+                    NotCleared(
+                        f"the code of {_printable(its.content.main)} was changed while you were asked about it; try it again"
+                    )
+                )
             else:
-                cleared.append(_approved(one, its))
+                cleared.append(_approved(one, its.content))
         return cleared
 
     def why_not_its_arguments(self, info: EpisodeInfo, made: MadeHere | None = None) -> str | None:
@@ -162,13 +234,16 @@ class Clearances:
         named = [_printable(text) for text in files_named(info)]
         if not named:
             return None
-        return f"a recording of {_printable(info.task)} that was not made here names files for its env to read ({', '.join(named[:3])})"
+        return (
+            f"a recording of {_printable(info.task)} that was not made here names files for its env to read "
+            f"({', '.join(named[:3])}), which it may only with --trust on the command line"
+        )
 
-    def _without_asking(self, wanted: Wanted) -> TaskName | NotCleared | TaskContent:
+    def _without_asking(self, wanted: Wanted) -> TaskName | NotCleared | _Open:
         """What may be opened; or the texts that have to be asked about."""
         made = made_here(wanted.info)
         if (why := self.why_not_its_arguments(wanted.info, made)) is not None:
-            return NotCleared(why)
+            return NotCleared(why, trust_helps=True)
         if wanted.recorded_text:
             try:
                 content = recorded_content(wanted.info)
@@ -177,8 +252,10 @@ class Clearances:
             trusted = made is not MadeHere.NO
         else:
             reference = wanted.reference
-            if isinstance(reference, str) or reference.file is None:
+            if isinstance(reference, str):
                 return reference
+            if reference.file is None:
+                return _registered(reference)
             if made is MadeHere.CONTENT_AND_PLACE and reference.file == wanted.info.source_file:
                 return str(reference)
             if _is_one_of(reference.file, self._named()):
@@ -188,20 +265,61 @@ class Clearances:
             except CannotRead as error:
                 return NotCleared(str(error))
             trusted = made is not MadeHere.NO and _as_recorded(content, wanted.info)
-        if trusted or self._all_trusted or self._store.trusts(content):
+        agreed = trusted or self._all_trusted or self._store.trusts(content)
+        if agreed and (not wanted.followed or self._all_trusted or self._store.follows(content)):
             return _approved(wanted, content)
-        return content
+        return _Open(content, agreed)
 
-    def _question(self, wanted: Wanted, content: TaskContent) -> Question:
+    def _question(self, wanted: Wanted, its: _Open) -> Question:
+        content = its.content
+        before = None if wanted.recorded_text or its.agreed else self._store.trusted_before(content)
         return Question(
-            _printable(content.main),
             _printable(wanted.info.task),
             wanted.recorded_text,
-            content.hash[:SHORT_HASH],
-            tuple(map(_printable, content.modules)),
+            asked_files(content, before),
             tuple(map(_printable, content.unseen)),
-            not wanted.recorded_text and self._store.trusted_before(content),
+            content.computed,
+            before is not None,
+            tuple(_printable(name) for name in before or () if name not in content.file_sums),
+            wanted.followed,
+            its.agreed,
         )
+
+
+def asked_files(content: TaskContent, before: Mapping[str, str] | None = None) -> tuple[AskedFile, ...]:
+    """What would run, file by file: the task's own first, then the modules, those that changed before the others.
+
+    Args:
+        before: `TaskContent.file_sums` of what was trusted before, if anything was; empty where that is not known.
+    """
+    paths = {content.name(path): path for path in content.texts}
+    files: list[AskedFile] = []
+    for name, found in content.file_sums.items():
+        since = Since.SAME
+        if before and before.get(name) != found:
+            since = Since.CHANGED if name in before else Since.NEW
+        shown = content.main if paths[name] == content.main else name
+        files.append(AskedFile(_printable(shown), found[:SHORT_HASH], content.texts[paths[name]], since))
+    # What is new to a person is not to be looked for in a long list.
+    return (*files[:1], *sorted(files[1:], key=lambda file: file.since is Since.SAME))
+
+
+def _registered(reference: RecordedTask) -> TaskName | NotCleared:
+    """What is opened by its id, if an installed package has registered it."""
+    if not is_like_a_file(reference.env_id):
+        return reference
+    return NotCleared(
+        f"a recording names the file {_printable(reference.env_id)} as its task, and a path that a recording names in place of "
+        "an id is never opened: if you know the task's file, name it yourself with --task FILE"
+    )
+
+
+def _is_as_it_was(content: TaskContent) -> bool:
+    """Whether opening the file would still run what was read."""
+    try:
+        return read_content(Path(content.main)).hash == content.hash
+    except CannotRead:
+        return False
 
 
 def files_named(info: EpisodeInfo) -> list[str]:

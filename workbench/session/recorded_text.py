@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import PurePath
+from pathlib import Path, PurePath
+
+from workbench.authoring.task_content import source_hash
+from workbench.recording.episode import EpisodeInfo
 
 
 class NoText(ValueError):
@@ -32,3 +35,12 @@ def below_one_folder(main: str, source: Mapping[str, str]) -> tuple[str, dict[st
     if not chosen:
         raise NoText("this recording does not hold the text of its task's own file")
     return chosen, found
+
+
+def version_of(info: EpisodeInfo) -> str:
+    """`source_hash` of the text that a recording holds, and not what it says of it; empty where it holds none."""
+    try:
+        _, texts = below_one_folder(info.source_file or "", info.source)
+    except NoText:
+        return ""
+    return source_hash(texts, Path())

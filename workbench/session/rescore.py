@@ -20,7 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.authoring.reference import TaskName
+from workbench.authoring.library_names import named_like_library
+from workbench.authoring.modules import hidden_by_libraries
+from workbench.authoring.reference import TaskName, named_file
 from workbench.core.recorded_run import RecordedRun
 from workbench.recording.description import info_from
 from workbench.recording.episode import EpisodeInfo
@@ -184,6 +186,12 @@ def group_episodes(
         replace(g, options=replace(g.options, num_envs=max(1, min(num_envs, len(g.files)))))
         for g in groups.values()
     ], unread
+
+
+def hidden_in_words(reference: TaskName) -> list[str]:
+    """What lies beside the task's file and cannot be imported because a library has its name, in sentences."""
+    file = named_file(reference)
+    return [] if file is None else [named_like_library(hidden) for hidden in hidden_by_libraries(file)]
 
 
 def not_judged(group: Group, verdicts: Iterable[Verdict], why_not: str) -> list[Verdict]:

@@ -17,7 +17,14 @@ from workbench.machine.current_folder import CurrentFolder
 from workbench.session.clearance import Clearances, NotCleared, NotTrusted
 from workbench.session.messages import TaskOptions
 from workbench.session.open_task import OpenedTask, open_task
-from workbench.session.rescore import Group, find_episodes, group_episodes, not_judged, with_renderer
+from workbench.session.rescore import (
+    Group,
+    find_episodes,
+    group_episodes,
+    hidden_in_words,
+    not_judged,
+    with_renderer,
+)
 from workbench.session.rescore_messages import Verdict
 from workbench.session.rescore_run import rescore
 from workbench.session.step_back import CannotStepIn, write_source
@@ -49,11 +56,13 @@ def rescore_all(
     on_progress: Callable[[Progress], None] = lambda progress: None,
     on_finding: Callable[[Finding], None] = warn_of,
     clearances: Clearances | None = None,
+    on_notice: Callable[[str], None] = lambda notice: None,
 ) -> tuple[list[Verdict], tuple[str, ...]]:
     """The verdicts, in the order of the files; and what is not as it was recorded on purpose, in words.
 
     Args:
         clearances: says what of the code that the recordings name may run; None asks nobody.
+        on_notice: gets a sentence for each file beside a task that no import finds, before the task is opened.
 
     Raises:
         NotTrusted: a recording names code that nobody agreed to, and there is nobody to ask; or the answer to all was no.
@@ -84,6 +93,10 @@ def rescore_all(
                 raise CannotStepIn(str(reference)) from reference
             if what.recorded_source:
                 folder, reference = write_source(group.info)
+            for notice in hidden_in_words(reference):
+                if notice not in told:
+                    told.add(notice)
+                    on_notice(notice)
             opened = _open(reference, group.options, on_activity, tell_once, here)
             before = steps
 
@@ -116,9 +129,12 @@ def rescore_all(
 def _cleared(groups: list[Group], clearances: Clearances) -> list[TaskName | NotCleared]:
     """What may be opened for each of the groups. Before any of them runs: who is not there to be asked gets all or nothing."""
     cleared = clearances.clear_all([group.wanted for group in groups])
-    refused = [one.question for one in cleared if isinstance(one, NotCleared) and one.question is not None]
-    if refused and (not clearances.asks or len(refused) == len(groups)):
-        raise NotTrusted(list(dict.fromkeys(refused)))
+    not_cleared = [one for one in cleared if isinstance(one, NotCleared)]
+    refused = [one.question for one in not_cleared if one.question is not None]
+    reasons = [str(one) for one in not_cleared if one.trust_helps]
+    all_of_them = len(refused) + len(reasons) == len(groups) > 0
+    if all_of_them or (refused and not clearances.asks):
+        raise NotTrusted(list(dict.fromkeys(refused)), list(dict.fromkeys(reasons)))
     return cleared
 
 

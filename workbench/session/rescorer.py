@@ -21,7 +21,7 @@ from workbench.session.background import BackgroundProcess
 from workbench.session.clearance import Clearances, NotCleared
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
 from workbench.session.messages import Failed, Load, Loaded, TaskOptions
-from workbench.session.rescore import Group, group_episodes, not_judged, with_renderer
+from workbench.session.rescore import Group, group_episodes, hidden_in_words, not_judged, with_renderer
 from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored, Verdict
 from workbench.session.step_back import CannotStepIn, write_source
 
@@ -55,6 +55,8 @@ class RescoreView:
     recorded_source: bool = False
     use_env_states: bool = False
     notes: tuple[str, ...] = ()
+    hidden: tuple[str, ...] = ()
+    """Of files beside a task that no import finds, a sentence each."""
     why: str = ""
     """Why it failed."""
     problem: Problem | None = None
@@ -177,7 +179,8 @@ class Rescorer:
         try:
             if asked.recorded_source:
                 folder, reference = write_source(group.info)
-            self._tell(job, state="loading", task=_judged_with(group, asked))
+            hidden = tuple(dict.fromkeys((*self._view.hidden, *hidden_in_words(reference))))
+            self._tell(job, state="loading", task=_judged_with(group, asked), hidden=hidden)
             # Never patched into what the last episodes were judged in.
             process.send(Load(reference, group.options, level="rebuilt"))
             told = process.answer(job, Loaded, Failed)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from workbench.authoring.reference import RecordedTask, named_file
 from workbench.recording.episode import EpisodeInfo
+from workbench.session.recorded_text import version_of
 from workbench.session.step_back import class_in, reference_of
 
 TODAYS, RECORDED = "today's", "as recorded"
@@ -64,6 +65,6 @@ def _in_words(reference: RecordedTask) -> str:
 
 
 def _recorded(infos: Sequence[EpisodeInfo]) -> str:
-    hashes = list(dict.fromkeys(info.source_hash for info in infos if info.source_hash))
+    hashes = list(dict.fromkeys(version for info in infos if (version := version_of(info))))
     version = f" (version {', '.join(hashes[:MOST_NAMED])})" if hashes else ""
     return f"With the text that each recording holds{version}. It runs here; you are asked first where it was not recorded here."

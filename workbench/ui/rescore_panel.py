@@ -273,5 +273,6 @@ def status_html(told: RescoreView) -> str:
         headline=words.summary(known) if known and told.state in ("done", "stopped") else "",
         doubt=words.doubts(known),
         notes=told.notes,
+        hidden=told.hidden,
         not_carried=words.not_carried(known),
     )

@@ -14,6 +14,7 @@ import viser
 
 from workbench.recording.episode import acted_by_in_words
 from workbench.session.changed_since import ChangesOnDisk
+from workbench.session.recorded_text import version_of
 from workbench.session.review import MOST_COMPARED, SPEEDS, Review
 from workbench.session.review_events import success_words
 from workbench.session.review_view import Opened, ReviewView
@@ -197,8 +198,8 @@ def facts(one: Opened, changed: str = "") -> list[tuple[str, str, str]]:
         rows.append(("seed", str(info.seed), "of the episode"))
     if info.reset_options:
         rows.append(("reset options", short(info.reset_options), short(info.reset_options, 2000)))
-    if info.source_hash:
-        rows.append(("source", info.source_hash, info.source_file or ""))
+    if version := version_of(info) or info.source_hash:
+        rows.append(("source", version, info.source_file or ""))
     if changed:
         rows.append(("changed since", changed, f"In {info.source_file}, as it is now"))
     if info.side_files:

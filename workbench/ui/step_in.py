@@ -15,14 +15,13 @@ from pathlib import Path
 
 import viser
 
-from workbench.authoring.reference import RecordedTask, TaskName
+from workbench.authoring.reference import TaskName
 from workbench.core.recorded_run import RecordedRun
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.library import Library
 from workbench.recording.side_files import side_files_in_words
 from workbench.session.clearance import Clearances, NotCleared, Wanted
 from workbench.session.messages import TaskOptions
-from workbench.session.recovery import is_on_disk
 from workbench.session.rescore_messages import EpisodeFile
 from workbench.session.rescorer import Rescorer
 from workbench.session.review_view import ReviewView
@@ -112,7 +111,7 @@ class StepIn:
         if there is not None:
             self._enter(there, run, info, state)
             return
-        wanted = Wanted(reference_of(info), info, self.recorded_source)
+        wanted = Wanted(reference_of(info), info, self.recorded_source, followed=not self.recorded_source)
         if self.recorded_source:
             run = replace(run, name=f"{run.name} as it was recorded")
         self._clearing = clearing = _Clearing(wanted, run, state)
@@ -139,11 +138,6 @@ class StepIn:
         folder: Path | None = None
         try:
             reference = self._clearances.clear(wanted, clearing.stop.is_set)
-            if isinstance(reference, RecordedTask) and not is_on_disk(reference.approved or {}):
-                # It would be followed from now on.
-                raise CannotStepIn(
-                    f"{reference.file} was changed while you were asked about it; try it again"
-                )
             if wanted.recorded_text:
                 folder, reference = write_source(wanted.info)
         except (CannotStepIn, NotCleared) as error:

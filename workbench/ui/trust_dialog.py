@@ -13,7 +13,7 @@ from typing import Literal
 
 import viser
 
-from workbench.session.clearance import Answer, Question
+from workbench.session.clearance import FOLLOWED, Answer, Question
 from workbench.ui.fragments import render
 from workbench.ui.library_forms import Question as Window
 from workbench.ui.review_page import Places
@@ -21,11 +21,11 @@ from workbench.ui.review_page import Places
 TITLE = "Run this code?"
 DO_NOT, ONCE, ALWAYS = (
     "Don't run it",
-    "Run it, and ask again next time",
+    "Run it, without asking until the workbench ends",
     "Run it, and trust this text from now on",
 )
-MOST_NAMED = 8
-"""Files that are named; the rest is counted."""
+MOST_OF_ONE, MOST_OF_ALL = 200_000, 1_000_000
+"""Characters of one text, and of all of them together, that go to the page; of the rest it is said that it is missing."""
 _LOOK = 0.1
 """Seconds between two looks at whether the answer is still wanted."""
 
@@ -100,7 +100,6 @@ class TrustDialog:
             with self._server.atomic():
                 self._window = Window(self._server, TITLE, lambda: None)
                 with self._window.modal:
-                    gui.add_html(question_html(question))
                     # The first has the focus: Enter must not run anything.
                     self._add_button(DO_NOT, None, viser.Icon.X, pending, Answer.NO)
                     if question.more:
@@ -108,6 +107,8 @@ class TrustDialog:
                         self._add_button(label, "gray", viser.Icon.X, pending, Answer.NONE)
                     self._add_button(ONCE, "gray", viser.Icon.PLAYER_PLAY, pending, Answer.ONCE)
                     self._add_button(ALWAYS, "gray", viser.Icon.SHIELD_CHECK, pending, Answer.ALWAYS)
+                    # After them, so that no name in it has the focus; page.css puts it above them.
+                    gui.add_html(question_html(question))
                 self._escape = gui.add_command(DO_NOT, hotkey="escape")
                 self._escape.on_trigger(lambda _: pending.take(Answer.NO))
             self._asking(True)
@@ -133,15 +134,24 @@ class TrustDialog:
 
 def question_html(question: Question) -> str:
     """What would run; every value escaped."""
+    files: list[dict[str, object]] = []
+    left = MOST_OF_ALL
+    for file in question.files:
+        shown = file.text[: min(MOST_OF_ONE, left)]
+        left -= len(shown)
+        left_out = len(file.text) - len(shown)
+        said = {"name": file.name, "hash": file.hash, "since": file.since.value, "text": shown}
+        files.append({**said, "left_out": left_out})
     return render(
         "trust_question",
-        file=question.file,
         task=question.task,
         recorded_text=question.recorded_text,
-        hash=question.hash,
-        modules=question.modules[:MOST_NAMED],
-        more_modules=max(0, len(question.modules) - MOST_NAMED),
-        unseen=question.unseen[:MOST_NAMED],
-        more_unseen=max(0, len(question.unseen) - MOST_NAMED),
-        changed=question.changed,
+        files=files,
+        computed=question.computed,
+        unseen=question.unseen,
+        trusted_before=question.trusted_before,
+        nothing_known=question.nothing_known,
+        gone=question.gone,
+        followed=FOLLOWED if question.followed else "",
+        agreed=question.agreed,
     )
