@@ -98,9 +98,10 @@
 
   const listen = (kind, does) => window.addEventListener(kind, does, true);
 
-  listen("beforeinput", (event) => {
-    if (held?.field !== event.target && isNumberField(event.target)) before = event.target.value;
-  });
+  for (const kind of ["focusin", "beforeinput"])
+    listen(kind, (event) => {
+      if (held?.field !== event.target && isNumberField(event.target)) before = event.target.value;
+    });
   listen("input", (event) => {
     if (!event.isTrusted || !isNumberField(event.target)) return; // what our own scripts type is whole
     if (held && held.field !== event.target) take();
