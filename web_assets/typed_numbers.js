@@ -42,9 +42,10 @@
     const found = {};
     for (let fiber = field[key], up = 0; fiber && up < 40 && !("min" in found); fiber = fiber.return, up++) {
       const props = fiber.memoizedProps ?? {};
-      for (const name of ["min", "max", "decimalScale"]) if (name in props) found[name] ??= props[name];
+      for (const name of ["min", "max", "step", "decimalScale"]) if (name in props) found[name] ??= props[name];
     }
-    return { low: found.min ?? -Infinity, high: found.max ?? Infinity, digits: found.decimalScale ?? 12 };
+    const { min = -Infinity, max = Infinity, step = 1, decimalScale: digits = 12 } = found;
+    return { low: min, high: max, step, digits };
   }
 
   function whyNot(typed, number, { low, high, digits }) {
@@ -83,17 +84,34 @@
     setTimeout(() => shown.remove(), STAYS);
   }
 
-  function take() {
+  // As if all were selected and this pasted over it. The key is for viser's field (react-number-format): it takes the new
+  // text apart by where the caret stood at the last key, and drops it where that does not go with the text before.
+  function paste(field, text) {
+    field.setSelectionRange(0, field.value.length);
+    field.dispatchEvent(new KeyboardEvent("keydown", { key: "Unidentified", bubbles: true }));
+    inDom.set.call(field, text);
+    field.setSelectionRange(text.length, text.length);
+    field.dispatchEvent(new Event("input", { bubbles: true }));
+  }
+
+  // With `steps`, one further: React's own step, a moment after this, would still be from the number before.
+  function take(steps = 0) {
     const { field, typed, shows } = release();
-    if (!field.isConnected || typed === shows) return;
+    if (!field.isConnected || (typed === shows && !steps)) return;
     const bounds = boundsOf(field);
-    const number = Number(typed);
+    let number = Number(typed);
     const why = whyNot(typed, number, bounds);
     if (why) return say(field, `${nameOf(field)}: ${why}. It stays ${shows || "as it was"}.`);
+    if (steps) number = Math.max(bounds.low, Math.min(bounds.high, number + steps * bounds.step));
     // In plain digits: of an exponent viser's field would keep the figures. Adding 0 makes -0 a 0.
     const digits = Math.min(bounds.digits, 20);
-    inDom.set.call(field, (number + 0).toFixed(digits).replace(/(\.\d*?)0+$/, "$1").replace(/\.$/, ""));
-    field.dispatchEvent(new Event("input", { bubbles: true }));
+    paste(field, (number + 0).toFixed(digits).replace(/(\.\d*?)0+$/, "$1").replace(/\.$/, ""));
+  }
+
+  function takeAStepFurther(event, steps) {
+    event.preventDefault();
+    event.stopImmediatePropagation();
+    take(steps);
   }
 
   const listen = (kind, does) => window.addEventListener(kind, does, true);
@@ -117,9 +135,16 @@
   });
   listen("keydown", (event) => {
     if (held?.field !== event.target) return;
+    const steps = { ArrowUp: 1, ArrowDown: -1 }[event.key];
     if (event.key === "Escape") release();
-    else if (["Enter", "ArrowUp", "ArrowDown"].includes(event.key)) take();
+    else if (event.key === "Enter") take();
+    else if (steps) takeAStepFurther(event, steps);
   });
-  listen("pointerdown", (event) => held && held.field !== event.target && take());
+  listen("pointerdown", (event) => {
+    if (!held || held.field === event.target) return;
+    const button = event.target.closest?.(".mantine-NumberInput-control");
+    if (!button || !held.field.parentElement.contains(button)) return take();
+    takeAStepFurther(event, button.dataset.direction === "up" ? 1 : -1);
+  });
   listen("focusout", (event) => held?.field === event.target && take());
 }
