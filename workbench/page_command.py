@@ -22,7 +22,7 @@ from workbench.recording.reading import start_reading
 from workbench.session.kept_worker import WorkerOptions
 from workbench.session.messages import Event, Failed, Loaded, TaskOptions
 from workbench.session.session import Session
-from workbench.terminal import out, print_event, print_line, refuse, say, warn
+from workbench.terminal import out, print_event, print_line, refuse, say, say_addresses, warn
 from workbench.ui.commands import Command
 from workbench.ui.door import Door, DoorError, DoorOptions, open_door
 from workbench.ui.pages import Which
@@ -184,7 +184,7 @@ class _End:
             if door.options.token:
                 door.renew_token()
                 say("  the token was renewed, and every page was closed; open the new address:")
-                say(f"  page    {door.url}")
+                say_addresses(door.addresses())
 
 
 def _announce(door: Door, what: str) -> None:
@@ -195,7 +195,7 @@ def _announce(door: Door, what: str) -> None:
         say(f"  first   {door.ssh_hint}   on the machine with the browser")
         say(f"  page    {door.url}   there")
     else:
-        say(f"  page    {door.url}")
+        say_addresses(door.addresses())
         say(f"  remote  {door.ssh_hint}")
     say("  Ctrl-C ends it.")
 

@@ -7,7 +7,7 @@ and tracebacks say past this module, `machine.guarded_terminal` stands before bo
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import IO, TYPE_CHECKING
 
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -60,6 +60,12 @@ _told: set[str] = set()
 def say(text: object) -> None:
     """One line to stdout, not broken where the terminal ends: it can be taken from there."""
     print(plain_text(str(text)), flush=True)
+
+
+def say_addresses(addresses: Sequence[str]) -> None:
+    """Where a page is: the address to open, and others that lead to it from elsewhere."""
+    for i, address in enumerate(addresses):
+        say(f"  {'or' if i else 'page':8}{address}")
 
 
 def refuse(message: str) -> int:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from workbench.recording.viewer import has_screen, open_window, recordings_among
-from workbench.terminal import refuse, say, warn
+from workbench.terminal import refuse, say, say_addresses, warn
 
 
 def view_in_terminal(files: Sequence[Path], web: bool, host: str, port: int) -> int:
@@ -42,7 +42,7 @@ def _in_page(files: Sequence[Path], host: str, port: int) -> int:
         address = RerunPages(door, Offers(door)).address(files)
         if door.warning:
             warn(door.warning)
-        say(f"  page    {door.address(address)}")
+        say_addresses(door.addresses(address))
         say(f"  remote  {door.ssh_hint}")
         say("  Ctrl-C ends it.")
         threading.Event().wait()

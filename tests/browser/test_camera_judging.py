@@ -130,6 +130,7 @@ def test_a_download_is_the_camera_and_places_it_again(page: Page) -> None:
 def test_placements_are_suggested_with_pictures_and_taken(page: Page) -> None:
     before = shown_matrix(page)
     page.get_by_role("textbox", name="Resets").fill("1")
+    page.keyboard.press("Enter")
     press(page, "Search")
     take = page.locator(".wb-offer [data-press]")
     expect(take.first).to_be_visible(timeout=180_000)

@@ -107,6 +107,11 @@ def test_opens_from_the_library_and_walks_with_the_keys(desk: tuple[Page, list[s
     page.keyboard.press("Shift+ArrowRight")
     says(page, "step 15 / 20")
     expect(page.locator(".wb-status").get_by_text("success", exact=True)).to_be_visible()
+    remark, note = (
+        page.locator(it).first.evaluate("it => getComputedStyle(it).fontSize")
+        for it in (".wb-opened-list .wb-small", ".wb-note")
+    )
+    assert float(remark[:-2]) == pytest.approx(float(note[:-2]), abs=0.1)
     page.keyboard.press("Home")
     says(page, "step 0 / 20")
     page.keyboard.press("Space")

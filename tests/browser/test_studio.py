@@ -175,6 +175,7 @@ def test_dragged_with_the_mouse_written_checked_and_taken_back(page: Page, task_
 def test_typed_and_nudged_and_undone(page: Page) -> None:
     page.get_by_text("Lens and picture", exact=True).click()
     page.get_by_label("Degrees high").fill("90")
+    page.keyboard.press("Enter")
     until(lambda: numbers(page, "Radians") == [1.5708], "radians")
     page.evaluate("document.activeElement.blur()")
     page.keyboard.press("Alt+ArrowLeft")
@@ -204,6 +205,7 @@ def test_an_eye_is_typed_and_the_target_stays_pressed_by_keys_alone(page: Page) 
     until(lambda: page.evaluate(at) == ["eye and target", "true"], "the other way to place")
     expect(page.get_by_text("the camera goes on looking at its target")).to_be_visible()
     page.locator("//label[text()='Eye']/ancestor::*[.//input][1]//input").first.fill("0.6")
+    page.keyboard.press("Enter")
     until(lambda: numbers(page, "Eye") == [0.6, 0, 0.6], "the eye")
     until(lambda: numbers(page, "Degrees")[1] == 49.09, "the angle")
     assert numbers(page, "Target") == [0.08, 0, 0]
@@ -217,6 +219,7 @@ def test_an_eye_is_typed_and_the_target_stays_pressed_by_keys_alone(page: Page) 
     press(page, "move, turn")
     until(lambda: "wb-on" in tool(page, "move, turn")["classes"], "the pose again")
     page.locator("//label[text()='Position']/ancestor::*[.//input][1]//input").first.fill("0.6")
+    page.keyboard.press("Enter")
     until(lambda: numbers(page, "Looks at") == [0.23, 0, 0], "the target, which goes along")
 
 

@@ -144,6 +144,60 @@ def test_keys_work_after_a_click_on_a_tab_a_checkbox_or_a_dropdown_but_not_in_a_
     reward.click()
 
 
+def test_a_number_is_taken_when_it_has_been_typed_and_else_what_holds_is_shown_again(desk: Desk) -> None:
+    page = desk.page
+    said, past = (
+        page.locator(".wb-not-taken"),
+        page.locator(".wb-timeline").locator("xpath=ancestor::*[.//input][1]//input"),
+    )
+    page.get_by_role("tab", name="Run").click()
+    seed = page.get_by_label("Seed", exact=True)
+    for typed, says in (
+        ("9223372036854775807", "Seed: it goes from 0 to 2147483647. It stays 0."),
+        ("-99999999999999999999999", "Seed: it goes from 0 to 2147483647. It stays 0."),
+        ("3.7", "Seed: 3.7 is not a whole number. It stays 0."),
+        ("1e400", "Seed: it goes from 0 to 2147483647. It stays 0."),
+        ("abc", "Seed: \u201cabc\u201d is not a number. It stays 0."),
+        ("", "Seed: it was left empty. It stays 0."),
+    ):
+        seed.press("Control+a")
+        page.keyboard.press("Delete")
+        page.keyboard.type(typed)
+        expect(seed).to_have_value(typed)
+        page.keyboard.press("Tab" if typed == "abc" else "Enter")
+        expect(said).to_have_text(says)
+        expect(seed).to_have_value("0")
+    # Longer than a seed waits until it is sent: every env would have been reset.
+    seed.press("Control+a")
+    page.keyboard.type("12")
+    time.sleep(1.0)
+    expect(seed).to_have_value("12")
+    desk.says(f"step {STEPS} /")
+    page.keyboard.press("Escape")
+    expect(seed).to_have_value("0")
+    seed.press("ArrowUp")
+    desk.says("step 0 /")
+    expect(seed).to_have_value("1")
+    seed.press("Control+a")
+    page.keyboard.type("1e2")
+    page.keyboard.press("ArrowUp")
+    expect(seed).to_have_value("101")
+    seed.press("Control+a")
+    page.keyboard.type("0")
+    page.get_by_role("tab", name="Reward").click()
+    desk.leave_inputs()
+    page.get_by_role("tab", name="Run").click()
+    expect(seed).to_have_value("0")
+
+    past.last.fill("7")
+    page.keyboard.press("Enter")
+    expect(said).to_have_text(re.compile(r"^Step of the past: it goes from -\d+ to 0\. It stays 0\.$"))
+    past.last.fill("-2")
+    page.keyboard.press("Enter")
+    desk.says("2 steps ago")
+    page.get_by_role("tab", name="Reward").click()
+
+
 def test_the_timeline_keeps_its_height_when_it_offers_to_go_on(desk: Desk) -> None:
     panel = ".mantine-Paper-root:has(.wb-timeline)"
     live = desk.box(panel)

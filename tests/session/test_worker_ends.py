@@ -121,6 +121,40 @@ def test_what_is_no_ordinary_exception_is_named_with_its_line(
     assert session.worker_pid == worker
 
 
+@pytest.mark.parametrize(
+    ("place", "error"),
+    [
+        ("evaluate", 'KeyboardInterrupt("two")'),
+        ("reset", 'KeyboardInterrupt("two")'),
+        ("import", 'KeyboardInterrupt("two")'),
+        ("build", 'GeneratorExit("two")'),
+    ],
+)
+def test_what_a_saved_version_raises_is_shown_with_the_text_of_that_version(
+    session: Session, risky_file: Path, place: str, error: str
+) -> None:
+    good, worker = risky_file.read_text(), session.worker_pid
+    hook = f'hazard("{place}")'
+    (line,) = [line for line in good.splitlines() if line.strip() == hook]
+    raised = line.replace(hook, f"raise {error}")
+    try:
+        # In the place of a line that says something else in the version that is kept.
+        risky_file.write_text(good.replace(f"{line}\n", f"{raised}\n{line}\n"))
+        view = wait_until(session, lambda v: v.problem is not None, "the problem")
+        assert view.problem.message == error.replace('("two")', ": two")
+        assert view.problem.line == line_of(risky_file, raised.strip())
+        assert view.problem.code == raised.strip()
+        shown = view.problem.traceback.splitlines()
+        assert any(
+            f"line {view.problem.line}, in" in above and below.strip() == raised.strip()
+            for above, below in zip(shown, shown[1:], strict=False)
+        ), view.problem.traceback
+    finally:
+        risky_file.write_text(good)
+    wait_until(session, lambda v: v.problem is None, "the mended version")
+    assert session.worker_pid == worker
+
+
 @pytest.mark.parametrize("what", ["device", "pipe", pytest.param("large", marks=pytest.mark.slow)])
 def test_a_task_file_that_is_no_file_any_more_is_told_and_the_mended_one_loaded(
     session: Session, risky_file: Path, what: str

@@ -17,6 +17,7 @@ import viser._messages
 import viser.infra._infra
 from playwright.sync_api import sync_playwright
 
+from workbench.terminal import say_addresses
 from workbench.ui import door as door_module
 from workbench.ui import listening, viser_seam
 from workbench.ui.door import DEFAULT_PORT, Door, DoorError, DoorOptions, open_door
@@ -66,7 +67,7 @@ def a_taken_port() -> tuple[socket.socket, int]:
 def test_it_listens_on_loopback_only_unless_told_otherwise(door):
     assert DoorOptions().host == "127.0.0.1"
     assert listening_addresses(door.port) == {"127.0.0.1"}
-    assert door.warning is None
+    assert door.warning is None and door.elsewhere == ()
 
 
 def test_localhost_is_the_address_that_is_printed():
@@ -78,13 +79,35 @@ def test_localhost_is_the_address_that_is_printed():
         door.close()
 
 
-def test_the_whole_machine_is_listened_on_only_with_a_token_and_a_warning():
+def test_the_whole_machine_is_listened_on_only_with_a_token_and_a_warning(capsys):
     door = open_door(DoorOptions(host="0.0.0.0", port=0))
     try:
         assert listening_addresses(door.port) == {"0.0.0.0"}
         assert door.warning is not None and "0.0.0.0" in door.warning
         assert "0.0.0.0" not in door.url  # no browser can open that
         assert len(token_of(door)) >= 43  # 256 bits
+        # Where the machine has no way out, the page's own address is of no use to others.
+        own = [address for host in psutil.net_if_addrs().values() for address in host]
+        reach = [a.address for a in own if a.family == socket.AF_INET and not a.address.startswith("127.")]
+        hosts = {url.removeprefix("http://").partition(":")[0] for url in door.elsewhere}
+        assert {socket.gethostname(), *reach} - {"localhost"} >= hosts and hosts >= {*reach[:1]}
+        assert all(url.endswith(f":{door.port}/?token={token_of(door)}") for url in door.elsewhere)
+        for host in hosts:
+            connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=20)
+            connection.request(
+                "GET",
+                f"/?token={token_of(door)}",
+                headers={"Host": f"{host}:{door.port}", "Connection": "close"},
+            )
+            assert connection.getresponse().status in (200, 303), host
+            connection.close()
+        say_addresses(door.addresses())
+        printed = capsys.readouterr().out.splitlines()
+        assert [line.split() for line in printed] == [
+            ["or" if i else "page", url] for i, url in enumerate(dict.fromkeys((door.url, *door.elsewhere)))
+        ]
+        door.renew_token()
+        assert all(url.endswith(token_of(door)) for url in (door.url, *door.elsewhere))
     finally:
         door.close()
 

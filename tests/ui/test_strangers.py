@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import http.client
 import logging
+import re
 import socket
 import time
 from collections.abc import Iterator
@@ -220,8 +221,26 @@ def test_the_same_thing_is_said_ever_more_rarely(monkeypatch):
         now[0] += 1.0
     assert said[:2] == ["It happened.", "It happened. (59 more times since this was last said.)"]
     assert len(said) < 12
+    lines = len(said)
+    for _ in range(2):
+        told.say_the_rest()
+    assert len(said) == lines + 1, "what was not told is told once"
+    untold = sum(int(number) for line in said for number in re.findall(r"\((\d+) more times", line))
+    assert lines + untold == 4 * 3600
     told.happened("b", "Another\x1b[2J\nthing\u202e.")
     assert said[-1] == r"Another\x1b[2J\nthing\u202e."
+
+
+def test_what_was_not_told_yet_is_told_at_the_end_with_the_total(caplog):
+    closing = open_door(DoorOptions(port=0))
+    with caplog.at_level(logging.WARNING):
+        for _ in range(30):
+            ask(closing, f"/?token=wrong{'x' * 30}", Cookie=None)
+        assert len(caplog.records) == 1
+        closing.close()
+    lines = [record.getMessage() for record in caplog.records]
+    assert "(29 more times since this was last said.)" in lines[1] and "token that is not valid" in lines[1]
+    assert lines[2:] == ["In all 30 requests were turned away."]
 
 
 def test_no_program_is_named(door):

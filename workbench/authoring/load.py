@@ -40,7 +40,7 @@ from workbench.authoring.named_modules import (
     not_found,
     split_reference,
 )
-from workbench.authoring.problem import TaskError, refused
+from workbench.authoring.problem import TaskError, is_ctrl_c, refused
 from workbench.authoring.reference import RecordedTask, TaskName
 from workbench.authoring.task_classes import (
     ChosenTask,
@@ -143,7 +143,7 @@ def load_task(reference: TaskName, source: Mapping[str, str] | None = None) -> L
     recording is followed.
 
     `source` gives, by path, texts to use in place of what is on disk, for the task's file and for
-    modules beside it; files in it need not exist. Raises `TaskError`, and lets KeyboardInterrupt
+    modules beside it; files in it need not exist. Raises `TaskError`, and lets a person's Ctrl-C
     through; in either case all is as it was before.
     """
     if isinstance(reference, RecordedTask):
@@ -206,9 +206,9 @@ def import_module(name: str) -> ModuleType:
         search_first(found.search_folder, for_good=True)
     try:
         return importlib.import_module(name)
-    except KeyboardInterrupt:
-        raise
     except BaseException as exc:
+        if is_ctrl_c(exc):
+            raise
         raise TaskError(named_module_problem(exc, found)) from exc
 
 
@@ -280,7 +280,7 @@ def _load_file(
             task = _task_in(module, class_name, load)
         except BaseException as exc:
             # Before anything is put back: the problem's lines are those of the text that failed.
-            problem = None if isinstance(exc, KeyboardInterrupt) else import_problem(exc, finder)
+            problem = None if is_ctrl_c(exc) else import_problem(exc, finder)
             _revert(load)
             if problem is None:
                 raise

@@ -62,6 +62,20 @@ _MACHINERY = ("workbench", "importlib", "_frozen_importlib", "_frozen_importlib_
 """Packages whose frames, at the start of a traceback, only say who ran the author's code."""
 
 
+_person: tuple[type[BaseException], ...] = (KeyboardInterrupt,)
+
+
+def nobody_presses_ctrl_c() -> None:
+    """Of a process that has no terminal: a KeyboardInterrupt in it is the author's, and a failure like others."""
+    global _person
+    _person = ()
+
+
+def is_ctrl_c(error: BaseException | None) -> bool:
+    """Whether it is a person at the terminal who leaves; to be raised on, and never blamed on a task."""
+    return isinstance(error, _person)
+
+
 @dataclass(frozen=True)
 class Problem:
     stage: str
@@ -128,7 +142,10 @@ def problem_from_exception(
     else:
         place = None if cls is None else _hook_definition(cls, stage_found, own)
     file, line = place if place is not None else (None, None)
-    code = linecache.getline(file, line).strip() if file is not None and line is not None else None
+    code = None
+    if file is not None and line is not None:
+        linecache.checkcache(file)  # of a module that was mended since a line of it was last shown
+        code = linecache.getline(file, line).strip()
     if isinstance(exc, AssertionError) and not str(exc) and code:
         message = shorten(f"{message}: {code}")
     return Problem(stage_found, message, file, line, code or None, format_traceback(exc))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.authoring.problem import TaskError
+from workbench.authoring.problem import TaskError, is_ctrl_c
 from workbench.core import actions
 from workbench.core.task_env import TaskEnv
 from workbench.machine.current_folder import CurrentFolder
@@ -23,14 +23,12 @@ from workbench.session.policy import Policy, load_policy, problem_of
 class Acting:
     """Chooses the action of every control step."""
 
-    def __init__(self, folder: CurrentFolder, *, ctrl_c_leaves: bool = False) -> None:
+    def __init__(self, folder: CurrentFolder) -> None:
         """
         Args:
             folder: from which a relative policy is meant.
-            ctrl_c_leaves: a KeyboardInterrupt is a person's at the terminal; else the policy itself raised it.
         """
         self._folder = folder
-        self._leaves = (KeyboardInterrupt,) if ctrl_c_leaves else ()
         self._source: ActionSource = "random"
         self._policy: Policy | None = None
         self._policy_name = ""
@@ -70,7 +68,7 @@ class Acting:
             with self._folder.again():
                 self._policy = load_policy(self._policy_name, beside)
         except BaseException as error:
-            if isinstance(error, self._leaves):
+            if is_ctrl_c(error):
                 raise
             raise TaskError(problem_of(error, self._policy_name, beside)) from error
 
@@ -92,7 +90,7 @@ class Acting:
                 whose = f"what {self._policy_name} returned"
                 return actions.to_flat_action(task.env, task.parts, self._policy(task.obs), whose)
             except BaseException as error:
-                if isinstance(error, self._leaves):
+                if is_ctrl_c(error):
                     raise
                 policy, self._policy = self._policy, None
                 raise TaskError(problem_of(error, self._policy_name, self._beside, policy)) from error

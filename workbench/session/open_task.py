@@ -22,6 +22,7 @@ from workbench.authoring.problem import (
     MESSAGE_LIMIT,
     Problem,
     TaskError,
+    is_ctrl_c,
     problem_from_exception,
     shorten,
 )
@@ -311,9 +312,17 @@ class blamed:
             files, cls = self._loaded.source_files, self._loaded.cls
             raise TaskError(problem_from_exception(error, self._stage, files, cls)) from error
         # SystemExit as well, and what an author derives from BaseException: neither must take the worker along.
-        # A KeyboardInterrupt may be the person's who records in a terminal; of a worker, see `HeldTask.at_work`.
-        if error is not None and not isinstance(error, (TaskError, KeyboardInterrupt, GeneratorExit)):
-            raise TaskError(self._problem(error)) from error
+        # Here and not further up: there the version before may have been put back, with its texts.
+        if error is None or isinstance(error, TaskError) or is_ctrl_c(error) or self._is_closed(error):
+            return
+        raise TaskError(self._problem(error)) from error
+
+    def _is_closed(self, error: BaseException) -> bool:
+        """Whether a generator of ours is closed in the middle; not where the author's code raised that."""
+        if not isinstance(error, GeneratorExit):
+            return False
+        files = {str(file) for file in self._loaded.source_files}
+        return not any(frame.filename in files for frame in traceback.extract_tb(error.__traceback__))
 
     def _problem(self, error: BaseException) -> Problem:
         loaded = self._loaded

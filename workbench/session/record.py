@@ -425,7 +425,7 @@ class _Share:
 
 
 def _acting(what: RecordOptions, here: CurrentFolder) -> Acting:
-    acting = Acting(here, ctrl_c_leaves=True)
+    acting = Acting(here)
     acting.seed(what.options.seed)
     if what.actions in ("hold", "zero"):
         acting.use(what.actions, None)

@@ -72,9 +72,10 @@ class _FarDealing:
 def _work(connection: Connection) -> None:
     # PhysX and the software renderer take a thread for each core that the process may use.
     os.sched_setaffinity(0, connection.recv())
-    from workbench.authoring.problem import TaskError
+    from workbench.authoring.problem import TaskError, nobody_presses_ctrl_c
     from workbench.session.record import run_episodes, with_given_actions
 
+    nobody_presses_ctrl_c()
     what: RecordOptions = connection.recv()
     dealing = _FarDealing(connection)
     try:

@@ -28,6 +28,9 @@ class _CannotMake(Exception):
 
 def main(socket: str) -> None:
     """Entry of the process; `socket` is a file descriptor."""
+    from workbench.authoring.problem import nobody_presses_ctrl_c
+
+    nobody_presses_ctrl_c()
     connection = Connection(int(socket))
     made: tuple[object, TaskEnv] | None = None
     while True:
@@ -95,7 +98,7 @@ def make(wanted: SceneWanted) -> TaskEnv:
             ),
             default_kwargs=loaded.default_kwargs,
         )
-    except Exception as error:
+    except BaseException as error:  # a constructor may end the program (SystemExit)
         traceback.print_exc()
         raise _CannotMake(
             f"{wanted.task} cannot be made here ({type(error).__name__}: {_line(error)}), so there are numbers and "
@@ -125,5 +128,5 @@ def scene_of(env: TaskEnv, wanted: SceneWanted, connection: Connection) -> Scene
     return SceneMade(geometry, np.stack(poses), tuple(f"{name}: {why}" for name, why in missed.items()))
 
 
-def _line(error: Exception) -> str:
+def _line(error: BaseException) -> str:
     return (str(error).strip() or "no reason given").splitlines()[0][:300]

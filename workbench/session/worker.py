@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from workbench.authoring.problem import TaskError
+from workbench.authoring.problem import TaskError, nobody_presses_ctrl_c
 from workbench.authoring.reference import named_file
 from workbench.core.camera_configs import note_camera_sites
 from workbench.core.inspect_env import inspect_env
@@ -479,4 +479,5 @@ def work(connection: int, pulse: PulseWriter) -> None:
     gc.collect()
     gc.freeze()
     note_camera_sites()
+    nobody_presses_ctrl_c()
     Worker(Connection(connection), pulse).run()

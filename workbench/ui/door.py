@@ -112,6 +112,9 @@ class Door:
     """What to type on one's own machine to reach the page over ssh."""
     warning: str | None
     """For the person at the terminal: what a wider binding means. None on loopback."""
+    elsewhere: tuple[str, ...]
+    """Addresses for browsers on other machines, with the token; empty on loopback. Which of them leads here depends on
+    the network that the other machine is in."""
     notice: str | None
     """Said once at the start: the page is on another port than usual. None if it is not."""
     _listening: Listening = field(repr=False)
@@ -145,8 +148,11 @@ class Door:
 
     def address(self, path: str) -> str:
         """The address to open, with the token, for ``path`` (from the root: ``/rerun/...``) in place of the page."""
-        root, _, token = self.url.partition("/?")
-        return f"{root}{path}" + (f"?{token}" if token else "")
+        return _with_path(self.url, path)
+
+    def addresses(self, path: str = "/") -> tuple[str, ...]:
+        """The same, and then those of `elsewhere`: each once."""
+        return tuple(dict.fromkeys(_with_path(url, path) for url in (self.url, *self.elsewhere)))
 
     def renew_token(self) -> str:
         """Make a new token and return the new address: who has the old one, or its cookie, does not get in any more,
@@ -160,7 +166,7 @@ class Door:
         token = secrets.token_urlsafe(32)
         self._doorkeeper.gate = replace(self._doorkeeper.gate, token=token)
         self._gated.close_pages("the token was renewed")
-        self.url = _url(self._listening, token)
+        self.url, self.elsewhere = _url(self._listening, token), _elsewhere(self._listening, token)
         return self.url
 
     def close(self) -> None:
@@ -171,6 +177,7 @@ class Door:
         atexit.unregister(self.close)
         self._gated.stop()
         self._listening.remove()
+        self._doorkeeper.say_the_rest()
 
 
 class _Doorkeeper:
@@ -205,6 +212,12 @@ class _Doorkeeper:
         if isinstance(verdict, gate.Entered):
             return entered_reply(verdict)
         return await admitted_reply(routes, viser_hook, connection, request, verdict.authority)
+
+    def say_the_rest(self) -> None:
+        """At the end: what was not told yet, and how many were turned away in all."""
+        self._told.say_the_rest()
+        if self.turned_away > 1:
+            self._told.happened("total", f"In all {self.turned_away} requests were turned away.")
 
     def _count(self, refused: gate.Refused, connection: ServerConnection) -> None:
         if self.tells:
@@ -253,6 +266,7 @@ def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) ->
             "door, and the token and everything on the page travel unencrypted. Whoever has the address with the "
             "token can run code here. On a network that you do not trust, listen on 127.0.0.1 and come in over ssh -L."
         ),
+        elsewhere=_elsewhere(listening, token),
         notice=None
         if listening.path is not None or options.port in (0, listening.port)
         else f"Port {options.port} is taken by another program, so this page is on port {listening.port}.",
@@ -273,8 +287,17 @@ def open_door(options: DoorOptions = DoorOptions(), label: str | None = None) ->
     return door
 
 
-def _url(listening: Listening, token: str | None) -> str:
-    return f"http://{listening.authority}/" + (f"?token={token}" if token else "")
+def _with_path(url: str, path: str) -> str:
+    root, _, token = url.partition("/?")
+    return f"{root.rstrip('/')}{path}" + (f"?{token}" if token else "")
+
+
+def _url(listening: Listening, token: str | None, host: str | None = None) -> str:
+    return f"http://{host or listening.host}:{listening.port}/" + (f"?token={token}" if token else "")
+
+
+def _elsewhere(listening: Listening, token: str | None) -> tuple[str, ...]:
+    return tuple(_url(listening, token, host) for host in listening.hosts_elsewhere())
 
 
 def _listen(options: DoorOptions) -> Listening:

@@ -19,6 +19,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import psutil
+
 DEFAULT_PORT = 8080
 PORTS_TO_TRY = 100
 LONGEST_PATH = 107
@@ -55,6 +57,15 @@ class Listening:
         """What to type on one's own machine to reach it."""
         to = f"{self.host if self.loopback else '127.0.0.1'}:{self.port}" if self.path is None else self.path
         return f"ssh -L {self.port}:{to} {_user()}@{socket.gethostname()}"
+
+    def hosts_elsewhere(self) -> tuple[str, ...]:
+        """This machine's name and addresses by which others reach the port, as their browsers need them."""
+        if self.loopback:
+            return ()
+        address = ipaddress.ip_address(self.bound_host.partition("%")[0])
+        hosts = [socket.gethostname()]
+        hosts += _own_addresses(address.version) if address.is_unspecified else [_in_address(address)]
+        return tuple(dict.fromkeys(host for host in hosts if host and host != "localhost"))
 
     def connect(self, timeout: float) -> socket.socket:
         """A client's end of it, on this machine."""
@@ -195,13 +206,33 @@ def _reach(host: str) -> str:
     """``host`` as a browser needs it: an IPv6 address in brackets, and for "every interface" the
     address of the one that leads out. Connecting a datagram socket sends nothing."""
     address = ipaddress.ip_address(host.partition("%")[0])
-    if address.is_unspecified:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                probe.connect(("192.0.2.1", 9))  # TEST-NET-1, RFC 5737
-                return probe.getsockname()[0]
-            except OSError:
-                return "127.0.0.1"
+    if not address.is_unspecified:
+        return _in_address(address)
+    # TEST-NET-1 and the prefix for documentation, RFC 5737 and 3849. A socket of ours for IPv6 takes no IPv4.
+    family, far = (socket.AF_INET6, "2001:db8::1") if address.version == 6 else (socket.AF_INET, "192.0.2.1")
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect((far, 9))
+            return _in_address(ipaddress.ip_address(probe.getsockname()[0].partition("%")[0]))
+        except OSError:
+            return "[::1]" if address.version == 6 else "127.0.0.1"
+
+
+def _own_addresses(version: int) -> list[str]:
+    """Of the interfaces that are up, but for those that lead nowhere else."""
+    up = {name for name, state in psutil.net_if_stats().items() if state.isup}
+    hosts: list[str] = []
+    for name, given in psutil.net_if_addrs().items():
+        for one in given if name in up else ():
+            if one.family not in (socket.AF_INET, socket.AF_INET6):
+                continue
+            address = ipaddress.ip_address(one.address.partition("%")[0])
+            if address.version == version and not address.is_loopback and not address.is_link_local:
+                hosts.append(_in_address(address))
+    return hosts
+
+
+def _in_address(address: ipaddress.IPv4Address | ipaddress.IPv6Address) -> str:
     return f"[{address}]" if address.version == 6 else str(address)
 
 

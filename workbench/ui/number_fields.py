@@ -17,7 +17,7 @@ from workbench.ui.controls import Control
 from workbench.ui.placing import FARTHEST
 
 TYPED = 0.3
-"""Seconds without a key after which what was typed is taken."""
+"""Seconds without another number after which the last is taken: the arrows beside a field are held down."""
 
 Send = Callable[[tuple[float, ...]], None]
 

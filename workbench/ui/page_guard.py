@@ -2,8 +2,8 @@
 
 What no page of ours sends ends its connection. A value that a control cannot hold is dropped: viser does not store
 it, no other page hears of it, and the page that sent it is told and shown the true value again once its hand is off
-the control. That is no attack: people type 99999999999999999999999 into a field, and a list of options may have
-changed between the click and its arrival. A page that speaks faster than a page can is slowed down, so that the
+the control. That is no attack: the ends of a slider or a list of options may have changed between the click and its
+arrival. (What is typed into a number field is looked at in the page first, ``web_assets/typed_numbers.js``.) A page that speaks faster than a page can is slowed down, so that the
 others keep their share of the event loop.
 """
 
@@ -29,7 +29,7 @@ from workbench.ui.control_values import check_value
 from workbench.ui.told_rarely import ToldRarely
 
 HANDS_OFF = 1.2
-"""Seconds without another value after which a control shows the true one again: numbers are typed digit by digit."""
+"""Seconds without another value after which a control shows the true one again: a hand may still be on it."""
 RATE = 200.0
 """Messages in a second that a page may send for long; a drag sends about twenty."""
 BURST = 400.0

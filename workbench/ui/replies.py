@@ -43,6 +43,7 @@ SCRIPTS = (
     "timeline_width.js",
     "unfolded.js",
     "typed_first.js",
+    "typed_numbers.js",
     "steady_resolution.js",
     "tab_title.js",
 )

@@ -20,6 +20,7 @@ from workbench.session.timeline import Scope
 from workbench.session.view import SessionView
 from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_int
+from workbench.ui.control_values import name_for_refusals
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
 from workbench.ui.over_the_view import GAP, FitsTheView
@@ -53,6 +54,7 @@ class TimelinePanel:
                 read=lambda value: checked_int(value, -(10**9), 0, "step of the past"),
                 send=self._seek,
             )
+            name_for_refusals(self._slider.handle, "step of the past")
             self._strip = gui.add_html("")
             # One of these two rows is there, and they are equally high: a panel that grows is moved up only a moment
             # later, its last row is cut off until then, and a second press on "step" would meet another button.

@@ -31,7 +31,8 @@ class ToldRarely:
         self._say, self._pause = say, pause
         self._silent_until: dict[Hashable, float] = {}
         self._pauses: dict[Hashable, float] = {}
-        self._untold: dict[Hashable, int] = {}
+        self._untold: dict[Hashable, tuple[int, str]] = {}
+        """How often, and what was to be said the last time."""
         self._lock = threading.Lock()
 
     def happened(self, kind: Hashable, sentence: str) -> None:
@@ -43,15 +44,34 @@ class ToldRarely:
         now = time.monotonic()
         with self._lock:
             if now < self._silent_until.get(kind, 0.0):
-                self._untold[kind] = self._untold.get(kind, 0) + 1
+                self._untold[kind] = self._untold.get(kind, (0, ""))[0] + 1, sentence
                 return
             if len(self._pauses) >= MOST_KINDS:
-                self._silent_until.clear()
-                self._pauses.clear()
-                self._untold.clear()
+                rest = self._forget()
+            else:
+                rest = ()
             pause = self._pauses.get(kind, self._pause)
             self._silent_until[kind] = now + pause
             self._pauses[kind] = min(2 * pause, LONGEST_PAUSE)
-            before = self._untold.pop(kind, 0)
-        more = f" ({before} more times since this was last said.)" if before else ""
-        self._say(short_line(sentence, LONGEST) + more)
+            before, _ = self._untold.pop(kind, (0, ""))
+        for line in (*rest, _line(sentence, before)):
+            self._say(line)
+
+    def say_the_rest(self) -> None:
+        """What happened since each was last said: at the end, when nothing further comes that would say it."""
+        with self._lock:
+            rest = self._forget()
+        for line in rest:
+            self._say(line)
+
+    def _forget(self) -> tuple[str, ...]:
+        rest = tuple(_line(sentence, times) for times, sentence in self._untold.values())
+        self._silent_until.clear()
+        self._pauses.clear()
+        self._untold.clear()
+        return rest
+
+
+def _line(sentence: str, times: int) -> str:
+    more = "once more" if times == 1 else f"{times} more times"
+    return short_line(sentence, LONGEST) + (f" ({more} since this was last said.)" if times else "")
