@@ -2,10 +2,11 @@ from __future__ import annotations
 
 import mmap
 import os
+from pathlib import Path
 
 import pytest
 
-from workbench.machine.process_tree import resident_memory
+from workbench.machine.process_tree import allocated_memory, resident_memory
 from workbench.session.memory_limit import in_words, parse_memory, total_memory
 
 
@@ -35,6 +36,21 @@ def test_memory_of_a_process_is_seen_and_of_none_is_nothing() -> None:
         held.write(b"x" * len(held))
         assert resident_memory(os.getpid()) - before > 0.9 * len(held)
     assert resident_memory(2**22 + 1) == 0
+
+
+def test_what_a_process_allocates_is_told_from_the_files_that_it_maps(tmp_path: Path) -> None:
+    size = 64 * 2**20
+    (tmp_path / "library").write_bytes(b"x" * size)
+    before, resident = allocated_memory(os.getpid()), resident_memory(os.getpid())
+    with open(tmp_path / "library", "rb") as file, mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ) as mapped:
+        assert mapped.find(b"y") == -1  # read, so that it is in memory
+        assert resident_memory(os.getpid()) - resident > 0.9 * size
+        assert allocated_memory(os.getpid()) - before < 0.1 * size
+    held = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE)
+    held.write(b"x" * size)
+    assert allocated_memory(os.getpid()) - before > 0.9 * size
+    held.close()
+    assert allocated_memory(2**22 + 1) == 0
 
 
 def test_in_words() -> None:

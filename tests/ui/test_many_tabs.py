@@ -123,6 +123,7 @@ def test_a_tab_that_comes_and_goes_leaves_nothing_behind(house: House) -> None:
     before = held()
     for _ in range(30):
         come_and_go()
-    # The kernel may take a socket's end later than viser does: what counts is that nothing has grown.
-    grown = {name: (before[name], now) for name, now in held().items() if now > before[name]}
+    # Something may begin meanwhile that has nothing to do with tabs, and the kernel may take a socket's end later than
+    # viser does. What each of thirty tabs left would be thirty.
+    grown = {name: (before[name], now) for name, now in held().items() if now > before[name] + 2}
     assert not grown

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Protocol
 
 from workbench.core.shared_shapes import SharedShapes
-from workbench.machine.process_tree import resident_memory
+from workbench.machine.process_tree import allocated_memory
 from workbench.machine.watched_thread import say_failure
 from workbench.recording.episode import Episode
 from workbench.recording.unreadable import UnreadableRecording
@@ -210,9 +210,9 @@ class Review:
         shapes = SharedShapes()
         files: dict[Path, Stamp] = {}
         shown_at, wait = time.monotonic(), FIRST_SHOWN
-        held = resident_memory(os.getpid())
+        held = allocated_memory(os.getpid())
         for done, row in enumerate(rows):
-            if opened and resident_memory(os.getpid()) - held > self._most_bytes:
+            if opened and allocated_memory(os.getpid()) - held > self._most_bytes:
                 left = len(rows) - done
                 said.append(
                     f"{row.name} {f'and {left - 1} more were' if left > 1 else 'was'} not opened: those before take "
