@@ -403,7 +403,9 @@ def _unknown_id(env_id: str) -> TaskError:
         return refused(f"{env_id} is a gymnasium environment, but not one of ManiSkill's (no BaseEnv)")
     ids = {known.lower(): known for known in registry.environment_ids()}
     close = [ids[name] for name in difflib.get_close_matches(env_id.lower(), list(ids), n=3)]
-    hint = f"did you mean {' or '.join(close)}?" if close else "give a .py file, or an id such as PickCube-v1"
+    hint = (
+        f"did you mean {' or '.join(close)}?" if close else "give a .py file, or an id such as PickCube-v1."
+    )
     return refused(f"no task is registered as {env_id!r}, and there is no such file; {hint} {IMPORT_HINT}")
 
 
