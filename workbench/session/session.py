@@ -240,6 +240,8 @@ class Session:
     def _on_policy_saved(self) -> None:
         with self._lock:
             request = self._state.policy_saved()
+        # A policy beside the task is taken for one of its modules too, of which "nothing changed" is said.
+        self._say("the policy's file was saved: it is read anew")
         self._note()
         self._send(request)
 
