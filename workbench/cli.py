@@ -158,6 +158,10 @@ def record(
         imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
             repeatable.
     """
+    from workbench.authoring.reference import why_not_there
+
+    if (why := why_not_there(task)) is not None:
+        return refuse(why)
     use_private_driver()
     from workbench.record_command import record_in_terminal
     from workbench.session.debugger import debug_here

@@ -224,7 +224,11 @@ def _write_new(file: Path, text: bytes) -> bool:
                 file.touch(exist_ok=False)
             except FileExistsError:
                 return False
-            os.replace(temporary, file)
+            try:
+                os.replace(temporary, file)
+            except OSError:
+                file.unlink(missing_ok=True)
+                raise
         return True
     finally:
         with suppress(FileNotFoundError):

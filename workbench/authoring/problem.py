@@ -62,6 +62,10 @@ _MACHINERY = ("workbench", "importlib", "_frozen_importlib", "_frozen_importlib_
 """Packages whose frames, at the start of a traceback, only say who ran the author's code."""
 
 
+class Interrupted(BaseException):
+    """Somebody had enough of waiting. Not an Exception: ``except Exception`` in a loop must not swallow it."""
+
+
 _person: tuple[type[BaseException], ...] = (KeyboardInterrupt,)
 
 
@@ -91,6 +95,8 @@ class Problem:
     """The text of that line, stripped."""
     traceback: str
     """The whole of it, as Python prints it; may be empty."""
+    interrupted: bool = False
+    """A person stopped it by hand."""
 
 
 class TaskError(Exception):
@@ -148,7 +154,8 @@ def problem_from_exception(
         code = linecache.getline(file, line).strip()
     if isinstance(exc, AssertionError) and not str(exc) and code:
         message = shorten(f"{message}: {code}")
-    return Problem(stage_found, message, file, line, code or None, format_traceback(exc))
+    stopped = isinstance(exc, Interrupted)
+    return Problem(stage_found, message, file, line, code or None, format_traceback(exc), stopped)
 
 
 def shorten(text: str, limit: int = MESSAGE_LIMIT) -> str:

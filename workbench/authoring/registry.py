@@ -69,18 +69,22 @@ class Registrations:
     """Name to what stood there before."""
     placed: dict[str, Slot] = field(default_factory=dict)
     """Name to what this load put there."""
+    _put_back: list[str] = field(default_factory=list)
+    """Of `placed`: names that the last `undo` took this load's entries from."""
 
     def undo(self) -> None:
         """Put back what stood under each name, unless somebody took the name since."""
+        self._put_back = []
         for name, before in self.displaced.items():
             if name not in self.placed or _same(_take(name), self.placed[name]):
                 _put(name, before)
+                self._put_back += [name] if name in self.placed else []
 
     def redo(self) -> None:
-        """Put this load's entries in again."""
-        for name, slot in self.placed.items():
+        """Put those entries in again that `undo` took out: a name that somebody took before that stays theirs."""
+        for name in self._put_back:
             self.displaced[name] = _take(name)
-            _put(name, slot)
+            _put(name, self.placed[name])
 
     def replaced_names(self) -> tuple[str, ...]:
         """Names that belonged to somebody else: built-in tasks, say."""

@@ -93,9 +93,12 @@ class TrustStore:
             self._followed_in_this_run.add((content.hash, content.main))
 
     def _read(self, mend: bool = False) -> list[_Entry]:
+        """What is kept; with `mend`, for writing it again: a broken store is set aside, and OSError is raised."""
         try:
             content = read_private(STORE_FILE)
         except OSError as error:
+            if mend:
+                raise  # what it holds would be written over
             self._tell(f"What you trusted before is not known: {error}")
             return []
         if content is None:

@@ -1,6 +1,6 @@
 """Which simulation and which renderer this machine can give.
 
-``auto`` must never surprise. It is the batched CPU everywhere, since the tests of GPU simulation (``pytest -m gpu``) have
+``auto`` must never surprise. It is the batched CPU everywhere, since the tests of GPU simulation (``make test-gpu``) have
 passed on no machine so far: the GPU is taken where it is asked for. It needs CUDA *and* PhysX's GPU library, and SAPIEN
 fetches that library from the network at first use. So it is looked for on disk, never fetched by the way.
 """

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -30,7 +31,13 @@ from workbench.core.constructors import refuse_unbuilt_agent, refuse_unbuilt_env
 from workbench.core.contacts import CpuArray
 from workbench.core.cpu_system import BatchedCpuSystem
 from workbench.core.drawn_poses import NOWHERE_ELSE, drawn_at
-from workbench.core.partial_reset import KeptControllers, others, told_whose_fault
+from workbench.core.partial_reset import (
+    KeptControllers,
+    in_ascending_order,
+    others,
+    seeded,
+    told_whose_fault,
+)
 from workbench.core.rules import Degree, Finding, degrees_of
 from workbench.core.scene_limit import require_scenes
 from workbench.core.seams import asks_for_a_gpu, install_index_seams, substeps_are_unwatched
@@ -203,10 +210,16 @@ class BatchedCpuMixin:
 
     def reset(self, seed: Any = None, options: dict[str, Any] | None = None) -> Any:
         untouched = others(self, options)
+        options, seeds = in_ascending_order(options or {}, seed, self)
+        # For as many seeds as there are envs ManiSkill has an answer: they are those of the whole batch.
+        if not untouched or seeds is None or len(seeds) == 1:
+            given: Any = nullcontext()
+        else:
+            given, seed = seeded(self, options["env_idx"].tolist(), seeds), None
         self._kept_controllers = KeptControllers(self, untouched) if untouched else None
         self._to_begin = [] if self.begins_anew else None
         try:
-            with told_whose_fault(self, untouched):
+            with told_whose_fault(self, untouched), given:
                 return super().reset(seed=seed, options=options)  # type: ignore[misc]
         except BaseException:
             self.drop_writes()

@@ -11,16 +11,20 @@ Second, many tasks have never been reset in part: a hook that makes ``num_envs``
 are wanted, or replaces a buffer of N rows by one of the subset's. The exception is then a torch message
 about sizes, often raised in a hook that is right. The traceback stays as it is, and gets a note that names the
 task's line and the buffers that shrank.
+
+Nor has ManiSkill one order of rows: its setters give them to the envs of a mask, lowest first, and a task its own
+as ``self.x[env_idx]``. So envs are reset in ascending order, in whichever they are named.
 """
 
 from __future__ import annotations
 
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from mani_skill.agents.controllers.base_controller import BaseController, CombinedController
 from mani_skill.envs.sapien_env import BaseEnv
@@ -28,8 +32,9 @@ from mani_skill.utils.structs import Pose
 
 from workbench.core.assignments import find_assignment
 from workbench.core.broken_rule import BrokenRule
+from workbench.core.env_numbers import env_numbers, envs_of_batch
 from workbench.core.kept_rows import rows_of_tensors
-from workbench.core.seams import task_class
+from workbench.core.seams import drawing_from, set_episode_seeds, task_class
 
 _CORE = str(Path(__file__).parent)
 
@@ -67,10 +72,65 @@ def active_controllers(env: Any) -> list[BaseController]:
 
 def others(env: Any, options: dict[str, Any] | None) -> list[int]:
     """The envs that a reset with these options does not touch; empty for a reset of all."""
-    chosen = (options or {}).get("env_idx")
+    chosen = _chosen(env, options or {})
+    return [] if chosen is None else sorted(set(range(env.num_envs)).difference(chosen))
+
+
+def _chosen(env: Any, options: Mapping[str, Any]) -> list[int] | None:
+    """The envs that are to be reset, as named; None for all. ManiSkill takes -1 for the last, and none at all."""
+    named = options.get("env_idx")
+    if named is None:
+        return None
+    count = env.num_envs
+    chosen = [i + count if -count <= i < 0 else i for i in env_numbers(named)]
+    return envs_of_batch(chosen, count) if chosen else []
+
+
+def in_ascending_order(
+    options: dict[str, Any], seeds: Any, env: Any
+) -> tuple[dict[str, Any], list[int] | None]:
+    """Options of a partial reset with the envs in ascending order, and with them what has a row for each as named.
+
+    Args:
+        seeds: what ``reset`` is given.
+
+    Returns:
+        the options, and the seeds if there is one for each of several envs that are reset and not of all.
+
+    Raises:
+        TypeError, IndexError, ValueError: ``env_idx`` is a mask, or names an env that is not there, or one twice.
+    """
+    chosen = _chosen(env, options)
     if chosen is None:
-        return []
-    return sorted(set(range(env.num_envs)) - {int(i) for i in chosen})
+        return options, None
+    order = sorted(range(len(chosen)), key=chosen.__getitem__)
+    one_each = np.ndim(seeds) == 1 and len(seeds) == len(chosen)
+    rows = torch.tensor([chosen[k] for k in order], dtype=torch.long, device=env.device)
+    made = {**options, "env_idx": rows}
+    states = options.get("reset_to_env_states", {})
+    if "obs" in states:
+        # ManiSkill puts them to `env_idx` row by row; the states themselves, as `set_state` does, lowest env first.
+        made["reset_to_env_states"] = {**states, "obs": _rows(states["obs"], order)}
+    return made, [int(seeds[k]) for k in order] if one_each else None
+
+
+def _rows(value: Any, order: list[int]) -> Any:
+    if isinstance(value, dict):
+        return {name: _rows(held, order) for name, held in value.items()}
+    return value[order] if np.ndim(value) else value
+
+
+@contextmanager
+def seeded(env: Any, env_idx: list[int], seeds: list[int]) -> Iterator[None]:
+    """Within this a reset of these envs, lowest first, starts their episodes from these seeds.
+
+    ``BaseEnv.reset(seed=[...])`` takes the seeds for those of the whole batch, whichever envs are reset.
+    """
+    set_episode_seeds(env, env_idx, seeds)
+    devices = [env.device] if env.device.type == "cuda" else []
+    with torch.random.fork_rng(devices=devices), drawing_from(env, env_idx[0]):
+        torch.manual_seed(seeds[0])
+        yield
 
 
 @contextmanager

@@ -208,13 +208,16 @@ def drawing_from(env: BaseEnv, index: int) -> Iterator[None]:
     """Within this ``_episode_rng``, from which the robot's first joints are drawn, is the generator of that env.
 
     ManiSkill keeps it for code that was written for one env, and it is env 0's for good: a partial reset of env 3
-    would draw on from wherever env 0's episode got to, whatever its own seed.
+    would draw on from wherever env 0's episode got to, whatever its own seed. Nor does ``enhanced_determinism``
+    draw other seeds than those that were set, which it does in a reset that is given none.
     """
     env._episode_rng = env._batched_episode_rng[index]
+    draws_seeds, env._enhanced_determinism = env._enhanced_determinism, False
     try:
         yield
     finally:
         env._episode_rng = env._batched_episode_rng[0]
+        env._enhanced_determinism = draws_seeds
 
 
 def keep_episode_seeds(env: BaseEnv, env_idx: list[int], seeds: NDArray[np.int64]) -> None:

@@ -21,14 +21,12 @@ the moment to the last bit. The session goes back so (`session.go_back`).
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
-import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
@@ -41,6 +39,7 @@ from workbench.core.cpu_state import (
     read_cpu_state,
     write_cpu_state,
 )
+from workbench.core.env_numbers import env_numbers, envs_of_batch
 from workbench.core.episode_rng import RngReader, RngState, SharedRng, read_shared_rng, write_shared_rng
 from workbench.core.gpu_state import GpuEnvState, read_gpu_state, write_gpu_state
 from workbench.core.open_env import open_env
@@ -99,7 +98,7 @@ def take_snapshot(env: Any, env_idx: Sequence[int] | int | None = None) -> Snaps
         NotImplementedError: a stock CPU env.
     """
     env = open_env(env)
-    chosen = _checked(range(env.num_envs) if env_idx is None else env_idx, env.num_envs)
+    chosen = envs_of_batch(range(env.num_envs) if env_idx is None else env_idx, env.num_envs)
     px = seams.batched_system(env.scene)
     if px is not None:
         simulation: Any = read_cpu_state(env, _plan(env), chosen)
@@ -157,8 +156,9 @@ def restore_snapshot(
     else:
         _require_gpu(env)
         carried, missed = write_gpu_state(env, targets, states)
-    whole = snapshot.num_envs == env.num_envs and [snapshot.env_idx[k] for k in positions] == list(
-        range(env.num_envs)
+    # In whichever order they were taken and are named.
+    whole = snapshot.num_envs == env.num_envs == len(targets) and all(
+        snapshot.env_idx[k] == i for i, k in zip(targets, positions, strict=True)
     )
     more, less = restore_memory(env, snapshot.memory, targets, positions, whole)
     return RestoreReport((*carried, *more), {**missed, **less})
@@ -245,29 +245,6 @@ def _require_gpu(env: BaseEnv) -> None:
         )
 
 
-def _indices(env_idx: Any) -> list[int]:
-    try:
-        each = [env_idx] if np.ndim(env_idx) == 0 else list(env_idx)
-        if any(isinstance(i, (bool, np.bool_)) or getattr(i, "dtype", None) == torch.bool for i in each):
-            raise TypeError("a mask")
-        return [operator.index(i) for i in each]
-    except TypeError as error:
-        raise TypeError(
-            f"env_idx and source are whole numbers, one an env, not {env_idx!r}: of a mask, take mask.nonzero().flatten()"
-        ) from error
-
-
-def _checked(env_idx: Sequence[int] | int, num_envs: int) -> list[int]:
-    chosen = _indices(env_idx)
-    if not chosen:
-        raise ValueError("env_idx is empty: name the envs, or leave it out for all")
-    if any(not 0 <= i < num_envs for i in chosen):
-        raise IndexError(f"env_idx {chosen} is out of range for {num_envs} envs")
-    if len(set(chosen)) < len(chosen):
-        raise ValueError(f"env_idx {chosen} names an env twice")
-    return chosen
-
-
 def _pairs(
     env: BaseEnv, snapshot: Snapshot, env_idx: Sequence[int] | int | None, source: int | Sequence[int] | None
 ) -> tuple[list[int], list[int]]:
@@ -279,11 +256,11 @@ def _pairs(
             f"the snapshot is of envs {list(snapshot.env_idx)}, and this env has {env.num_envs}: say with env_idx which "
             "are to be set, and with source whose state they get"
         )
-    targets = _checked(snapshot.env_idx if env_idx is None else env_idx, env.num_envs)
+    targets = envs_of_batch(snapshot.env_idx if env_idx is None else env_idx, env.num_envs)
     if source is None:
         sources = [snapshot.env_idx[0]] * len(targets) if len(snapshot.env_idx) == 1 else targets
     else:
-        sources = _indices(source)
+        sources = env_numbers(source)
         if np.ndim(source) == 0:
             sources *= len(targets)
     if len(sources) != len(targets):

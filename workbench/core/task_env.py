@@ -26,15 +26,15 @@ from workbench.core.constructors import refuse_unbuilt_env
 from workbench.core.contact_list import Contact, list_contacts
 from workbench.core.cpu_scene import batched_class
 from workbench.core.entries import FLAGS, split_entries
+from workbench.core.env_numbers import envs_of_batch
+from workbench.core.partial_reset import in_ascending_order, seeded
 from workbench.core.render_device import keep_render_device
 from workbench.core.rules import Degree, Finding, degrees_of
 from workbench.core.seams import (
-    drawing_from,
     episode_seeds,
     flatten_observation,
     keep_observation,
     last_observation,
-    set_episode_seeds,
 )
 from workbench.core.snapshot import (
     RestoreReport,
@@ -184,19 +184,16 @@ class TaskEnv:
 
         All at once is ManiSkill's own ``reset(seed=[...])``. For a subset, ManiSkill seeds torch with the
         seed of env 0, whichever envs are reset, so that a seed given for env 3 means nothing; here a
-        partial reset draws from the first seed given, and ``reset(seed=7, env_idx=[3])`` starts the
-        episode that a single stock env starts with ``reset(seed=7)``.
+        partial reset draws from the seed of the lowest env, and ``reset(seed=7, env_idx=[3])`` starts the
+        episode that a single stock env starts with ``reset(seed=7)``. In which order envs are named, each
+        with its seed, makes no difference.
 
         Args:
             seed: one seed for the whole batch (the i-th env that is reset gets ``seed + i``), or one for
                 each env that is reset; None goes on with the task's own random numbers.
             options: further ``options`` for the task's own ``reset``.
         """
-        chosen = list(range(self.num_envs)) if env_idx is None else [int(i) for i in env_idx]
-        if not chosen:
-            raise ValueError("env_idx is empty: name the envs to reset, or leave it out to reset all")
-        if any(not 0 <= i < self.num_envs for i in chosen):
-            raise IndexError(f"env_idx {chosen} is out of range for {self.num_envs} envs")
+        chosen = envs_of_batch(range(self.num_envs) if env_idx is None else env_idx, self.num_envs)
         seeds = _seed_list(seed, len(chosen))
         if env_idx is None:
             self.obs, info = self.env.reset(seed=seeds, options=dict(options or {}))
@@ -211,13 +208,11 @@ class TaskEnv:
     def _partial_reset(
         self, chosen: list[int], seeds: list[int] | None, further: Mapping[str, Any]
     ) -> tuple[Any, dict[str, Any]]:
-        options = {**further, "env_idx": torch.tensor(chosen, device=self.env.device)}
+        # Here too, as GPU simulation has only ManiSkill's own reset.
+        options, seeds = in_ascending_order({**further, "env_idx": chosen}, seeds, self.env)
         if seeds is None:
             return self.env.reset(options=options)
-        set_episode_seeds(self.env, chosen, seeds)
-        devices = [self.env.device] if self.env.device.type == "cuda" else []
-        with torch.random.fork_rng(devices=devices), drawing_from(self.env, chosen[0]):
-            torch.manual_seed(seeds[0])
+        with seeded(self.env, sorted(chosen), seeds):
             return self.env.reset(options=options)
 
     def step(self, action: NDArray[np.float32] | None) -> StepResult:

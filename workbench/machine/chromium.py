@@ -7,6 +7,7 @@ is what users have. Ubuntu's ``chromium-browser`` is a snap behind a shell scrip
 
 from __future__ import annotations
 
+import ctypes
 import importlib.util
 import os
 import shutil
@@ -36,6 +37,7 @@ def chromium_version(path: str) -> str | None:
     except (OSError, subprocess.TimeoutExpired):
         return None
     said = done.stdout.strip()
+    # A browser tells what it is by this line alone; another program of that name may end with 0 too.
     return said if done.returncode == 0 and ("Chrom" in said) else None
 
 
@@ -88,10 +90,18 @@ def driver_complaint() -> str | None:
     return None if done.returncode == 0 else done.stderr.strip()
 
 
+def _lacks_libatomic() -> bool:
+    try:
+        ctypes.CDLL("libatomic.so.1")
+    except OSError:
+        return True
+    return False
+
+
 def ensure_driver() -> None:
     """Bring the one library that Playwright's Node loads and a bare Debian lacks."""
     complaint = driver_complaint()
-    if complaint is not None and "libatomic" in complaint and can_install_packages():
+    if complaint is not None and _lacks_libatomic() and can_install_packages():
         try:
             apt_get(["update"])
             apt_get(["install", "--no-install-recommends", "libatomic1"])
@@ -100,7 +110,7 @@ def ensure_driver() -> None:
         complaint = driver_complaint()
     if complaint is not None:
         print(f"The browser tests will fail, Playwright does not start: {complaint}", file=sys.stderr)
-        if "libatomic" in complaint:
+        if _lacks_libatomic():
             print("Type: sudo apt-get install libatomic1", file=sys.stderr)
 
 

@@ -188,7 +188,7 @@ def _gpu() -> list[Finding]:
             what += f" (PhysX GPU library {answer['library']})"
             advice = (
                 "GPU simulation has passed its tests on no machine so far, so --backend auto does not take it. In a clone, "
-                "pytest -m gpu says whether they pass on this one."
+                "make test-gpu says whether they pass on this one."
             )
         return [Finding("CUDA", True, found), Finding("GPU physics", None, what, advice)]
     nvidia = Path("/proc/driver/nvidia/version").is_file()

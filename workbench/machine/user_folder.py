@@ -47,12 +47,16 @@ def read_private(name: str) -> bytes | None:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError:
         return None
-    with os.fdopen(descriptor, "rb") as file:
+    try:
         _check_private(path.parent, path.parent.stat())
         _check_private(path, status := os.fstat(descriptor))
         if not stat.S_ISREG(status.st_mode) or status.st_size > MOST_BYTES:
             raise NoUserFolder(f"{path} is no ordinary file of at most {MOST_BYTES >> 20} MB")
-        return file.read(MOST_BYTES)
+        # Not before: of a folder it raises, and leaves the descriptor open.
+        with os.fdopen(descriptor, "rb", closefd=False) as file:
+            return file.read(MOST_BYTES)
+    finally:
+        os.close(descriptor)
 
 
 def write_private(name: str, content: bytes) -> None:
@@ -124,10 +128,14 @@ def _made() -> Path:
 def _temporary(path: Path, content: bytes) -> Path:
     temporary = path.with_name(f".{uuid.uuid4().hex}.part")
     descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(descriptor)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(descriptor)
+    except BaseException:  # a full disk, say: what is left of it would stay for good
+        temporary.unlink(missing_ok=True)
+        raise
     return temporary
 
 

@@ -30,12 +30,8 @@ def read_notes(path: Path) -> dict[str, tuple[tuple[str, ...], str]]:
     """Tags and note of each trajectory ("" where the file has no trajectories) in a ``.notes``; what is not
     one holds none."""
     try:
-        entries = read_json(path, MOST_NOTES_BYTES)[_NOTES]
-        return {
-            str(name): (clean_tags(entry.get("tags")), clean_note(entry.get("note")))
-            for name, entry in entries.items()
-        }
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return _notes(path)
+    except (OSError, ValueError):
         return {}
 
 
@@ -43,9 +39,13 @@ def write_notes(path: Path, trajectory: str | None, tags: tuple[str, ...], note:
     """Put tags and note of one trajectory into a ``.notes``; without any left, the file goes.
 
     Raises:
-        OSError: the folder cannot be written to.
+        OSError: the file cannot be read, or the folder not written to.
+        ValueError: there is something else in the file, which is not written over. The message is a sentence's end.
     """
-    entries = read_notes(path)
+    try:
+        entries = _notes(path)
+    except FileNotFoundError:
+        entries = {}
     entries.pop(trajectory or "", None)
     if tags or note:
         entries[trajectory or ""] = (tags, note)
@@ -54,6 +54,18 @@ def write_notes(path: Path, trajectory: str | None, tags: tuple[str, ...], note:
         return
     plain = {name: {"tags": list(tags), "note": note} for name, (tags, note) in sorted(entries.items())}
     replace_file(path, json.dumps({_NOTES: plain}, indent=2, ensure_ascii=False).encode())
+
+
+def _notes(path: Path) -> dict[str, tuple[tuple[str, ...], str]]:
+    """Raises OSError, ValueError."""
+    try:
+        entries = read_json(path, MOST_NOTES_BYTES)[_NOTES]
+        return {
+            str(name): (clean_tags(entry.get("tags")), clean_note(entry.get("note")))
+            for name, entry in entries.items()
+        }
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path.name} holds no notes that this version can read: move it away") from error
 
 
 def write_into_description(path: Path, tags: tuple[str, ...], note: str) -> None:

@@ -8,6 +8,7 @@ thread.
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -269,8 +270,10 @@ class EpisodeWriter:
 
     def discard(self) -> None:
         """Forget the episode: nothing of it stays on the disk, but for the files that `finish` has made."""
-        self._journal.remove()
-        self._scene.unlink(missing_ok=True)
+        # What the disk does not let go of is left to `recover`: files that were made are no failure for it.
+        for remove in (self._journal.remove, self._scene.unlink):
+            with contextlib.suppress(OSError):
+                remove()
         tidy(self._folder)
 
     def _pictures_of(

@@ -21,6 +21,7 @@ process dies, however it dies: that is how the dead are told from the living.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
 import os
@@ -74,7 +75,8 @@ class Journal:
             with self._writing:
                 self._put(_SCHEMA.serialize())
         except OSError:
-            self.remove()
+            with contextlib.suppress(OSError):  # what is to be told is why it cannot be begun
+                self.remove()
             raise
         _keeper.watch(self)
 
@@ -108,9 +110,7 @@ class Journal:
             if not isinstance(item, Entry):
                 item.add_done_callback(self._weigh)
         if full:
-            self.write()
-        if self._error is not None:
-            raise self._error
+            self.write()  # where that fails the next one is told: this one is kept
 
     def put(self, kind: str, number: int, value: bytes) -> None:
         """`add` and `commit` of what is a whole state by itself, in one: sixty-four envs do it at every step."""
@@ -122,8 +122,6 @@ class Journal:
             self._waiting_bytes += _size(entry)
         if self._waiting_bytes > _BATCH_BYTES:
             self.write()
-            if self._error is not None:
-                raise self._error
 
     def rollback(self) -> None:
         """Forget what was added since the last `commit`."""
@@ -197,21 +195,18 @@ class Journal:
 
     def remove(self) -> None:
         """Close, and take the file away."""
-        self.path.unlink(missing_ok=True)
-        self.close()
+        try:
+            self.path.unlink(missing_ok=True)
+        finally:
+            self.close()
 
     def _put(self, content: pa.Buffer) -> None:
-        view = memoryview(content)
-        written = 0
-        try:
-            while written < len(view):
-                written += os.write(self._descriptor, view[written:])
-        except OSError:
-            # Half a batch would end the journal for a reader, and what is written after it would be lost.
-            os.ftruncate(self._descriptor, self._size)
-            os.lseek(self._descriptor, self._size, os.SEEK_SET)
-            raise
-        self._size += written
+        # Where half a batch was written before, this one holds all of that and goes to its place: behind it nobody would find it.
+        view, end = memoryview(content), self._size
+        while view:
+            written = os.pwrite(self._descriptor, view, end)
+            view, end = view[written:], end + written
+        self._size = end
 
 
 def _made(items: Sequence[Item]) -> tuple[list[Entry], int, OSError | None]:
@@ -307,15 +302,17 @@ def before_writing(flush: Callable[[], None]) -> None:
 def read_journal(path: Path) -> Iterator[list[Entry]]:
     """The entries of the journal `path`, a batch at a time, as far as it was written whole. Raises OSError."""
     with open_regular_file(path) as file:
-        try:
-            reader = pa.ipc.open_stream(file)
-        except (pa.ArrowInvalid, OSError):
-            return
+        reader = None
         while True:
             try:
+                reader = reader or pa.ipc.open_stream(file)
                 batch = reader.read_next_batch()
                 columns = [column.to_pylist() for column in batch.columns]
-            except (StopIteration, pa.ArrowInvalid, OSError):
+            except (StopIteration, pa.ArrowInvalid):
+                return
+            except OSError as error:
+                if error.errno is not None:  # of the disk, and not Arrow's, whose own has no number
+                    raise
                 return
             yield [Entry(*row) for row in zip(*columns)]
 

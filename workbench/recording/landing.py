@@ -10,6 +10,7 @@ itself, swallows the rest, and tells at the end. What writes the .rrd raises at 
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import io
 import os
@@ -154,13 +155,13 @@ def publish(temporaries: Sequence[Path], folder: Path, stem: str) -> list[Path]:
             for temporary, path in zip(temporaries, paths):
                 _name(temporary, path)
                 done.append(path)
+            sync_folder(folder)
         except FileExistsError:
             _remove(done)
             continue
         except BaseException:
             _remove(done)
             raise
-        sync_folder(folder)
         return paths
     raise AssertionError("unreachable: the candidates do not end")
 
@@ -184,12 +185,17 @@ def _name(temporary: Path, path: Path) -> None:
             raise
         # A filesystem without hard links (FAT, some network drives): claim the name, then replace it.
         path.touch(exist_ok=False)
-        os.replace(temporary, path)
+        try:
+            os.replace(temporary, path)
+        except BaseException:
+            _remove([path])
+            raise
 
 
 def _remove(paths: Sequence[Path]) -> None:
     for path in reversed(paths):
-        path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # what is to be told is why the others have no name
+            path.unlink(missing_ok=True)
 
 
 def sync_folder(path: Path) -> None:

@@ -224,4 +224,6 @@ def _remove(path: Path) -> bool:
 
 
 def _is_locked(error: sqlite3.Error) -> bool:
-    return isinstance(error, sqlite3.OperationalError) and ("locked" in str(error) or "busy" in str(error))
+    # What Python's module raises by itself has no code. The low byte is the error, the rest tells its kinds apart.
+    code = getattr(error, "sqlite_errorcode", None)
+    return code is not None and code & 0xFF in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED)

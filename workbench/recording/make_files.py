@@ -6,6 +6,7 @@ is as good as what was never in danger.
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import errno
 import re
@@ -60,7 +61,9 @@ def make_files(journal: Path, header: Header, folder: Path, states: int | None =
         ) from error
     finally:
         for path in temporaries:
-            path.unlink(missing_ok=True)
+            # What stays is taken away by `recover`; the files are there, or it is to be told why they are not.
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
 
 
 def temporary_files(journal: Path) -> tuple[Path, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import uuid
@@ -23,7 +24,7 @@ def new_file(path: Path) -> Iterator[Path]:
         raise _taken(path)
     temporary = path.parent / f".{uuid.uuid4().hex}.part"
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        _make_folder(path.parent)
         yield temporary
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
@@ -33,7 +34,16 @@ def new_file(path: Path) -> Iterator[Path]:
             raise
         raise OSError(error.errno, f"Cannot write {path}: {os.strerror(error.errno)}.") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        # The other name is there by now, or it is to be told why it is not.
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:  # which would be taken for one of the file's own name
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), os.fspath(path)) from error
 
 
 def _taken(path: Path) -> FileExistsError:

@@ -34,27 +34,32 @@ def recover(folder: Path) -> list[EpisodeFiles]:
     others are, and the error is raised then.
 
     Raises:
-        RecordingError: files cannot be written, or the folder not read; the journals stay.
+        RecordingError: files cannot be written, or the folder or a journal not read; the journals stay.
+        MemoryError: for a journal; the others are done.
     """
     folder = Path(folder)
     if (folder / FOLDER).is_symlink():
         # Strays are removed there: another folder's files would be.
         raise RecordingError(f"Cannot recover what lies in {folder}: {FOLDER} is a link to another folder")
     made: list[EpisodeFiles] = []
-    failed: RecordingError | None = None
+    failed: Exception | None = None
     try:
         for journal in sorted((folder / FOLDER).glob("*.arrow")):
             try:
                 if (files := _recover(journal, folder)) is not None:
                     made.append(files)
-            except RecordingError as error:
+            except Exception as error:
+                # Of any kind: nobody knows what lies there, and the others are whole.
                 failed = error
         _remove_strays(folder)
         tidy(folder)
     except OSError as error:
         raise RecordingError(f"Cannot recover what lies in {folder}: {reason(error, folder)}") from error
-    if failed is not None:
+    if isinstance(failed, RecordingError | MemoryError):
         raise failed
+    if failed is not None:
+        why = reason(failed, folder) if isinstance(failed, OSError) else f"{failed}."
+        raise RecordingError(f"Cannot recover all that lies in {folder}: {why}") from failed
     return made
 
 
@@ -63,16 +68,14 @@ def _recover(journal: Path, folder: Path) -> EpisodeFiles | None:
     if descriptor is None:
         return None
     try:
-        scene = journal.with_suffix(SCENE_SUFFIX)
         reader = JournalReader(journal)
-        header = reader.header(read_scene(scene))
+        header = reader.header(read_scene(journal.with_suffix(SCENE_SUFFIX)))
         files = None
         if header is not None and not _already_made(header.info, journal, folder):
             header = recovered(header)
             if reader.survey(header).length > 0:
                 files = make_files(journal, header, folder)
         journal.unlink(missing_ok=True)
-        scene.unlink(missing_ok=True)
         return files
     finally:
         os.close(descriptor)

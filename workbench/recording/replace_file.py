@@ -25,5 +25,7 @@ def replace_file(path: Path, content: bytes) -> None:
         with contextlib.suppress(OSError):  # a new file has no mode to keep
             shutil.copymode(path, temporary)
         os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    except BaseException:
+        with contextlib.suppress(OSError):  # what is to be told is why it was not written
+            temporary.unlink(missing_ok=True)
+        raise

@@ -235,12 +235,18 @@ class JournalReader:
         self.layouts: list[np.dtype] = []
 
     def header(self, geometry: SceneGeometry | None) -> Header | None:
-        """None where the journal ends before its header, or it is none of ours. Raises OSError."""
+        """None where the journal ends before its header.
+
+        Raises:
+            OSError: the journal cannot be read.
+            ValueError: it begins with something else: it is of a later version, or none of ours.
+        """
         for entries in read_journal(self._path):
             try:
                 return header_from(entries[0].value.decode(), geometry)
-            except (ValueError, KeyError, TypeError):
-                return None
+            except (ValueError, KeyError, TypeError, AttributeError) as error:
+                why = f"{self._path.name} is no recording that this version can read; a later one may, else remove it"
+                raise ValueError(why) from error
         return None
 
     def raw(self) -> Iterator[_Raw]:

@@ -25,14 +25,15 @@ class Trash:
     """What is in there."""
 
     batches: tuple[str, ...] = ()
-    """One a deletion, the last one last."""
+    """One a deletion that holds something, the last one last."""
     files: int = 0
     size: int = 0
     """Bytes."""
 
 
 class TrashError(OSError):
-    """Files could not be moved; the message says which and why. Those of the same recording are where they were."""
+    """Files could not be moved; the message says which and why. Those of the same recording are where they were, or
+    the message says where."""
 
 
 def put_into_trash(folder: Path, recordings: Sequence[Sequence[Path]]) -> str | None:
@@ -75,7 +76,7 @@ def take_out_of_trash(folder: Path, batch: str) -> tuple[str, ...]:
 
 
 def look_into_trash(folder: Path) -> Trash:
-    batches, files, size = [], 0, 0
+    size = 0
     if (folder / TRASH).is_symlink():
         return Trash()  # another folder, which came with this one
     try:
@@ -83,15 +84,17 @@ def look_into_trash(folder: Path) -> Trash:
             batches = sorted(entry.name for entry in listed if entry.is_dir(follow_symlinks=False))
     except OSError:
         return Trash()
+    held: dict[str, int] = {}
     for batch in batches:
         for below, _, names in os.walk(folder / TRASH / batch):
             for name in names:
                 try:
                     size += os.lstat(os.path.join(below, name)).st_size
-                    files += 1
+                    held[batch] = held.get(batch, 0) + 1
                 except OSError:
                     continue  # taken out meanwhile
-    return Trash(tuple(batches), files, size)
+    # A deletion that failed leaves folders, and taking that back would be taken for taking back the one before it.
+    return Trash(tuple(held), sum(held.values()), size)
 
 
 def empty_trash(folder: Path) -> None:
@@ -113,13 +116,21 @@ def _move_together(pairs: Sequence[tuple[Path, Path]]) -> bool:
     done: list[tuple[Path, Path]] = []
     try:
         for source, target in pairs:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            if os.path.lexists(target):
-                raise FileExistsError(None, "there is a file of that name already", os.fspath(target))
-            os.rename(source, target)
+            _move(source, target)
             done.append((source, target))
     except OSError as error:
+        what = f"{pairs[len(done)][0]} was left where it is: {error.strerror or error}."
         for source, target in reversed(done):
-            os.rename(target, source)
-        raise TrashError(f"{pairs[len(done)][0]} was left where it is: {error.strerror or error}.") from error
+            try:
+                _move(target, source)
+            except OSError as again:
+                what += f" {source} is {target} now and could not be moved back: {again.strerror or again}."
+        raise TrashError(what) from error
     return bool(done)
+
+
+def _move(source: Path, target: Path) -> None:
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if os.path.lexists(target):
+        raise FileExistsError(None, "there is a file of that name already", os.fspath(target))
+    os.rename(source, target)

@@ -45,7 +45,7 @@ def recordings_among(paths: Sequence[Path]) -> list[Path]:
     """These recordings, in full.
 
     Raises:
-        ValueError: `paths` is empty.
+        ValueError: `paths` is empty, or one is no .rrd file by its name.
         FileNotFoundError: one of them is no file.
     """
     files = [Path(path).resolve() for path in paths]
@@ -54,6 +54,9 @@ def recordings_among(paths: Sequence[Path]) -> list[Path]:
     for file in files:
         if not file.is_file():
             raise FileNotFoundError(f"{file} is not a file: give the path of an .rrd file.")
+        if file.suffix != ".rrd":
+            # A page would show nothing of it, and say nothing.
+            raise ValueError(f"{file} is no .rrd file.")
     return files
 
 

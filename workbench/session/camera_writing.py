@@ -20,7 +20,7 @@ from workbench.authoring.modules import read_source
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.core.pictures import CameraInfo
 from workbench.session.messages import TaskDescription
-from workbench.session.studio_view import Change, Writing
+from workbench.session.studio_view import Change, Writing, WritingStage
 
 if TYPE_CHECKING:
     from workbench.authoring.camera_source import Refusal, SourceEdit
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 PARENTS_HOOKS = ("_default_sensor_configs", "_default_human_render_camera_configs")
 """What a task's class can take over from its parent."""
-MADE = ("written", "checked", "mismatch")
+MADE: tuple[WritingStage, ...] = ("written", "checked", "mismatch")
 """Stages in which the change is in the file."""
 
 
@@ -268,29 +268,41 @@ class CameraWriting:
 
     def write(self) -> bool:
         """Make the planned edit. False if there is none, or it cannot be made."""
-        return self._apply("planned", "apply", "written", "Written to {file}, being loaded now.")
+        from workbench.authoring import camera_source
+
+        return self._apply(
+            ("planned",), camera_source.apply, "written", "Written to {file}, being loaded now."
+        )
 
     def undo(self) -> bool:
         """Take the edit that was made out of the file again."""
-        return self._apply(None, "revert", "undone", "{file} {was} before, being loaded now.")
-
-    def _apply(self, needs: str | None, how: str, stage: str, message: str) -> bool:
         from workbench.authoring import camera_source
 
+        return self._apply(MADE, camera_source.revert, "undone", "{file} {was} before, being loaded now.")
+
+    def _apply(
+        self,
+        needs: tuple[WritingStage, ...],
+        do: Callable[[SourceEdit], Refusal | None],
+        stage: WritingStage,
+        message: str,
+    ) -> bool:
         view = self.view
-        ready = view.stage == needs if needs else view.stage in MADE
-        if view.edit is None or not ready:
+        if view.edit is None or view.stage not in needs:
             return False
-        do: Callable[[SourceEdit], Refusal | None] = getattr(camera_source, how)
         refusal = do(view.edit)
         file = view.edit.names
         if refusal is not None:
-            kept = view.stage if needs is None else "refused"
+            kept = "refused" if stage == "written" else view.stage
             self.view = replace(view, stage=kept, refusal=refusal, message=f"Not done: {refusal.reason}.")
             return False
         self.view = replace(
-            view, stage=stage, refusal=None, message=message.format(file=file, was=_was(view.edit))
-        )  # type: ignore[arg-type]
+            view,
+            stage=stage,
+            refusal=None,
+            message=message.format(file=file, was=_was(view.edit)),
+            loading=True,
+        )
         if stage == "undone":
             del self._made[-1:]
         elif self.wish is not None:
@@ -300,9 +312,7 @@ class CameraWriting:
     @property
     def awaited(self) -> bool:
         """The edit was made or taken back, and the version with it has not come in yet."""
-        return self.view.stage == "written" or (
-            self.view.stage == "undone" and self.view.message.endswith("loaded now.")
-        )
+        return self.view.loading
 
     def is_in(self, task: TaskDescription) -> bool:
         """Whether this version is the one with the edit, or without it, that is awaited."""
@@ -327,7 +337,8 @@ class CameraWriting:
         file = view.edit.names
         if view.stage == "undone":
             back = f" {wish.key[1]} stands as it says; Undo puts it where you placed it." if went_back else ""
-            self.view = replace(view, message=f"{file} {_was(view.edit)} before.{back}")
+            message = f"{file} {_was(view.edit)} before.{back}"
+            self.view = replace(view, message=message, refusal=None, loading=False)
             return
         wrong = _mismatch(wish, infos, view.edit.settings)
         if wrong:
@@ -335,6 +346,8 @@ class CameraWriting:
                 view,
                 stage="mismatch",
                 message=f"{wrong} Take the change back, or look at what else in the task places this camera.",
+                refusal=None,
+                loading=False,
             )
             self._made[-1:] = [(wish, self.view)]
             return
@@ -344,7 +357,7 @@ class CameraWriting:
             "rename": f"{wish.key[1]} is {wish.name} in {file} now.",
             "duplicate": f"{wish.name} is in {file}, a copy of {wish.key[1]}.",
         }.get(wish.what, f"{wish.key[1]} is written to {file}, and the new env has it.")
-        self.view = replace(view, stage="checked", message=done)
+        self.view = replace(view, stage="checked", message=done, refusal=None, loading=False)
         self._made[-1:] = [(wish, self.view)]
 
     def failed_to_load(self) -> None:
@@ -356,11 +369,13 @@ class CameraWriting:
             )
         if self.awaited and self.view.edit is not None:
             file = self.view.edit.names
+            undone = self.view.stage == "undone"
             told = "the change is in it; take it back if that is the reason"
-            if self.view.stage == "undone":
+            if undone:
                 told = "the camera's change is out of it"
             does = "does" if len(self.view.edit.changes) == 1 else "do"
-            self.view = replace(self.view, message=f"{file} {does} not load: {told}.")
+            message = f"{file} {does} not load: {told}."
+            self.view = replace(self.view, message=message, refusal=None, loading=not undone)
 
 
 def _was(edit: SourceEdit) -> str:
@@ -384,7 +399,20 @@ def _mismatch(wish: Wish, infos: dict[CameraKey, CameraInfo], wanted: CameraSett
 
 
 def _said(settings: CameraSettings | None, what: str) -> str:
-    value = getattr(settings, {"orientation": "quaternion"}.get(what, what), None)
+    if settings is None:
+        return "none"
+    values: dict[str, object] = {
+        "position": settings.position,
+        "orientation": settings.quaternion,
+        "fov": settings.fov,
+        "intrinsic": settings.intrinsic,
+        "width": settings.width,
+        "height": settings.height,
+        "near": settings.near,
+        "far": settings.far,
+        "shader_pack": settings.shader_pack,
+    }
+    value = values[what]
     if isinstance(value, tuple):
         return "(" + ", ".join(f"{v:.6g}" if isinstance(v, float) else str(v) for v in value) + ")"
     return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -17,7 +17,7 @@ from itertools import count
 
 import numpy as np
 
-from workbench.authoring.problem import TaskError
+from workbench.authoring.problem import Interrupted, TaskError
 from workbench.core import seams
 from workbench.core.snapshot import (
     RestoreReport,
@@ -28,7 +28,6 @@ from workbench.core.snapshot import (
 )
 from workbench.core.stand_still import only_these_move
 from workbench.core.step import StepResult
-from workbench.session.interrupts import Interrupted
 from workbench.session.messages import Restore, Restored
 from workbench.session.open_task import OpenedTask, blamed, step_checked
 

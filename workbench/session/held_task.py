@@ -12,9 +12,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from workbench.authoring.modules import is_own_file
-from workbench.authoring.problem import Problem, TaskError, problem_from_exception
+from workbench.authoring.problem import Interrupted, Problem, TaskError, problem_from_exception
 from workbench.core.snapshot import restore_snapshot
-from workbench.session.interrupts import Interrupted, Interrupts
+from workbench.session.interrupts import Interrupts
 from workbench.session.messages import Failed
 from workbench.session.open_task import OpenedTask
 from workbench.session.pulse import Doing, PulseWriter

@@ -15,14 +15,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+from workbench.authoring.problem import Interrupted
+
 INTERRUPT_SIGNAL = signal.SIGUSR1
 """Not SIGINT, for which libraries and authors install handlers of their own."""
 STACK_SIGNAL = signal.SIGUSR2
 """Makes the worker write its stack into the file that it was given, without the interpreter's help."""
-
-
-class Interrupted(BaseException):
-    """Somebody had enough of waiting. Not an Exception: ``except Exception`` in a loop must not swallow it."""
 
 
 class Interrupts:

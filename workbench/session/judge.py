@@ -17,6 +17,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from enum import Enum
 from typing import Literal
 
 from workbench.authoring.problem import Problem
@@ -33,8 +34,6 @@ from workbench.session.moment_messages import Judged, JudgeMoments, MomentToJudg
 
 IDLE_SECONDS = 300.0
 """How long the process is kept without a judgement."""
-FILE_SAVED = "the file was saved again"
-"""Why a save stops a judgement."""
 _CHUNK_SECONDS = 0.1
 """About how long one answer takes: how soon progress is seen, and stopping heard."""
 _MOST_AT_ONCE = 64
@@ -43,6 +42,17 @@ _SUMMARY_EVERY = 0.5
 _MOMENT_PATIENCE = 2.0
 _LOAD_PATIENCE = 10.0
 """Seconds after which a process that was told to stop, and is still at a chunk or a load, is ended."""
+
+
+class StoppedBy(Enum):
+    """Why a judgement ended before it was done; the value is what the page says."""
+
+    HAND = "stopped by hand"
+    SAVE = "the file was saved again"
+    LOAD = "another version was loaded"
+    LOSS = "the episodes are gone"
+    CLOSING = "closing"
+
 
 JudgeState = Literal["none", "loading", "judging", "done", "stopped", "failed"]
 
@@ -58,8 +68,9 @@ class JudgementView:
     done: int = 0
     total: int = 0
     """Control steps of the batch."""
+    stopped_by: StoppedBy | None = None
     why: str = ""
-    """Why it stopped or failed."""
+    """Why it stopped or failed, in words."""
     problem: Problem | None = None
     """What the new code raised."""
     not_carried: tuple[str, ...] = ()
@@ -81,7 +92,7 @@ def what_a_load_means(
         return "judge"
     if level in ("same", "cameras"):
         # Saved again without a change that matters: what that stopped is to be had all the same.
-        return "judge" if view.state == "stopped" and view.why == FILE_SAVED else "keep"
+        return "judge" if view.stopped_by is StoppedBy.SAVE else "keep"
     return "forget"
 
 
@@ -91,8 +102,8 @@ class _Case:
 
     load: Load
     judgement: Judgement
-    stopped: str = ""
-    """Why it is to stop; empty while it is to go on."""
+    stopped: StoppedBy | None = None
+    """Why it is to stop; None while it is to go on."""
     not_carried: dict[str, str] = field(default_factory=dict)
     seconds: float = 0.0
     summed: float = 0.0
@@ -141,10 +152,10 @@ class Judge:
             return
         case = _Case(load, judgement)
         with self._lock:
-            self._stop("another version was loaded")
+            self._stop(StoppedBy.LOAD)
             self._lane.start("judging", lambda job: self._run(job, case))
 
-    def stop(self, why: str) -> None:
+    def stop(self, why: StoppedBy) -> None:
         """Go no further with what is under way; what is known by then stays to be seen."""
         with self._lock:
             self._stop(why)
@@ -152,7 +163,7 @@ class Judge:
     def forget(self) -> None:
         """Stop, and have nothing to show: the record is gone."""
         with self._lock:
-            self._stop("the episodes are gone")
+            self._stop(StoppedBy.LOSS)
             self._case = None
             self._view = JudgementView(serial=self._view.serial + 1)
         self._on_change()
@@ -160,11 +171,11 @@ class Judge:
     def close(self) -> None:
         """End the process; returns when the thread has ended."""
         self._closing = True
-        self.stop("closing")
+        self.stop(StoppedBy.CLOSING)
         self._lane.close()
 
-    def _stop(self, why: str) -> None:
-        if self._case is not None and not self._case.stopped:
+    def _stop(self, why: StoppedBy) -> None:
+        if self._case is not None and self._case.stopped is None:
             self._case.stopped = why
         self._lane.stop()
 
@@ -180,7 +191,7 @@ class Judge:
                 self._live_through(job, case, rows)
             self._tell(case, "done")
         except Stopped:
-            self._tell(case, "stopped", case.stopped)
+            self._tell(case, "stopped")
             patience = _LOAD_PATIENCE if self._process.owes(Loaded) else _MOMENT_PATIENCE
             self._process.settle(patience, lambda: self._closing)
         except JobFailed as failure:
@@ -242,6 +253,7 @@ class Judge:
             if self._case is not case:
                 return  # it was forgotten
             before, judgement = self._view, case.judgement
+            stopped = case.stopped if state == "stopped" else None
             now = time.monotonic()
             summary = before.summary
             if state != "judging" or now - case.summed > _SUMMARY_EVERY:
@@ -253,7 +265,8 @@ class Judge:
                 serial=before.serial + 1,
                 done=judgement.judged_steps,
                 total=judgement.steps,
-                why=why,
+                stopped_by=stopped,
+                why=why if stopped is None else stopped.value,
                 problem=problem,
                 not_carried=tuple(f"{what}: {reason}" for what, reason in case.not_carried.items()),
                 steps_per_second=judgement.judged_steps / case.seconds if case.seconds else 0.0,

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from workbench.authoring.modules import read_source
 from workbench.authoring.problem import HOOK_STAGES, Problem
+from workbench.session.pulse import Doing
 
 _FRAME = re.compile(r'^  File "(?P<file>.*)", line (?P<line>\d+|\?\?\?) in (?P<function>.*)$', re.MULTILINE)
 _FATAL = re.compile(r"^Fatal Python error: (?P<what>.+)$", re.MULTILINE)
@@ -121,7 +122,7 @@ def code_of(file: str, line: int, texts: Mapping[str, str] | None = None) -> str
 
 
 def busy_at(
-    seconds: float, doing: str, dump: str, own_files: Iterable[str], deaf: bool, held: bool = False
+    seconds: float, doing: Doing, dump: str, own_files: Iterable[str], deaf: bool, held: bool = False
 ) -> Busy:
     """What a look at a worker at work showed; `dump` may be empty. Other arguments are as of `Busy`."""
     frames = parse_stack(dump)

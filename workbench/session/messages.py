@@ -262,6 +262,8 @@ class StepBack:
     source_file: str | None = None
     source: Mapping[str, str] = field(default_factory=dict)
     """What the task was when it was recorded, where what has changed since is to be told."""
+    number: int = 0
+    """Which request of the session this is; its answer has the same."""
 
 
 @dataclass(frozen=True)
@@ -399,6 +401,8 @@ class Restored:
     """Of a `StepBack`: the episode and the state, in words. Its `origin` is `NO_MOMENT`."""
     how: str = ""
     """How the state was come to, in a sentence; empty where it was put there."""
+    number: int = 0
+    """Of the `StepBack` that it answers; 0 for a `Restore`."""
     lived_through: tuple[int, ...] = ()
     """The envs that came there by the steps that led to it. For them it is no exact point, as a state that is put there
     is, from which the same actions give the same bits."""

@@ -20,6 +20,7 @@ from workbench.authoring import registry
 from workbench.authoring.load import LoadedTask, import_modules, load_task, take_back, with_late_imports
 from workbench.authoring.problem import (
     MESSAGE_LIMIT,
+    Interrupted,
     Problem,
     TaskError,
     is_ctrl_c,
@@ -42,7 +43,6 @@ from workbench.core.step import StepResult
 from workbench.core.take_pictures import list_cameras, segmentation_names
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env
 from workbench.core.visibility import objects_to_see
-from workbench.session.interrupts import Interrupted
 from workbench.session.messages import ActionDimension, TaskDescription, TaskOptions
 
 
@@ -91,12 +91,17 @@ def open_task(
 
 
 def with_advice(
-    error: TaskError, loaded: LoadedTask, options: TaskOptions, again: Callable[[], LoadedTask]
+    error: TaskError,
+    loaded: LoadedTask,
+    options: TaskOptions,
+    again: Callable[[], LoadedTask],
+    knows_others: bool = False,
 ) -> TaskError:
     """Of a task that could not be opened: also what would open in its place.
 
     Args:
         again: imports it once more; the failed one was taken back.
+        knows_others: the other tasks of the file need not be told of.
     """
     advice: list[str] = []
     if (
@@ -105,7 +110,7 @@ def with_advice(
         and _runs_alone(again, options)
     ):
         advice.append(f"it fails with {options.num_envs} envs and runs with one: --num-envs 1")
-    if loaded.others and loaded.file is not None:
+    if loaded.others and loaded.file is not None and not knows_others:
         file = loaded.file.name
         advice.append(
             f"{loaded.chosen} of {file} was tried, which also has {', '.join(loaded.others)}: name one, as in "

@@ -27,7 +27,7 @@ from workbench.authoring.load import (
     with_late_imports,
 )
 from workbench.authoring.modules import read_source
-from workbench.authoring.problem import TaskError
+from workbench.authoring.problem import Interrupted, TaskError
 from workbench.authoring.reference import class_beside
 from workbench.authoring.same_function import line_in
 from workbench.core import actions
@@ -45,7 +45,6 @@ from workbench.core.snapshot import RestoreReport, Snapshot, restore_snapshot
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import list_cameras
 from workbench.core.task_env import TaskEnv
-from workbench.session.interrupts import Interrupted
 from workbench.session.messages import Load, ReloadReport
 from workbench.session.open_task import (
     Clock,
@@ -97,15 +96,28 @@ def load_version(
     try:
         return _bring_in(request, running, before, loaded, began, clock, on_activity, on_finding)
     except TaskError as error:
+        # The author of a task that runs knows what else is in the file, and so does a person who chose one in it.
+        knows_others = False
         if running is None:
             found = _another(request, loaded, error, on_activity, on_finding)
             if found is not None:
                 return found, None
-        elif running.opened.loaded.chosen == loaded.chosen:
-            raise  # its author knows what else is in the file
+        else:
+            same = running.opened.loaded.chosen == loaded.chosen
+            knows_others = same or not loaded.alternatives
+            if same and not isinstance(error.__cause__, _MAY_BE_OF_THE_BATCH):
+                raise  # a slip in a name is told at once
         raise with_advice(
-            error, loaded, request.options, lambda: load_task(request.task, source=request.source)
+            error,
+            loaded,
+            request.options,
+            lambda: load_task(request.task, source=request.source),
+            knows_others,
         ) from error.__cause__
+
+
+_MAY_BE_OF_THE_BATCH = (RuntimeError, ValueError, TypeError, IndexError)
+"""What torch and numpy raise over shapes, of which one env may have none."""
 
 
 def _another(

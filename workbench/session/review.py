@@ -89,6 +89,7 @@ class Review:
         make_scene: SceneMaker | None = None,
         clock: Callable[[], float] = time.monotonic,
         most_bytes: int | None = None,
+        memory: Callable[[], int] = lambda: allocated_memory(os.getpid()),
     ) -> None:
         """
         Args:
@@ -97,9 +98,11 @@ class Review:
             make_scene: for recordings without a scene; None leaves them without.
             clock: seconds.
             most_bytes: of memory that the recordings which are opened at once may take; None for `MEMORY_SHARE`.
+            memory: bytes that the process has filled.
         """
         self._most_bytes = int(MEMORY_SHARE * total_memory()) if most_bytes is None else most_bytes
         self._library, self._read, self._make_scene, self._clock = library, read, make_scene, clock
+        self._memory = memory
         self._changed = threading.Condition()
         self._view = ReviewView()
         self._walk: _Walk | None = None
@@ -210,9 +213,9 @@ class Review:
         shapes = SharedShapes()
         files: dict[Path, Stamp] = {}
         shown_at, wait = time.monotonic(), FIRST_SHOWN
-        held = allocated_memory(os.getpid())
+        held = self._memory()
         for done, row in enumerate(rows):
-            if opened and allocated_memory(os.getpid()) - held > self._most_bytes:
+            if opened and self._memory() - held > self._most_bytes:
                 left = len(rows) - done
                 said.append(
                     f"{row.name} {f'and {left - 1} more were' if left > 1 else 'was'} not opened: those before take "

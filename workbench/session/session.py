@@ -11,6 +11,7 @@ What is done here is to bring those together: who is asked, and who is told of w
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +26,7 @@ from workbench.session.camera_messages import CameraAnswer
 from workbench.session.camera_studio import CameraStudio
 from workbench.session.debugger_words import listening_for_a_debugger
 from workbench.session.env_table import EnvRows
-from workbench.session.judge import FILE_SAVED, Judge, what_a_load_means
+from workbench.session.judge import Judge, StoppedBy, what_a_load_means
 from workbench.session.judgement import JudgedCurve, Judgement
 from workbench.session.keep_past import PastKeeper
 from workbench.session.kept_worker import Death, KeptWorker, WorkerOptions
@@ -79,6 +80,7 @@ class Session:
         recordings: Path,
         history_bytes: int = HISTORY_BYTES,
         worker: WorkerOptions | None = None,
+        make_worker: Callable[..., KeptWorker] = KeptWorker,
         on_event: Callable[[Event], None] = lambda event: None,
         on_line: Callable[[PrintedLine], None] = lambda line: None,
         on_notice: Callable[[str], None] = lambda words: None,
@@ -89,6 +91,7 @@ class Session:
             recordings: folder that recorded episodes go to; made when the first is written.
             history_bytes: memory that the past may take.
             worker: limits of the worker process, and whether there is a spare one.
+            make_worker: what the worker is kept by: another, for tests that need none.
             on_event: called with every event of the worker, and its death as a failure, on the session's thread
                 (the terminal).
             on_line: called with the lines that the worker printed, from its own threads; not with all of a flood.
@@ -99,13 +102,14 @@ class Session:
         self._state = LiveState(task, options, history_bytes)
         self._shared = SharedState(self._state)
         self._lock, self._note = self._shared.lock, self._shared.note
-        self._step_in: tuple[RecordedRun, bool, str | None, Mapping[str, str]] | None = None
+        self._step_in: tuple[int, RecordedRun, bool, str | None, Mapping[str, str]] | None = None
         """What is to be gone into as soon as a task is there."""
+        self._step_backs = itertools.count(1)
         self._printed = PrintedLog(self._on_lines)
         self._versions = Versions(
             self._shared, self._send, lambda: self._worker.replace(), on_save=self._on_save
         )
-        self._worker = KeptWorker(
+        self._worker = make_worker(
             worker or WorkerOptions(),
             WarmUp(options),
             greet=self._versions.greeting,
@@ -199,11 +203,13 @@ class Session:
 
     def play(self) -> None:
         self.past.seek(None)
-        self._shared.set(playing=True, wants_play=True)
+        with self._shared.changing() as state:
+            state.playing = state.wants_play = True
         self._send(Play(True))
 
     def pause(self) -> None:
-        self._shared.set(playing=False, wants_play=False)
+        with self._shared.changing() as state:
+            state.playing = state.wants_play = False
         self._send(Play(False))
 
     def step(self) -> None:
@@ -225,15 +231,18 @@ class Session:
 
     def set_speed(self, speed: float) -> None:
         """Simulated seconds per wall second; ``math.inf`` for as fast as the machine can."""
-        self._shared.set(speed=speed)
+        with self._shared.changing() as state:
+            state.speed = speed
         self._send(SetSpeed(speed))
 
     def set_episode_end(self, rule: EpisodeEnd) -> None:
-        self._shared.set(episode_end=rule)
+        with self._shared.changing() as state:
+            state.episode_end = rule
         self._send(SetEpisodeEnd(rule))
 
     def set_action_source(self, source: ActionSource, policy: str | None = None) -> None:
-        self._shared.set(action_source=source, policy=policy)
+        with self._shared.changing() as state:
+            state.action_source, state.policy = source, policy
         self._send(self._state.action_request())
         self._policy_file.follow(policy if source == "policy" else None, self._state.folder)
 
@@ -247,7 +256,8 @@ class Session:
 
     def set_sliders(self, action: tuple[float, ...]) -> None:
         """The action (A,) that every env gets while the action source is ``sliders``."""
-        self._shared.set(sliders=action)
+        with self._shared.changing() as state:
+            state.sliders = action
         self._send(SetSliders(action))
 
     def select_env(self, env: int) -> None:
@@ -331,29 +341,44 @@ class Session:
         everywhere: bool = False,
         source_file: str | None = None,
         source: Mapping[str, str] = MappingProxyType({}),
-    ) -> None:
+    ) -> int:
         """Put the selected env, or all, into the last state of a recorded run; pauses there. Before a task is loaded
         it is done when one is.
 
         Args:
             source_file, source: what the task was then; what has changed since is told on arrival.
+
+        Returns:
+            What `TimelineView.entered` is when it is done.
         """
+        number = next(self._step_backs)
+        self._go_into(number, run, everywhere, source_file, source)
+        return number
+
+    def _go_into(
+        self,
+        number: int,
+        run: RecordedRun,
+        everywhere: bool,
+        source_file: str | None,
+        source: Mapping[str, str],
+    ) -> None:
         self.past.seek(None)
         self.pause()
         with self._lock:
             task, env = self._state.task, self._state.selected_env
             if task is None:
-                self._step_in = run, everywhere, source_file, source
+                self._step_in = number, run, everywhere, source_file, source
                 return
         env_idx = tuple(range(task.num_envs)) if everywhere else (env,)
-        self._send(StepBack(run, env_idx, source_file, dict(source)))
+        self._send(StepBack(run, env_idx, source_file, dict(source), number))
         self._note()
 
     # --- the past judged again -----------------------------------------------------------------------
 
     def stop_judging(self) -> None:
         """Judge the past no further; what is known by then stays."""
-        self._judge.stop("stopped by hand")
+        self._judge.stop(StoppedBy.HAND)
 
     def judged_curve(self, name: str, env: int) -> JudgedCurve | None:
         """One number of one env, as recorded and as the new code has it. Copies: not for every frame."""
@@ -394,7 +419,7 @@ class Session:
         self._note()
 
     def _handle(self, event: Event) -> None:
-        if isinstance(event, Failed) and self._worker.load_waits and "Interrupted:" in event.problem.message:
+        if isinstance(event, Failed) and self._worker.load_waits and event.problem.interrupted:
             return  # left for the sake of a newer version, which waits: nobody need hear of it
         if isinstance(event, Loaded):
             self._on_loaded(event)
@@ -446,7 +471,7 @@ class Session:
         with self._lock:
             step_in, self._step_in = self._step_in, None
         if step_in is not None:
-            self.step_back(*step_in)
+            self._go_into(*step_in)
 
     def _record_on(self, event: Loaded, env_idx: tuple[int, ...], one_each: bool) -> None:
         """A version came in while these envs were recorded."""
@@ -465,7 +490,7 @@ class Session:
         self._recorder.take(event)
 
     def _on_save(self) -> None:
-        self._judge.stop(FILE_SAVED)
+        self._judge.stop(StoppedBy.SAVE)
         self.studio.interrupted()
 
     def _on_lines(self, lines: list[PrintedLine], dropped: int) -> None:

@@ -7,6 +7,8 @@ Pages, the worker's thread, the file watcher and the recorder all change it. A p
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from workbench.session.live_state import LiveState
 
@@ -22,11 +24,11 @@ class SharedState:
         self._count = 0
         self._closing = False
 
-    def set(self, **values: object) -> None:
-        """Set fields of the state, and note that they are new."""
+    @contextmanager
+    def changing(self) -> Iterator[LiveState]:
+        """The state, with the lock held, to set fields of it; then notes that they are new."""
         with self.lock:
-            for name, value in values.items():
-                setattr(self.state, name, value)
+            yield self.state
         self.note()
 
     def note(self) -> None:

@@ -28,7 +28,9 @@ def step_back(
     file = None if loaded.file is None else str(loaded.file)
     changed = changed_since(request.source_file, request.source, file, loaded.source)
     said = f"{where} (changed since: {changed}): {how(arrival)}" if changed else f"{where}: {how(arrival)}"
-    return step, Restored(request.env_idx, source, NO_MOMENT, None, arrival.missed, where, said)
+    return step, Restored(
+        request.env_idx, source, NO_MOMENT, None, arrival.missed, where, said, number=request.number
+    )
 
 
 def going_there(request: StepBack, done: int) -> str:

@@ -57,10 +57,13 @@ class Writing:
     what: Change = "edit"
     edit: SourceEdit | None = None
     refusal: Refusal | None = None
+    """Why the last thing that was asked for was not done; its reason is told in `message` too."""
     message: str = ""
     """One sentence or two: what happened, and what to do next."""
     can_copy: bool = False
     """Refused since the file is not the user's to edit, and a copy of it would be: see `StudioFile.copy_task`."""
+    loading: bool = False
+    """It is in the file, or out of it again, and the version with that has not come in yet."""
 
 
 @dataclass(frozen=True)

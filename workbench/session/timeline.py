@@ -48,6 +48,8 @@ class TimelineView:
     """What the last going back could not put back, each with its reason."""
     arrived: str = ""
     """Where the last jump came from, and how, if that was a recording."""
+    entered: int = 0
+    """Number of the last `Session.step_back` that has arrived; 0 for none."""
     wants_pictures: bool = False
     """The shown moment has no pictures of the cameras that are looked through."""
 
@@ -78,6 +80,7 @@ class Timeline:
         self._shown: int | None = None
         self._not_carried: tuple[str, ...] = ()
         self._arrived = ""
+        self._entered = 0
         self._asked: tuple[int, int, tuple[CameraRequest, ...]] | None = None
 
     # --- what comes ----------------------------------------------------------------------------------
@@ -88,6 +91,8 @@ class Timeline:
             missed = {} if stepped.restored is None else stepped.restored.not_carried
             self._not_carried = tuple(f"{what}: {why}" for what, why in missed.items())
             self._arrived = "" if stepped.restored is None else stepped.restored.how
+        if stepped.restored is not None and stepped.restored.number:
+            self._entered = stepped.restored.number
         if self._shown is not None and self._shown < self.history.first:
             self._shown = self.history.first  # what was looked at had to go
         return moment
@@ -163,6 +168,7 @@ class Timeline:
             undo=None if jump is None else _in_words(jump, history.moved_last_by(jump), self._num_envs),
             not_carried=self._not_carried,
             arrived=self._arrived,
+            entered=self._entered,
             wants_pictures=moment is not None and bool(self._lacking(moment, env, cameras)),
         )
 

@@ -75,9 +75,9 @@ class Versions:
 
     def _on_files_changed(self, paths: set[Path]) -> None:
         self._on_save()
-        self._shared.set(stale=True)
-        with self._shared.lock:
-            self._shared.state.file_is_edited()
+        with self._shared.changing() as state:
+            state.stale = True
+            state.file_is_edited()
         self.reload()
 
     # --- what a worker needs to know -----------------------------------------------------------------

@@ -26,8 +26,10 @@ def warm_up(options: TaskOptions, goes_on: Callable[[], bool]) -> None:
 
     It can only fail where the author's own load would (no renderer, no GPU), which then says so better.
     """
+    # Of the author's own arguments the one that says whether there is anything to draw with.
+    renderer = {name: value for name, value in options.env_kwargs.items() if name == "render_backend"}
     try:
-        opened = open_task(_TASK, replace(options, num_envs=1, env_kwargs={}, imports=()))
+        opened = open_task(_TASK, replace(options, num_envs=1, env_kwargs=renderer, imports=()))
     except TaskError:
         return
     try:

@@ -96,7 +96,7 @@ def banner_html(problem: Problem, view: SessionView) -> str:
     if problem.file is not None:
         where = Path(problem.file).name + (f":{problem.line}" if problem.line is not None else "")
     doing = DOING.get(problem.stage, f"failed in {problem.stage}")
-    if problem.message.startswith("Interrupted:"):
+    if problem.interrupted:
         doing = INTERRUPTED.get(problem.stage, f"was interrupted in {problem.stage}")
     return render(
         "banner",

@@ -101,7 +101,6 @@ def writing_html(
         files=[(change.file, PurePath(change.file).name, diff_lines(change.diff)) for change in files],
         folded=writing.stage in DONE,
         notes=() if edit is None or writing.stage == "undone" else edit.notes,
-        reason="" if refusal is None or refusal.reason in writing.message else refusal.reason,
         snippet="" if refusal is None else refusal.snippet,
         scroll_to=scroll_to,
     )

@@ -20,6 +20,7 @@ from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.session.messages import CameraRequest, TaskDescription
 from workbench.session.view import SessionView
 from workbench.ui.changed import fill
+from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.false_colour import DepthRange
 from workbench.ui.fragments import render
 from workbench.ui.in_colours import COLOUR, MODALITIES, depth_span, image_format, in_colours
@@ -55,7 +56,11 @@ class MakesPictures(Protocol):
 
 class CamerasPanel:
     def __init__(
-        self, server: viser.ViserServer, session: MakesPictures, no_camera: str = "This task has no camera."
+        self,
+        server: viser.ViserServer,
+        session: MakesPictures,
+        no_camera: str = "This task has no camera.",
+        clock: Clock = time.monotonic,
     ) -> None:
         self._no_camera = no_camera
         self._server = server
@@ -63,9 +68,7 @@ class CamerasPanel:
         self._cameras: dict[tuple[CameraKind, str], _Camera] = {}
         self._remembered: dict[tuple[CameraKind, str, str], bool] = {}
         self._cameras_serial = -1
-        self._pictures_serial = -1
-        self._env = -1
-        self._drawn_at = 0.0
+        self._due = DrawDue(FASTEST, clock)
         self._asked: tuple[CameraRequest, ...] | None = None
         self._quick = False
         self._studio: CameraKey | None = None
@@ -93,12 +96,8 @@ class CamerasPanel:
             self._build(view.task)
         self._ask()
         self._mark_stale(view)
-        if view.pictures_serial == self._pictures_serial and view.selected_env == self._env:
+        if not self._due.is_due((view.pictures_serial, view.selected_env)):
             return
-        if time.monotonic() - self._drawn_at < FASTEST:
-            return
-        self._pictures_serial, self._env = view.pictures_serial, view.selected_env
-        self._drawn_at = time.monotonic()
         for key, camera in self._cameras.items():
             picture = view.pictures.get(key)
             if picture is None or picture.env != view.selected_env or view.task is None:

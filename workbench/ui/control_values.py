@@ -22,13 +22,18 @@ LARGEST_INT = 2**53
 LONGEST_LINE = 10_000
 LONGEST_TEXT = 100_000
 """Characters of a text field with several lines, such as a camera that is pasted as JSON."""
-_NAME = "name_for_refusals"
+_NAME = "name_of_control"
 """Attribute: viser's handles have no other place for it, and cannot be a dictionary's keys."""
 
 
-def name_for_refusals(control: Any, name: str) -> None:
-    """Of a control without a label: what a sentence calls it."""
+def name_control(control: Any, name: str) -> None:
+    """Of a control whose label says nothing: what a sentence calls it, and what it is found by."""
     setattr(control, _NAME, name)
+
+
+def name_of(control: Any) -> str:
+    """Its label, unless it was given a name."""
+    return getattr(control, _NAME, "") or control.label
 
 
 def check_value(control: Any, value: object) -> None:
@@ -40,7 +45,7 @@ def check_value(control: Any, value: object) -> None:
     Raises:
         ValueError: The control cannot hold that; the sentence is for the person at the page.
     """
-    name = control.label or getattr(control, _NAME, "value")
+    name = name_of(control) or "value"
     if isinstance(control, viser.GuiCheckboxHandle):
         if not isinstance(value, bool):
             raise ValueError(f"The {name} is on or off.")

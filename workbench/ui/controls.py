@@ -17,6 +17,8 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 import viser
 
+from workbench.ui.draw_due import Clock
+
 T = TypeVar("T")
 Handle = TypeVar("Handle", bound=viser.GuiInputHandle)
 
@@ -36,6 +38,7 @@ class Control(Generic[Handle, T]):
         send: Asks the session for it. Must not block.
         shown: The session's value as the input's.
         settle: Seconds without a change before a value is sent.
+        clock: Of the page.
     """
 
     _last_touch: ClassVar[float] = -1e9
@@ -47,12 +50,14 @@ class Control(Generic[Handle, T]):
         send: Callable[[T], None],
         shown: Callable[[T], Any] = lambda value: value,
         settle: float = 0.0,
+        clock: Clock = time.monotonic,
     ) -> None:
         self.handle = handle
         self._read = read
         self._send = send
         self._shown = shown
         self._settle = settle
+        self._clock = clock
         self._touched = -1e9
         self._waiting: viser.ClientHandle | None = None
         self._lock = threading.Lock()
@@ -66,7 +71,7 @@ class Control(Generic[Handle, T]):
 
     def show(self, value: T) -> None:
         """Show what the session says, unless someone has their hand on the input; send what settled."""
-        idle = time.monotonic() - self._touched
+        idle = self._clock() - self._touched
         with self._lock:
             client = self._waiting if idle >= self._settle else None
             if client is not None:
@@ -87,7 +92,8 @@ class Control(Generic[Handle, T]):
         # has put the session's value over the new one, which is then what would be sent.
         if event.client is None:
             return  # `show` wrote it; sending it back would make an endless exchange.
-        self._touched = Control._last_touch = time.monotonic()
+        # Keys are of this moment, whatever the clock of the page says.
+        self._touched, Control._last_touch = self._clock(), time.monotonic()
         if self._settle:
             with self._lock:
                 self._waiting = event.client

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from workbench.session.number_text import lost_text, number_text
 from workbench.session.view import SessionView
 from workbench.ui.changed import fill, show
+from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import CURSOR, LONGEST, SELECTED_COLOUR, STEP, YES_OR_NO, LineChart, Span, line
 
@@ -25,14 +26,13 @@ BATCH_COLOUR = "#868e96"
 
 
 class CurvesPanel:
-    def __init__(self, server: viser.ViserServer) -> None:
+    def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
         folder = server.gui.add_folder(None)
         self._reward = LineChart(server, folder, HEIGHT)
         self._success = LineChart(server, folder, HEIGHT)
         self._lost = server.gui.add_html("", visible=False)
-        self._empty = server.gui.add_html('<div class="wb-note">Curves appear with the first step.</div>')
-        self._drawn: tuple[int, int, int, int | None] | None = None
-        self._drawn_at = 0.0
+        self._empty = server.gui.add_html('<div class="wb-note">Curves appear with the second step.</div>')
+        self._due = DrawDue(REDRAW_EVERY, clock)
 
     def draw(self, view: SessionView) -> None:
         curves = view.curves
@@ -45,9 +45,8 @@ class CurvesPanel:
             return
         shown = None if view.timeline.shown is None else view.timeline.tick
         wanted = (curves.serial, view.selected_env, curves.reward.shape[1], shown)
-        if wanted == self._drawn or time.monotonic() - self._drawn_at < REDRAW_EVERY:
+        if not self._due.is_due(wanted):
             return
-        self._drawn, self._drawn_at = wanted, time.monotonic()
         env = view.selected_env
         _draw(self._reward, "reward", curves.tick, curves.reward, env, None, shown)
         lost = said_of(curves.reward[-1])

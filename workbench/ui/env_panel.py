@@ -17,6 +17,7 @@ from workbench.session.env_table import EnvRows
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.changed import fill
+from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.env_strip import (
     FILTERS,
     MEANS,
@@ -51,24 +52,24 @@ HINTS = {
 class EnvPanel:
     """The table of envs in the present container."""
 
-    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+    def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
         self._session = session
         self._handle = server.gui.add_html("")
         self._presses = Presses(server)
         self._column, self._descending = "env", False
         self._filter: Filter = "all"
         self._first = 0
-        self._changed = True
-        self._drawn: tuple[int, int, int] | None = None
-        self._drawn_at = 0.0
+        self._pressed = 0
+        """How often something was that changes the table."""
+        self._at_once: object = None
+        """What a person waits for, as it was drawn."""
+        self._due = DrawDue(REDRAW_EVERY, clock)
 
     def draw(self, view: SessionView) -> None:
-        wanted = (view.task_serial, view.step_serial, view.selected_env)
-        late = time.monotonic() - self._drawn_at >= REDRAW_EVERY
-        selected = self._drawn is not None and wanted[2] != self._drawn[2]
-        if not (self._changed or selected or (late and wanted != self._drawn)):
+        at_once = (view.selected_env, self._pressed)
+        if not self._due.is_due((view.task_serial, view.step_serial, *at_once), at_once != self._at_once):
             return
-        self._changed, self._drawn, self._drawn_at = False, wanted, time.monotonic()
+        self._at_once = at_once
         rows = self._session.env_rows()
         content = render("envs", head=()) if rows is None else self._html(rows, view.selected_env)
         fill(self._handle, content)
@@ -135,7 +136,7 @@ class EnvPanel:
     def _press(self, key: Hashable, do: Callable[[], None]) -> str:
         def pressed(client: viser.ClientHandle | None) -> None:
             do()
-            self._changed = True
+            self._pressed += 1
 
         return self._presses.id_of(key, pressed)
 
@@ -167,7 +168,7 @@ class EnvPanel:
         env = None if rows is None else first_flagged(rows)
         if env is not None:
             self._choose_env(env)
-            self._changed = True
+            self._pressed += 1
 
     def select_next(self, wanted: Filter) -> None:
         """The next env, by number and round the end, that a filter lets through; none if there is none."""
@@ -178,4 +179,4 @@ class EnvPanel:
         if len(envs):
             later = envs[envs > self._session.view().selected_env]
             self._choose_env(int(later[0] if len(later) else envs[0]))
-            self._changed = True
+            self._pressed += 1

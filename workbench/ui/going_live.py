@@ -20,17 +20,15 @@ from workbench.ui.busy_banner import is_shown as is_busy_for_long
 @dataclass(frozen=True)
 class GoingLive:
     session: Session
-    where: str
-    """The recorded moment, as the session names it when it is there."""
+    number: int
+    """What `TimelineView.entered` is when it is there."""
     task: str
     state: int
-    last_moment: int
-    """Of the session, when it was asked."""
     problems: int
 
     def is_over(self, view: SessionView) -> bool:
         """Whether the live page has something to show now."""
-        arrived = view.timeline.last > self.last_moment and view.timeline.arrived.startswith(self.where)
+        arrived = view.timeline.entered == self.number
         failed = view.problem_serial > self.problems or view.state == "stopped"
         return arrived or failed or is_busy_for_long(view)
 
@@ -47,8 +45,6 @@ def begin_to_go(
     session: Session, run: RecordedRun, everywhere: bool, info: EpisodeInfo, state: int
 ) -> GoingLive:
     """Ask the session for a recorded moment."""
-    view = session.view()
-    last = view.timeline.last if view.task is not None else -1
-    going = GoingLive(session, f"{run.name}, step {run.length}", info.task, state, last, view.problem_serial)
-    session.step_back(run, everywhere, info.source_file, info.source)
-    return going
+    problems = session.view().problem_serial
+    number = session.step_back(run, everywhere, info.source_file, info.source)
+    return GoingLive(session, number, info.task, state, problems)

@@ -7,6 +7,7 @@ for only when the last has come: a worker that is busy is not sent a queue. Pose
 
 from __future__ import annotations
 
+import math
 import time
 
 import viser
@@ -14,6 +15,7 @@ import viser
 from workbench.core.inspection import SECTIONS, Inspection, Section
 from workbench.session.session import Session
 from workbench.session.view import SessionView
+from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.inspect_rows import contact_rows, joint_rows, leaf_rows, pose_rows
 
@@ -33,8 +35,8 @@ CHOICES: dict[str, Section | None] = {
 
 
 class InspectPanel:
-    def __init__(self, server: viser.ViserServer, session: Session) -> None:
-        self._session = session
+    def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
+        self._session, self._clock = session, clock
         self._show = server.gui.add_dropdown(
             "Show",
             tuple(CHOICES),
@@ -48,12 +50,13 @@ class InspectPanel:
         )
         self._handle = server.gui.add_html("")
         self._asked: tuple[object, ...] | None = None
-        self._asked_at = 0.0
+        self._asked_at = -math.inf
         self._had: Inspection | None = None
         self._now: Inspection | None = None
         self._before: Inspection | None = None
-        self._drawn: tuple[object, ...] | None = None
-        self._drawn_at = 0.0
+        self._drawn: str | None = None
+        """Which choice."""
+        self._due = DrawDue(READ_EVERY, clock)
 
     def draw(self, view: SessionView) -> None:
         choice = self._show.value if self._show.value in CHOICES else NOTHING
@@ -63,10 +66,9 @@ class InspectPanel:
         wanted = (choice, view.task_serial, view.selected_env, id(self._now), no_step)
         if choice == POSES:
             wanted = (*wanted, view.step_serial)
-        chosen = self._drawn is None or wanted[0] != self._drawn[0]
-        if wanted == self._drawn or not (chosen or time.monotonic() - self._drawn_at >= READ_EVERY):
+        if not self._due.is_due(wanted, at_once=choice != self._drawn):
             return
-        self._drawn, self._drawn_at = wanted, time.monotonic()
+        self._drawn = choice
         self._handle.content = inspect_html(choice, view, self._now, self._before, no_step)
 
     def forces(self, view: SessionView) -> Inspection | None:
@@ -93,10 +95,10 @@ class InspectPanel:
         wanted = (view.task_serial, view.step_serial, view.selected_env, sections)
         if not sections or view.task is None or wanted == self._asked:
             return
-        waited = time.monotonic() - self._asked_at
+        waited = self._clock() - self._asked_at
         answered = self._asked is None or view.inspection is not self._had
         if waited >= (READ_EVERY if answered else PATIENCE):
-            self._asked, self._asked_at, self._had = wanted, time.monotonic(), view.inspection
+            self._asked, self._asked_at, self._had = wanted, self._clock(), view.inspection
             self._session.inspect(sections)
 
     def _take(self, view: SessionView) -> None:

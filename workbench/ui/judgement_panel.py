@@ -21,6 +21,7 @@ from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui import judged_in_words as words
 from workbench.ui.changed import fill, show
+from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import LONGEST
 from workbench.ui.presses import Presses
@@ -32,7 +33,7 @@ MOST_ROWS = 8
 
 
 class JudgementPanel:
-    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+    def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
         self._server, self._session = server, session
         self._status = server.gui.add_html("", visible=False)
         self._stop = server.gui.add_button("Stop judging", icon=viser.Icon.PLAYER_STOP, visible=False)
@@ -49,16 +50,14 @@ class JudgementPanel:
         self._presses = Presses(server)
         self._first = 0
         self._listed: tuple[EpisodeDifference, ...] = ()
-        self._drawn: object = None
-        self._drawn_at = 0.0
+        self._due = DrawDue(REDRAW_EVERY, clock)
 
     def draw(self, view: SessionView) -> None:
         judged = view.judgement
         shown = view.timeline.shown
         wanted = (judged.serial, view.selected_env, shown, self._name.value, self._first, view.timeline.first)
-        if wanted == self._drawn or time.monotonic() - self._drawn_at < REDRAW_EVERY:
+        if not self._due.is_due(wanted):
             return
-        self._drawn, self._drawn_at = wanted, time.monotonic()
         show(self._status, judged.state != "none")
         show(self._stop, judged.state in ("loading", "judging"))
         if judged.state == "none":

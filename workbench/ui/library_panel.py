@@ -25,6 +25,7 @@ from workbench.recording.library import Library, LibraryView
 from workbench.recording.library_row import LibraryRow
 from workbench.ui.changed import fill, show
 from workbench.ui.commands import Command
+from workbench.ui.draw_due import Clock
 from workbench.ui.file_size import size_in_words
 from workbench.ui.fragments import render
 from workbench.ui.library_commands import Action, acting, walking
@@ -69,8 +70,9 @@ class LibraryPanel:
         library: Library,
         on_open: Callable[[tuple[str, ...]], None],
         on_selection: Callable[[tuple[str, ...]], None] | None = None,
+        clock: Clock = time.monotonic,
     ) -> None:
-        self._server, self._library = server, library
+        self._server, self._library, self._clock = server, library, clock
         self._on_selection = on_selection
         self._folder = os.fsencode(library.folder).decode(errors="replace")
         self._list = LibraryList(library)
@@ -205,7 +207,7 @@ class LibraryPanel:
         """
         view = self._library.view()
         with self._lock, self._list.lock:
-            if self._typed_at is not None and time.monotonic() - self._typed_at > TYPING:
+            if self._typed_at is not None and self._clock() - self._typed_at > TYPING:
                 self._typed_at = None
                 self._list.look_for(self._find.value, self._list.task)
             if not self._is_new("all", (view.serial, self._list.state(), len(self._actions))):
@@ -427,7 +429,7 @@ class LibraryPanel:
 
     def _on_typed(self) -> None:
         with self._lock:
-            self._typed_at = time.monotonic()
+            self._typed_at = self._clock()
 
     def _on_task(self) -> None:
         self._list.look_for(self._list.words, self._tasks.value)

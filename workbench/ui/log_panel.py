@@ -6,6 +6,7 @@ hook of every step costs the page no more than one that prints once.
 
 from __future__ import annotations
 
+import math
 import time
 
 import viser
@@ -15,6 +16,7 @@ from workbench.session.memory_limit import in_words
 from workbench.session.printed import Printed
 from workbench.session.view import SessionView
 from workbench.ui.checked import checked_text
+from workbench.ui.draw_due import Clock
 from workbench.ui.fragments import render
 from workbench.ui.log_colours import spans_of_lines
 
@@ -30,7 +32,7 @@ class LogPanel:
         clear: Asks the session to forget what was printed.
     """
 
-    def __init__(self, server: viser.ViserServer, clear) -> None:
+    def __init__(self, server: viser.ViserServer, clear, clock: Clock = time.monotonic) -> None:
         self._filter = server.gui.add_text(
             "Filter", "", hint="Only lines with this in them; stderr: or stdout: before it takes one stream."
         )
@@ -43,10 +45,10 @@ class LogPanel:
         self._wanted = ""
         self._drawn: tuple[int, str] | None = None
         self._vitals_drawn = ""
-        self._drawn_at = 0.0
+        self._clock, self._drawn_at = clock, -math.inf
 
     def draw(self, view: SessionView) -> None:
-        now = time.monotonic()
+        now = self._clock()
         if now - self._drawn_at < REDRAW_EVERY:
             return
         key = view.printed.serial, self._wanted

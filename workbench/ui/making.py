@@ -25,6 +25,7 @@ import msgspec
 
 from workbench.machine.child_python import child_environment, python_command
 from workbench.machine.watched_thread import say_failure
+from workbench.session.process import describe_exit
 from workbench.ui.make_shared import Made, Wanted
 
 END_SECONDS = 5.0
@@ -146,7 +147,8 @@ class Making:
                     self._on_change()
             _end(process)
         if made is None and not problem:
-            problem = f"The process that makes it ended with {process.returncode}; the terminal says more."
+            more = "; the terminal says more" if process.returncode >= 0 else ""
+            problem = f"The process that makes it {describe_exit(process.returncode)}{more}."
         return problem, made
 
 

@@ -7,6 +7,7 @@ import time
 import viser
 
 from workbench.session.view import SessionView
+from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.numbers_table import number_rows
 
@@ -14,16 +15,14 @@ REDRAW_EVERY = 0.12
 
 
 class NumbersPanel:
-    def __init__(self, server: viser.ViserServer) -> None:
+    def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
         self._handle = server.gui.add_html("")
-        self._drawn: tuple[int, int, int] | None = None
-        self._drawn_at = 0.0
+        self._due = DrawDue(REDRAW_EVERY, clock)
 
     def draw(self, view: SessionView) -> None:
         wanted = (view.task_serial, view.step_serial, view.selected_env)
-        if wanted == self._drawn or time.monotonic() - self._drawn_at < REDRAW_EVERY:
+        if not self._due.is_due(wanted):
             return
-        self._drawn, self._drawn_at = wanted, time.monotonic()
         task, step = view.task, view.step
         rows = []
         if task is not None and step is not None:

@@ -9,6 +9,7 @@ With no page open nothing is drawn, and the session is told so that it renders n
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -22,6 +23,7 @@ from workbench.ui.camera_frustums import LARGE, SMALL, CameraFrustums, without_t
 from workbench.ui.cameras_panel import CamerasPanel
 from workbench.ui.commands import Command, register
 from workbench.ui.curves_panel import CurvesPanel
+from workbench.ui.draw_due import Clock
 from workbench.ui.env_layout import EnvLayout, acting_box, env_under_ray, lay_out
 from workbench.ui.env_panel import EnvPanel
 from workbench.ui.force_arrows import ForceArrows
@@ -60,6 +62,7 @@ class Page:
         on_review: Called when a person wants to see the recordings; None leaves the button out.
         stage: The 3-D view; None makes one.
         commands: Of the program; in the palette as well.
+        clock: That the parts of the page go by.
     """
 
     def __init__(
@@ -70,9 +73,11 @@ class Page:
         on_review: Callable[[], None] | None = None,
         stage: Stage | None = None,
         commands: tuple[Command, ...] = (),
+        clock: Clock = time.monotonic,
     ) -> None:
         self._server = server
         self._session = session
+        self._clock = clock
         self._on_review = on_review
         self._loop = RedrawLoop(server, "page", session.wait, lambda: self._count_clients() > 0, self.redraw)
         self._layout: EnvLayout | None = None
@@ -88,11 +93,11 @@ class Page:
         server.gui.set_panel_label("Workbench")
 
         self._status = StatusLine(
-            server, session.env_rows, on_flagged=lambda: self._envs.select_first_flagged()
+            server, session.env_rows, on_flagged=lambda: self._envs.select_first_flagged(), clock=clock
         )
         self._rules = RulesMark(server)
         run_tab = self._add_tabs(dark)
-        self._timeline = TimelinePanel(server, session)
+        self._timeline = TimelinePanel(server, session, clock)
         self._add_table_of_envs()
         self._banner = Banner(server, session.reload, session.restart_worker)
         self._busy_banner = BusyBanner(server, session.interrupt, session.restart_worker)
@@ -116,30 +121,30 @@ class Page:
             self._view_panel = ViewPanel(server, dark)
             self._version = VersionPanel(server, session)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
-            self._cameras = CamerasPanel(server, session)
+            self._cameras = CamerasPanel(server, session, clock=self._clock)
         with tabs.add_tab("Studio", viser.Icon.CAMERA_PLUS):
-            self._studio = StudioPanel(server, session)
+            self._studio = StudioPanel(server, session, self._clock)
         with tabs.add_tab("Reward", viser.Icon.CHART_LINE):
-            self._numbers = NumbersPanel(server)
+            self._numbers = NumbersPanel(server, self._clock)
             self._judged_above = JudgedAbove(server)
-            self._curves = CurvesPanel(server)
-            self._terms = TermsPanel(server, session)
-            self._judgement = JudgementPanel(server, session)
+            self._curves = CurvesPanel(server, self._clock)
+            self._terms = TermsPanel(server, session, self._clock)
+            self._judgement = JudgementPanel(server, session, self._clock)
         with tabs.add_tab("Inspect", viser.Icon.ZOOM_IN):
-            self._inspect = InspectPanel(server, session)
+            self._inspect = InspectPanel(server, session, self._clock)
         with tabs.add_tab("Episodes", viser.Icon.MOVIE):
             self._record = RecordPanel(server, session)
             if on_review is not None:
                 review = server.gui.add_button("Review recordings", icon=viser.Icon.LIST_DETAILS)
                 review.on_click(lambda _: on_review())
         with tabs.add_tab("Log", viser.Icon.TERMINAL_2):
-            self._log = LogPanel(server, session.clear_printed)
+            self._log = LogPanel(server, session.clear_printed, self._clock)
         return run_tab
 
     def _add_table_of_envs(self) -> None:
         self._env_window = self._server.gui.add_panel(order=5.0)
         with self._env_window.add_tab("Envs", viser.Icon.LIST_DETAILS):
-            self._envs = EnvPanel(self._server, self._session)
+            self._envs = EnvPanel(self._server, self._session, self._clock)
         self._env_window.dock_left()
         self._env_window.set_width(ENVS_WIDTH)
         # A strip at the edge until somebody wants it: it takes half of a small screen's view.

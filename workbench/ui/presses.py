@@ -27,6 +27,7 @@ from collections.abc import Callable, Hashable
 
 import viser
 
+from workbench.ui.control_values import name_control
 from workbench.ui.fragments import render
 from workbench.ui.viser_seam import element_id
 
@@ -57,6 +58,7 @@ class Presses:
         if key not in self._ids:
             with self._folder:
                 button = self._server.gui.add_button("·")
+            name_control(button, _in_words(key))
             button.on_click(lambda event: pressed(event.client))
             self._ids[key] = element_id(button)
         return self._ids[key]
@@ -80,6 +82,7 @@ class Presses:
         if key not in self._ids:
             with self._folder:
                 number = self._server.gui.add_number("·", 0)
+            name_control(number, _in_words(key))
 
             def typed(event: viser.GuiEvent[viser.GuiNumberHandle[int]]) -> None:
                 sent = number_of(event.target.value)
@@ -102,6 +105,7 @@ class Presses:
         if key not in self._ids:
             with self._folder:
                 number = self._server.gui.add_number("·", 0)
+            name_control(number, _in_words(key))
 
             def typed(event: viser.GuiEvent[viser.GuiNumberHandle[int]]) -> None:
                 place = place_of(event.target.value)
@@ -111,6 +115,10 @@ class Presses:
             number.on_update(typed)
             self._ids[key] = element_id(number)
         return self._ids[key]
+
+
+def _in_words(key: Hashable) -> str:
+    return " ".join(_in_words(part) for part in key) if isinstance(key, tuple) else str(key)
 
 
 def number_of(sent: object) -> int | None:

@@ -198,7 +198,10 @@ def folder_handler(folder: Path) -> Callable[[str], tuple[int, str, bytes]]:
     root = folder.resolve()
 
     def handle(path: str) -> tuple[int, str, bytes]:
-        file = (root / path.lstrip("/")).resolve()
+        try:
+            file = (root / path.lstrip("/")).resolve()
+        except RuntimeError:  # a link that leads to itself
+            file = root
         if not file.is_relative_to(root) or not file.is_file():
             return 404, "text/plain; charset=utf-8", b"There is no such file."
         return 200, content_type(file.name), file.read_bytes()

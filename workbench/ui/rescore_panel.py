@@ -20,6 +20,7 @@ from workbench.session.rescorer import Rescorer, RescoreView
 from workbench.session.review import Review
 from workbench.session.review_view import ReviewView
 from workbench.ui.changed import fill, show
+from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.judged_with import RECORDED, TODAYS, codes_for
 from workbench.ui.line_chart import LONGEST
@@ -63,6 +64,7 @@ class RescorePanel:
         find: Callable[[Sequence[str]], list[EpisodeFile]],
         choices: RescoreChoices,
         known: Callable[[], Sequence[Path]] = tuple,
+        clock: Clock = time.monotonic,
     ) -> None:
         self._server, self._rescorer, self._review = server, rescorer, review
         self._find, self._choices, self._known = find, choices, known
@@ -95,8 +97,7 @@ class RescorePanel:
         self._first = 0
         self._listed: list[Verdict] = []
         self._selected: str | None = None
-        self._drawn: object = None
-        self._drawn_at = 0.0
+        self._due = DrawDue(REDRAW_EVERY, clock)
 
     def judge(self, ids: Sequence[str]) -> None:
         """Begin with these recordings of the library."""
@@ -121,9 +122,8 @@ class RescorePanel:
         self._draw_codes(view)
         told = self._rescorer.view
         wanted = (told.serial, view.opened_serial, view.selected, self._first, self._selected)
-        if wanted == self._drawn or time.monotonic() - self._drawn_at < REDRAW_EVERY:
+        if not self._due.is_due(wanted):
             return
-        self._drawn, self._drawn_at = wanted, time.monotonic()
         running = told.state in RUNNING
         show(self._begin, bool(view.opened) and not running)
         show(self._stop, running)

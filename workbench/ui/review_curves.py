@@ -19,6 +19,7 @@ from workbench.session.review import MOST_COMPARED
 from workbench.session.review_events import ACTION, REWARD, TERMS, curves
 from workbench.session.review_view import ReviewView, column_at
 from workbench.ui.changed import fill, show
+from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import CURSOR, LONGEST, STEP, LineChart, line, span_of
 from workbench.ui.numbers_table import NumberRow, number_rows
@@ -34,9 +35,9 @@ Lines = dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
 
 
 class ReviewCurves:
-    def __init__(self, server: viser.ViserServer) -> None:
+    def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
         self._numbers = server.gui.add_html("")
-        self._numbers_drawn: object = None
+        self._numbers_due = DrawDue(_NUMBERS_EVERY, clock)
         folder = server.gui.add_folder(None)
         self._entry: viser.GuiDropdownHandle = server.gui.add_dropdown(
             "Also", ("-",), initial_value="-", visible=False
@@ -46,9 +47,8 @@ class ReviewCurves:
             name: LineChart(server, folder, height, order)
             for order, (name, height) in enumerate(CHARTS.items(), start=1)
         }
-        self._drawn: object = None
+        self._due = DrawDue(REDRAW_EVERY, clock)
         self._lines_drawn: object = None
-        self._drawn_at = self._numbers_at = 0.0
         self._found: dict[str, dict[str, Lines]] = {}
         self._offered: dict[str, tuple[str, str]] = {}
         """What is in the list, to the entry and which of its lines; empty where it has one."""
@@ -65,9 +65,8 @@ class ReviewCurves:
             self._wish,
             len(view.opened),
         )
-        if wanted == self._drawn or time.monotonic() - self._drawn_at < REDRAW_EVERY:
+        if not self._due.is_due(wanted):
             return
-        self._drawn, self._drawn_at = wanted, time.monotonic()
         # By the recording's id: what gets its scene later is the same recording.
         self._found = {one.id: self._found.get(one.id) or curves(one.episode) for one in view.opened}
         shown = shown_together(view)
@@ -85,9 +84,8 @@ class ReviewCurves:
 
     def _draw_numbers(self, view: ReviewView) -> None:
         wanted = (view.opened_serial, view.selected, view.position, view.anchors)
-        if wanted == self._numbers_drawn or time.monotonic() - self._numbers_at < _NUMBERS_EVERY:
+        if not self._numbers_due.is_due(wanted):
             return
-        self._numbers_drawn, self._numbers_at = wanted, time.monotonic()
         chosen = view.chosen
         if chosen is None:
             fill(self._numbers, render("note", text="Numbers and curves appear when a recording is open."))

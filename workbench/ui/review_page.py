@@ -8,6 +8,7 @@ belong in and are drawn with the rest.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from workbench.session.review_view import ReviewView
 from workbench.ui.cameras_panel import CamerasPanel
 from workbench.ui.changed import fill
 from workbench.ui.commands import Command, register
+from workbench.ui.draw_due import Clock
 from workbench.ui.fragments import render
 from workbench.ui.library_commands import Action
 from workbench.ui.library_panel import LibraryPanel
@@ -75,6 +77,7 @@ class Places:
     beside the table."""
     unfolded: Callable[[], None] = lambda: None
     """To be called when a page shows that panel: the table is folded if the two leave no view."""
+    clock: Clock = time.monotonic
 
 
 Part = Callable[[viser.ViserServer, Places], "Drawn | None"]
@@ -107,6 +110,7 @@ class ReviewPage:
         offers: What else there is on the page.
         dark: How it begins.
         stage: The 3-D view; None makes one.
+        clock: That the parts of the page go by.
     """
 
     def __init__(
@@ -117,8 +121,9 @@ class ReviewPage:
         offers: ReviewOffers | None = None,
         dark: bool = True,
         stage: Stage | None = None,
+        clock: Clock = time.monotonic,
     ) -> None:
-        self._server, self._review = server, review
+        self._server, self._review, self._clock = server, review, clock
         self._offers = offers or ReviewOffers()
         self._loop = RedrawLoop(server, "review-page", review.wait, self._has_viewers, self._look_and_redraw)
         self._reader = PictureReader()
@@ -134,7 +139,7 @@ class ReviewPage:
         self._unfolded = "", 0.0
         """Which of the two panels came into a page last, and when, until something is done about it."""
         self._told: ReviewView | None = None
-        self._told_at = 0.0
+        self._told_at = -math.inf
         stage = stage or Stage(server)
         self._framing = stage.framing
 
@@ -155,6 +160,7 @@ class ReviewPage:
             self._library,
             self._make_way,
             self._other_unfolded,
+            self._clock,
         )
         made = [part(server, places) for part in self._offers.parts]
         self._parts = tuple(part for part in made if part is not None)
@@ -184,9 +190,9 @@ class ReviewPage:
             self._panel = ReviewPanel(server, review, self._offers.on_step_back)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
             self._cameras_note = server.gui.add_html("")
-            self._cameras = CamerasPanel(server, self, "This recording has no pictures.")
+            self._cameras = CamerasPanel(server, self, "This recording has no pictures.", self._clock)
         with tabs.add_tab("Curves", viser.Icon.CHART_LINE):
-            self._curves = ReviewCurves(server)
+            self._curves = ReviewCurves(server, self._clock)
         self._compare_tab = tabs.add_tab("Compare", viser.Icon.ARROWS_DIFF)
         with self._compare_tab:
             self._compare = ReviewComparePanel(server, review)
@@ -199,7 +205,7 @@ class ReviewPage:
         if library is not None:
             self._library_window = self._server.gui.add_panel(order=5.0)
             with self._library_window.add_tab("Library", viser.Icon.LIST_DETAILS):
-                self._library = LibraryPanel(self._server, library, self._review.open)
+                self._library = LibraryPanel(self._server, library, self._review.open, clock=self._clock)
                 Presses(self._server).when_unfolded(self._library_unfolded)
             self._library.add_action(
                 Action(
@@ -257,7 +263,7 @@ class ReviewPage:
 
     def _draw_panels(self, view: ReviewView) -> None:
         """While it plays, less often than the 3-D view, and all of them at once: what they say is of one moment."""
-        now = time.monotonic()
+        now = self._clock()
         if (
             view.playing
             and self._told is not None
@@ -324,10 +330,10 @@ class ReviewPage:
 
     def _library_unfolded(self) -> None:
         self._library_open = True
-        self._unfolded = "library", time.monotonic()
+        self._unfolded = "library", self._clock()
 
     def _other_unfolded(self) -> None:
-        self._unfolded = "other", time.monotonic()
+        self._unfolded = "other", self._clock()
 
     def _fold_what_crowds(self) -> None:
         """Of two panels that leave no view, the one that was unfolded last is the one that is wanted.
@@ -338,7 +344,7 @@ class ReviewPage:
         if not last or not 0 < self._smallest_view() < LEAST_VIEW:
             return
         self._unfolded = "", 0.0
-        if time.monotonic() - since > TOLD_WIDTH or not self._library_open:
+        if self._clock() - since > TOLD_WIDTH or not self._library_open:
             return
         if last == "library":
             self._other_folded = True

@@ -13,7 +13,7 @@ from workbench.session.review import MOST_COMPARED, Review
 from workbench.session.review_view import Opened, ReviewView, column_at
 from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_int
-from workbench.ui.control_values import name_for_refusals
+from workbench.ui.control_values import name_control
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
 from workbench.ui.over_the_view import GAP, FitsTheView
@@ -50,7 +50,7 @@ class ReviewTimeline:
                 read=lambda value: checked_int(value, *self._ends, "step of the timeline"),
                 send=self._seek,
             )
-            name_for_refusals(self._slider.handle, "step of the timeline")
+            name_control(self._slider.handle, "step of the timeline")
             self._strip = gui.add_html("")
             self._walk = gui.add_button_group("", walk(False))
         self._walk.on_click(lambda event: self._on_walk(event.target.value))

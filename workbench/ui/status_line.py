@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from workbench.session.env_table import EnvRows
 from workbench.session.last_words import Busy
 from workbench.session.view import SessionView
 from workbench.ui.changed import fill, show
+from workbench.ui.draw_due import Clock
 from workbench.ui.env_strip import first_flagged, mask
 from workbench.ui.fragments import render
 from workbench.ui.presses import Presses
@@ -60,6 +62,7 @@ class StatusLine:
         server: viser.ViserServer,
         env_rows: Callable[[], EnvRows | None],
         on_flagged: Callable[[], None],
+        clock: Clock = time.monotonic,
     ) -> None:
         self._env_rows, self._on_flagged = env_rows, on_flagged
         self._handle = server.gui.add_html("")
@@ -67,16 +70,16 @@ class StatusLine:
         self._standing = server.gui.add_html("", visible=False)
         # At the end of the panel, behind the tabs: all that comes after it is hidden.
         self._presses = Presses(server)
-        self._drawn_at = 0.0
+        self._clock, self._drawn_at = clock, -math.inf
         self._state = ""
         self._task_serial = 0
-        self._loaded_at = 0.0
+        self._loaded_at = -math.inf
 
     def draw(self, view: SessionView) -> None:
-        now = time.monotonic()
+        now = self._clock()
         if view.task_serial != self._task_serial:
             # The first version is no news.
-            self._loaded_at = now if self._task_serial else 0.0
+            self._loaded_at = now if self._task_serial else -math.inf
             self._task_serial = view.task_serial
         fresh = now - self._loaded_at < NEWS
         busy = "" if view.busy is None else f"{view.busy.doing} {view.busy.seconds:.0f}"

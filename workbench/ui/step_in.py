@@ -313,6 +313,7 @@ class Judging:
                 lambda ids: episode_files(shelf.library, ids),
                 self._choices,
                 self._place.task_files,
+                places.clock,
             )
         return self._panel
 

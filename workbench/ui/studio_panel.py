@@ -11,6 +11,7 @@ to the session; `camera_gizmo`, `camera_numbers`, `look_through` and `camera_wri
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import PurePath
 from typing import Any
@@ -37,6 +38,7 @@ from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_choice
 from workbench.ui.commands import Command
 from workbench.ui.controls import Control
+from workbench.ui.draw_due import Clock
 from workbench.ui.fragments import render
 from workbench.ui.look_through import LookThrough
 from workbench.ui.placing import Placing
@@ -63,7 +65,7 @@ IN_ITS_EYE = "You look from where it stands. Move the view, and its handles appe
 
 
 class StudioPanel:
-    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+    def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
         self._server, self._session = server, session
         self._placing = Placing(session)
         self._keys: tuple[CameraKey, ...] = ()
@@ -79,7 +81,7 @@ class StudioPanel:
             shown=self._name_of,
         )
         self._note = gui.add_html(render("note", text="Cameras appear when the task is loaded."))
-        self._picture = StudioPicture(server, session)
+        self._picture = StudioPicture(server, session, clock)
         self._facts = gui.add_html("", visible=False)
         self._tools = gui.add_html("", visible=False)
         self._look = LookThrough(server, self._placing)

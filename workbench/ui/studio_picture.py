@@ -7,6 +7,7 @@ on the Cameras tab at the same time; here is one.
 
 from __future__ import annotations
 
+import math
 import time
 
 import numpy as np
@@ -20,6 +21,7 @@ from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.cameras_panel import FASTEST, modalities_of
 from workbench.ui.changed import fill, show
+from workbench.ui.draw_due import Clock
 from workbench.ui.false_colour import DepthRange
 from workbench.ui.fragments import render
 from workbench.ui.in_colours import COLOUR, depth_span, image_format, in_colours
@@ -28,11 +30,11 @@ from workbench.ui.in_colours import COLOUR, depth_span, image_format, in_colours
 class StudioPicture:
     """The picture in the present container; what lies over it goes into `folder`."""
 
-    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+    def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
         self._server, self._session = server, session
         self._picture: viser.GuiImageHandle | None = None
         self._drawn: tuple[CameraKey, Picture, str] | None = None
-        self._drawn_at = 0.0
+        self._clock, self._drawn_at = clock, -math.inf
         self._span: DepthRange | None = None
         self._wanted = COLOUR
         self.kinds: tuple[str, ...] = (COLOUR,)
@@ -73,13 +75,13 @@ class StudioPicture:
         if key is None or picture is None or picture.env != view.selected_env or view.task is None:
             return
         if self._drawn is not None and (self._drawn[0], self._drawn[2]) == (key, kind):
-            if self._drawn[1] is picture or time.monotonic() - self._drawn_at < FASTEST:
+            if self._drawn[1] is picture or self._clock() - self._drawn_at < FASTEST:
                 return
         self._span = depth_span(self._span if self._drawn and self._drawn[0] == key else None, picture)
         coloured = in_colours(picture, kind, view.task.segmentation, self._span)
         if coloured is None:
             return  # it is not there yet
-        self._drawn, self._drawn_at = (key, picture, kind), time.monotonic()
+        self._drawn, self._drawn_at = (key, picture, kind), self._clock()
         self._put(kind, *coloured)
 
     def _put(self, kind: str, pixels: NDArray[np.uint8], caption: str) -> None:

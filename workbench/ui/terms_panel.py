@@ -15,6 +15,7 @@ from workbench.session.reward_terms import MOST, TermCurves
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.changed import fill, show
+from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import LONGEST, STEP, LineChart, line
 
@@ -30,19 +31,17 @@ HOW_TO = (
 
 
 class TermsPanel:
-    def __init__(self, server: viser.ViserServer, session: Session) -> None:
+    def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
         self._session = session
         self._chart = LineChart(server, server.gui.add_folder(None), height=170)
         self._how_to = server.gui.add_html(render("note", text=HOW_TO), visible=False)
         self._no_curve = server.gui.add_html("", visible=False)
-        self._drawn: tuple[int, int, int] | None = None
-        self._drawn_at = 0.0
+        self._due = DrawDue(REDRAW_EVERY, clock)
 
     def draw(self, view: SessionView) -> None:
         wanted = (view.task_serial, view.step_serial, view.selected_env)
-        if wanted == self._drawn or time.monotonic() - self._drawn_at < REDRAW_EVERY:
+        if not self._due.is_due(wanted):
             return
-        self._drawn, self._drawn_at = wanted, time.monotonic()
         curves = self._session.term_curves()
         if curves is not None and len(curves.tick) < 2:
             curves = None

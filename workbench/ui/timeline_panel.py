@@ -11,6 +11,7 @@ moment for a while are its pictures asked of the worker, where there are none.
 
 from __future__ import annotations
 
+import math
 import time
 
 import viser
@@ -20,8 +21,9 @@ from workbench.session.timeline import Scope
 from workbench.session.view import SessionView
 from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_int
-from workbench.ui.control_values import name_for_refusals
+from workbench.ui.control_values import name_control
 from workbench.ui.controls import Control
+from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.over_the_view import GAP, FitsTheView
 from workbench.ui.timeline_strip import strip_values
@@ -44,8 +46,8 @@ WALK = (LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, NOW, EPISODE)
 
 
 class TimelinePanel:
-    def __init__(self, server: viser.ViserServer, session: Session) -> None:
-        self._server, self._session = server, session
+    def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
+        self._server, self._session, self._clock = server, session, clock
         gui = server.gui
         self._panel = gui.add_panel(visible=False, order=10.0)
         with self._panel.add_tab("Timeline", viser.Icon.HISTORY):
@@ -53,14 +55,17 @@ class TimelinePanel:
                 gui.add_slider("", min=-1, max=0, step=1, initial_value=0),
                 read=lambda value: checked_int(value, -(10**9), 0, "step of the past"),
                 send=self._seek,
+                clock=clock,
             )
-            name_for_refusals(self._slider.handle, "step of the past")
+            name_control(self._slider.handle, "step of the past")
             self._strip = gui.add_html("")
             # One of these two rows is there, and they are equally high: a panel that grows is moved up only a moment
             # later, its last row is cut off until then, and a second press on "step" would meet another button.
             self._hint = gui.add_html("")
             self._travel = gui.add_button_group("", (GO_ON,), visible=False)
             self._walk = gui.add_button_group("", WALK)
+            name_control(self._travel, "way to go on")
+            name_control(self._walk, "step to take")
         self._walk.on_click(lambda event: self._on_walk(event.target.value))
         self._travel.on_click(lambda event: self._on_travel(event.target.value))
         # Across the bottom of the view: viser docks panels at the sides only.
@@ -74,8 +79,8 @@ class TimelinePanel:
         """What was shown before the slider was last moved."""
         self._newest = 0
         """The serial that the page last took for 0."""
-        self._range_at = self._strip_at = 0.0
-        self._drawn: object = None
+        self._range_at = -math.inf
+        self._strip_due = DrawDue(REDRAW_EVERY, clock)
         self._stood: tuple[object, float] = (None, 0.0)
 
     # --- what buttons and keys do ------------------------------------------------------------------
@@ -114,7 +119,7 @@ class TimelinePanel:
             self.go_live()
         elif name in (EPISODE, EVERYTHING):
             self._episode_only = name == EPISODE
-            self._range_at = 0.0
+            self._range_at = -math.inf
         elif isinstance(name, str) and name.startswith(UNDO):
             self._session.past.undo()
 
@@ -139,7 +144,7 @@ class TimelinePanel:
         self._ask_for_pictures(view)
 
     def _draw_slider(self, view: SessionView) -> None:
-        past, now = view.timeline, time.monotonic()
+        past, now = view.timeline, self._clock()
         moved = past.shown is not None and not self._range[0] <= past.shown <= self._range[1]
         if now - self._range_at >= RANGE_EVERY or moved:
             self._range_at = now
@@ -173,11 +178,10 @@ class TimelinePanel:
                 self._travel.visible, self._hint.visible = bool(travel), not travel
 
     def _draw_strip(self, view: SessionView) -> None:
-        past, now = view.timeline, time.monotonic()
+        past = view.timeline
         wanted = (past.first, past.last, past.shown, view.selected_env, self._range, view.playing)
-        if wanted == self._drawn or now - self._strip_at < REDRAW_EVERY:
+        if not self._strip_due.is_due(wanted):
             return
-        self._strip_at, self._drawn = now, wanted
         low, high = self._range
         strip = self._session.past.strip(low, high)
         if strip is not None:
@@ -186,8 +190,8 @@ class TimelinePanel:
     def _ask_for_pictures(self, view: SessionView) -> None:
         at = (view.timeline.shown, view.selected_env)
         if at != self._stood[0]:
-            self._stood = (at, time.monotonic())
-        elif view.timeline.wants_pictures and time.monotonic() - self._stood[1] > STANDS_STILL:
+            self._stood = (at, self._clock())
+        elif view.timeline.wants_pictures and self._clock() - self._stood[1] > STANDS_STILL:
             self._session.past.draw()
 
 

@@ -110,8 +110,9 @@ class SeamError(RuntimeError):
     """viser is not the viser that this module was written for."""
 
 
-def element_id(handle: viser.GuiButtonHandle | viser.GuiNumberHandle) -> str:
-    """The ``id`` of its element in the page (viser's ``Button.tsx``, ``NumberInput.tsx``), for HTML that works it."""
+def element_id(handle: viser.GuiInputHandle | viser.GuiButtonHandle) -> str:
+    """What a page calls it; the ``id`` of its element there too, where it is a button or a number (viser's
+    ``Button.tsx``, ``NumberInput.tsx``), for HTML that works it."""
     return handle._impl.uuid
 
 

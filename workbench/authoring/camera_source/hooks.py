@@ -175,6 +175,14 @@ def new_hook(
     return [at_end_of_class(file, cls, hook, whole)]
 
 
+def class_named(file: SourceFile, name: str) -> cst.ClassDef:
+    """The class of that name at the top level of the file. Raises Refused."""
+    for node in file.module.body:
+        if isinstance(node, cst.ClassDef) and node.name.value == name:
+            return node
+    raise Refused(f"there is no class {name} in {file.name}")
+
+
 def at_end_of_class(
     file: SourceFile, cls: cst.ClassDef, hook: Hook, text: Callable[[str], str]
 ) -> Replacement:

@@ -20,7 +20,14 @@ from workbench.authoring.camera_source.find import (
     candidates,
     check_own,
 )
-from workbench.authoring.camera_source.hooks import HOOK_OF, appended, needed_imports, new_hook, returned
+from workbench.authoring.camera_source.hooks import (
+    HOOK_OF,
+    appended,
+    class_named,
+    needed_imports,
+    new_hook,
+    returned,
+)
 from workbench.authoring.camera_source.read_camera import FIELDS, ReadCamera, mismatch, readings
 from workbench.authoring.camera_source.result import Refusal, Refused, SourceEdit
 from workbench.authoring.camera_source.snippet import repr_text, snippet
@@ -173,11 +180,7 @@ def _add(
 ) -> SourceEdit:
     file = project.file(path)
     check_own(path)
-    cls = next(
-        (n for n in file.module.body if isinstance(n, cst.ClassDef) and n.name.value == class_name), None
-    )
-    if cls is None:
-        raise Refused(f"there is no class {class_name} in {file.name}")
+    cls = class_named(file, class_name)
     hook = HOOK_OF[kind]
     name = _siblings_look_at(project, file, hook)
     pose = name and look_at_text(name, settings, target) or ""

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import libcst as cst
-
 from workbench.authoring.camera_source.definitions import Project
 from workbench.authoring.camera_source.find import check_own
-from workbench.authoring.camera_source.hooks import HOOK_OF, Hook, at_end_of_class, needed_imports
+from workbench.authoring.camera_source.hooks import (
+    HOOK_OF,
+    Hook,
+    at_end_of_class,
+    class_named,
+    needed_imports,
+)
 from workbench.authoring.camera_source.members import as_written, checked
 from workbench.authoring.camera_source.result import Refusal, Refused, SourceEdit
 from workbench.authoring.camera_source.snippet import repr_text, snippet
@@ -70,11 +74,7 @@ def _plan(
 ) -> SourceEdit:
     file = project.file(path)
     check_own(path)
-    cls = next(
-        (n for n in file.module.body if isinstance(n, cst.ClassDef) and n.name.value == class_name), None
-    )
-    if cls is None:
-        raise Refused(f"there is no class {class_name} in {file.name}")
+    cls = class_named(file, class_name)
     for where, owner in project.above(file, cls, []):
         if hook in project.bindings(where, owner):
             raise Refused(

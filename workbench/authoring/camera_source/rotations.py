@@ -87,7 +87,7 @@ def from_matrix(rotation: Array) -> Quaternion:
     )
     best = int(np.argmax(roots))
     w, x, y, z = (float(part / (2 * max(roots[best], m.dtype.type(0.1)))) for part in rows[best])
-    return w, x, y, z
+    return (-w, -x, -y, -z) if w < 0 else (w, x, y, z)
 
 
 def from_euler(roll: float, pitch: float, yaw: float) -> Quaternion:

@@ -1,0 +1,42 @@
+"""Which envs of a batch are meant: the numbers that a caller names, read and checked."""
+
+from __future__ import annotations
+
+import operator
+from typing import Any
+
+import numpy as np
+import torch
+
+
+def env_numbers(env_idx: Any) -> list[int]:
+    """The numbers in `env_idx`, one or several, in the order given.
+
+    Raises:
+        TypeError: they are no whole numbers, or a mask.
+    """
+    try:
+        each = [env_idx] if np.ndim(env_idx) == 0 else list(env_idx)
+        if any(isinstance(i, (bool, np.bool_)) or getattr(i, "dtype", None) == torch.bool for i in each):
+            raise TypeError("a mask")
+        return [operator.index(i) for i in each]
+    except TypeError as error:
+        raise TypeError(
+            f"env_idx and source are whole numbers, one an env, not {env_idx!r}: of a mask, take mask.nonzero().flatten()"
+        ) from error
+
+
+def envs_of_batch(env_idx: Any, num_envs: int) -> list[int]:
+    """As `env_numbers`, each once and there.
+
+    Raises:
+        IndexError, ValueError: `env_idx` names envs that are not there, one twice, or none.
+    """
+    chosen = env_numbers(env_idx)
+    if not chosen:
+        raise ValueError("env_idx is empty: name the envs, or leave it out for all")
+    if any(not 0 <= i < num_envs for i in chosen):
+        raise IndexError(f"env_idx {chosen} is out of range for {num_envs} envs")
+    if len(set(chosen)) < len(chosen):
+        raise ValueError(f"env_idx {chosen} names an env twice")
+    return chosen
