@@ -4,19 +4,22 @@
 #
 #   make open TASK=path/to/task.py ARGS="--num-envs 4 --port 8123"
 #   make test ARGS="-k camera"
+#   make mutants MODULES="ui/gate core/snapshot"
 
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help open test test-all lint wheel doctor clean set-up set-up-test FORCE
+.PHONY: help open test test-all test-gpu gpu-wheels mutants lint wheel doctor clean set-up set-up-test FORCE
 
 TASK ?= tasks/push_cube.py
 ARGS ?=
-# Processes that run the tests, a file of tests each: half of the time goes into waiting for a browser or a worker.
-# More would not help two cores, and each compiles the renderer's shaders for itself.
+MODULES ?= all
+# Processes that run the tests, a file of tests each: a third of the time goes into waiting for a browser or a worker.
+# A third process would not help two cores: tried, and the tests in a browser took as much longer as others gained.
 # The files keep their order: by number of tests, as xdist has it, those of one long test come last and leave a core idle.
 WORKERS ?= 2
+SEEDS ?= $(shell echo $$RANDOM $$RANDOM)
 VENV := .venv
 BIN := $(VENV)/bin
 
@@ -26,6 +29,9 @@ PYTHON ?= $(shell for p in python3 python3.12 python3.11; do \
 	$$p -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))' 2>/dev/null && echo $$p && break; \
 	done)
 
+# The one that has a torch with CUDA, where several do.
+GPU_PYTHON ?= $(PYTHON)
+
 # A .venv whose interpreter is gone (the system's Python was upgraded) is made anew.
 ifneq ($(wildcard $(VENV)/pyvenv.cfg),)
 BROKEN_VENV := $(shell $(BIN)/python -c '' 2>/dev/null || echo FORCE)
@@ -34,7 +40,11 @@ endif
 help:
 	@echo "make open      show tasks/push_cube.py in the browser (TASK=file or env id, ARGS=options of workbench open)"
 	@echo "make test      lint, types and the tests that need no GPU and little time (ARGS=options of pytest)"
-	@echo "make test-all  the slow tests too"
+	@echo "make test-fast ruff and the tests that need no process, renderer or browser: about two minutes"
+	@echo "make test-all  the slow tests too, all of them twice in random order (SEEDS=\"1 2\" makes two orders again)"
+	@echo "make mutants   would a test notice? Slips are planted in copies of MODULES (ui/gate ..., or all)"
+	@echo "make test-gpu  on a machine with CUDA: what of GPU simulation and GPU pictures works, within 8 minutes"
+	@echo "               (without a network: WHEELS=DIR, filled by make gpu-wheels WHEELS=DIR elsewhere, and PHYSX_GPU=FILE)"
 	@echo "make lint      ruff and pyright"
 	@echo "make wheel     dist/*.whl"
 	@echo "make doctor    what this machine can do, and what to do about the rest"
@@ -48,9 +58,21 @@ test: lint
 	@env_lines=$$($(BIN)/python -m workbench.machine.software_vulkan --export); eval "$$env_lines"; \
 	$(BIN)/python -m pytest -m "not slow" -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
+test-fast: set-up-test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/python -m pytest --fast -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
+
+# Whatever a test leaves behind for another is found by an order in which it comes first.
 test-all: lint
 	@env_lines=$$($(BIN)/python -m workbench.machine.software_vulkan --export); eval "$$env_lines"; \
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
+	failed=; \
+	for seed in $(SEEDS); do \
+		echo "order of the tests: make test-all SEEDS=$$seed"; \
+		$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder --random-order-seed=$$seed $(ARGS) \
+			|| failed="$$failed $$seed"; \
+	done; \
+	[ -z "$$failed" ] || { echo "failed in the order of seed$$failed" >&2; exit 1; }
 
 lint: set-up-test
 	$(BIN)/ruff check .
@@ -64,8 +86,8 @@ doctor: set-up
 	@$(BIN)/python -m workbench.machine.doctor
 
 clean:
-	rm -rf dist build .pytest_cache .ruff_cache .hypothesis
-	find . -path ./$(VENV) -prune -o -name __pycache__ -type d -print0 | xargs -0 -r rm -rf
+	rm -rf dist build test-results .pytest_cache .ruff_cache .hypothesis
+	find . \( -path ./$(VENV) -o -path ./.venv-gpu \) -prune -o -name __pycache__ -type d -print0 | xargs -0 -r rm -rf
 
 set-up: $(VENV)/.installed
 
@@ -97,5 +119,9 @@ $(VENV)/.installed-test: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
 	@echo "Installing into $(VENV): some minutes the first time, nothing the next."
 	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[test]'
 	@touch $(VENV)/.installed $@
+
+$(VENV)/.installed-mutants: $(VENV)/pyvenv.cfg pyproject.toml constraints.txt
+	$(BIN)/python -m pip install --disable-pip-version-check -q -c constraints.txt -e '.[mutants]'
+	@touch $@
 
 FORCE:

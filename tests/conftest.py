@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 # Before anything imports rerun, which reads it once: a wrong argument raises instead of printing a warning.
 os.environ["RERUN_STRICT"] = "1"
@@ -19,7 +21,10 @@ os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="workbench-test-config-"
 import psutil
 import pytest
 
-from workbench.machine.chromium import find_chromium, how_to_get_chromium
+pytest_plugins = ["tests.drive.tiers"]
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -33,13 +38,36 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.skip(reason="torch sees no CUDA device"))
 
 
-@pytest.fixture(scope="session")
-def chromium_path() -> str:
-    """Path of the Chromium to give to Playwright as ``executable_path``. Without one the test fails."""
-    path = find_chromium()
-    if path is None:
-        pytest.fail(how_to_get_chromium())
-    return path
+SIGHTS = Path(__file__).parents[1] / "test-results"
+"""Where a failed test leaves what its pages showed."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    report = yield
+    if "tests.drive.page" not in sys.modules:
+        return report
+    # Of a test that passes too, so that what it expected to raise is not shown with a later one's failure.
+    sights = sys.modules["tests.drive.page"].seen_at_failure(report.failed)
+    if report.failed and sights:
+        folder = SIGHTS / re.sub(r"[^\w.-]+", "-", f"{item.nodeid}-{report.when}")[-150:]
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        for number, sight in enumerate(sights):
+            (folder / f"{number}.txt").write_text(sight.log)
+            if sight.picture is not None:
+                (folder / f"{number}.png").write_bytes(sight.picture)
+        report.sections.append(("what its pages and terminals showed", f"is in {folder}"))
+    return report
+
+
+@pytest.fixture(scope="module")
+def browser(chromium_path: str) -> Iterator[Browser]:
+    """Not one for all files: a thread in which Playwright waits takes no other loop of asyncio."""
+    from tests.drive.page import browser_at
+
+    with browser_at(chromium_path) as browser:
+        yield browser
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,62 @@
+"""What a person has in front of them: the page, the task file, the terminal."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from playwright.sync_api import FloatRect, Locator, Page, expect
+
+from tests.drive.page import TASK, Opened
+from tests.drive.waiting import until
+
+
+@dataclass
+class Desk:
+    page: Page
+    errors: list[str]
+    """What is wrong on the page so far."""
+    file: Path
+    opened: Opened
+
+    def tab(self, name: str) -> None:
+        self.page.get_by_role("tab", name=name).click()
+
+    def button(self, name: str) -> Locator:
+        return self.page.get_by_role("button", name=name, exact=True)
+
+    def press(self, *keys: str) -> None:
+        for key in keys:
+            self.page.keyboard.press(key)
+
+    def leave_inputs(self) -> None:
+        """So that no slider takes the keys. A click on the view would select the env that happens to lie there."""
+        self.page.evaluate("document.activeElement?.blur()")
+
+    def edit(self, old: str, new: str) -> None:
+        """Write the example's text with this change into the file."""
+        text = TASK.read_text()
+        assert old in text
+        self.file.write_text(text.replace(old, new))
+
+    def row(self, name: str) -> list[str]:
+        """The cells of a row of the numbers table on the Reward tab."""
+        row = self.page.locator("tr", has=self.page.get_by_text(name, exact=True))
+        return [cell.strip() for cell in row.first.locator("td, th").all_inner_texts()]
+
+    def elapsed(self) -> int:
+        """Steps of the selected env, as the Reward tab shows them."""
+        return int(self.row("elapsed steps")[1].split("/")[0])
+
+    def comes_to(self, steps: int) -> None:
+        until(lambda: self.elapsed() == steps, f"step {steps}", seen=self.elapsed)
+
+    def timeline_says(self, text: str) -> None:
+        expect(self.page.locator(".wb-timeline").get_by_text(re.compile(text)).first).to_be_visible()
+
+    def box(self, what: str) -> FloatRect:
+        """Where it lies on the page, in pixels."""
+        place = self.page.locator(what).last
+        # What is drawn anew is gone for a moment.
+        return until(place.bounding_box, f"{what} on the page")

@@ -1,0 +1,177 @@
+"""Episodes as arrays whose numbers can be checked by hand, and their files by the real writer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tests.ui.scenes import camera, table_scene
+from workbench.core.geometry import SceneGeometry
+from workbench.core.pictures import CameraInfo, Picture
+from workbench.recording.episode import Episode, EpisodeInfo
+from workbench.recording.episode_writer import EpisodeFiles, EpisodeWriter
+from workbench.recording.row import EpisodeRow
+
+BODY = {"ground": 0, "table": 1, "arm/hand": 2, "cube": 3}
+
+
+def made(
+    steps: int = 10, success_from: int | None = None, seed: int = 3, speed: float = 0.01, **info: Any
+) -> Episode:
+    """An episode in which a cube moves along x, `speed` metres a step, and the reward is the number of the step."""
+    geometry, poses = table_scene(1)
+    track = np.repeat(poses, steps + 1, axis=0)
+    track[:, BODY["cube"], 0] = np.arange(steps + 1) * speed
+    states = np.arange(steps + 1)
+    success = np.zeros(steps + 1, bool) if success_from is None else states >= success_from
+    terms = np.concatenate([[np.nan], np.arange(1, steps + 1) / 2])
+    return Episode(
+        info=EpisodeInfo(
+            **{
+                "task": "Push-v1",
+                "env_index": 0,
+                "seed": seed,
+                "source_file": "push.py",
+                "source_hash": "0" * 12,
+                "source": {"push.py": "reward = 1\n"},
+                "control_dt": 0.05,
+                "control_mode": "pd_joint_delta_pos",
+                "backend": "cpu (batched)",
+                **info,
+            }
+        ),
+        geometry=geometry,
+        segmentation={1: "table"},
+        poses=track,
+        action=np.full((steps, 2), 0.5, np.float32),
+        action_names=("arm/joint1", "gripper"),
+        reward=np.arange(1, steps + 1, dtype=np.float32),
+        terminated=success[1:].copy(),
+        truncated=states[1:] == 50,
+        evaluate={"success": success, "distance": 1.0 - states / 100, "reward_terms/reach": terms},
+        cameras=[],
+    )
+
+
+def poses_of(episode: Episode) -> NDArray[np.float32]:
+    """Those of an episode that has some; to be written to."""
+    assert episode.poses is not None
+    return episode.poses
+
+
+def geometry_of(episode: Episode) -> SceneGeometry:
+    assert episode.geometry is not None
+    return episode.geometry
+
+
+def begin(folder: Path, episode: Episode) -> None:
+    """All of it in a journal, as a writer leaves it that was killed before it made the files."""
+    writer = appended(folder, episode, pictures=False)
+    writer._journal.write()
+    writer.close()
+
+
+def write(folder: Path, episode: Episode, pictures: bool = True, every: int = 1) -> Path:
+    """Its files in `folder`, with a camera whose picture at state k, of each of so many, is k * 20 bright; returns the .json."""
+    return appended(folder, episode, pictures, every).finish().json
+
+
+def appended(folder: Path, episode: Episode, pictures: bool, every: int = 1) -> EpisodeWriter:
+    cameras = (camera(),) if pictures else ()
+    writer = EpisodeWriter(
+        folder, episode.info, geometry_of(episode), episode.segmentation, episode.action_names, cameras
+    )
+    for state in range(episode.length + 1):
+        seen = Picture(
+            "base_camera",
+            "sensor",
+            0,
+            np.array([0, 0, 1, 1, 0, 0, 0], np.float32),
+            rgb=np.full((6, 8, 3), state * 20 % 256, np.uint8),
+            depth=np.full((6, 8), state / 10, np.float32),
+            segmentation=np.ones((6, 8), np.int32),
+        )
+        writer.append(
+            row_at(
+                episode,
+                state,
+                pictures=(seen,) if pictures and state % every == 0 else (),
+                others=episode.others_at(state),
+            )
+        )
+    return writer
+
+
+def row_at(episode: Episode | Made, state: int, **others: Any) -> EpisodeRow:
+    """What a recorder is given of a state and of the step that led to it."""
+    assert episode.poses is not None
+    return EpisodeRow(
+        poses=episode.poses[state],
+        evaluate={name: values[state] for name, values in episode.evaluate.items()},
+        action=episode.action[state - 1] if state else None,
+        reward=float(episode.reward[state - 1]) if state else 0.0,
+        terminated=bool(episode.terminated[state - 1]) if state else False,
+        truncated=bool(episode.truncated[state - 1]) if state else False,
+        **others,
+    )
+
+
+@dataclass
+class Track:
+    info: CameraInfo
+    frame: NDArray[np.int64]
+    pose: NDArray[np.float32]
+    rgb: NDArray[np.uint8] | None = None
+    depth: NDArray[np.float32] | None = None
+    segmentation: NDArray[np.int32] | None = None
+
+    def picture(self, state: int) -> Iterator[Picture]:
+        for index in np.flatnonzero(self.frame == state):
+            held = {
+                name: array[index]
+                for name in ("rgb", "depth", "segmentation")
+                if (array := getattr(self, name)) is not None
+            }
+            yield Picture(self.info.name, self.info.kind, 0, self.pose[index], **held)
+
+
+@dataclass
+class Made:
+    info: EpisodeInfo
+    geometry: SceneGeometry
+    segmentation: dict[int, str]
+    poses: NDArray[np.float32]
+    action: NDArray[np.float32]
+    action_names: tuple[str, ...]
+    reward: NDArray[np.float32]
+    terminated: NDArray[np.bool_]
+    truncated: NDArray[np.bool_]
+    evaluate: dict[str, NDArray]
+    cameras: list[Track]
+    env_states: dict[str, NDArray] = field(default_factory=dict)
+    obs: dict[str, NDArray] = field(default_factory=dict)
+
+    def rows(self) -> Iterator[EpisodeRow]:
+        for state in range(len(self.poses)):
+            yield row_at(
+                self,
+                state,
+                env_states={name: values[state] for name, values in self.env_states.items()},
+                obs={name: values[state] for name, values in self.obs.items()},
+                pictures=tuple(picture for track in self.cameras for picture in track.picture(state)),
+            )
+
+    def writer(self, folder: Path) -> EpisodeWriter:
+        cameras = [track.info for track in self.cameras]
+        return EpisodeWriter(folder, self.info, self.geometry, self.segmentation, self.action_names, cameras)
+
+    def write(self, folder: Path) -> EpisodeFiles:
+        writer = self.writer(folder)
+        for row in self.rows():
+            writer.append(row)
+        return writer.finish()

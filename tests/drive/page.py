@@ -1,0 +1,249 @@
+"""``workbench open`` and its like as a person types them, and a real Chromium in front of them."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from playwright.sync_api import (
+    Browser,
+    ConsoleMessage,
+    Error,
+    FloatRect,
+    Page,
+    Playwright,
+    expect,
+    sync_playwright,
+)
+
+from tests.drive.waiting import until
+
+TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
+"""The example task; what is edited is a copy of it."""
+CHROMIUM_ARGUMENTS = (
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    # Without these Chromium looks up its maker's hosts at every start.
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+)
+START_SECONDS = 60.0
+expect.set_options(timeout=60_000)
+DRAWN_WHEN_LOOKED_AT = """
+[window.viewIsSeen, window.drawnInView] = [false, 0];
+for (const name of ["drawElements", "drawArrays", "drawElementsInstanced", "drawArraysInstanced"]) {
+    const draw = WebGL2RenderingContext.prototype[name];
+    WebGL2RenderingContext.prototype[name] = function (...what) {
+        if (!window.viewIsSeen) return;
+        window.drawnInView += 1;
+        draw.apply(this, what);
+    };
+}
+"""
+"""A frame of the 3-D view takes half a second of processor to draw in software, and keys wait for it. All else is done."""
+
+
+@dataclass
+class Opened:
+    """A running command with a page, such as ``workbench open``."""
+
+    process: subprocess.Popen[str]
+    url: str
+    lines: list[str] = field(default_factory=list)
+    """What it printed so far, stdout and stderr."""
+
+    def wait_for_line(self, pattern: str, seconds: float = 60.0) -> str:
+        return until(
+            lambda: [line for line in list(self.lines) if re.search(pattern, line)],
+            f"a line like {pattern!r}",
+            seconds,
+            lambda: "it printed\n" + "\n".join(self.lines),
+        )[0]
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What a person would have seen when a test failed: a page, or a terminal (without a picture)."""
+
+    log: str
+    picture: bytes | None = None
+
+
+_pages: list[tuple[Page, list[str]]] = []
+_commands: list[Opened] = []
+_seen: list[Sight] = []
+"""What was there when an exception closed it, before the test's failure is reported."""
+
+
+def seen_at_failure(failed: bool) -> list[Sight]:
+    """Pages and terminals that are open, and those that an exception has closed since the last call; none if not `failed`."""
+    _pages[:] = [(page, errors) for page, errors in _pages if not page.is_closed()]
+    closed = list(_seen)
+    _seen.clear()
+    if not failed:
+        return []
+    shown = [_sight_of(page, errors) for page, errors in _pages]
+    return [*closed, *shown, *(Sight("\n".join(opened.lines)) for opened in _commands)]
+
+
+def _sight_of(page: Page, errors: list[str]) -> Sight:
+    log = "\n".join([page.url, *errors])
+    try:
+        # Not `evaluate`, which waits for ever for a page that hangs.
+        page.wait_for_function("viewIsSeen = true", timeout=10_000)
+        page.wait_for_timeout(1500)  # viser draws once a second
+        return Sight(log, page.screenshot(timeout=10_000))
+    except Error as error:
+        return Sight(f"{log}\nno picture: {error}")
+
+
+@contextmanager
+def open_workbench(
+    *arguments: str, cwd: Path | None = None, what: str = "open", env: dict[str, str] | None = None
+) -> Iterator[Opened]:
+    """Start ``workbench open``, or `what`, on a free port; end it with Ctrl-C's signal and insist that it ends."""
+    command = [sys.executable, "-m", "workbench.cli", what, *arguments, "--port", "0"]
+    process = subprocess.Popen(
+        command,
+        cwd=cwd,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "COLUMNS": "200", "PYTHONUNBUFFERED": "1", **(env or {})},
+    )
+    opened = Opened(process, "")
+    stream = process.stdout
+    assert stream is not None
+
+    def read() -> None:
+        for line in stream:
+            opened.lines.append(line.rstrip())
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    _commands.append(opened)
+    try:
+        opened.url = opened.wait_for_line(r"page +http", START_SECONDS).split()[-1]
+        yield opened
+    except BaseException:
+        _seen.append(Sight("\n".join(opened.lines)))
+        raise
+    finally:
+        _commands.remove(opened)
+        process.send_signal(signal.SIGINT)
+        try:
+            process.wait(timeout=30)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            raise
+        reader.join(timeout=5)
+
+
+def launch(playwright: Playwright, chromium: str) -> Browser:
+    return playwright.chromium.launch(executable_path=chromium, args=list(CHROMIUM_ARGUMENTS))
+
+
+@contextmanager
+def browser_at(chromium: str) -> Iterator[Browser]:
+    """A Chromium; a process can have one at a time."""
+    with sync_playwright() as playwright:
+        browser = launch(playwright, chromium)
+        yield browser
+        browser.close()
+
+
+def new_page(
+    browser: Browser, width: int = 1280, height: int = 720, drawn: bool = True
+) -> tuple[Page, list[str]]:
+    """A page, and the console errors and uncaught exceptions that it has so far.
+
+    Args:
+        drawn: Whether the 3-D view is drawn at all times; without it, for `picture_of_view` alone.
+    """
+    page = browser.new_page(viewport={"width": width, "height": height})
+    if not drawn:
+        page.add_init_script(DRAWN_WHEN_LOOKED_AT)
+    errors: list[str] = []
+
+    def on_console(message: ConsoleMessage) -> None:
+        if message.type == "error":
+            errors.append(message.text)
+
+    page.on("console", on_console)
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.set_default_timeout(60_000)
+    _pages.append((page, errors))
+    return page, errors
+
+
+@contextmanager
+def page_at(
+    browser: Browser, url: str, width: int = 1280, height: int = 720, drawn: bool = False
+) -> Iterator[tuple[Page, list[str]]]:
+    """`new_page` at an address, closed at the end."""
+    page, errors = new_page(browser, width, height, drawn)
+    try:
+        page.goto(url)
+        yield page, errors
+    except BaseException:
+        _seen.append(_sight_of(page, errors))
+        raise
+    finally:
+        page.close()
+
+
+@contextmanager
+def page_on(
+    file: Path,
+    *arguments: str,
+    browser: Browser,
+    width: int = 1280,
+    height: int = 720,
+    drawn: bool = False,
+    spare: bool = False,
+) -> Iterator[tuple[Page, list[str], Opened]]:
+    """A page that shows the file's task, paused; what is wrong on it so far; and the terminal.
+
+    Args:
+        spare: Whether a second worker warms up beside, which takes a core for some ten seconds.
+    """
+    arguments = arguments if spare else (*arguments, "--no-spare")
+    with (
+        open_workbench(str(file), *arguments, cwd=file.parent) as opened,
+        page_at(browser, opened.url, width, height, drawn) as (page, errors),
+    ):
+        expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
+        yield page, errors, opened
+
+
+def picture_of_view(page: Page, clip: FloatRect) -> NDArray[np.uint8]:
+    """What that part of the 3-D view shows, as RGB."""
+    before = page.evaluate("viewIsSeen = true, drawnInView")
+    # viser draws once a second, also what has not changed.
+    page.wait_for_function("before => drawnInView > before", arg=before)
+    shot = page.screenshot(clip=clip)
+    page.evaluate("viewIsSeen = false")
+    return np.asarray(Image.open(io.BytesIO(shot)).convert("RGB"))
+
+
+def close_notice(page: Page) -> None:
+    """Press away viser's notice that the browser draws in software: it lies over what is below it."""
+    notice = page.locator(".mantine-Notification-closeButton")
+    if notice.count():
+        notice.first.click()

@@ -1,0 +1,312 @@
+"""What a viser server shows, and what a person does to it, without a browser.
+
+A control is found by its label, or by the name that the product gave it where the label says nothing; a part of our own
+HTML that can be pressed by the key of its hidden button. A press takes viser's way of a page's message, with a client,
+and is over when all that it began on viser's threads is. Nothing can be pressed that a page does not offer, but for
+`claim`, which says what any stranger can. viser's private names are used here and in no test.
+"""
+
+# pyright: reportAttributeAccessIssue=false, reportPrivateUsage=false
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import viser
+from viser._messages import CommandTriggerMessage, GuiSetPanelCollapsedMessage, GuiUpdateMessage
+
+from workbench.ui.control_values import name_of
+from workbench.ui.viser_seam import element_id
+
+Kind = Literal["button", "field"]
+"""Of an input. A button and what it is for may have the same label."""
+_Roots = list[tuple[Any, bool]]
+"""Containers, and whether each is seen."""
+
+
+class Clock:
+    """A clock for a page's parts that moves when it is told to."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+    def passes(self, seconds: float = 60.0) -> None:
+        self.now += seconds
+
+
+@dataclass
+class Client:
+    """The page that presses, as far as a callback asks for it."""
+
+    client_id: int = 1
+    notices: list[str] = field(default_factory=list)
+
+    def add_notification(self, title: str, body: str, **_: object) -> None:
+        self.notices.append(body)
+
+
+class _Threads:
+    """Stands before viser's pool of threads, and waits for what was begun in it."""
+
+    def __init__(self, pool: Any) -> None:
+        self._pool = pool
+        self._begun: list[Future[Any]] = []
+        self._held: list[Callable[[], object]] | None = None
+
+    @contextmanager
+    def held(self) -> Iterator[list[Callable[[], object]]]:
+        """What is begun within waits for whoever calls it."""
+        self._held = []
+        try:
+            yield self._held
+        finally:
+            self._held = None
+
+    def submit(self, call: Callable[..., Any], *args: Any) -> Future[Any]:
+        if self._held is not None:
+            self._held.append(lambda: call(*args))
+            return Future()
+        future = self._pool.submit(call, *args)
+        self._begun.append(future)
+        return future
+
+    def shutdown(self, *args: Any, **named: Any) -> None:
+        self._pool.shutdown(*args, **named)
+
+    def wait(self) -> None:
+        begun, self._begun = self._begun, []
+        for future in begun:
+            future.result(timeout=60)
+
+
+def held_by(server: viser.ViserServer) -> dict[str, int]:
+    """How many things of each kind the server has for its pages. Words for things that went are swept away first."""
+    server._run_garbage_collector(force=True)
+    gui, sockets = server.gui, server._websock_server
+    return {
+        "inputs": len(gui._gui_input_handle_from_uuid),
+        "containers": len(gui._container_handle_from_uuid),
+        "panels": len(gui._panel_handle_from_uuid),
+        "commands": len(gui._command_handle_from_uuid),
+        "nodes": len(server.scene._handle_from_node_name),
+        "clicks": len(server.scene._scene_pointer_cb),
+        "messages": len(sockets._broadcast_buffer.message_from_id),
+        "pages": len(sockets._client_state_from_id),
+    }
+
+
+def inputs_of(gui: viser.GuiApi) -> list[Any]:
+    """All inputs of a server's pages, or of one page."""
+    return list(gui._gui_input_handle_from_uuid.values())
+
+
+class Panels:
+    """All that a server shows in its panels; `part` is one tab or folder of it."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self.server = server
+        self.client = Client()
+        self._path: tuple[str, ...] = ()
+        gui: Any = server.gui
+        self._threads = _Threads(gui._thread_executor)
+        gui._thread_executor = self._threads
+        gui._resolve_client = lambda client_id: self.client
+
+    def part(self, label: str) -> Panels:
+        """One tab, folder or tab of a panel."""
+        part = object.__new__(Panels)
+        part.__dict__.update(self.__dict__, _path=(*self._path, label))
+        return part
+
+    # --- what is seen ------------------------------------------------------------------------------
+
+    def control(self, name: str, kind: Kind | None = None) -> Any:
+        """viser's handle of an input. Where several have the name, the one that is seen."""
+        found = list(self._named(name, kind))
+        if len(found) > 1:
+            found = [(handle, seen) for handle, seen in found if seen]
+        assert len(found) == 1, (name, len(found), sorted(name_of(handle) for handle, _ in self._inputs()))
+        return found[0][0]
+
+    def shows(self, name: str, kind: Kind | None = None) -> bool:
+        """Whether an input is there and can be seen."""
+        return any(seen for _, seen in self._named(name, kind))
+
+    def offers(self, option: str) -> bool:
+        """Whether a group of buttons has one with this on it."""
+        return any(option in group.options for group in self._of(viser.GuiButtonGroupHandle))
+
+    @property
+    def seen(self) -> bool:
+        """Of a part: whether it can be seen once its tab is in front."""
+        return any(seen for _, seen in self._roots())
+
+    def html(self, mark: str = "") -> str:
+        """The HTML that is seen and has `mark` in it, such as a class of the style sheet."""
+        return "\n".join(handle.content for handle in self.htmls() if mark in handle.content)
+
+    def htmls(self) -> list[viser.GuiHtmlHandle]:
+        return self._of(viser.GuiHtmlHandle)
+
+    def charts(self, hidden: bool = False) -> list[viser.GuiUplotHandle]:
+        """Those that are seen, and the hidden ones too if that is said."""
+        return self._of(viser.GuiUplotHandle, hidden)
+
+    def images(self) -> list[viser.GuiImageHandle]:
+        return self._of(viser.GuiImageHandle)
+
+    def folders(self) -> list[str]:
+        """Labels of what there is in folders and tabs, in the order of the page."""
+        containers = sorted(_containers(self._roots()), key=lambda one: getattr(one[0], "order", 0.0))
+        return [label for one, seen in containers if seen and (label := _label_of(one)) is not None]
+
+    def commands(self) -> list[str]:
+        """Of the palette, by their labels."""
+        return list(self._commands())
+
+    def takes(self, label: str) -> bool:
+        """Whether a command of the palette can be chosen now."""
+        return not self._commands()[label][1].disabled
+
+    def is_folded(self, label: str) -> bool:
+        """Of a panel with a tab of this name: whether the page was last told to make a strip of it."""
+        panels = self.server.gui._panel_handle_from_uuid
+        (uuid,) = (uuid for uuid, one in panels.items() if label in map(_label_of, one._tab_handles))
+        messages = list(self.server._websock_server._broadcast_buffer.message_from_id.values())
+        told = [m for m in messages if isinstance(m, GuiSetPanelCollapsedMessage) and m.uuid == uuid]
+        return bool(told) and told[-1].collapsed
+
+    def bodies(self, word: str) -> list[viser.BatchedMeshHandle]:
+        """The shapes in the 3-D view of what has `word` in its name."""
+        return [node for node in self.nodes(word) if hasattr(node, "batched_positions")]
+
+    def labels(self) -> list[str]:
+        """What is written in the 3-D view."""
+        return [node.text for node in self.nodes("") if isinstance(node, viser.LabelHandle) and node.visible]
+
+    def nodes(self, word: str) -> list[Any]:
+        """What is in the 3-D view with `word` in its name."""
+        nodes = self.server.scene._handle_from_node_name
+        return [handle for name, handle in sorted(nodes.items()) if word in name]
+
+    # --- what a person does ------------------------------------------------------------------------
+
+    def press(self, name: str) -> None:
+        """Press a button, or a part of our HTML by the key that `Presses` has for it."""
+        button = self.control(name, "button")
+        offered = self.html(f'="{element_id(button)}"') if button.label == "·" else self.shows(name, "button")
+        assert offered and not button.disabled, f"no page offers {name}"
+        self._say(button, True)
+
+    def press_late(self, name: str) -> Callable[[], None]:
+        """Press a button whose press is on its way: what it does it does when this is called."""
+        with self._threads.held() as calls:
+            self.press(name)
+
+        def arrives() -> None:
+            for call in calls:
+                call()
+
+        return arrives
+
+    def set(self, name: str, value: object) -> None:
+        """Move a slider, choose of a list, type a text."""
+        control = self.control(name, "field")
+        assert self.shows(name, "field") and not control.disabled, f"no page offers {name}"
+        assert value in getattr(control, "options", (value,)), (name, value, control.options)
+        self._say(control, value)
+
+    def choose(self, option: str) -> None:
+        """Press one button of a group, by what is on it."""
+        groups = self._of(viser.GuiButtonGroupHandle)
+        (group,) = (group for group in groups if option in group.options)
+        self._say(group, option)
+
+    def claim(self, name: str, value: object, kind: Kind = "field") -> None:
+        """Say that an input has this value, whether or not any page offers it."""
+        self._say(self.control(name, kind), value)
+
+    def command(self, label: str) -> None:
+        """Choose a command of the palette, as its key does."""
+        uuid, handle = self._commands()[label]
+        assert not handle.disabled, f"{label} is greyed"
+        self._handled(self.server.gui._handle_command_trigger, CommandTriggerMessage(uuid))
+
+    def settle(self) -> None:
+        """Wait until viser has done what it was given: its loop, and what that began."""
+
+        async def nothing() -> None: ...
+
+        asyncio.run_coroutine_threadsafe(nothing(), self.server.gui._event_loop).result(60)
+        self._threads.wait()
+
+    # --- viser's own -------------------------------------------------------------------------------
+
+    def _say(self, control: Any, value: object) -> None:
+        update = GuiUpdateMessage(control._impl.uuid, {"value": value})
+        self._handled(self.server.gui._handle_gui_updates, update)
+
+    def _handled(self, handler: Callable[..., Any], message: object) -> None:
+        loop = self.server.gui._event_loop
+        asyncio.run_coroutine_threadsafe(handler(self.client.client_id, message), loop).result(60)
+        self._threads.wait()
+
+    def _commands(self) -> dict[str, tuple[str, viser.CommandHandle]]:
+        commands = self.server.gui._command_handle_from_uuid
+        return {handle.label: (uuid, handle) for uuid, handle in commands.items()}
+
+    def _named(self, name: str, kind: Kind | None) -> Iterator[tuple[Any, bool]]:
+        return (
+            (handle, seen)
+            for handle, seen in self._inputs()
+            if name_of(handle) == name
+            and kind in (None, "button" if isinstance(handle, viser.GuiButtonHandle) else "field")
+        )
+
+    def _inputs(self) -> Iterator[tuple[Any, bool]]:
+        inputs = self.server.gui._gui_input_handle_from_uuid
+        return ((handle, seen) for handle, seen in self._walk(self._roots()) if _id_of(handle) in inputs)
+
+    def _of(self, kind: type[Any], hidden: bool = False) -> list[Any]:
+        there = self._walk(self._roots())
+        return [handle for handle, seen in there if (seen or hidden) and isinstance(handle, kind)]
+
+    def _roots(self) -> _Roots:
+        gui = self.server.gui
+        roots: _Roots = [(gui._container_handle_from_uuid["root"], True)]
+        for panel in gui._panel_handle_from_uuid.values():
+            roots += [(tab, panel.visible) for tab in panel._tab_handles]
+        roots += [(modal, True) for modal in gui._modal_handle_from_uuid.values()]
+        for label in self._path:
+            roots = [(one, seen) for one, seen in _containers(roots) if _label_of(one) == label]
+            assert roots, f"there is no {label}"
+        return roots
+
+    def _walk(self, roots: _Roots) -> Iterator[tuple[Any, bool]]:
+        for container, seen in _containers(roots):
+            for child in list(container._children.values()):
+                yield child, seen and child.visible
+
+
+def _containers(roots: _Roots) -> Iterator[tuple[Any, bool]]:
+    for container, seen in roots:
+        yield container, seen
+        for child in list(container._children.values()):
+            inner = [child] if hasattr(child, "_children") else getattr(child, "_tab_handles", [])
+            yield from _containers([(one, seen and child.visible) for one in inner])
+
+
+def _label_of(container: Any) -> str | None:
+    return getattr(container, "_label", None) or getattr(container, "label", None)
+
+
+def _id_of(handle: Any) -> str:
+    return handle._impl.uuid

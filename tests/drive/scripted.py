@@ -1,0 +1,168 @@
+"""A worker that is no process: it answers a session at once with a scene that is made by hand.
+
+For the tests of parts that only need a session with something in it. What a worker really says is tested on real ones.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from tests.ui.scenes import camera, description, step_of, table_scene
+from workbench.core.pictures import Picture
+from workbench.core.step import StepResult
+from workbench.session.kept_worker import Death, KeptWorker, Vitals, WorkerOptions
+from workbench.session.last_words import Busy
+from workbench.session.messages import (
+    Event,
+    Load,
+    Loaded,
+    Pictures,
+    Play,
+    Request,
+    Reset,
+    Restore,
+    Restored,
+    SingleStep,
+    Status,
+    Stepped,
+    TaskDescription,
+    WarmUp,
+    WatchCameras,
+)
+from workbench.session.process import Output
+
+STEP_SECONDS = 0.02
+"""Between two steps while it plays."""
+Evaluate = Callable[[np.ndarray], dict[str, np.ndarray]]
+"""The entries of `evaluate()`, of the elapsed steps of each env."""
+
+
+def no_success(elapsed: np.ndarray) -> dict[str, np.ndarray]:
+    return {"success": np.zeros(len(elapsed), bool)}
+
+
+class ScriptedWorker:
+    """Takes what `KeptWorker` takes, after what its scene is."""
+
+    pid = None
+    load_waits = False
+    vitals = Vitals()
+
+    def __init__(
+        self,
+        task: TaskDescription,
+        poses: np.ndarray,
+        evaluate: Evaluate,
+        options: WorkerOptions,
+        warm_up: WarmUp,
+        *,
+        greet: Callable[[], list[Request]],
+        on_event: Callable[[Event], None],
+        on_death: Callable[[Death], None],
+        on_busy: Callable[[Busy | None], None],
+        own_files: Callable[[], list[str]],
+        output: Output,
+    ) -> None:
+        self._task, self._start, self._evaluate = task, poses, evaluate
+        self._greet, self._tell = greet, on_event
+        self._lived: list[StepResult] = []
+        self._playing = False
+        self._requests: queue.Queue[Request | None] = queue.Queue()
+        self._thread = threading.Thread(target=self._run, name="scripted-worker", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def send(self, request: Request) -> None:
+        self._requests.put(request)
+
+    def interrupt(self) -> None:
+        """It is never at anything."""
+
+    def ran(self) -> None:
+        """It never dies."""
+
+    def replace(self) -> None:
+        for request in self._greet():
+            self.send(request)
+
+    def stop(self) -> None:
+        self._requests.put(None)
+        self._thread.join()
+
+    def _run(self) -> None:
+        self.replace()
+        while True:
+            try:
+                request = self._requests.get(timeout=STEP_SECONDS if self._playing else None)
+            except queue.Empty:
+                self._step()
+                continue
+            if request is None:
+                return
+            self._answer(request)
+
+    def _answer(self, request: Request) -> None:
+        count = self._task.num_envs
+        if isinstance(request, Load):
+            first = self._at(self._start, np.zeros(count, np.int32))
+            self._tell(Loaded(self._task, first, {"import": 1.0}))
+            self._send(first, range(count), seeds=np.arange(count))
+        elif isinstance(request, Play):
+            self._playing = request.playing
+            self._tell(Status(self._playing, 1 / STEP_SECONDS, 1.0))
+        elif isinstance(request, SingleStep):
+            self._step()
+        elif isinstance(request, Reset):
+            envs = range(count) if request.env_idx is None else request.env_idx
+            poses, elapsed = self._lived[-1].poses.copy(), self._lived[-1].elapsed_steps.copy()
+            poses[list(envs)], elapsed[list(envs)] = self._start[list(envs)], 0
+            self._send(self._at(poses, elapsed), envs, seeds=np.arange(count))
+        elif isinstance(request, Restore):
+            self._restore(request)
+        elif isinstance(request, WatchCameras) and request.cameras:
+            self._draw(request)
+
+    def _step(self) -> None:
+        # Every body moves on by a centimetre.
+        moved = self._lived[-1].poses + np.array([0.01, 0, 0, 0, 0, 0, 0], np.float32)
+        action = np.zeros((self._task.num_envs, len(self._task.actions)), np.float32)
+        self._send(replace(self._at(moved, self._lived[-1].elapsed_steps + 1), action=action), ())
+
+    def _restore(self, request: Restore) -> None:
+        poses, elapsed = self._lived[-1].poses.copy(), self._lived[-1].elapsed_steps.copy()
+        before, envs = self._lived[request.origin], list(request.env_idx)
+        poses[envs] = before.poses[list(request.source)]
+        elapsed[envs] = before.elapsed_steps[list(request.source)]
+        restored = Restored(request.env_idx, request.source, request.origin, request.undoes, {})
+        self._send(self._at(poses, elapsed), request.env_idx, restored=restored)
+
+    def _at(self, poses: np.ndarray, elapsed: np.ndarray) -> StepResult:
+        return replace(step_of(poses, **self._evaluate(elapsed)), elapsed_steps=elapsed)
+
+    def _send(self, step: StepResult, envs: Any, **more: Any) -> None:
+        self._lived.append(step)
+        begins = np.isin(np.arange(self._task.num_envs), list(envs))
+        number = len(self._lived)
+        self._tell(Stepped(step, begins, snapshot=b"a moment", part_keys=(), number=number, **more))
+
+    def _draw(self, request: WatchCameras) -> None:
+        grey = np.full((6, 8, 3), 128, np.uint8)
+        pose = np.array([1, 0, 0.5, 1, 0, 0, 0], np.float32)
+        wanted = [Picture(one.name, one.kind, request.env, pose, grey) for one in request.cameras]
+        self._tell(Pictures(tuple(wanted), 1.0, (len(self._lived),) * len(wanted)))
+
+
+def scripted(num_envs: int, evaluate: Evaluate = no_success) -> Callable[..., KeptWorker]:
+    """For `Session`'s ``make_worker``: the table scene with so many envs and one camera."""
+    geometry, poses = table_scene(num_envs)
+    # No file of it is there to be followed.
+    task = replace(description(geometry, (camera(),)), file=None, source_files=(), source={})
+    return partial(ScriptedWorker, task, poses, evaluate)  # type: ignore[return-value]

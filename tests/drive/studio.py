@@ -1,0 +1,81 @@
+"""The Studio tab, used with mouse and keys."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from playwright.sync_api import FloatRect, Page
+
+from tests.drive.page import picture_of_view
+from tests.drive.waiting import until
+
+WIDTH, HEIGHT = 1080, 640
+VIEW: FloatRect = {"x": 40, "y": 0, "width": WIDTH - 390, "height": HEIGHT - 200}
+"""The 3-D view, less what lies over it."""
+
+
+def choose(page: Page, name: str) -> None:
+    page.locator("input[aria-haspopup=listbox]:visible").first.click()
+    page.get_by_role("option", name=name, exact=True).click()
+
+
+def tool(page: Page, name: str) -> dict:
+    """A pill, found and looked at in one go: the row is replaced when its state changes."""
+    found: list[dict] = []
+
+    def find() -> bool:
+        found[:] = page.evaluate(
+            """n => [...document.querySelectorAll('.wb-tools .wb-pill')].filter(e => e.textContent === n).map(e => {
+                e.scrollIntoView({block: 'nearest'});
+                const r = e.getBoundingClientRect();
+                return {classes: e.className, at: [r.x + r.width / 2, r.y + r.height / 2]};
+            })""",
+            name,
+        )
+        return bool(found)
+
+    until(find, name)
+    return found[0]
+
+
+def press(page: Page, name: str) -> None:
+    page.mouse.click(*tool(page, name)["at"])
+
+
+def numbers(page: Page, label: str) -> list[float]:
+    return page.evaluate(
+        """l => {
+            let e = [...document.querySelectorAll('label')].find(e => e.textContent === l);
+            while (!e.querySelector('input')) e = e.parentElement;
+            return [...e.querySelectorAll('input')].map(i => Number(i.value));
+        }""",
+        label,
+    )
+
+
+def view(page: Page) -> NDArray[np.int64]:
+    return picture_of_view(page, VIEW).astype(np.int64)
+
+
+def picture(page: Page) -> str:
+    """What the picture shows, as text that can be compared."""
+    return page.evaluate(
+        """() => {
+            const image = [...document.querySelectorAll("img[src^='blob:']")].find(i => i.offsetParent);
+            if (!image?.naturalWidth) return '';
+            const canvas = document.createElement('canvas');
+            [canvas.width, canvas.height] = [image.naturalWidth, image.naturalHeight];
+            canvas.getContext('2d').drawImage(image, 0, 0);
+            return canvas.toDataURL();
+        }"""
+    )
+
+
+def field(page: Page, label: str, number: int = 1) -> str:
+    """XPath: viser's fields are not tied to their labels."""
+    return f"(//label[text()='{label}']/ancestor::*[.//input][1]//input)[{number}]"
+
+
+def option(page: Page, label: str, name: str) -> None:
+    page.locator(field(page, label)).click()
+    page.get_by_role("option", name=name, exact=True).click()

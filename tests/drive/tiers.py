@@ -1,0 +1,111 @@
+"""What a test needs is said by its fixtures, which give it its marker; `--fast` runs those that need nothing.
+
+In that run a test that starts a process or renders all the same fails with the name of the fixture that it lacks.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from workbench.machine.chromium import find_chromium, how_to_get_chromium
+
+MARKER_OF = {"chromium_path": "browser", "child_process": "process", "renderer": "render"}
+STARTS_A_PROCESS = {"subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.spawn", "os.system"}
+
+
+@pytest.fixture(scope="session")
+def chromium_path(child_process: None) -> str:
+    """Path of the Chromium to give to Playwright as ``executable_path``. Without one the test fails."""
+    path = find_chromium()
+    if path is None:
+        pytest.fail(how_to_get_chromium())
+    return path
+
+
+@pytest.fixture(scope="session")
+def child_process() -> None:
+    """For whatever starts a process: a worker, a reader of recordings, a command, ffmpeg."""
+
+
+@pytest.fixture(scope="session")
+def renderer() -> None:
+    """For whatever renders in the tests' process. The device is kept: with the last one go its shaders, 5 s an env."""
+    from workbench.core.render_device import keep_render_device
+
+    keep_render_device("cpu")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    words = "only tests that are quick and need no process, renderer or browser; each is held to it"
+    parser.addoption("--fast", action="store_true", help=words)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("fast"):
+        config.pluginmanager.register(Guard())
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    for fixture in MARKER_OF.keys() & set(getattr(item, "fixturenames", ())):
+        item.add_marker(MARKER_OF[fixture])
+
+
+class Guard:
+    """Leaves out what is not fast, and fails what starts a process or makes a renderer without the fixture."""
+
+    def __init__(self) -> None:
+        self.running = False
+        self.refused: list[str] = []
+        sys.addaudithook(self.heard)
+
+    def heard(self, event: str, args: tuple[Any, ...]) -> None:
+        if event in STARTS_A_PROCESS:
+            self.refuse(f"it starts a process ({event} {args[:2]!r:.200})", "child_process")
+
+    def refuse(self, what: str, fixture: str) -> None:
+        if self.running:
+            self.refused.append(
+                f"{what}: let it, or the fixture that does, ask for the fixture `{fixture}`, which marks it "
+                f"`{MARKER_OF[fixture]}`"
+            )
+            pytest.fail(self.refused[-1])
+
+    def pytest_collection_modifyitems(self, config: pytest.Config, items: list[pytest.Item]) -> None:
+        left_out = (*MARKER_OF.values(), "thorough", "slow")
+        fast, others = [], []
+        for item in items:
+            (others if any(map(item.get_closest_marker, left_out)) else fast).append(item)
+        config.hook.pytest_deselected(items=others)
+        items[:] = fast
+
+    def pytest_collection_finish(self) -> None:
+        render: Any = sys.modules.get("sapien.render")
+        if render is None:
+            return
+        make = render.RenderSystem.__init__
+
+        def refuse(system: Any, *args: Any, **kwargs: Any) -> None:
+            self.refuse("it renders", "renderer")
+            make(system, *args, **kwargs)
+
+        render.RenderSystem.__init__ = refuse
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self) -> Iterator[None]:
+        self.running = True
+        try:
+            return (yield)
+        finally:
+            self.running = False
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_call(self) -> Iterator[None]:
+        """What a thread, or code that catches everything, was refused fails the test as well."""
+        self.refused.clear()
+        yield
+        if self.refused:
+            pytest.fail(self.refused[0])

@@ -1,0 +1,63 @@
+"""``pytest --fast`` leaves out what needs a process, a renderer or a browser, and fails what does not say so."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+TESTS = """
+import os, subprocess, sys, threading
+import sapien
+import pytest
+
+def test_plain(): pass
+
+def test_says_so(child_process): subprocess.run(["true"], check=True)
+def test_says_nothing(): subprocess.run(["true"], check=True)
+def test_forks():
+    if os.fork() == 0: os._exit(0)
+def test_in_a_thread():
+    thread = threading.Thread(target=os.system, args=("true",))
+    thread.start()
+    thread.join()
+def test_swallowed():
+    try: subprocess.run(["true"])
+    except BaseException: pass
+
+def test_renders(renderer): sapien.render.RenderSystem(sapien.Device("cpu"))
+def test_renders_unsaid(): sapien.render.RenderSystem(sapien.Device("cpu"))
+
+@pytest.fixture(scope="module")
+def worker(child_process): subprocess.run(["true"], check=True)
+def test_by_a_fixture(worker): pass
+def test_in_a_browser(chromium_path): pass
+@pytest.mark.slow
+def test_that_takes_long(): pass
+"""
+
+
+def test_only_what_needs_nothing_is_fast_and_the_rest_is_named_its_fixture(
+    child_process: None, tmp_path: Path
+) -> None:
+    (tmp_path / "conftest.py").write_text('pytest_plugins = ["tests.drive.tiers"]\n')
+    (tmp_path / "test_all.py").write_text(TESTS)
+    markers = "browser process render slow".split()
+    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers =\n  " + "\n  ".join(markers))
+    said = subprocess.run(
+        [sys.executable, "-m", "pytest", "--fast", "-rA", "-p", "no:cacheprovider", str(tmp_path)],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    ).stdout
+    outcomes = {
+        name: outcome for outcome, name in re.findall(r"^(PASSED|FAILED) \S+::(\w+)", said, re.MULTILINE)
+    }
+    unsaid = ("test_says_nothing", "test_forks", "test_in_a_thread", "test_swallowed", "test_renders_unsaid")
+    assert outcomes == {"test_plain": "PASSED", **dict.fromkeys(unsaid, "FAILED")}, said
+    assert " 5 deselected" in said and "fixture `renderer`" in said, said
+    assert said.count("ask for the fixture `child_process`") >= 4, said
