@@ -1,0 +1,183 @@
+"""What every command says of itself, how it ends, and the shape of what it writes, held against the texts in ``cli/``.
+
+Where one is meant to be another, WORKBENCH_RENEW=1 writes them anew, and the difference is read before it is committed:
+
+    WORKBENCH_RENEW=1 .venv/bin/python -m pytest tests/golden/test_cli.py
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+import sys
+from pathlib import Path
+from typing import Any, NoReturn
+
+import pytest
+
+from tests.golden.make import GOLDEN
+from workbench import cli
+from workbench.exit_codes import Exit
+
+TEXTS = Path(__file__).parent / "cli"
+COMMANDS = ("open", "record", "review", "rescore", "share", "export", "view", "doctor")
+CALLS = {
+    "workbench": ["", "nonsense", "open --nonsense", "record"],
+    "open": [
+        "open gone.py",
+        "open gone.package:Task",
+        "open push.py --num-envs many",
+        "open push.py --num-envs 0",
+        "open push.py --backend quantum",
+        "open push.py --env control_mode",
+        "open push.py --history much",
+        "open push.py --memory-limit much",
+        "open push.py --host 0.0.0.0 --no-token",
+        "open push.py --debug --socket here",
+    ],
+    "record": [
+        "record gone.py",
+        "record push.py --episodes 0",
+        "record push.py --episodes 1 --successes 1",
+        "record push.py --workers 2 --debug",
+        "record push.py --actions gone.npy",
+        "record push.py --use-env-states",
+        "record push.py --out push.py",
+        "record broken.py --no-pictures --episodes 1",
+    ],
+    "review": ["review gone", "review made --task gone.py", "review made --host 0.0.0.0 --no-token"],
+    "rescore": [
+        "rescore",
+        "rescore gone",
+        "rescore empty",
+        "rescore push.py",
+        "rescore made --task push.py --recorded-source",
+        "rescore made --csv gone/table.csv",
+        "rescore made",
+    ],
+    "share": [
+        "share gone --sheet",
+        "share made",
+        "share empty --sheet",
+        "share made --mp4 gone --out shared",
+        "share made --sheet --out shared",
+    ],
+    "export": [
+        "export made",
+        "export gone --lerobot set",
+        "export made --lerobot set --fps 0",
+        "export made --lerobot made",
+        "export made --lerobot set --cameras gone",
+    ],
+    "view": ["view gone.rrd", "view push.py", "view empty"],
+}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a task, one that raises, recordings from elsewhere and an empty folder."""
+    folder = tmp_path_factory.mktemp("place")
+    for file in (GOLDEN / "tasks" / "push").iterdir():
+        if file.is_file():
+            shutil.copy(file, folder)
+    shutil.copytree(GOLDEN / "v1" / "tagged", folder / "made")
+    (folder / "empty").mkdir()
+    text = (folder / "push.py").read_text()
+    assert "> WANTED" in text
+    (folder / "broken.py").write_text(text.replace("> WANTED", "> WANTED.gone"))
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def plain_terminal(monkeypatch: pytest.MonkeyPatch, place: Path) -> None:
+    """A hundred columns, no colours, no screen, the same folder; and a page that is opened all the same ends no tests."""
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("NO_COLOR", "1")
+    for name in ("FORCE_COLOR", "DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.chdir(place)
+
+    def leave(code: int) -> NoReturn:
+        raise AssertionError(f"a page was opened, which ends the process with {code}")
+
+    monkeypatch.setattr(os, "_exit", leave)
+
+
+def run(capsys: pytest.CaptureFixture[str], call: str) -> tuple[int, str]:
+    """Exit code and all that it says but bars and calls of a traceback, with nothing in it that belongs to this machine."""
+    with pytest.raises(SystemExit) as ended:
+        cli.main(shlex.split(call))
+    told = capsys.readouterr()
+    said = (told.out + told.err).replace(os.getcwd(), "HERE").replace(sys.executable, "PYTHON")
+    said = re.sub(r"^Traceback .*\n(?: .*\n)*", "", said, flags=re.MULTILINE)
+    lines = [line.rstrip() for line in said.splitlines()]
+    return int(ended.value.code or 0), "\n".join(line for line in lines if not is_bar(line)).strip()
+
+
+def is_bar(line: str) -> bool:
+    """With how long it takes, and how long it may take yet."""
+    return "━" in line or line.endswith("-:--:--")
+
+
+def holds(name: str, text: str) -> None:
+    """`text` is the one that is kept under this name, or becomes it."""
+    path = TEXTS / name
+    if os.environ.get("WORKBENCH_RENEW"):
+        path.write_text(text + "\n")
+    assert text + "\n" == path.read_text()
+
+
+def shape(value: Any) -> Any:
+    """The same with types in place of values; of a list, the shapes that are in it."""
+    if isinstance(value, dict):
+        return {key: shape(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        shapes = [shape(entry) for entry in value]
+        return [one for k, one in enumerate(shapes) if one not in shapes[:k]]
+    return type(value).__name__
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code, said = run(capsys, f"{command} --help")
+    assert code == Exit.DONE
+    holds(f"help_{command}.txt", said)
+
+
+def test_every_command_is_held(capsys: pytest.CaptureFixture[str]) -> None:
+    code, said = run(capsys, "--help")
+    assert code == Exit.DONE
+    assert f"{{{','.join(COMMANDS)}}}" in said
+    holds("help.txt", said)
+
+
+@pytest.mark.usefixtures("child_process", "renderer")
+@pytest.mark.parametrize("command", CALLS)
+def test_how_calls_end(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    ends = []
+    for call in CALLS[command]:
+        code, said = run(capsys, call)
+        ends.append(f"$ workbench {call}".rstrip() + f"\n{said}\n-> {code}\n")
+    holds(f"ends_{command}.txt", "\n".join(ends))
+
+
+@pytest.mark.usefixtures("child_process", "renderer")
+def test_what_is_written_for_programs(capsys: pytest.CaptureFixture[str]) -> None:
+    """The table of rescore, and what a recording says of itself."""
+    code, _ = run(capsys, "record push.py --episodes 1 --max-steps 2 --no-pictures --out new")
+    assert code == Exit.DONE
+    (path,) = Path("new").glob("*.json")
+    holds("recording.json", json.dumps(shape(json.loads(path.read_text())), indent=1))
+    code, _ = run(capsys, "rescore new --task push.py --json table.json --csv table.csv")
+    assert code == Exit.DONE
+    holds("rescore.json", json.dumps(shape(json.loads(Path("table.json").read_text())), indent=1))
+    holds("rescore.csv", Path("table.csv").read_text().splitlines()[0])
+
+
+def test_no_text_is_left_over() -> None:
+    ours = {"help.txt", "recording.json", "rescore.json", "rescore.csv"}
+    ours |= {f"help_{command}.txt" for command in COMMANDS} | {f"ends_{command}.txt" for command in CALLS}
+    assert {path.name for path in TEXTS.iterdir()} == ours

@@ -1,0 +1,61 @@
+"""Which part of the workbench may import which."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "workbench"
+BELOW = {
+    "ui": {"session", "authoring", "recording", "core", "machine"},
+    "session": {"authoring", "recording", "core", "machine"},
+    "authoring": {"core", "machine"},
+    "recording": {"core", "machine"},
+    "core": {"machine"},
+    "machine": set(),
+}
+"""Each part, and those that it may import. Modules beside them are the commands, which nothing imports."""
+OF_NO_PART = {"web_assets"}
+"""Where the files of the page are."""
+
+
+def imported(file: Path) -> Iterator[tuple[int, str]]:
+    """Line and name below the package; also within functions, and of types alone."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        names: list[str] = []
+        if isinstance(node, ast.ImportFrom) and node.module == "workbench":
+            names = [f"workbench.{alias.name}" for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names = [node.module]
+        elif isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        for name in names:
+            if name.startswith("workbench."):
+                yield getattr(node, "lineno", 0), name.split(".")[1]
+
+
+@pytest.mark.parametrize("part", BELOW)
+def test_imports_run_one_way(part: str) -> None:
+    files = list((PACKAGE / part).rglob("*.py"))
+    assert files
+    wrong = [
+        f"{file.relative_to(PACKAGE)}:{line} imports {name}"
+        for file in files
+        for line, name in imported(file)
+        if name not in {part, *BELOW[part], *OF_NO_PART}
+    ]
+    assert wrong == []
+
+
+def test_the_page_is_the_only_part_that_knows_viser() -> None:
+    knowing = {
+        file.relative_to(PACKAGE).parts[0]
+        for file in PACKAGE.rglob("*.py")
+        for node in ast.walk(ast.parse(file.read_text()))
+        if (isinstance(node, ast.Import) and any(a.name.split(".")[0] == "viser" for a in node.names))
+        or (isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "viser")
+    }
+    assert knowing == {"ui"}

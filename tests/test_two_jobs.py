@@ -1,0 +1,228 @@
+"""Two jobs at once of which one is killed: the other comes to its result, the end is told, the next of its kind works."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from tests.drive.waiting import until
+from tests.golden.make import GOLDEN
+from workbench.recording.episode import Episode
+from workbench.recording.read_episode import read_episode
+from workbench.recording.sources import sources_among
+from workbench.session.clearance import Clearances
+from workbench.session.rescore import find_episodes
+from workbench.session.rescorer import Rescorer
+from workbench.ui.make_shared import Wanted
+from workbench.ui.making import Making
+
+pytestmark = pytest.mark.usefixtures("child_process")
+PATIENCE = 200.0
+ROWS_ARE_KEPT = 1.0
+"""Seconds: README says that nothing but the last one is lost."""
+POLICY = """
+import time
+from pathlib import Path
+import torch
+
+steps = 0
+
+def act(obs):
+    global steps
+    steps += 1
+    if steps == 4:
+        Path("NAME.waits").touch()
+        while not Path("NAME.may").exists():
+            time.sleep(0.02)
+    return torch.tensor([0.8, 0.1]).repeat(len(obs), 1)
+"""
+
+
+# --- two processes of the page --------------------------------------------------------------------------
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    """A golden recording with a camera, and beside it the task that it names."""
+    for name in ("tasks", "v1/cameras"):
+        shutil.copytree(GOLDEN / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+    return tmp_path
+
+
+class Judging:
+    def __init__(self, place: Path) -> None:
+        self._files = find_episodes((place / "v1",))
+        self._rescorer = Rescorer(Clearances(all_trusted=True))
+
+    def start(self) -> None:
+        self._rescorer.start(self._files)
+
+    def pids(self) -> list[int]:
+        found = running("workbench.session.worker_start")
+        # Each has a keeper above it of the same name.
+        return [process.pid for process in found if not process.children()]
+
+    def ended(self) -> bool:
+        return self._rescorer.view.state in ("done", "failed")
+
+    def told(self) -> str:
+        return self._rescorer.view.why
+
+    def assert_right(self) -> None:
+        (verdict,) = self._rescorer.view.verdicts
+        assert (verdict.why_not, verdict.differs, verdict.length) == ("", False, 8)
+
+    def close(self) -> None:
+        self._rescorer.close()
+
+
+class Filming:
+    def __init__(self, place: Path) -> None:
+        self._wanted = Wanted("film", sources_among([place / "v1"]), place / "films", "eye")
+        self._making = Making()
+
+    def start(self) -> None:
+        assert self._making.start(self._wanted)
+
+    def pids(self) -> list[int]:
+        return [process.pid for process in running("workbench.ui.making_process")]
+
+    def ended(self) -> bool:
+        return not self._making.view().running
+
+    def told(self) -> str:
+        return self._making.view().problem
+
+    def assert_right(self) -> None:
+        ((film,),) = (made.paths for made in self._making.view().made)
+        assert film.suffix == ".mp4" and film.stat().st_size > 1000
+        assert list(film.parent.iterdir()) == [film]
+
+    def close(self) -> None:
+        self._making.close()
+
+
+def running(module: str) -> list[psutil.Process]:
+    found = []
+    for process in psutil.Process().children(recursive=True):
+        try:
+            if module in process.cmdline():
+                found.append(process)
+        except psutil.NoSuchProcess:
+            continue
+    return found
+
+
+@pytest.fixture
+def jobs(place: Path) -> Iterator[list[Judging | Filming]]:
+    jobs = [Judging(place), Filming(place)]
+    yield jobs
+    for job in jobs:
+        job.close()
+
+
+@pytest.mark.parametrize("which", [0, 1], ids=["judging", "filming"])
+def test_of_two_processes_of_a_page_one_is_killed(jobs: list[Judging | Filming], which: int) -> None:
+    killed, other = jobs[which], jobs[1 - which]
+    held: dict[int, int] = {}
+    for number, job in enumerate(jobs):
+        job.start()
+        until(lambda job=job: bool(job.pids()) or job.ended(), "the process")
+        (held[number],) = job.pids()
+        # It stands still, so that both are under way when one is killed.
+        os.kill(held[number], signal.SIGSTOP)
+    assert not killed.ended() and not other.ended()
+    os.kill(held[which], signal.SIGKILL)
+    until(killed.ended, "the end of the killed one")
+    assert killed.told().lower().startswith("the process that ") and "was killed by SIGKILL" in killed.told()
+    assert not other.ended()
+    os.kill(held[1 - which], signal.SIGCONT)
+    until(other.ended, "the end of the other")
+    assert other.told() == ""
+    other.assert_right()
+    killed.start()
+    until(killed.ended, "the end of the next")
+    assert killed.told() == ""
+    killed.assert_right()
+
+
+# --- two commands ---------------------------------------------------------------------------------------
+
+
+@contextmanager
+def recording(folder: Path, name: str, seed: int) -> Iterator[subprocess.Popen[str]]:
+    """``workbench record`` with a policy that waits before its fourth step until it may go on; killed if it has not ended."""
+    (folder / f"{name}.py").write_text(POLICY.replace("NAME", name))
+    command = [
+        sys.executable,
+        "-m",
+        "workbench.cli",
+        "record",
+        "push.py",
+        "--out",
+        "out",
+        "--seed",
+        str(seed),
+    ]
+    command += ["--actions", f"{name}.py:act", "--episodes", "1", "--num-envs", "1", "--no-pictures"]
+    command += ["--env", "render_backend=none"]
+    process = subprocess.Popen(
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+    with process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.slow
+def test_of_two_that_record_into_one_folder_one_is_killed(tmp_path: Path) -> None:
+    folder = tmp_path / "author"
+    shutil.copytree(GOLDEN / "tasks" / "push", folder, ignore=shutil.ignore_patterns("__pycache__"))
+    journals = folder / "out" / ".writing"
+    with ExitStack() as ending:
+        one, other = (ending.enter_context(recording(folder, *which)) for which in (("one", 9), ("other", 7)))
+        until(lambda: (folder / "one.waits").exists() and (folder / "other.waits").exists(), "both")
+        until(lambda: len(list(journals.glob("*.arrow"))) == 2, "both journals")
+        time.sleep(ROWS_ARE_KEPT)
+        one.kill()
+        assert one.wait() == -signal.SIGKILL and other.poll() is None
+        (folder / "other.may").touch()
+        said, _ = other.communicate(timeout=PATIENCE)
+        assert other.returncode == 0, said
+        (path,) = (folder / "out").glob("*.json")
+        assert_recorded(read_episode(path), "tagged", 8)
+        assert len(list(journals.glob("*.arrow"))) == 1, "what the killed one left is for the next"
+
+        (folder / "next.may").touch()
+        third = ending.enter_context(recording(folder, "next", 6))
+        said, _ = third.communicate(timeout=PATIENCE)
+        assert third.returncode == 0 and re.search("1 episode that an earlier recording left .* mended", said)
+    episodes = {episode.info.seed: episode for episode in map(read_episode, (folder / "out").glob("*.json"))}
+    assert sorted(episodes) == [6, 7, 9] and not journals.exists()
+    assert episodes[9].info.recovered and not episodes[6].info.recovered
+    assert_recorded(episodes[9], "recovered", 3)
+
+
+def assert_recorded(episode: Episode, kind: str, length: int) -> None:
+    """It is the golden one of this kind, which has the same seed and actions, or its beginning."""
+    (path,) = (GOLDEN / "v1" / kind).glob("*.json")
+    golden = read_episode(path)
+    assert episode.length == length
+    np.testing.assert_allclose(episode.reward, golden.reward[:length], atol=1e-3)
+    np.testing.assert_array_equal(episode.action, golden.action[:length])
+    for name, rows in golden.env_states.items():
+        np.testing.assert_allclose(episode.env_states[name], rows[: length + 1], atol=1e-3)
