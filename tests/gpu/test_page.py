@@ -1,0 +1,55 @@
+"""What the page rests on: a worker plays the task and draws its pictures. Its rates are printed, not judged."""
+
+# pyright: reportOptionalMemberAccess=false
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.drive.session import wait_until
+from tests.gpu.conftest import Simulation, Told
+from workbench.session.messages import CameraRequest, TaskOptions
+from workbench.session.session import Session
+
+TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"
+STEPS, PICTURES = 100, 5
+N = 16
+
+
+@pytest.fixture
+def session(simulation: Simulation, renderer: str, tmp_path: Path) -> Iterator[Session]:
+    session = Session(str(TASK), TaskOptions(num_envs=N, backend=simulation), recordings=tmp_path)
+    wait_until(session, lambda view: view.task is not None, "the first load")
+    yield session
+    session.close()
+
+
+@pytest.mark.slow
+def test_it_plays_with_pictures(session: Session, simulation: Simulation, told: Told) -> None:
+    assert ("gpu" in session.view().task.backend) == (simulation == "gpu")
+    session.set_clients(1)
+    session.watch_cameras((CameraRequest("base_camera", "sensor", ("rgb",)),))
+    session.set_speed(float("inf"))
+    session.play()
+    first = wait_until(
+        session, lambda v: bool(v.pictures) and bool(v.step.elapsed_steps.any()), "a first picture"
+    )
+    begun = time.monotonic()
+    view = wait_until(
+        session,
+        lambda v: (
+            v.step_serial >= first.step_serial + STEPS
+            and v.pictures_serial >= first.pictures_serial + PICTURES
+        ),
+        "steps and pictures",
+    )
+    took = time.monotonic() - begun
+    assert view.problem is None
+    told(
+        f"{simulation}: {(view.step_serial - first.step_serial) / took:.0f} control steps/s of {N} envs, "
+        f"{(view.pictures_serial - first.pictures_serial) / took:.1f} pictures/s beside them"
+    )

@@ -1,0 +1,117 @@
+"""Pictures: what the GPU draws is what the batched CPU draws of the same state, and a pose that was not applied is in both."""
+
+# ManiSkill annotates an env's members as the widest thing they may be in any task.
+# pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportOptionalSubscript=false
+# pyright: reportCallIssue=false
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
+from mani_skill.utils.structs.pose import Pose
+
+from tests.gpu.conftest import Simulation
+from workbench.core.take_pictures import take_pictures
+from workbench.core.task_env import EnvOptions, make_env
+
+N = 2
+MODE = "rgb+depth+segmentation"
+SENSOR = ("base_camera", "sensor", ("rgb", "depth", "segmentation"))
+
+pytestmark = pytest.mark.filterwarnings("ignore::workbench.core.strict.RuleWarning")
+
+
+@pytest.fixture(scope="module")
+def pushes(simulation: Simulation, renderer: str) -> Iterator[tuple[Any, Any]]:
+    """PushCube on the backend that is looked at, and on the batched CPU, in one state."""
+
+    def opened(backend: Simulation) -> Any:
+        kwargs = {"obs_mode": MODE, "render_backend": renderer}
+        return make_env(PushCubeEnv, EnvOptions(N, backend, kwargs=kwargs))
+
+    looked_at, judge = opened(simulation), opened("cpu")
+    yield looked_at, judge
+    looked_at.close()
+    judge.close()
+
+
+@pytest.fixture
+def in_one_state(pushes: tuple[Any, Any]) -> tuple[Any, Any]:
+    looked_at, judge = pushes
+    judge.reset(seed=[3, 4])
+    looked_at.reset(seed=[3, 4])
+    state = judge.get_state_dict()
+    looked_at.set_state_dict(
+        {kind: {name: row.to(looked_at.device) for name, row in rows.items()} for kind, rows in state.items()}
+    )
+    for env in pushes:
+        env.scene._gpu_apply_all()
+        env.scene.px.gpu_update_articulation_kinematics()
+        env.scene._gpu_fetch_all()
+    return looked_at, judge
+
+
+def seen(env: Any) -> dict[str, np.ndarray]:
+    data = env.get_obs(env.evaluate())["sensor_data"]["base_camera"]
+    return {name: picture.cpu().numpy() for name, picture in data.items()}
+
+
+def cube_pixels(env: Any, segmentation: np.ndarray) -> list[int]:
+    return [int((row == int(env.obj.per_scene_id[i])).sum()) for i, row in enumerate(segmentation)]
+
+
+def test_the_same_state_gives_the_same_picture(in_one_state: tuple[Any, Any]) -> None:
+    (env, judge), (here, there) = in_one_state, map(seen, in_one_state)
+    names = {
+        backend: {int(k): v.name for k, v in backend.segmentation_id_map.items()} for backend in in_one_state
+    }
+    assert set(names[env].values()) == set(names[judge].values())
+    for picture in ("rgb", "depth", "segmentation"):
+        assert here[picture].shape == there[picture].shape and here[picture].dtype == there[picture].dtype
+    name_of = np.vectorize(lambda number, table: table.get(number, "-"), otypes=[object])
+    same = name_of(here["segmentation"], names[env]) == name_of(there["segmentation"], names[judge])
+    assert same.mean() > 0.99, "edges may fall on the other side of a pixel, no more"
+    inside = same[..., 0]
+    np.testing.assert_allclose(
+        np.median(np.abs(here["depth"][inside].astype(int) - there["depth"][inside].astype(int))), 0, atol=2
+    )
+    assert np.abs(here["rgb"].astype(int) - there["rgb"].astype(int)).mean() < 8
+
+
+def test_the_page_s_picture_of_an_env_is_what_the_env_observes(in_one_state: tuple[Any, Any]) -> None:
+    env, _ = in_one_state
+    observed = seen(env)
+    for number in range(N):
+        (picture,) = take_pictures(env, number, [SENSOR])
+        np.testing.assert_array_equal(picture.segmentation, observed["segmentation"][number, ..., 0])
+        np.testing.assert_array_equal(picture.rgb, observed["rgb"][number])
+
+
+def test_a_pose_that_was_set_and_not_applied_is_in_the_picture(in_one_state: tuple[Any, Any]) -> None:
+    counted = []
+    for env in in_one_state:
+        before = cube_pixels(env, seen(env)["segmentation"])
+        away = env.obj.pose.raw_pose.clone()
+        away[1:, 2] += 50
+        env.obj.set_pose(Pose.create(away))
+        after = cube_pixels(env, seen(env)["segmentation"])
+        env.step(torch.zeros(env.action_space.shape, device=env.device))
+        again = cube_pixels(env, seen(env)["segmentation"])
+        assert all(before) and after[0] and not after[1] and all(again), "hidden, and back with the next step"
+        counted.append(after)
+    assert counted[0][0] == pytest.approx(counted[1][0], rel=0.1)
+
+
+@pytest.mark.gpu
+def test_cpu_simulation_is_drawn_by_the_gpu(renderer: str) -> None:
+    env = make_env(PushCubeEnv, EnvOptions(N, "cpu", kwargs={"obs_mode": "rgb"}))
+    assert renderer == "gpu" and env.backend.render_backend == "sapien_cuda"
+    obs, _ = env.reset(seed=0)
+    rgb = obs["sensor_data"]["base_camera"]["rgb"]
+    assert rgb.shape == (N, 128, 128, 3) and rgb.float().std() > 1
+    env.close()

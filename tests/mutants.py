@@ -1,0 +1,396 @@
+"""Would a test notice? Single slips are planted in a module, and the tests that protect it are run on each.
+
+Not a test: ``make mutants MODULES="ui/gate core/snapshot"`` runs it, ``MODULES=all`` all of `PROTECTED`. Cosmic Ray
+makes the slips; the rest is here: which of them, in a copy of the tree, and by which tests they should be found.
+"""
+
+# pyright: reportMissingImports=false
+# Cosmic Ray comes with `make mutants`, not with what lint and the tests need.
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import tomllib
+from cosmic_ray.ast import ast_nodes, get_ast
+from cosmic_ray.mutating import mutate_code
+from cosmic_ray.operators.operator import Operator
+from cosmic_ray.plugins import get_operator
+from parso.python.tree import Keyword
+
+ROOT = Path(__file__).resolve().parents[1]
+REASONS = ROOT / "tests" / "mutants_that_live.toml"
+LAST = ROOT / "build" / "mutants"
+"""What the last run found, a file for each module: ``--lived`` runs those that lived again."""
+ENOUGH = 85
+"""Percent of a module's mutants that have to die."""
+
+PROTECTED = {
+    "recording/journal": "recording/test_journal.py",
+    "recording/recover": "recording/test_recover.py",
+    "recording/trash": "recording/test_trash.py",
+    "authoring/registry": "authoring/test_registry.py",
+    "authoring/modules": "authoring/test_load.py",
+    "core/snapshot": "core/test_snapshot.py",
+    "core/partial_reset": "core/test_partial_reset.py",
+    "core/task_env": "core/test_task_env.py",
+    "core/contacts": "core/test_contact_queries.py",
+    "session/history": "session/test_history.py",
+    "session/outliers": "session/test_outlier_watch.py",
+    "session/kept_worker": "session/test_kept_worker.py",
+    "ui/gate": "ui/test_gate.py",
+    "ui/door": "ui/test_door.py ui/test_socket_and_renewal.py ui/test_strangers.py::test_a_page_that_has_shown_the_token_is_not_hurried"
+    " ui/test_strangers.py::test_what_is_turned_away_is_counted_and_told_once_of_each_kind"
+    " ui/test_strangers.py::test_what_was_not_told_yet_is_told_at_the_end_with_the_total"
+    " -k 'not nothing_is_printed and not command and not palette and not many_that_start'",
+    "ui/replies": "ui/test_replies.py",
+    "ui/file_reply": "ui/test_file_reply.py",
+}
+"""The tests below ``tests/`` that should notice a slip in a module below ``workbench/``: the fast ones among them, since
+each mutant runs them all until one fails."""
+
+# Each operator with slips that people make; Cosmic Ray's other replacements (a division for a concatenation) die of a
+# TypeError, and would only make the share of dead mutants look better.
+_CORE = (
+    *("AddNot", "ReplaceTrueWithFalse", "ReplaceFalseWithTrue", "ReplaceAndWithOr", "ReplaceOrWithAnd"),
+    *("ReplaceBreakWithContinue", "ReplaceContinueWithBreak", "ExceptionReplacer", "NumberReplacer"),
+    *("ZeroIterationForLoop", "ReplaceUnaryOperator_Delete_Not", "ReplaceUnaryOperator_Delete_USub"),
+    *(
+        f"ReplaceBinaryOperator_{pair}"
+        for pair in (
+            *("Add_Sub", "Sub_Add", "Mul_Div", "Div_Mul", "FloorDiv_Mul", "Mod_Mul", "Pow_Mul"),
+            *("LShift_RShift", "RShift_LShift", "BitOr_BitAnd", "BitAnd_BitOr"),
+        )
+    ),
+    *(
+        f"ReplaceComparisonOperator_{pair}"
+        for pair in (
+            *("Eq_NotEq", "NotEq_Eq", "Is_IsNot", "IsNot_Is"),
+            *("Lt_LtE", "Lt_GtE", "LtE_Lt", "LtE_Gt", "Gt_GtE", "Gt_LtE", "GtE_Gt", "GtE_Lt"),
+        )
+    ),
+)
+
+
+class LeaveOut(Operator):
+    """A line that is forgotten: a call, a raise, or an assignment to something that outlives the function."""
+
+    def mutation_positions(self, node: Any) -> Iterator[tuple[Any, Any]]:
+        if node.type == "simple_stmt" and self._may_be_missed(node.children[0]):
+            yield node.children[0].start_pos, node.children[0].end_pos
+
+    def mutate(self, node: Any, index: int) -> Any:
+        statement = node.children[0]
+        node.children[0] = Keyword("pass", statement.start_pos, statement.get_first_leaf().prefix)
+        return node
+
+    @classmethod
+    def examples(cls) -> tuple[()]:
+        return ()
+
+    @staticmethod
+    def _may_be_missed(statement: Any) -> bool:
+        if statement.type == "expr_stmt":
+            target, operator = statement.children[:2]
+            return (
+                target.type in ("power", "atom_expr") or operator.type == "operator" and operator.value != "="
+            )
+        return statement.type in ("power", "atom_expr", "await_expr", "raise_stmt")
+
+
+@dataclass(frozen=True)
+class Mutant:
+    module: str
+    number: int
+    """Of the line, from 1."""
+    line: str
+    becomes: str
+    """Both stripped: how `REASONS` knows it again, wherever the line moves."""
+    code: str
+    """The whole file with the slip in it."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """How a mutant ended."""
+
+    number: int
+    line: str
+    becomes: str
+    end: str
+    """``killed``, ``timed out`` or ``lived``."""
+
+
+def _is_declaration(node: Any) -> bool:
+    """Whether the node is read by people and type checkers only, or says what a class is."""
+    child, parent = node, node.parent
+    while parent is not None:
+        if parent.type == "decorator":
+            return True
+        if parent.type in ("annassign", "tfpdef") and child is not parent.children[0]:
+            # Of ``name: kind = value`` the value is code.
+            before = parent.children[parent.children.index(child) - 1]
+            if before.get_code().strip() == ":":
+                return True
+        if (
+            parent.type == "funcdef"
+            and parent.children[parent.children.index(child) - 1].get_code().strip() == "->"
+        ):
+            return True
+        if parent.type == "if_stmt" and parent.children[1].get_code().strip() == "TYPE_CHECKING":
+            return True
+        child, parent = parent, parent.parent
+    if node.type == "operator" and node.parent.type == "parameters":
+        return True  # the star between parameters
+    # A union of types that is given a name at the module's top.
+    return node.type == "operator" and node.value == "|" and _at_the_top(node)
+
+
+def _at_the_top(node: Any) -> bool:
+    while node.parent is not None:
+        if node.type in ("funcdef", "classdef", "lambdef"):
+            return False
+        node = node.parent
+    return True
+
+
+Place = tuple[tuple[int, int], tuple[int, int]]
+"""Where a slip begins and ends: line from 1 and column, each."""
+
+
+def all_slips(source: str) -> dict[Place, list[tuple[Operator, int]]]:
+    """By place, in the order of the file: the operators that can change it, and at which of their occurrences."""
+    at_place: defaultdict[Place, list[tuple[Operator, int]]] = defaultdict(list)
+    nodes = list(ast_nodes(get_ast(source)))
+    for operator in [*(get_operator(f"core/{name}")() for name in _CORE), LeaveOut()]:
+        spots = [(node, *spot) for node in nodes for spot in operator.mutation_positions(node)]
+        for occurrence, (node, start, end) in enumerate(spots):
+            # In a file that has to do with paths a slash joins them: nothing else would run.
+            joins = node.type == "operator" and node.value == "/" and "import Path\n" in source
+            if not joins and not _is_declaration(node):
+                at_place[start, end].append((operator, occurrence))
+    return {place: at_place[place] for place in sorted(at_place)}
+
+
+def _mutated(module: str, source: str, place: Place, operator: Operator, occurrence: int) -> Mutant | None:
+    try:
+        code = mutate_code(source, operator, occurrence)
+    except AttributeError:
+        return None  # Cosmic Ray has no other name for an exception of a module (asyncio.TimeoutError)
+    assert code is not None, (module, place)
+    mutant = _as_mutant(module, source, code, *place)
+    return mutant if _compiles(mutant.code) else None
+
+
+def _compiles(code: str) -> bool:
+    try:
+        compile(code, "mutant", "exec", dont_inherit=True)
+    except SyntaxError:
+        return False  # such as {*others} for {**others}: no test is needed for that
+    return True
+
+
+def _as_mutant(module: str, source: str, code: str, start: tuple[int, int], end: tuple[int, int]) -> Mutant:
+    """Of the changed file only what stands at the place: Cosmic Ray joins lines before it, and drops their comments."""
+    lines = source.splitlines(keepends=True)
+    before = "".join(lines[: start[0] - 1]) + lines[start[0] - 1][: start[1]]
+    after = lines[end[0] - 1][end[1] :] + "".join(lines[end[0] :])
+    assert code.startswith(before.rstrip()) and code.endswith(after), (module, start, end)
+    put = code[len(before.rstrip()) : len(code) - len(after)].strip()
+    becomes = (lines[start[0] - 1][: start[1]] + put + lines[end[0] - 1][end[1] :]).strip()
+    return Mutant(module, start[0], lines[start[0] - 1].strip(), becomes, before + put + after)
+
+
+def sample(module: str, count: int, seed: int) -> list[Mutant]:
+    """``count`` mutants of the module, at as many places as there are, the same ones for the same file and seed."""
+    source = (ROOT / "workbench" / f"{module}.py").read_text(encoding="utf-8")
+    chance = random.Random(f"{module} {seed}")
+    places = list(all_slips(source).items())
+    chosen: list[Mutant] = []
+    while len(chosen) < count and places:
+        chance.shuffle(places)
+        for place, slips in places:
+            mutant = _mutated(module, source, place, *slips.pop(chance.randrange(len(slips))))
+            if mutant is not None:
+                chosen.append(mutant)
+            if len(chosen) == count:
+                break
+        places = [(place, slips) for place, slips in places if slips]
+    return sorted(chosen, key=lambda mutant: (mutant.number, mutant.becomes))
+
+
+def copy_tree(into: Path) -> None:
+    """What git tracks or would: a mutant is never written into the author's own files."""
+    listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    for name in subprocess.run(listed, cwd=ROOT, check=True, capture_output=True).stdout.decode().split("\0"):
+        if name and (ROOT / name).is_file():
+            (into / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, into / name)
+
+
+def run_tests(tree: Path, module: str, seconds: float) -> str:
+    """``passed``, ``killed`` or ``timed out``."""
+    scratch = tree.parent / "t"
+    scratch.mkdir()
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(tree),
+        "TMPDIR": str(scratch),
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    tests = [f"tests/{word}" if ".py" in word else word for word in shlex.split(PROTECTED[module])]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-x",
+        "-q",
+        "-m",
+        "not slow and not browser",
+        "-p",
+        "no:cacheprovider",
+    ]
+    command += ["--hypothesis-seed=0", *tests]
+    with open(tree.parent / "output.txt", "wb") as output:
+        process = subprocess.Popen(
+            command,
+            cwd=tree,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        )
+        try:
+            code = process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            code = None
+        finally:
+            # Also what the tests started and a killed test left behind.
+            try:
+                os.killpg(process.pid, signal.SIGKILL)
+            except ProcessLookupError:
+                pass
+            process.wait()
+    shutil.rmtree(scratch, ignore_errors=True)
+    if code is None:
+        return "timed out"
+    if code not in (0, 1, 2, 3) and code > 0:  # no tests, or a wrong option: says nothing on the mutant
+        sys.exit((tree.parent / "output.txt").read_text(encoding="utf-8", errors="replace"))
+    return "passed" if code == 0 else "killed"
+
+
+def try_module(tree: Path, module: str, mutants: list[Mutant]) -> list[Told]:
+    """Run the module's tests on each mutant."""
+    file = tree / "workbench" / f"{module}.py"
+    clean = file.read_text(encoding="utf-8")
+    started = time.monotonic()
+    if run_tests(tree, module, 900) != "passed":
+        sys.exit(f"{module}: its tests fail without a mutant\n" + (tree.parent / "output.txt").read_text())
+    seconds = time.monotonic() - started
+    print(f"{module}: {seconds:.0f} s for its tests", file=sys.stderr, flush=True)
+    told = []
+    for mutant in mutants:
+        file.write_text(mutant.code, encoding="utf-8")
+        try:
+            end = run_tests(tree, module, 30 + 4 * seconds)
+        finally:
+            file.write_text(clean, encoding="utf-8")
+        told.append(Told(mutant.number, mutant.line, mutant.becomes, "lived" if end == "passed" else end))
+        print(
+            f"  {end if end != 'passed' else 'LIVED'}: {_as_diff(module, told[-1])}",
+            file=sys.stderr,
+            flush=True,
+        )
+    return told
+
+
+def _as_diff(module: str, one: Told) -> str:
+    return f"workbench/{module}.py:{one.number}: {one.line}  ->  {one.becomes}"
+
+
+def reasons() -> dict[tuple[str, str, str], str]:
+    """Why some live: by module, line and what becomes of it."""
+    listed = tomllib.loads(REASONS.read_text(encoding="utf-8")).get("lives", [])
+    return {(one["module"], one["line"], one["becomes"]): one["reason"] for one in listed}
+
+
+def gone(module: str) -> list[str]:
+    """Lines that a reason is given for and that the module has no more."""
+    lines = {
+        line.strip()
+        for line in (ROOT / "workbench" / f"{module}.py").read_text(encoding="utf-8").splitlines()
+    }
+    return [line for name, line, _ in reasons() if name == module and line not in lines]
+
+
+def report(module: str, told: list[Told], seconds: float) -> bool:
+    """Print how the mutants of a module ended. True where nothing is left to do."""
+    known = reasons()
+    lived = [one for one in told if one.end == "lived"]
+    holes = [one for one in lived if (module, one.line, one.becomes) not in known]
+    late = [one for one in told if one.end == "timed out"]
+    died = len(told) - len(lived)
+    share = 100 * died // len(told) if told else 100
+    print(
+        f"{module}: {len(told)} mutants, {died} killed ({len(late)} by time), {len(lived)} lived "
+        f"({len(lived) - len(holes)} with a reason), {share} %, {seconds:.0f} s"
+    )
+    for one in late:
+        print(f"  by time: {_as_diff(module, one)}")
+    for one in lived:
+        why = known.get((module, one.line, one.becomes))
+        print(f"  {f'lives, {why}' if why else 'NO TEST NOTICES'}: {_as_diff(module, one)}")
+    missing = gone(module)
+    for line in missing:
+        print(f"  {REASONS.name} gives a reason for a line that is gone: {line}")
+    return not holes and not missing and share >= ENOUGH
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("modules", nargs="+", choices=[*PROTECTED, "all"], metavar="module")
+    parser.add_argument("--count", type=int, default=30, help="mutants of each module")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--lived", action="store_true", help="only those that lived the last time")
+    options = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that the copy is removed
+    good = True
+    for module in PROTECTED if "all" in options.modules else options.modules:
+        mutants = sample(module, options.count, options.seed)
+        kept, last = LAST / f"{module.replace('/', '.')}.json", []
+        if options.lived:
+            last = [Told(**one) for one in json.loads(kept.read_text(encoding="utf-8"))]
+            again = {(one.line, one.becomes) for one in last if one.end == "lived"}
+            last = [one for one in last if (one.line, one.becomes) not in again]
+            mutants = [mutant for mutant in mutants if (mutant.line, mutant.becomes) in again]
+        started = time.monotonic()
+        with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
+            tree = Path(folder) / "tree"
+            tree.mkdir()
+            copy_tree(tree)
+            told = try_module(tree, module, mutants)
+        told = last + told
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        kept.write_text(json.dumps([asdict(one) for one in told], indent=1), encoding="utf-8")
+        good &= report(module, told, time.monotonic() - started)
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
