@@ -11,9 +11,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
 import websockets.sync.client
 
 from tests.ui.tabs import camera_message, handshake, messages_in
+
+pytestmark = pytest.mark.usefixtures("child_process")
 
 TASK = Path(__file__).parents[1] / "tasks" / "minimal.py"
 COMMAND = Path(sys.executable).with_name("workbench")

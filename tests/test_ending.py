@@ -4,25 +4,20 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import psutil
 import pytest
 
-from tests.browser.opened import open_workbench
+from tests.drive.page import open_workbench
+from tests.drive.waiting import until
 from tests.recording.verify_rrd import verify_rrd
 from tests.session.hazards import provoke, provoked, write_task
 from tests.ui.tabs import open_deaf_tab, tabs_of
 
+pytestmark = pytest.mark.usefixtures("child_process")
+
 PATIENCE = 15.0
-
-
-def until(reached: Callable[[], object], what: str) -> None:
-    deadline = time.monotonic() + 90
-    while not reached():
-        assert time.monotonic() < deadline, f"{what} did not come"
-        time.sleep(0.05)
 
 
 def gone(processes: list[psutil.Process]) -> bool:
@@ -35,7 +30,14 @@ def workers_of(server: psutil.Process) -> int:
     return sum("workbench.session.worker_start" in child.cmdline() for child in server.children())
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL], ids=["ctrl-c", "kill -9"])
+@pytest.mark.parametrize(
+    "number",
+    [
+        # All that there can be hangs and is ended by Ctrl-C below.
+        pytest.param(signal.SIGINT, id="ctrl-c", marks=pytest.mark.slow),
+        pytest.param(signal.SIGKILL, id="kill -9"),
+    ],
+)
 def test_a_worker_that_hangs_ends_with_its_server(tmp_path: Path, number: signal.Signals) -> None:
     file = write_task(tmp_path)
     provoke(file, "build", "catch")

@@ -30,6 +30,8 @@ from workbench.core.backends import BackendUnavailable, why_no_gpu_simulation
 from workbench.core.broken_rule import WrongReturn
 from workbench.core.cpu_scene import SIM_BACKEND
 
+pytestmark = pytest.mark.thorough
+
 CPU = {"backend": "cpu", "render_backend": "none"}
 TASKS = Path(__file__).resolve().parents[1] / "tasks"
 README = TASKS.parent / "README.md"
@@ -304,7 +306,10 @@ def test_the_default_reward_is_stocks_or_where_stock_has_none_the_richest() -> N
         ("PickCube-v1", 2, {**CPU, "render_mode": "rgb"}, ValueError, "none of .*rgb_array"),
         ("PickCube-v1", 2, {"backend": "cppu"}, ValueError, "auto, cpu, gpu"),
         ("PickCube-v1", 2, {**CPU, "rules": "yes"}, ValueError, "'stop', 'warn' or 'off'"),
-        ("PickCube-v1", 2, {"backend": "cpu", "render_mode": "human"}, ValueError, "workbench open"),
+        pytest.param(
+            *("PickCube-v1", 2, {"backend": "cpu", "render_mode": "human"}, ValueError, "workbench open"),
+            marks=pytest.mark.render,
+        ),
         ("PickCube-v1", 2, {**CPU, "parallel_in_single_scene": True}, ValueError, "parallel_in_single_scene"),
         ("PickCube-v1", 2, {**CPU, "reward_mode": "lavish"}, ValueError, "none of .*normalized_dense"),
         ("PickCub-v1", 2, CPU, TaskError, "PickCube-v1"),
@@ -394,7 +399,7 @@ def test_a_missing_download_is_named_with_its_command(monkeypatch: pytest.Monkey
 # --- importing -------------------------------------------------------------------------------------
 
 
-def test_importing_the_package_imports_no_simulation() -> None:
+def test_importing_the_package_imports_no_simulation(child_process: None) -> None:
     # The process that serves the page imports it, and must start at once and without a graphics driver.
     heavy = {"mani_skill", "sapien", "torch", "gymnasium"}
     code = f"import sys, workbench; assert not {heavy!r} & set(sys.modules), sorted(sys.modules)"
@@ -414,7 +419,8 @@ def readme_example() -> str:
     return section.split("```python\n")[1].split("```")[0]
 
 
-def test_the_example_of_the_readme_learns(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.slow
+def test_the_example_of_the_readme_learns(renderer: None, capsys: pytest.CaptureFixture[str]) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error", UserWarning)
         threads = torch.get_num_threads()

@@ -57,7 +57,7 @@ def test_the_seed_that_a_reset_draws_itself_is_kept(tmp_path: Path) -> None:
     assert [e.info.seed for e in episodes_in(tmp_path)] == [drawn] and drawn != 8
 
 
-def test_it_keeps_what_maniskills_own_recorder_keeps(tmp_path: Path) -> None:
+def test_it_keeps_what_maniskills_own_recorder_keeps(child_process: None, tmp_path: Path) -> None:
     """The same run through both, RecordEpisode around ours: states, actions, rewards and flags are equal."""
     env = workbench.make(str(TASKS / "push_cube.py"), 2, **OPTIONS)
     ours = workbench.Recorder(env, tmp_path / "ours")
@@ -124,7 +124,7 @@ for step in range(1, 10**6):
 """
 
 
-def test_a_killed_program_loses_a_second(tmp_path: Path) -> None:
+def test_a_killed_program_loses_a_second(child_process: None, tmp_path: Path) -> None:
     """Its steps wait in memory to be taken apart together, and a second is for all that waits anywhere."""
     child = subprocess.Popen([sys.executable, "-c", CHILD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
     assert child.stdout is not None and child.stdout.readline() == "begun\n"

@@ -8,8 +8,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from tests.session.recordings import made, write
+from tests.drive.episodes import made, write
 from workbench.share_command import export_in_terminal, share_in_terminal
+
+pytestmark = pytest.mark.usefixtures("child_process")
 
 
 @pytest.fixture

@@ -23,3 +23,38 @@ def test_the_degree_of_the_rules_is_an_option_of_the_task(rules: Rules) -> None:
 def test_a_size_that_is_none_is_refused_with_an_example(text: str) -> None:
     with pytest.raises(ValueError, match="such as 256MB or 2GB"):
         history_bytes(text)
+
+
+@pytest.mark.parametrize(
+    ("num_envs", "seed", "named"),
+    [(1, 0, None), (4096, 2**31 - 1, None), (1, -1, "--seed"), (1, 2**31, "--seed")]
+    + [(0, 0, "--num-envs"), (4097, 0, "--num-envs")],
+)
+def test_the_limits_themselves_are_taken_and_what_is_past_them_is_not(
+    num_envs: int, seed: int, named: str | None
+) -> None:
+    if named is None:
+        options = task_options(num_envs, "cpu", seed, ())
+        assert (options.num_envs, options.seed) == (num_envs, seed)
+    else:
+        with pytest.raises(ValueError, match=named):
+            task_options(num_envs, "cpu", seed, ())
+
+
+def test_the_smallest_and_the_largest_history_are_taken() -> None:
+    assert (history_bytes("1MB"), history_bytes("1048576MB")) == (2**20, 2**40)
+    for text in (str(2**20 - 1), str(2**40 + 2**20)):
+        with pytest.raises(ValueError, match="--history"):
+            history_bytes(text)
+
+
+def test_an_argument_of_the_env_is_json_or_else_a_string() -> None:
+    options = task_options(
+        1, "cpu", 0, ("robot_uids=fetch", "flag=true", "size=0.5", "pair=[1, 2]", "text=a=b")
+    )
+    assert options.env_kwargs == {
+        "robot_uids": "fetch", "flag": True, "size": 0.5, "pair": [1, 2], "text": "a=b",
+    }  # fmt: skip
+    for wrong in ("robot_uids", "=1", "a-b=1", "1a=1"):
+        with pytest.raises(ValueError, match="--env takes name=value"):
+            task_options(1, "cpu", 0, (wrong,))

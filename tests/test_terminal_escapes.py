@@ -30,7 +30,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from tests.session.recordings import made, write
+from tests.drive.episodes import made, write
 from tests.ui.tabs import handshake
 from workbench import terminal
 from workbench.authoring.problem import Problem
@@ -113,7 +113,9 @@ def on_terminal(folder: Path, *arguments: str) -> Iterator[Terminal]:
         terminal.close()
 
 
-def test_a_task_and_a_request_full_of_escapes_do_nothing_to_the_terminal(tmp_path: Path) -> None:
+def test_a_task_and_a_request_full_of_escapes_do_nothing_to_the_terminal(
+    child_process: None, tmp_path: Path
+) -> None:
     file = tmp_path / f"mine{TITLE}.py"
     file.write_text(
         f"import sys, warnings\nprint({EVIL!r} + 'printed')\nprint({EVIL!r} + 'said', file=sys.stderr)\n"
@@ -140,7 +142,9 @@ def test_a_task_and_a_request_full_of_escapes_do_nothing_to_the_terminal(tmp_pat
 
 
 @pytest.mark.parametrize("workers", ["1", pytest.param("2", marks=pytest.mark.slow)])
-def test_a_task_that_is_recorded_does_nothing_to_the_terminal(workers: str, tmp_path: Path) -> None:
+def test_a_task_that_is_recorded_does_nothing_to_the_terminal(
+    child_process: None, workers: str, tmp_path: Path
+) -> None:
     """Its code runs in the command's own process, or in some that write to the terminal themselves."""
     (tmp_path / "mine.py").write_text(
         f"import sys\nprint({EVIL!r} + 'printed')\nprint({EVIL!r} + 'said', file=sys.stderr)\n"
@@ -153,7 +157,7 @@ def test_a_task_that_is_recorded_does_nothing_to_the_terminal(workers: str, tmp_
     assert all(word in text for word in ("printed", "said", "green", "raised"))
 
 
-def test_a_recording_full_of_escapes_is_told_as_text(tmp_path: Path) -> None:
+def test_a_recording_full_of_escapes_is_told_as_text(child_process: None, tmp_path: Path) -> None:
     info: dict[str, Any] = {"task": f"Push{EVIL}-v1", "source_file": f"{EVIL}.py"}
     first = write(tmp_path, made(3, **info), pictures=False)
     for file in sorted(tmp_path.glob(f"{first.stem}.*")):
@@ -165,7 +169,7 @@ def test_a_recording_full_of_escapes_is_told_as_text(tmp_path: Path) -> None:
     assert "\\x1b]0;owned\\x07" in text and "\\u202e" in text
 
 
-def test_a_row_of_the_library_is_told_as_text(tmp_path: Path) -> None:
+def test_a_row_of_the_library_is_told_as_text(child_process: None, tmp_path: Path) -> None:
     first = write(tmp_path, made(3, task=f"Push{EVIL}-v1"), pictures=False)
     for file in sorted(tmp_path.glob(f"{first.stem}.*")):
         file.rename(file.with_name(f"a\u202e{TITLE}b{file.suffix}"))
@@ -220,7 +224,7 @@ def test_a_loggers_record_is_one_line_and_its_traceback_is_text(monkeypatch: pyt
     assert "Traceback" in said and "ValueError" in said and "\x1b[31mred\x1b[0m" in said
 
 
-def test_what_ends_a_command_is_printed_as_text(tmp_path: Path) -> None:
+def test_what_ends_a_command_is_printed_as_text(child_process: None, tmp_path: Path) -> None:
     program = f"from workbench.machine.guarded_terminal import guard_terminal\nguard_terminal()\nraise ValueError({EVIL!r})"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
     assert harmful(done.stderr) == set() and "ValueError" in done.stderr and "\\x1b" in done.stderr

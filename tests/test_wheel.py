@@ -24,6 +24,8 @@ from zipfile import ZipFile
 import psutil
 import pytest
 
+pytestmark = pytest.mark.usefixtures("child_process")
+
 ROOT = Path(__file__).parent.parent
 
 

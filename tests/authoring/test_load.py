@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import importlib
 import inspect
+import linecache
 import os
 import sys
 import traceback
@@ -569,3 +570,94 @@ def test_a_file_of_mani_skills_own_can_be_opened_by_its_path() -> None:
         sys.modules["mani_skill.envs.tasks.tabletop.pick_cube"].PickCubeEnv
         is REGISTERED_ENVS["PickCube-v1"].cls
     )
+
+
+def test_a_failed_save_leaves_an_id_with_the_file_that_took_it_since(write: Write) -> None:
+    one = write("one/push.py", PUSH, task=True)
+    two = write("two/push.py", PUSH, task=True)
+    load_task(str(one))
+    newer = load_task(str(two))
+    assert REGISTERED_ENVS["AuthorPush-v1"].cls is newer.cls
+    text = one.read_text()
+    one.write_text(text + "\n1 / 0\n")
+    before = tables()
+    refused(one)
+    assert tables() == before
+    assert REGISTERED_ENVS["AuthorPush-v1"].cls is newer.cls
+    one.write_text(text)
+    again = load_task(str(one))
+    assert take_back(again) and tables() == before
+
+
+def test_what_a_failed_load_put_on_the_search_path_is_gone(write: Write, folder: Path) -> None:
+    head = "import sys\nsys.path.insert(0, 'first')\nsys.path.append('last')\nimport helper\n"
+    path = write("push.py", head + "1 / 0\n")
+    write("helper.py", "SIZE = 1\n")
+    search_path, finders, modules = list(sys.path), list(sys.meta_path), set(sys.modules)
+    assert str(folder) not in search_path
+    refused(path)
+    assert (sys.path, sys.meta_path) == (search_path, finders)
+    assert "helper" not in sys.modules and set(sys.modules) == modules
+    # The second failure in a row, and one after a version that works.
+    refused(path)
+    assert (sys.path, sys.meta_path) == (search_path, finders)
+    good = load_task(str(write("push.py", head + PUSH, task=True)))
+    search_path, finders = list(sys.path), list(sys.meta_path)
+    for _ in range(2):
+        path.write_text(path.read_text() + "sys.path.append('more')\n1 / 0\n")
+        refused(path)
+        assert (sys.path, sys.meta_path) == (search_path, finders)
+    assert REGISTERED_ENVS["AuthorPush-v1"].cls is good.cls
+
+
+def test_a_package_has_the_modules_of_the_good_version_after_a_failed_load(write: Write) -> None:
+    # The name is no other test's: what lies outside of the task's own folder stays imported.
+    write("push_lab/__init__.py", "")
+    write("push_lab/tasks/__init__.py", "")
+    helper = write("push_lab/tasks/helper.py", "SIZE = 1\n")
+    path = write("push_lab/tasks/push.py", "from . import helper\n" + PUSH, task=True)
+    load_task(str(path))
+    good, package = sys.modules["push_lab.tasks"], sys.modules["push_lab"]
+    path.write_text(path.read_text() + "\n1 / 0\n")
+    helper.write_text("SIZE = 2\n")
+    for _ in range(2):
+        refused(path)
+        assert sys.modules["push_lab"] is package
+        assert package.tasks is good is sys.modules["push_lab.tasks"]
+        assert good.helper is sys.modules["push_lab.tasks.helper"] and good.helper.SIZE == 1
+
+
+def test_tracebacks_show_nothing_of_a_version_that_failed(write: Write) -> None:
+    helper = write("helper.py", "SIZE = 1\n")
+    path = write("push.py", "import helper\n1 / 0\n")
+    refused(path)
+    assert not {str(helper), str(path)} & set(linecache.cache)
+
+
+def test_the_tasks_of_one_folder_stay_imported_beside_each_other(write: Write) -> None:
+    one = load_task(str(write("one.py", PUSH, task=True)))
+    module = sys.modules[one.cls.__module__]
+    two = load_task(str(write("two.py", PUSH.replace("AuthorPush", "AuthorTwo"), task=True)))
+    assert sys.modules[one.cls.__module__] is module
+    assert sys.modules[two.cls.__module__] is not module
+
+
+def test_a_file_that_is_called_like_a_library_does_not_take_its_place(write: Write) -> None:
+    sys.modules.pop("antigravity", None)
+    task = load_task(str(write("antigravity.py", PUSH, task=True)))
+    assert task.env_id == "AuthorPush-v1" and "antigravity" not in sys.modules
+
+
+def test_a_null_byte_is_told_at_its_line(write: Write) -> None:
+    problem = refused(write("push.py", "x = 1\ny = 2\nz = '\0'\n"))
+    assert (problem.stage, problem.line) == ("syntax", 3)
+
+
+def test_a_package_itself_may_be_the_task(write: Write) -> None:
+    helper = write("package_that_pushes/shapes.py", "SIZE = 1\n")
+    path = write("package_that_pushes/__init__.py", "from .shapes import SIZE\n" + PUSH, task=True)
+    for size in (1, 2):
+        helper.write_text(f"SIZE = {size}\n")
+        task = load_task(str(path))
+        assert task.source_files == (path, helper)
+        assert sys.modules[task.cls.__module__].SIZE == size

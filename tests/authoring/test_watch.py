@@ -15,8 +15,6 @@ from workbench.authoring.watch import SourceWatcher
 
 PATIENCE = 20.0
 """Seconds to wait for what must come. Nothing is asserted of how soon it does."""
-SILENCE = 0.8
-"""Seconds to wait for what must not come."""
 
 
 class Calls:
@@ -38,12 +36,10 @@ class Calls:
                 return number
         raise AssertionError("too many calls")
 
-    def none(self) -> bool:
-        try:
-            self.queue.get(timeout=SILENCE)
-        except queue.Empty:
-            return True
-        return False
+    def nothing_before(self, last: Path) -> bool:
+        """Whether a save of another followed file is the next that is told."""
+        last.write_text(f"{last.read_text()}# again\n")
+        return self.next() == {last.name: last.read_text()}
 
 
 @pytest.fixture
@@ -59,10 +55,19 @@ def watcher(request: pytest.FixtureRequest, calls: Calls) -> Iterator[SourceWatc
 
 
 @pytest.fixture
-def file(watcher: SourceWatcher, tmp_path: Path) -> Path:
+def last(tmp_path: Path) -> Path:
+    """A followed file in a folder of its own, whose save is told after all that is told of the others."""
+    path = tmp_path / "beside" / "last.py"
+    path.parent.mkdir()
+    path.write_text("")
+    return path
+
+
+@pytest.fixture
+def file(watcher: SourceWatcher, tmp_path: Path, last: Path) -> Path:
     path = tmp_path / "task.py"
     path.write_text("a = 0\n")
-    watcher.follow([path])
+    watcher.follow([path, last])
     return path
 
 
@@ -88,54 +93,60 @@ def delete_and_create(path: Path, text: str) -> None:
 
 @pytest.mark.parametrize("save", [write, rename_over, backup_and_create, delete_and_create])
 def test_every_way_of_saving_is_seen_again_and_again(
-    save: Callable[[Path, str], None], file: Path, calls: Calls
+    save: Callable[[Path, str], None], file: Path, last: Path, calls: Calls
 ) -> None:
     for number in (1, 2, 3):
         save(file, f"a = {number}\n")
         assert calls.next() == {"task.py": f"a = {number}\n"}
-    assert calls.none()
+    assert calls.nothing_before(last)
 
 
-def test_a_burst_of_saves_is_few_calls_and_the_last_content_wins(file: Path, calls: Calls) -> None:
+def test_a_burst_of_saves_is_few_calls_and_the_last_content_wins(
+    file: Path, last: Path, calls: Calls
+) -> None:
     for number in range(1, 11):
         file.write_text(f"a = {number}\n")
         time.sleep(0.005)
     assert calls.until({"task.py": "a = 10\n"}) <= 3
-    assert calls.none()
+    assert calls.nothing_before(last)
 
 
-def test_only_new_content_of_followed_files_counts(file: Path, calls: Calls) -> None:
+def test_only_new_content_of_followed_files_counts(file: Path, last: Path, calls: Calls) -> None:
     os.utime(file)
     file.with_name("other.py").write_text("b = 1\n")
     file.write_text(file.read_text())
-    assert calls.none()
+    assert calls.nothing_before(last)
 
 
-def test_line_ends_alone_are_no_change_and_a_crlf_file_is_followed(file: Path, calls: Calls) -> None:
+def test_line_ends_alone_are_no_change_and_a_crlf_file_is_followed(
+    file: Path, last: Path, calls: Calls
+) -> None:
     file.write_bytes(b"a = 0\r\n")
-    assert calls.none()
+    assert calls.nothing_before(last)
     file.write_bytes(b"a = 1\r\n")
     assert calls.next() == {"task.py": "a = 1\n"}
 
 
-def test_a_file_that_stays_away_is_told_once_and_so_is_its_return(file: Path, calls: Calls) -> None:
+def test_a_file_that_stays_away_is_told_once_and_so_is_its_return(
+    file: Path, last: Path, calls: Calls
+) -> None:
     file.unlink()
     assert calls.next() == {"task.py": None}
-    assert calls.none()
+    assert calls.nothing_before(last)
     file.write_text("a = 0\n")
     assert calls.next() == {"task.py": "a = 0\n"}
 
 
-def test_a_save_that_truncates_first_is_not_seen_empty(file: Path, calls: Calls) -> None:
+def test_a_save_that_truncates_first_is_not_seen_empty(file: Path, last: Path, calls: Calls) -> None:
     with open(file, "w") as opened:
         opened.flush()
         time.sleep(0.12)
         opened.write("a = 1\n")
     assert calls.next() == {"task.py": "a = 1\n"}
-    assert calls.none()
+    assert calls.nothing_before(last)
 
 
-def test_a_file_emptied_for_good_is_told(file: Path, calls: Calls) -> None:
+def test_a_file_emptied_for_good_is_told(file: Path, last: Path, calls: Calls) -> None:
     file.write_text("")
     assert calls.next() == {"task.py": ""}
 
@@ -156,18 +167,18 @@ def test_a_folder_deleted_and_made_again_is_watched_again(
 
 
 def test_what_was_saved_between_the_reading_and_the_following_is_not_lost(
-    watcher: SourceWatcher, calls: Calls, tmp_path: Path
+    watcher: SourceWatcher, last: Path, calls: Calls, tmp_path: Path
 ) -> None:
     path = tmp_path / "task.py"
     path.write_text("a = 1\n")
     watcher.follow([path], {str(path): "a = 0\n"})
     assert calls.next() == {"task.py": "a = 1\n"}
-    watcher.follow([path], {str(path): "a = 1\n"})
-    assert calls.none()
+    watcher.follow([path, last], {str(path): "a = 1\n"})
+    assert calls.nothing_before(last)
 
 
 def test_files_in_several_folders_are_followed_and_left(
-    watcher: SourceWatcher, calls: Calls, tmp_path: Path
+    watcher: SourceWatcher, last: Path, calls: Calls, tmp_path: Path
 ) -> None:
     one, two = tmp_path / "one.py", tmp_path / "below" / "two.py"
     two.parent.mkdir()
@@ -177,11 +188,11 @@ def test_files_in_several_folders_are_followed_and_left(
     watcher.follow([one, two])
     two.write_text("a = 1\n")
     assert calls.next() == {"two.py": "a = 1\n"}
-    watcher.follow([one])
+    watcher.follow([one, last])
     two.write_text("a = 2\n")
     one.write_text("a = 2\n")
     assert calls.next() == {"one.py": "a = 2\n"}
-    assert calls.none()
+    assert calls.nothing_before(last)
 
 
 def test_a_call_that_raises_is_logged_and_the_next_save_is_seen(
@@ -214,7 +225,7 @@ def test_it_stops_from_outside_and_from_its_own_call(tmp_path: Path) -> None:
     assert calls.next() == {"task.py": "a = 1\n"}
     watcher.stop()
     path.write_text("a = 2\n")
-    assert calls.none()
+    assert calls.queue.empty()
     idle = SourceWatcher(calls)
     idle.stop()
     idle.stop()

@@ -25,7 +25,7 @@ import tyro
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.benchmarks.reload import cold_restart
-from tests.browser.opened import TASK
+from tests.drive.page import TASK
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.session.messages import CameraRequest, TaskOptions
 from workbench.session.session import Session

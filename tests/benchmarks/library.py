@@ -108,6 +108,7 @@ def open_once(folder: Path, count: int, browser: bool) -> dict[str, float]:
     start_reading()
     import viser
 
+    from tests.drive.panels import Panels
     from workbench.recording.library import Library
     from workbench.ui.library_list import MOST_ROWS
     from workbench.ui.library_panel import LibraryPanel
@@ -116,7 +117,7 @@ def open_once(folder: Path, count: int, browser: bool) -> dict[str, float]:
     began = time.perf_counter()
     library = Library(folder)
     library.watch()
-    panel = LibraryPanel(server, library, lambda ids: None)
+    panel, panels = LibraryPanel(server, library, lambda ids: None), Panels(server)
     said: dict[str, float] = {}
     draws: list[float] = []
     wanted = min(MOST_ROWS, count)
@@ -125,13 +126,13 @@ def open_once(folder: Path, count: int, browser: bool) -> dict[str, float]:
         panel.draw()
         draws.append(time.perf_counter() - at)
         view = library.view()
-        if "first" not in said and panel._table.content.count("<tbody") == wanted:
+        if "first" not in said and panels.html("wb-library").count("<tbody") == wanted:
             said["first"] = 1e3 * (time.perf_counter() - began)
         if view.reading is None and len(view.rows) == count:
             said["all"] = 1e3 * (time.perf_counter() - began)
             panel.draw()
         time.sleep(1 / 30)
-    said["page KB"] = len(panel._table.content) / 1e3
+    said["page KB"] = len(panels.html("wb-library")) / 1e3
     said["longest draw"] = 1e3 * max(draws)
     at = time.perf_counter()
     library.refresh()
@@ -146,7 +147,7 @@ def open_once(folder: Path, count: int, browser: bool) -> dict[str, float]:
 def in_chromium(port: int) -> float:
     from playwright.sync_api import sync_playwright
 
-    from tests.browser.opened import launch, new_page
+    from tests.drive.page import launch, new_page
     from workbench.machine.chromium import find_chromium, how_to_get_chromium
 
     chromium = find_chromium()

@@ -28,7 +28,7 @@ import tyro
 from playwright.sync_api import Page, expect, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.browser.opened import launch, new_page, open_workbench
+from tests.drive.page import launch, new_page, open_workbench
 from workbench.machine.chromium import find_chromium, how_to_get_chromium
 
 TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"

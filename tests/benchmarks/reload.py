@@ -30,7 +30,7 @@ import tyro
 from playwright.sync_api import Page, expect
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.browser.opened import TASK, page_on
+from tests.drive.page import TASK, browser_at, page_on
 from workbench.machine.chromium import find_chromium, how_to_get_chromium
 
 WIDTH = 100
@@ -111,7 +111,14 @@ def save_to_seen(page: Page, file: Path, level: str, number: int) -> tuple[float
 
 def workbench_side(options: Options, folder: Path, chromium: str) -> dict[str, list[tuple[float, float]]]:
     file = Path(shutil.copy(TASK, folder / "push_cube.py"))
-    with page_on(file, "--num-envs", str(options.num_envs), chromium=chromium) as (page, _, _):
+    with (
+        browser_at(chromium) as browser,
+        page_on(file, "--num-envs", str(options.num_envs), browser=browser, drawn=True, spare=True) as (
+            page,
+            _,
+            _,
+        ),
+    ):
         # Tabs that were opened once keep their content, so both the picture and the table are there.
         page.get_by_role("tab", name="Cameras").click()
         expect(page.get_by_text("rendered in").first).to_be_visible(timeout=60_000)

@@ -30,7 +30,8 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.benchmarks.page_rate import NO_DRAWING
-from tests.browser.opened import launch, new_page, until
+from tests.drive.page import launch, new_page
+from tests.drive.waiting import until
 from workbench.machine.chromium import find_chromium, how_to_get_chromium
 
 TASK = Path(__file__).parents[2] / "tasks" / "push_cube.py"

@@ -29,7 +29,7 @@ from playwright.sync_api import Page, expect, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.benchmarks.page_rate import NO_DRAWING
-from tests.browser.opened import launch, new_page, open_workbench
+from tests.drive.page import launch, new_page, open_workbench
 from tests.session.hazards import calm, provocation, provoke, write_task
 from workbench.machine.chromium import find_chromium, how_to_get_chromium
 

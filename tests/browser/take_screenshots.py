@@ -18,7 +18,7 @@ from PIL import Image
 from playwright.sync_api import Page, expect, sync_playwright
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.browser.opened import close_notice, launch, new_page, open_workbench
+from tests.drive.page import close_notice, launch, new_page, open_workbench
 from workbench.machine.chromium import find_chromium, how_to_get_chromium
 
 ROOT = Path(__file__).parents[2]

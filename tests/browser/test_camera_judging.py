@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Locator, Page, expect
+from playwright.sync_api import Browser, Locator, Page, expect
 
-from tests.browser.opened import page_on, until
+from tests.drive.page import page_on
+from tests.drive.waiting import until
 
 pytestmark = pytest.mark.browser
-expect.set_options(timeout=60_000)
 ENVS = 3
 CAMERA = "base_camera"
 PICTURE = "img[src^='blob:']:visible"
@@ -28,10 +28,10 @@ FOLDERS = {
 
 
 @pytest.fixture(scope="module")
-def page(task_file: Path, chromium_path: str) -> Iterator[Page]:
+def page(task_file: Path, browser: Browser) -> Iterator[Page]:
     """The Studio tab on base_camera, with every folder that judges open."""
-    arguments = ("--num-envs", str(ENVS), "--no-spare")
-    with page_on(task_file, *arguments, chromium=chromium_path, height=900) as (page, errors, _):
+    arguments = ("--num-envs", str(ENVS))
+    with page_on(task_file, *arguments, browser=browser, height=900) as (page, errors, _):
         page.get_by_role("tab", name="Studio").click()
         page.locator("input[aria-haspopup=listbox]:visible").first.click()
         page.get_by_role("option", name=f"{CAMERA} · sensor", exact=True).click()

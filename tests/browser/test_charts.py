@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 import viser
 from numpy.typing import NDArray
-from playwright.sync_api import Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
 
-from tests.browser.opened import launch, new_page, until
+from tests.drive.page import page_at
+from tests.drive.panels import Clock
+from tests.drive.waiting import until
 from tests.ui.scenes import running
 from workbench.session.view import Curves
 from workbench.ui.curves_panel import REDRAW_EVERY, CurvesPanel
 from workbench.ui.line_chart import SELECTED_COLOUR
 
 pytestmark = pytest.mark.browser
-expect.set_options(timeout=60_000)
 ENVS = 3
 COLUMNS_OF = """([colour]) => {
     const canvas = document.querySelector(".uplot canvas");
@@ -69,18 +70,16 @@ def whole(page: Page) -> bool:
 
 
 def test_the_curve_is_drawn_through_nan_another_env_and_a_rebuild(
-    server: viser.ViserServer, chromium_path: str
+    server: viser.ViserServer, browser: Browser
 ) -> None:
     """It went blank, and stayed so: each new range or line moved the x axis, until none of the steps was on it."""
-    panel = CurvesPanel(server)
-    with sync_playwright() as playwright:
-        browser = launch(playwright, chromium_path)
-        page, errors = new_page(browser)
-        page.goto(f"http://127.0.0.1:{server.get_port()}")
-        expect(page.get_by_text("Curves appear with the first step.")).to_be_visible()
+    clock = Clock()
+    panel = CurvesPanel(server, clock)
+    with page_at(browser, f"http://127.0.0.1:{server.get_port()}") as (page, errors):
+        expect(page.get_by_text("Curves appear with the second step.")).to_be_visible()
 
         def draw(curves: Curves, env: int = 0) -> None:
-            panel._drawn_at = 0.0
+            clock.passes()
             panel.draw(running(ENVS, curves=curves, selected_env=env))
             page.wait_for_timeout(1000 * REDRAW_EVERY / 4)
 
@@ -99,4 +98,3 @@ def test_the_curve_is_drawn_through_nan_another_env_and_a_rebuild(
             draw(past(0, last), env=last // 20)
         until(lambda: whole(page), "the curve after a rebuild")
         assert errors == []
-        browser.close()

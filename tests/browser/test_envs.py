@@ -7,16 +7,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Browser, Page, expect
 
-from tests.browser.opened import page_on, until
+from tests.drive.page import page_on
+from tests.drive.waiting import until
 
 pytestmark = pytest.mark.browser
 ENVS = 6
 
 
 @pytest.fixture(scope="module")
-def page(task_file: Path, chromium_path: str) -> Iterator[Page]:
+def page(task_file: Path, browser: Browser) -> Iterator[Page]:
     # Env 4 says from its fifth step on that it knows no height; nothing else of the task asks for it.
     good, lost = '"cube_height": height', "(self.elapsed_steps >= 5) & (torch.arange(len(height)) == 4)"
     text = task_file.read_text()
@@ -24,7 +25,7 @@ def page(task_file: Path, chromium_path: str) -> Iterator[Page]:
     task_file.write_text(text.replace(good, f"{good}.masked_fill({lost}, torch.nan)"))
     # Without pictures there are no shaders to wait for.
     arguments = ("--num-envs", str(ENVS), "--env", "render_backend=none")
-    with page_on(task_file, *arguments, chromium=chromium_path) as (page, errors, _):
+    with page_on(task_file, *arguments, browser=browser) as (page, errors, _):
         yield page
         assert not errors
 

@@ -4,45 +4,26 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Browser, Locator, expect
 
-from tests.browser.opened import TASK, page_on, until
+from tests.drive.desk import Desk
+from tests.drive.page import page_on
+from tests.drive.waiting import until
 
 pytestmark = pytest.mark.browser
-expect.set_options(timeout=60_000)
 REWARD = "return self.compute_dense_reward(obs, action, info) / 3"
 STEPS = 60
 
 
-@dataclass
-class Desk:
-    page: Page
-    errors: list[str]
-    file: Path
-
-    def edit(self, old: str, new: str) -> None:
-        text = TASK.read_text()
-        assert old in text
-        self.file.write_text(text.replace(old, new))
-
-    def says(self, pattern: str) -> None:
-        expect(self.page.locator(".wb-again").get_by_text(re.compile(pattern)).first).to_be_visible()
-
-    @property
-    def rows(self):
-        return self.page.locator(".wb-again-table tbody tr")
-
-
 @pytest.fixture(scope="module")
-def desk(task_file: Path, chromium_path: str) -> Iterator[Desk]:
+def desk(task_file: Path, browser: Browser) -> Iterator[Desk]:
     """Three envs that have made some sixty steps, paused, on the Reward tab."""
     # Without pictures there are no shaders to wait for.
     arguments = ("--num-envs", "3", "--env", "render_backend=none")
-    with page_on(task_file, *arguments, chromium=chromium_path, height=1000) as (page, errors, _):
+    with page_on(task_file, *arguments, browser=browser, height=1000) as (page, errors, opened):
         page.get_by_role("button", name="Play", exact=True).click()
         strip = page.locator(".wb-timeline")
 
@@ -55,7 +36,15 @@ def desk(task_file: Path, chromium_path: str) -> Iterator[Desk]:
         expect(page.get_by_text("paused", exact=True)).to_be_visible()
         page.get_by_role("button", name="Reset all", exact=True).click()
         page.get_by_role("tab", name="Reward").click()
-        yield Desk(page, errors, task_file)
+        yield Desk(page, errors, task_file, opened)
+
+
+def says(desk: Desk, pattern: str) -> None:
+    expect(desk.page.locator(".wb-again").get_by_text(re.compile(pattern)).first).to_be_visible()
+
+
+def rows(desk: Desk) -> Locator:
+    return desk.page.locator(".wb-again-table tbody tr")
 
 
 def test_nothing_is_shown_before_there_is_something_to_say(desk: Desk) -> None:
@@ -65,17 +54,17 @@ def test_nothing_is_shown_before_there_is_something_to_say(desk: Desk) -> None:
 
 def test_an_edited_reward_is_drawn_over_the_recorded_one_and_what_differs_is_listed(desk: Desk) -> None:
     desk.edit(REWARD, f"{REWARD} * 2")
-    desk.says(r"(\d+) of \1 episodes differ\.")
-    desk.says("mean return: .* → ")
-    desk.says("to the last bit")
+    says(desk, r"(\d+) of \1 episodes differ\.")
+    says(desk, "mean return: .* → ")
+    says(desk, "to the last bit")
     expect(desk.page.get_by_text("reward of env 0, before and now")).to_be_visible()
     expect(desk.page.get_by_text("judged again", exact=True)).to_be_visible()
-    until(lambda: desk.rows.count() >= 6, "the list")
+    until(lambda: rows(desk).count() >= 6, "the list")
     expect(desk.page.get_by_role("button", name="Stop judging")).to_have_count(0)
     above = desk.page.get_by_role("link", name=re.compile(r"judged again: (\d+) of \1 episodes differ"))
     desk.page.set_viewport_size({"width": 1280, "height": 600})
     expect(above).to_be_in_viewport()
-    expect(desk.rows.last).not_to_be_in_viewport()
+    expect(rows(desk).last).not_to_be_in_viewport()
     above.click()
     expect(desk.page.locator(".wb-again")).to_be_in_viewport(ratio=0.9)
     desk.page.set_viewport_size({"width": 1280, "height": 1000})
@@ -83,32 +72,32 @@ def test_an_edited_reward_is_drawn_over_the_recorded_one_and_what_differs_is_lis
 
 def test_a_row_shows_its_env_at_its_moment_and_a_key_goes_to_the_next(desk: Desk) -> None:
     desk.edit(REWARD, f"{REWARD} * 2")
-    until(lambda: desk.rows.count() >= 6, "the list")
-    row = desk.rows.nth(2)
+    until(lambda: rows(desk).count() >= 6, "the list")
+    row = rows(desk).nth(2)
     env = row.locator("td").first.inner_text()
     row.click()
     expect(desk.page.locator(".wb-timeline").get_by_text("past", exact=True)).to_be_visible()
     expect(desk.page.get_by_role("columnheader", name=f"env {env}")).to_be_visible()
     expect(desk.page.get_by_text(f"reward of env {env}, before and now")).to_be_visible()
-    expect(desk.rows.nth(2)).to_have_class("wb-selected")
+    expect(rows(desk).nth(2)).to_have_class("wb-selected")
     desk.page.keyboard.press("j")
-    expect(desk.rows.nth(3)).to_have_class("wb-selected")
+    expect(rows(desk).nth(3)).to_have_class("wb-selected")
     desk.page.keyboard.press("Shift+J")
-    expect(desk.rows.nth(2)).to_have_class("wb-selected")
+    expect(rows(desk).nth(2)).to_have_class("wb-selected")
     desk.page.keyboard.press("End")
     expect(desk.page.locator(".wb-timeline").get_by_text("live", exact=True)).to_be_visible()
 
 
 def test_an_edit_that_changes_no_number_is_one_line(desk: Desk) -> None:
     desk.edit(REWARD, f"third = 3\n        {REWARD.replace('3', 'third')}")
-    desk.says(r"Nothing differs in \d+ episodes: reward, success and fail are as they were\.")
-    expect(desk.rows).to_have_count(0)
+    says(desk, r"Nothing differs in \d+ episodes: reward, success and fail are as they were\.")
+    expect(rows(desk)).to_have_count(0)
     expect(desk.page.get_by_text("before and now")).to_have_count(0)
 
 
 def test_code_that_raises_on_the_way_is_told_with_its_line(desk: Desk) -> None:
     desk.edit(REWARD, f"if self.elapsed_steps.max() > 40: raise KeyError('far')\n        {REWARD} * 2")
-    desk.says("the new code raised: KeyError")
-    desk.says(r"push_cube\.py:\d+")
+    says(desk, "the new code raised: KeyError")
+    says(desk, r"push_cube\.py:\d+")
     expect(desk.page.get_by_text("before and now")).to_be_visible()
     assert desk.errors == []

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import pytest
 import viser
-from playwright.sync_api import Locator, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Locator, Page, expect
 
-from tests.browser.opened import launch, new_page, until
+from tests.drive.page import page_at
+from tests.drive.waiting import until
 from tests.recording.library_files import describe
 from workbench.recording.library import Library
 from workbench.ui.commands import register
@@ -42,7 +43,7 @@ class Shown:
 
 
 @pytest.fixture(scope="module")
-def shown(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Iterator[Shown]:
+def shown(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[Shown]:
     folder = tmp_path_factory.mktemp("recordings")
     for k in range(COUNT):
         when = f"2026-11-21T10:{k:02}:00"
@@ -64,9 +65,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Itera
 
     drawing = threading.Thread(target=draw, daemon=True)
     drawing.start()
-    with sync_playwright() as playwright:
-        browser = launch(playwright, chromium_path)
-        page, errors = new_page(browser)
+    with page_at(browser, "about:blank") as (page, errors):
         page.set_default_timeout(15_000)
         page.add_init_script(path=web_assets_folder() / "pressed.js")
         page.goto(f"http://127.0.0.1:{server.get_port()}")
@@ -74,7 +73,6 @@ def shown(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Itera
         page.wait_for_selector(".wb-library tbody")
         yield Shown(page, panel, library, opened)
         assert not errors
-        browser.close()
     stopping.set()
     drawing.join()
     library.close()

@@ -5,50 +5,28 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Browser, expect
 
-from tests.browser.opened import TASK, Opened, page_on, until
+from tests.drive.desk import Desk
+from tests.drive.page import TASK, page_on
+from tests.drive.studio import picture
+from tests.drive.waiting import until
 from tests.recording.verify_rrd import verify_rrd
 
 pytestmark = pytest.mark.browser
-expect.set_options(timeout=60_000)
 
 
-@dataclass
-class Desk:
-    """What a person has in front of them: the page, the file, and the terminal."""
-
-    page: Page
-    errors: list[str]
-    file: Path
-    opened: Opened
-    recordings: Path
-
-    def tab(self, name: str) -> None:
-        self.page.get_by_role("tab", name=name).click()
-
-    def button(self, name: str):
-        return self.page.get_by_role("button", name=name, exact=True)
-
-    def row(self, name: str) -> list[str]:
-        """The cells of a row of the numbers table on the Reward tab."""
-        row = self.page.locator("tr", has=self.page.get_by_text(name, exact=True))
-        return [cell.strip() for cell in row.first.locator("td, th").all_inner_texts()]
-
-    def elapsed(self) -> int:
-        return int(self.row("elapsed steps")[1].split("/")[0])
+RECORDINGS = "kept"
 
 
 @pytest.fixture(scope="module")
-def desk(task_file: Path, chromium_path: str) -> Iterator[Desk]:
-    recordings = task_file.parent / "kept"
-    arguments = ("--num-envs", "2", "--recordings", str(recordings))
-    with page_on(task_file, *arguments, chromium=chromium_path) as (page, errors, opened):
-        yield Desk(page, errors, task_file, opened, recordings)
+def desk(task_file: Path, browser: Browser) -> Iterator[Desk]:
+    arguments = ("--num-envs", "2", "--recordings", RECORDINGS)
+    with page_on(task_file, *arguments, browser=browser) as (page, errors, opened):
+        yield Desk(page, errors, task_file, opened)
 
 
 @pytest.fixture
@@ -138,6 +116,21 @@ def test_the_sensor_and_human_pictures_arrive(calm: Desk) -> None:
     until(lambda: calm.page.locator("img").count() >= 2, "two pictures")
 
 
+def test_a_moment_of_the_past_that_one_stands_still_at_is_drawn(calm: Desk) -> None:
+    calm.tab("Reward")
+    calm.press("s", "s", "s")
+    calm.comes_to(3)
+    calm.tab("Cameras")
+    until(lambda: picture(calm.page), "a picture", 90)
+    time.sleep(1.0)  # the one of the last step is the last to come
+    live = picture(calm.page)
+    calm.leave_inputs()
+    calm.press("Shift+ArrowLeft")
+    until(lambda: picture(calm.page) not in ("", live), "another picture")
+    calm.press("End")
+    until(lambda: picture(calm.page) == live, "the picture of now")
+
+
 def test_an_edited_camera_keeps_its_place(calm: Desk) -> None:
     calm.tab("Cameras")
     expect(calm.page.locator("img[src^='blob:']:visible").first).to_be_visible(timeout=90_000)
@@ -209,13 +202,12 @@ def test_record_keeps_an_episode(calm: Desk) -> None:
     calm.button("Record").click()
     stop = calm.page.get_by_role("button", name=re.compile("Stop"))
     expect(stop).to_be_visible()
-    for _ in range(3):
-        calm.page.keyboard.press("s")
-        time.sleep(0.5)
-    until(lambda: bool(re.search(r"\b[1-9]\d* steps?\b", calm.page.inner_text("body"))), "recorded steps")
+    calm.press("s", "s", "s")
+    expect(calm.page.get_by_text("env 0: step 3").first).to_be_visible()
     stop.click()
-    until(lambda: calm.recordings.is_dir() and any(calm.recordings.glob("*.rrd")), "the file")
-    (written,) = calm.recordings.glob("*.rrd")
+    recordings = calm.file.parent / RECORDINGS
+    until(lambda: any(recordings.glob("*.rrd")), "the file")
+    (written,) = recordings.glob("*.rrd")
     assert verify_rrd(written) is None
     expect(calm.page.get_by_text(written.name).first).to_be_visible()
 

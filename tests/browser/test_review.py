@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import io
-import os
 import re
-import signal
-import subprocess
-import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from PIL import Image
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
 
-from tests.browser.opened import close_notice, launch, new_page, open_workbench, until
-from tests.session.recordings import made, write
+from tests.drive.episodes import made, write
+from tests.drive.page import close_notice, open_workbench, page_at
+from tests.drive.waiting import until
 
 pytestmark = pytest.mark.browser
-expect.set_options(timeout=60_000)
 LATE = "Tried to update non-existent component"
 """What viser's page says in its console when a thing goes that was written to in the same moment."""
 
@@ -36,39 +31,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def address(folder: Path) -> Iterator[str]:
     """Of ``workbench review``, which ends with Ctrl-C's signal."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "workbench.cli", "review", str(folder), "--port", "0"],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env={**os.environ, "COLUMNS": "200", "PYTHONUNBUFFERED": "1"},
-    )
-    assert process.stdout is not None
-    lines = []
-    for line in process.stdout:
-        lines.append(line)
-        if re.search(r"page +http", line):
-            break
-    else:
-        raise AssertionError("".join(lines))
-    yield lines[-1].split()[-1]
-    process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=20) == 0, process.stdout.read()
+    with open_workbench(str(folder), what="review") as opened:
+        yield opened.url
+    assert opened.process.returncode == 0, "\n".join(opened.lines)
 
 
 @pytest.fixture(scope="module")
-def browser(chromium_path: str) -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = launch(playwright, chromium_path)
-        yield browser
-        browser.close()
-
-
-@pytest.fixture(scope="module")
-def desk(address: str, browser: Browser) -> tuple[Page, list[str]]:
-    page, errors = new_page(browser)
-    page.goto(address)
-    return page, errors
+def desk(address: str, browser: Browser) -> Iterator[tuple[Page, list[str]]]:
+    with page_at(browser, address) as (page, errors):
+        yield page, errors
 
 
 def row(page: Page, seed: int) -> None:
@@ -101,7 +72,6 @@ def test_opens_from_the_library_and_walks_with_the_keys(desk: tuple[Page, list[s
     says(page, "step 0 / 20")
     for _ in range(3):
         page.keyboard.press("ArrowRight")
-        time.sleep(0.3)
     says(page, "step 3 / 20")
     until(lambda: any(abs(x - 0.03) < 1e-4 for x in cubes(page)), "the cube at its place")
     page.keyboard.press("Shift+ArrowRight")
@@ -194,7 +164,9 @@ def test_what_is_shared_is_named_made_and_fetched(desk: tuple[Page, list[str]]) 
 def test_of_rerun_and_the_library_the_one_unfolded_last_folds_the_other_where_there_is_no_room_for_both(
     desk: tuple[Page, list[str]],
 ) -> None:
-    page, _ = desk  # its console has what rerun says when it is taken away while it loads
+    page, _ = desk  # its console has what rerun says of this
+    # It is loaded anew at each of its returns, a core for some seconds; what it shows is tests/ui/test_rerun_view.py's.
+    page.route("**/rerun/viewer-*/*.wasm", lambda route: route.abort())
     library, rerun = page.locator(".wb-library"), page.locator("iframe.wb-rerun")
     unfold = page.get_by_role("button", name="Expand column").first
     page.get_by_role("button", name="Open in rerun").click()
@@ -221,17 +193,19 @@ def test_of_rerun_and_the_library_the_one_unfolded_last_folds_the_other_where_th
 def test_from_the_live_page_to_the_recordings_and_back(folder: Path, browser: Browser) -> None:
     """The env is there as it was."""
     task = Path(__file__).parents[2] / "tasks" / "minimal.py"
-    arguments = (str(task), "--num-envs", "1", "--no-spare", "--recordings", str(folder))
-    with open_workbench(*arguments, cwd=folder) as opened:
-        page, errors = new_page(browser)
-        page.goto(opened.url)
+    # Without pictures there are no shaders to wait for.
+    quick = ("--num-envs", "1", "--no-spare", "--env", "render_backend=none")
+    with (
+        open_workbench(str(task), *quick, "--recordings", str(folder)) as opened,
+        page_at(browser, opened.url) as (page, errors),
+    ):
         expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
         page.get_by_role("tab", name="Episodes").click()
         page.get_by_role("button", name="Review recordings").click()
         expect(page.get_by_text("No recording is open")).to_be_visible()
         close_notice(page)
         page.get_by_role("button", name="Back to the live env").click()
-        expect(page.get_by_role("tab", name="Studio")).to_be_visible()
+        expect(page.get_by_role("tab", name="Run")).to_be_visible()
 
         def steps() -> bool:
             # Keys come with the last part of the page.
@@ -241,4 +215,3 @@ def test_from_the_live_page_to_the_recordings_and_back(folder: Path, browser: Br
 
         until(steps, "a step")
         assert [e for e in errors if LATE not in e] == []
-        page.close()

@@ -5,15 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Browser, expect
 
-from .opened import TASK, page_on
+from tests.drive.page import TASK, page_on
 
 pytestmark = pytest.mark.browser
 DRAWN = "        self.drawn = torch.rand((self.num_envs, 2))\n"
 
 
-def test_the_mark_stands_until_the_file_is_mended(tmp_path: Path, chromium_path: str) -> None:
+def test_the_mark_stands_until_the_file_is_mended(tmp_path: Path, browser: Browser) -> None:
     text = TASK.read_text()
     def_line = next(line for line in text.splitlines() if "def _initialize_episode" in line)
     hook = text.index(def_line)
@@ -23,7 +23,7 @@ def test_the_mark_stands_until_the_file_is_mended(tmp_path: Path, chromium_path:
     file.write_text(broken)
     line = broken[: broken.index(DRAWN)].count("\n") + 1
     arguments = ("--num-envs", "3", "--env", "render_backend=none")
-    with page_on(file, *arguments, chromium=chromium_path) as (page, errors, opened):
+    with page_on(file, *arguments, browser=browser) as (page, errors, opened):
         mark = page.locator(".wb-rules-mark")
         expect(mark).to_contain_text("1 warning")
         opened.wait_for_line(rf"warning .*push_cube\.py:{line}: self\.drawn is changed in envs 1, 2")

@@ -6,9 +6,8 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Browser, Page
 
-from tests.browser.opened import launch
 from workbench.ui.door import Door, DoorOptions, open_door
 
 pytestmark = pytest.mark.browser
@@ -42,22 +41,19 @@ def door() -> Iterator[Door]:
 
 
 @pytest.fixture(scope="module")
-def show(door: Door, chromium_path: str) -> Iterator[Show]:
+def show(door: Door, browser: Browser) -> Iterator[Show]:
     """Opens the page on a screen of twice the usual resolution, and waits for its view."""
-    with sync_playwright() as playwright:
-        browser = launch(playwright, chromium_path)
 
-        def opened(*scripts: str, wish: str = "") -> Page:
-            page = browser.new_page(viewport={"width": 640, "height": 400}, device_scale_factor=2)
-            for script in scripts:
-                page.add_init_script(script)
-            page.goto(door.url + wish)
-            # Made with 300 x 150, as every canvas; the view's size comes some frames later.
-            page.wait_for_function(f"{CANVAS}?.clientWidth === 640 && {CANVAS}.width !== 300", timeout=60_000)
-            return page
+    def opened(*scripts: str, wish: str = "") -> Page:
+        page = browser.new_page(viewport={"width": 640, "height": 400}, device_scale_factor=2)
+        for script in scripts:
+            page.add_init_script(script)
+        page.goto(door.url + wish)
+        # Made with 300 x 150, as every canvas; the view's size comes some frames later.
+        page.wait_for_function(f"{CANVAS}?.clientWidth === 640 && {CANVAS}.width !== 300", timeout=60_000)
+        return page
 
-        yield opened
-        browser.close()
+    yield opened
 
 
 def draw_until(door: Door, page: Page, reached: str) -> None:

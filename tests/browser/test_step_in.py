@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import re
 import shutil
-import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, expect, sync_playwright
+from playwright.sync_api import Browser, Page, expect
 
-from tests.browser.opened import TASK, launch, new_page, until
+from tests.drive.page import TASK, open_workbench, page_at
+from tests.drive.waiting import until
 from workbench.session.messages import TaskOptions
 from workbench.session.record import RecordOptions, record
 
@@ -42,22 +38,9 @@ def author(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def address(author: Path) -> Iterator[str]:
     """Of ``workbench review``, which ends with Ctrl-C's signal and leaves no folder of recorded text."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "workbench.cli", "review", "recordings", "--port", "0"],
-        cwd=author,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        env={**os.environ, "COLUMNS": "200", "PYTHONUNBUFFERED": "1", "TMPDIR": str(author)},
-    )
-    assert process.stdout is not None
-    said = ""
-    for said in process.stdout:
-        if re.search(r"page +http", said):
-            break
-    yield said.split()[-1]
-    process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=30) == 0, process.stdout.read()
+    with open_workbench("recordings", cwd=author, what="review", env={"TMPDIR": str(author)}) as opened:
+        yield opened.url
+    assert opened.process.returncode == 0, "\n".join(opened.lines)
     assert not list(author.glob("workbench-recorded-*"))
 
 
@@ -74,12 +57,9 @@ def timeline_width(page: Page) -> float:
 
 
 def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
-    address: str, author: Path, chromium_path: str
+    address: str, author: Path, browser: Browser
 ) -> None:
-    with sync_playwright() as playwright:
-        browser = launch(playwright, chromium_path)
-        page, errors = new_page(browser)
-        page.goto(address)
+    with page_at(browser, address) as (page, errors):
         page.locator("tr", has_text="WorkbenchPushCube").first.click()
         page.keyboard.press("Enter")
         live = page.get_by_role("button", name="Go on live from here")
@@ -121,4 +101,3 @@ def test_a_recording_is_judged_and_gone_into_with_todays_code_and_with_its_own(
         expect(told).to_be_visible(timeout=PATIENT)
         assert list(author.glob("workbench-recorded-*/push_cube.py"))
         assert not [error for error in errors if "non-existent component" not in error]
-        browser.close()

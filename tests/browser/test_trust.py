@@ -7,9 +7,9 @@ import shutil
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import expect, sync_playwright
+from playwright.sync_api import Browser, expect
 
-from tests.browser.opened import TASK, launch, new_page, open_workbench
+from tests.drive.page import TASK, open_workbench, page_at
 from workbench.session.messages import TaskOptions
 from workbench.session.record import RecordOptions, record
 from workbench.ui.trust_dialog import DO_NOT, ONCE
@@ -19,7 +19,7 @@ PATIENT = 120_000
 
 
 def test_code_of_a_recording_from_elsewhere_runs_when_a_person_says_so(
-    tmp_path: Path, chromium_path: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, browser: Browser, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file = Path(shutil.copy(TASK, tmp_path))
     (tmp_path / "marks.py").write_text("open(__file__ + '.ran', 'w').close()\n")
@@ -29,10 +29,10 @@ def test_code_of_a_recording_from_elsewhere_runs_when_a_person_says_so(
     mark = tmp_path / "marks.py.ran"
     mark.unlink()
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "another user"))
-    with open_workbench("r", cwd=tmp_path, what="review") as opened, sync_playwright() as playwright:
-        browser = launch(playwright, chromium_path)
-        page, errors = new_page(browser)
-        page.goto(opened.url)
+    with (
+        open_workbench("r", cwd=tmp_path, what="review") as opened,
+        page_at(browser, opened.url) as (page, errors),
+    ):
         page.locator("tr", has_text="WorkbenchPushCube").first.click()
         page.keyboard.press("Enter")
         live = page.get_by_role("button", name="Go on live from here")
@@ -72,4 +72,3 @@ def test_code_of_a_recording_from_elsewhere_runs_when_a_person_says_so(
         expect(page.get_by_text("every body is where it was")).to_be_visible(timeout=PATIENT)
         assert mark.exists()
         assert not [error for error in errors if "non-existent component" not in error]
-        browser.close()

@@ -6,23 +6,23 @@ import re
 from collections.abc import Iterator
 
 import pytest
-from playwright.sync_api import expect
+from playwright.sync_api import Browser, expect
 
-from tests.browser.opened import page_on, until
-from tests.browser.test_page import Desk
+from tests.drive.desk import Desk
+from tests.drive.page import page_on
+from tests.drive.waiting import until
 from tests.session.hazards import calm, provoke, write_task
 
 pytestmark = pytest.mark.browser
-expect.set_options(timeout=60_000)
-ARGUMENTS = "--num-envs 2 --no-spare --env render_backend=none".split()
+ARGUMENTS = "--num-envs 2 --env render_backend=none".split()
 """Without pictures there are no shaders to wait for."""
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory, chromium_path: str) -> Iterator[Desk]:
+def desk(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[Desk]:
     file = write_task(tmp_path_factory.mktemp("author"))
-    with page_on(file, *ARGUMENTS, chromium=chromium_path) as (page, errors, opened):
-        yield Desk(page, errors, file, opened, file.parent)
+    with page_on(file, *ARGUMENTS, browser=browser) as (page, errors, opened):
+        yield Desk(page, errors, file, opened)
 
 
 def test_a_loop_shows_a_banner_that_ends_it_with_its_traceback(desk: Desk) -> None:

@@ -6,26 +6,24 @@ import threading
 
 import numpy as np
 import pytest
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Browser
 
-from tests.browser.opened import launch, until
+from tests.drive.page import page_at
+from tests.drive.waiting import until
 from workbench.ui.commands import Command, register
 from workbench.ui.door import DoorOptions, open_door
 
 pytestmark = pytest.mark.browser
 
 
-def test_keys_do_what_they_say_and_the_view_stays(chromium_path: str) -> None:
+def test_keys_do_what_they_say_and_the_view_stays(browser: Browser) -> None:
     door = open_door(DoorOptions(port=0))
     stepped, walked = threading.Event(), threading.Event()
     register(
         door.server, [Command("step", stepped.set, "S"), Command("a step back", walked.set, "arrowleft")]
     )
     try:
-        with sync_playwright() as playwright:
-            browser = launch(playwright, chromium_path)
-            page = browser.new_page(viewport={"width": 1000, "height": 600})
-            page.goto(door.url)
+        with page_at(browser, door.url, 1000, 600) as (page, _):
             until(lambda: len(door.server.get_clients()) == 1, "the page")
             (client,) = door.server.get_clients().values()
             until(lambda: client.camera.image_width > 300, "the view")
@@ -44,6 +42,5 @@ def test_keys_do_what_they_say_and_the_view_stays(chromium_path: str) -> None:
             until(lambda: not np.allclose(client.camera.position, before), "the view that is dragged")
             height = client.camera.position[2]
             assert height == pytest.approx(before[2], abs=1e-3), "it was moved up or down by a key"
-            browser.close()
     finally:
         door.close()

@@ -21,7 +21,6 @@ from tests.core.single_env_judge import Bare, batch_of
 from workbench.core import camera_frames as frames
 from workbench.core.camera_frames import LookAt
 from workbench.core.camera_settings import CameraSettings
-from workbench.core.render_device import keep_render_device
 
 unhurried = settings(deadline=None, max_examples=50)  # a busy machine is no failure
 numbers = st.floats(-10, 10, allow_subnormal=False)
@@ -57,8 +56,7 @@ class Posed(Bare):
         ]
 
 
-def test_matrices_are_those_of_maniskills_cameras() -> None:
-    keep_render_device("cpu")
+def test_matrices_are_those_of_maniskills_cameras(renderer: None) -> None:
     env: Any = batch_of(Posed, 2, obs_mode="rgb", render_backend="cpu")
     for i, eye in enumerate(Posed.EYES):
         camera = env._sensors[f"c{i}"]

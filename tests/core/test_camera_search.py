@@ -24,7 +24,7 @@ LOW, HIGH = (-0.8, -0.8, 0.1), (0.8, 0.8, 1.0)
 
 
 @pytest.fixture(scope="module")
-def env() -> Iterator[Any]:
+def env(renderer: None) -> Iterator[Any]:
     made = make_env(REGISTERED_ENVS["PushCube-v1"].cls, EnvOptions(num_envs=N, backend="cpu"))
     made.reset(seed=3)
     yield made

@@ -20,14 +20,16 @@ from mani_skill.utils.structs.pose import Pose
 import workbench
 from tests.core.drawn_envs import batched
 from workbench.core.body_table import build_body_table, read_poses
-from workbench.core.render_device import keep_render_device
 from workbench.core.step_pictures import observed_pictures
 from workbench.core.take_pictures import take_pictures
 from workbench.core.task_env import TaskEnv
 from workbench.core.visibility import judge_camera
 
 # That they are set and not applied is what these tests are about.
-pytestmark = pytest.mark.filterwarnings("ignore::workbench.core.strict.RuleWarning")
+pytestmark = [
+    pytest.mark.usefixtures("renderer"),
+    pytest.mark.filterwarnings("ignore::workbench.core.strict.RuleWarning"),
+]
 MODE = "rgb+segmentation"
 N = 2
 AWAY = 50.0
@@ -62,11 +64,6 @@ class Hiding(Pushing):
         pose[1:, 2] += AWAY
         self.obj.set_pose(Pose.create(pose))
         return found
-
-
-@pytest.fixture(scope="module", autouse=True)
-def render_device() -> None:
-    keep_render_device("cpu")
 
 
 @pytest.fixture(scope="module")

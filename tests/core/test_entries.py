@@ -219,7 +219,9 @@ def test_info_is_what_stock_maniskill_gives(odd_task: Path) -> None:
     stock.close()
 
 
-def test_maniskills_wrappers_take_it_from_a_batch(odd_task: Path, tmp_path: Path) -> None:
+def test_maniskills_wrappers_take_it_from_a_batch(
+    child_process: None, odd_task: Path, tmp_path: Path
+) -> None:
     env: Any = workbench.make(odd_task, 2, backend="cpu", render_backend="none")
     env = RecordEpisode(env, str(tmp_path), save_video=False)
     env = ManiSkillVectorEnv(env, auto_reset=True, record_metrics=True)

@@ -36,12 +36,12 @@ def rows_of_the_page() -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("env_id", WITH_CAMERAS)
-def test_a_task_does_all_that_is_promised_with_cameras_on(env_id: str) -> None:
+def test_a_task_does_all_that_is_promised_with_cameras_on(renderer: None, env_id: str) -> None:
     row = exercise(env_id)
     assert row.outcome == "passed" and row.cameras, row
 
 
-def test_a_task_with_a_fault_of_its_own_does_the_rest() -> None:
+def test_a_task_with_a_fault_of_its_own_does_the_rest(renderer: None) -> None:
     row = exercise("MS-HopperStand-v1")
     assert row.outcome == "upstream" and row.after_restore, row
 
@@ -92,7 +92,7 @@ def test_the_buffers_that_a_partial_reset_replaced_are_named() -> None:
     env.close()
 
 
-def test_a_fault_that_upstream_mended_is_found_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fault_that_upstream_mended_is_found_out(renderer: None, monkeypatch: pytest.MonkeyPatch) -> None:
     faulty = FAULTS[0]
     mended = Fault(
         ("MS-CartpoleBalance-v1",), faulty.stage, faulty.file, faulty.line, faulty.why, faulty.upstream
@@ -107,6 +107,7 @@ def test_a_fault_that_upstream_mended_is_found_out(monkeypatch: pytest.MonkeyPat
 
 
 def test_what_must_be_downloaded_is_named_without_a_question_and_without_the_network(
+    child_process: None,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     # ManiSkill takes this for a yes to every download.
@@ -124,7 +125,7 @@ def test_what_must_be_downloaded_is_named_without_a_question_and_without_the_net
     assert named["ReplicaCADSetTableVal_SceneManipulation-v1"] == ["ReplicaCAD", "ReplicaCADRearrange"]
 
 
-def test_a_task_that_does_not_come_back_is_one_row() -> None:
+def test_a_task_that_does_not_come_back_is_one_row(child_process: None) -> None:
     (row,) = sweep(["PickCube-v1"], limit=0.2)
     assert row["outcome"] == "hung"
 
@@ -132,7 +133,7 @@ def test_a_task_that_does_not_come_back_is_one_row() -> None:
 # --- the page -------------------------------------------------------------------------------------------
 
 
-def test_the_page_has_a_row_for_every_registered_id_and_no_failure() -> None:
+def test_the_page_has_a_row_for_every_registered_id_and_no_failure(child_process: None) -> None:
     rows = rows_of_the_page()
     # Asked of a new process: in this one other tests may have loaded copies of ManiSkill's files, whose ids they take.
     ask = "from tests.sweeps.task_ids import registered_ids; print(*registered_ids(), sep='\\n')"

@@ -90,6 +90,13 @@ def test_nothing_but_the_systems_is_new() -> None:
     env.close()
 
 
+def test_a_step_is_as_long_as_before() -> None:
+    slow = made(PICK_CUBE, 2, sim_config={"sim_freq": 60, "control_freq": 20})
+    renew_physics(slow.scene, [1])
+    assert [system.timestep for system in slow.scene.px.systems] == [pytest.approx(1 / 60)] * 2
+    slow.close()
+
+
 def test_gravity_is_that_of_the_env_and_the_processs_default_stays() -> None:
     light = made(PICK_CUBE, 1, sim_config={"scene_config": {"gravity": np.array([0.0, 0.0, -1.0])}})
     other = made(PICK_CUBE, 1)
@@ -135,7 +142,7 @@ def test_a_drive_between_two_bodies_still_holds() -> None:
     env.close()
 
 
-def test_pictures_and_segmentation_are_the_same_after_it() -> None:
+def test_pictures_and_segmentation_are_the_same_after_it(renderer: None) -> None:
     env: Any = made(PICK_CUBE, 2, render=True, obs_mode="rgb+segmentation")
     env.reset(seed=[0, 1])
     env.step(env.action_space.sample())

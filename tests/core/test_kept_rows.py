@@ -25,6 +25,8 @@ from workbench.core.broken_rule import BrokenRule
 from workbench.core.rules import Finding
 from workbench.core.task_env import EnvOptions, make_env
 
+pytestmark = pytest.mark.thorough
+
 N = 3
 PICK_CUBE: Any = REGISTERED_ENVS["PickCube-v1"].cls
 ACTION = np.zeros((N, 8), np.float32)

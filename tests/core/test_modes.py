@@ -28,7 +28,8 @@ from mani_skill.utils.structs.pose import Pose
 
 import workbench
 from tests.core import single_env_judge
-from workbench.core.render_device import keep_render_device
+
+pytestmark = pytest.mark.thorough
 
 N, ENV = 2, 1
 """The batch, and the env of it that is compared."""
@@ -41,7 +42,6 @@ CAMERA_TOLERANCE = 2e-7
 def pair(task: Any = PickCubeEnv, num_envs: int = N, **kwargs: Any) -> tuple[Any, Any]:
     """The same task batched and stock, unwrapped."""
     if kwargs.get("render_backend") != "none":
-        keep_render_device("cpu")
         kwargs["render_backend"] = "cpu"
     cls = REGISTERED_ENVS[task].cls if isinstance(task, str) else task
     batch = workbench.make(task, num_envs, backend="cpu", **deepcopy(kwargs)).unwrapped
@@ -74,7 +74,7 @@ def assert_same(batched: Any, single: Any, path: str, env: int = ENV) -> None:
 
 # --- observations ----------------------------------------------------------------------------------
 
-slow = pytest.mark.slow
+draws, slow = pytest.mark.render, pytest.mark.slow
 
 
 @pytest.mark.parametrize(
@@ -83,8 +83,8 @@ slow = pytest.mark.slow
         "state",
         "state_dict",
         "none",
-        "rgb+depth+segmentation",
-        "pointcloud",
+        pytest.param("rgb+depth+segmentation", marks=draws),
+        pytest.param("pointcloud", marks=draws),
         pytest.param("sensor_data", marks=slow),
         pytest.param("rgb+state", marks=slow),
         pytest.param("rgb", marks=slow),
@@ -122,8 +122,7 @@ def test_observations(obs_mode: str) -> None:
     stock.close()
 
 
-def test_an_observation_that_is_kept_does_not_change_with_the_next_step() -> None:
-    keep_render_device("cpu")
+def test_an_observation_that_is_kept_does_not_change_with_the_next_step(renderer: None) -> None:
     env = workbench.make("PickCube-v1", N, backend="cpu", obs_mode="rgb+state", sensor_configs=dict(SMALL))
     kept, _ = env.reset(seed=0)
     copied = common.torch_clone_dict(kept)
@@ -281,7 +280,7 @@ class TwoCameras(PickCubeEnv):
 
 
 @pytest.fixture(scope="module", params=[PickCubeEnv, TwoCameras], ids=["one-camera", "two-cameras"])
-def rendered(request: pytest.FixtureRequest) -> Iterator[tuple[Any, Any]]:
+def rendered(renderer: None, request: pytest.FixtureRequest) -> Iterator[tuple[Any, Any]]:
     batch, stock = pair(
         request.param,
         obs_mode="rgb+segmentation",

@@ -19,7 +19,6 @@ from mani_skill.utils.structs.pose import Pose
 from tests.core.single_env_judge import Bare, batch_of, put_in_same_state, single
 from tests.core.test_actors_and_articulations import by_hand
 from workbench.core.body_table import build_body_table, read_poses
-from workbench.core.render_device import keep_render_device
 from workbench.core.take_pictures import take_pictures
 
 N = 3
@@ -75,8 +74,7 @@ class Watched(Bare):
 
 
 @pytest.fixture(scope="module")
-def env() -> Iterator[Any]:
-    keep_render_device("cpu")
+def env(renderer: None) -> Iterator[Any]:
     env = batch_of(Watched, N, **RENDERED)
     yield env
     env.close()

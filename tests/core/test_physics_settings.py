@@ -20,6 +20,8 @@ from mani_skill.utils.structs.types import SceneConfig, SimConfig
 from tests.core.single_env_judge import Bare, batch_of, follow
 from tests.core.test_actors_and_articulations import BOX, box, by_hand
 
+pytestmark = pytest.mark.thorough
+
 STEPS = 15
 Change = Callable[[Any], None]
 

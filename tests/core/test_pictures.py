@@ -19,13 +19,10 @@ from workbench.core.pictures import Picture
 from workbench.core.render_device import keep_render_device
 from workbench.core.take_pictures import list_cameras, segmentation_names, take_pictures
 
+pytestmark = pytest.mark.usefixtures("renderer")
+
 OBS_MODE = "rgb+depth+segmentation"
 ALL = ("rgb", "depth", "segmentation")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def render_device() -> None:
-    keep_render_device("cpu")
 
 
 def act(env: Any) -> None:

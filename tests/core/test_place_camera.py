@@ -20,7 +20,6 @@ from workbench.core.camera_configs import settings_of
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.exchange import exchange_cameras
 from workbench.core.place_camera import PlacedCameras
-from workbench.core.render_device import keep_render_device
 from workbench.core.snapshot import restore_snapshot, take_snapshot
 from workbench.core.take_pictures import list_cameras, segmentation_names, take_pictures
 
@@ -32,9 +31,8 @@ TURNED = (0.96, 0.0, 0.28, 0.0)
 
 
 @pytest.fixture(scope="module")
-def envs() -> Iterator[tuple[Any, Any]]:
+def envs(renderer: None) -> Iterator[tuple[Any, Any]]:
     """One whose cameras are placed, and one whose cameras are configured so."""
-    keep_render_device("cpu")
     pair = batch_of(Watched, N, **RENDERED), batch_of(Watched, N, **RENDERED)
     yield pair
     for env in pair:
@@ -147,6 +145,37 @@ def test_a_reset_that_builds_the_scene_anew_is_followed_by_putting_cameras_back(
     placed.put_back(env)
     (picture,) = take_pictures(env, 0, [("people", "human", ("rgb",))])
     assert picture.pose[0] == -1.0
+
+
+class Wandering(Watched):
+    """Each time that its scene is built a camera stands elsewhere, and looks another way."""
+
+    builds = 0
+
+    @property
+    def _default_human_render_camera_configs(self) -> CameraConfig:
+        return CameraConfig("people", sapien.Pose([0, 0, 1.0 + self.builds], TURNED), 32, 24, 1.5, 0.01, 10)
+
+    def _load_scene(self, options: dict) -> None:
+        super()._load_scene(options)
+        self.builds += 1
+
+
+def test_a_camera_goes_back_to_where_the_scene_that_is_there_has_it(renderer: None) -> None:
+    env = batch_of(Wandering, 2, **RENDERED)
+    env.reset(seed=SEEDS)
+    placed, first = PlacedCameras(), said(env, PEOPLE)
+    placed.place(env, PEOPLE, replace(first, position=(-1.0, 0.5, 0.2)))
+    env.reset(seed=SEEDS, options={"reconfigure": True})
+    second = said(env, PEOPLE)
+    assert second.position != first.position
+    placed.put_back(env)
+    assert np.allclose(said(env, PEOPLE).position, (-1.0, 0.5, 0.2))
+    placed.place(env, PEOPLE, None)
+    assert said(env, PEOPLE) == second
+    (picture,) = take_pictures(env, 1, [("people", "human", ("rgb",))])
+    assert np.allclose(picture.pose, [*second.position, *second.quaternion])
+    env.close()
 
 
 @pytest.mark.parametrize(

@@ -20,16 +20,12 @@ from PIL import Image, ImageDraw
 from tests.core.drawn_envs import batched, stock
 from workbench.core.body_table import build_body_table, read_poses
 from workbench.core.geometry import SceneGeometry, Visual
-from workbench.core.render_device import keep_render_device
 from workbench.core.scene_geometry import Detail, read_geometry
 from workbench.core.take_pictures import list_cameras, segmentation_names, take_pictures
 
+pytestmark = pytest.mark.usefixtures("renderer")
+
 EVERYTHING = Detail(max_faces_per_visual=None, max_texture_size=None)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def render_device() -> None:
-    keep_render_device("cpu")
 
 
 # --- what it looks like ----------------------------------------------------------------------------

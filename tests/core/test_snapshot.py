@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import pickle
+import random
 from collections.abc import Iterator
 from typing import Any
 
@@ -26,6 +27,8 @@ from workbench.core.cpu_state import CpuEnvState, plan_cpu_state
 from workbench.core.fresh_physics import renew_physics
 from workbench.core.snapshot import restore_snapshot, take_snapshot
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+
+pytestmark = pytest.mark.thorough
 
 N = 6
 PICK_CUBE: Any = REGISTERED_ENVS["PickCube-v1"].cls
@@ -207,6 +210,12 @@ def test_what_was_evaluated_is_evaluated_again(pick: BaseEnv) -> None:
     for _ in range(4):
         held = env.step(close)
     assert held.evaluate["is_grasped"].any(), "nothing is grasped: the test would prove nothing"
+
+    def pressed() -> torch.Tensor:
+        return pick.scene.get_pairwise_contact_impulses(pick.agent.finger1_link, pick.cube).clone()
+
+    impulses = pressed()
+    assert len(impulses.unique(dim=0)) == N, "each env has its own"
     snapshot = env.snapshot()
     opened = -close
     for _ in range(6):
@@ -216,6 +225,7 @@ def test_what_was_evaluated_is_evaluated_again(pick: BaseEnv) -> None:
     assert not report.not_carried
     for name, value in held.evaluate.items():
         assert np.array_equal(restored.evaluate[name], value), name
+    assert torch.equal(pressed(), impulses)
     np.testing.assert_allclose(restored.poses, held.poses, atol=1e-6)
     assert restored.elapsed_steps.tolist() == held.elapsed_steps.tolist()
     assert not restored.reward.any() and restored.action is None
@@ -292,6 +302,56 @@ def test_a_part_of_the_batch_leaves_the_processs_generators_alone(pick: BaseEnv)
     restore_snapshot(pick, snapshot)
     assert torch.equal(torch.get_rng_state(), state[0])
     assert np.array_equal(np.random.get_state()[1], state[1])
+
+
+@pytest.mark.parametrize(
+    ("taken", "into", "source", "whole"),
+    [
+        (range(N), None, None, True),
+        ([5, 3, 4, 1, 0, 2], None, None, True),
+        (range(N), [5, 3, 4, 1, 0, 2], None, True),
+        (range(N), [5, 3, 4, 1, 0, 2], range(N), False),
+        (range(N), range(N), 0, False),
+        (range(N - 1), None, None, False),
+        ([0], range(N), None, False),
+    ],
+)
+def test_the_processs_generators_go_back_when_every_env_does_in_whichever_order(
+    pick: BaseEnv, taken: Any, into: Any, source: Any, whole: bool
+) -> None:
+    pick.reset(seed=list(range(N)))
+    snapshot = take_snapshot(pick, taken)
+    then = drawn_next()
+    moved = drawn_next(set_it_on=True)
+    restore_snapshot(pick, snapshot, into, source)
+    assert drawn_next() == (then if whole else moved)
+
+
+def test_the_processs_generators_stay_where_they_are_for_a_snapshot_of_another_number_of_envs(
+    pick: BaseEnv,
+) -> None:
+    larger = made("PickCube-v1", N + 1)
+    larger.reset(seed=0)
+    snapshot = take_snapshot(larger, range(N))
+    moved = drawn_next(set_it_on=True)
+    restore_snapshot(pick, snapshot)
+    assert drawn_next() == moved
+    restore_snapshot(larger, take_snapshot(pick), range(N))
+    assert drawn_next() == moved
+    larger.close()
+
+
+def drawn_next(set_it_on: bool = False) -> tuple[float, ...]:
+    """What torch, numpy and Python would draw next."""
+    if set_it_on:
+        for draw in (torch.rand, np.random.rand, lambda count: random.random()):
+            draw(3)
+    kept = torch.get_rng_state(), np.random.get_state(), random.getstate()
+    drawn = float(torch.rand(1)), float(np.random.rand()), random.random()
+    torch.set_rng_state(kept[0])
+    np.random.set_state(kept[1])
+    random.setstate(kept[2])
+    return drawn
 
 
 def test_joint_forces_are_restored() -> None:
@@ -441,22 +501,6 @@ def test_a_stock_env_is_refused_in_words() -> None:
     with pytest.raises(NotImplementedError, match="workbench.make"):
         take_snapshot(stock)
     stock.close()
-
-
-@pytest.mark.gpu
-def test_a_gpu_env_goes_back_to_where_it_was() -> None:
-    options = EnvOptions(4, "gpu", render=False, kwargs={"obs_mode": "state"})
-    env = make_env(PICK_CUBE, options)
-    env.reset(seed=[0, 1, 2, 3])
-    after_reset = env.get_state()
-    snapshot = pickle.loads(pickle.dumps(take_snapshot(env)))
-    for action in random_actions(env, 5, 0):
-        env.step(action)
-    restore_snapshot(env, snapshot, [0, 2])
-    torch.testing.assert_close(env.get_state()[[0, 2]], after_reset[[0, 2]], atol=1e-5, rtol=0)
-    assert not torch.allclose(env.get_state()[1], after_reset[1])
-    assert env.elapsed_steps.tolist() == [0, 5, 0, 5]
-    env.close()
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ import torch
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 
 from workbench.core import actions
+from workbench.core.cpu_state import CpuEnvState
 from workbench.core.snapshot import Snapshot
 from workbench.core.snapshot_bytes import WholeSnapshot
 from workbench.core.snapshot_parts import PackedSnapshot, SnapshotPacker, unpack_snapshot
@@ -100,6 +102,28 @@ def test_a_grasp_and_what_it_touches_come_back(task: TaskEnv) -> None:
     assert same(unpack_snapshot(packed.body, Receiver().take(packed)), snapshot)
 
 
+def test_what_touches_and_sleeps_is_of_its_own_env(task: TaskEnv) -> None:
+    """As it is where envs differ: one holds, one pushes two things, and one sleeps."""
+    snapshot = task.snapshot()
+    touches = [
+        (),
+        (
+            ("cube", "panda/panda_leftfinger", np.array([1, 2, 3], np.float32)),
+            ("cube", "table", np.array([4, 5, 6], np.float32)),
+        ),
+        (),
+        (("cube", "table", np.array([7, 8, 9], np.float32)),),
+    ]
+    simulation = []
+    for env, state in enumerate(snapshot.simulation):
+        assert isinstance(state, CpuEnvState)
+        asleep = tuple((part + env) % 3 == 0 for part in range(len(state.contents)))
+        simulation.append(state._replace(touching=touches[env], asleep=asleep))
+    other = replace(snapshot, simulation=tuple(simulation))
+    packed = SnapshotPacker().pack(other)
+    assert same(unpack_snapshot(packed.body, Receiver().take(packed)), other)
+
+
 def test_of_a_step_only_what_moved_is_sent(task: TaskEnv) -> None:
     rng, packer = np.random.default_rng(0), SnapshotPacker()
     task.reset(seed=0)
@@ -138,7 +162,7 @@ def test_whole_bytes_unpickle_as_a_snapshot(task: TaskEnv) -> None:
     assert isinstance(back, Snapshot) and same(back, snapshot)
 
 
-def test_whole_bytes_are_made_without_torch_or_a_simulator() -> None:
+def test_whole_bytes_are_made_without_torch_or_a_simulator(child_process: None) -> None:
     code = (
         "import pickle, sys\n"
         "from workbench.core.snapshot_bytes import WholeSnapshot\n"

@@ -9,17 +9,13 @@ import pytest
 
 from tests.core.drawn_envs import batched
 from workbench.core import step_pictures as module
-from workbench.core.render_device import keep_render_device
 from workbench.core.step_pictures import step_pictures
 from workbench.core.take_pictures import take_pictures
 from workbench.core.task_env import TaskEnv
 
+pytestmark = pytest.mark.usefixtures("renderer")
+
 ALL = ("rgb", "depth", "segmentation")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def render_device() -> None:
-    keep_render_device("cpu")
 
 
 def test_what_was_observed_is_not_drawn_again(monkeypatch: pytest.MonkeyPatch) -> None:

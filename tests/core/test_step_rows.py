@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from mani_skill.utils.structs.pose import Pose
 
 import workbench
 from tests.session.odd_entries import write_task
@@ -54,6 +56,9 @@ def test_steps_told_later_are_those_that_were_read(
         if step == 4:
             for actor in seams.hidden_objects(held.env):
                 actor.hide_visual()  # moves it 99999 m away, as a sensor's picture does
+                # While it is hidden its row in the simulation's tensor keeps place and turn of before.
+                turned = torch.tensor([[0.5, 0.5, -0.5, 0.5], [0.6, 0, 0.8, 0], [0, 1, 0, 0]])
+                actor.set_pose(Pose.create_from_pq(p=torch.arange(9.0).reshape(3, 3), q=turned))
         action = rng.uniform(-1, 1, (3, width)).astype(np.float32)
         made = actions.to_env_action(held.env, held.parts, action)
         _, reward, terminated, truncated, info = env.step(made)

@@ -18,6 +18,8 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from workbench.core.cpu_scene import batched_class
 from workbench.core.seams import substeps_are_unwatched
 
+pytestmark = pytest.mark.thorough
+
 STATE_ONLY: dict[str, Any] = {"obs_mode": "state", "render_backend": "none"}
 PICK_CUBE = REGISTERED_ENVS["PickCube-v1"].cls
 

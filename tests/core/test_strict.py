@@ -28,6 +28,8 @@ from workbench.core.strict_system import StrictCpuSystem
 from workbench.core.struct_access import STATE_PROPERTIES, TARGET_SETTERS
 from workbench.core.task_env import EnvOptions, make_env
 
+pytestmark = pytest.mark.thorough
+
 N = 3
 PICK_CUBE: Any = REGISTERED_ENVS["PickCube-v1"].cls
 Hook = Callable[..., Any]

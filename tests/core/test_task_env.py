@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Iterator
 from typing import get_args
 
@@ -95,7 +96,103 @@ def test_a_partial_reset_touches_its_subset_only(
     assert [int(after.elapsed_steps[i]) for i in others] == [steps] * len(others)
 
 
-@pytest.mark.parametrize("wrong", [[], [N], [-1], [0, 99]])
+def test_in_whichever_order_envs_are_named_each_starts_from_its_own_seed(push: TaskEnv) -> None:
+    push.reset(seed=0)
+    ascending = push.reset(seed=[41, 40], env_idx=[0, 2])
+    push.reset(seed=0)
+    named = push.reset(seed=[40, 41], env_idx=[2, 0])
+    assert push.episode_seeds.tolist() == [41, 1, 40, 3]
+    assert np.array_equal(named.poses, ascending.poses, equal_nan=True)
+    stock = gym.make("PushCube-v1", num_envs=1, obs_mode="state", render_backend="none").unwrapped
+    stock.reset(seed=41)
+    assert torch.equal(push.env.obj.pose.p[0], stock.obj.pose.p[0])
+    # Its first joints come from numpy's generator, of which ManiSkill keeps one for the whole batch.
+    assert torch.equal(push.env.agent.robot.qpos[0], stock.agent.robot.qpos[0])
+    stock.close()
+
+
+class DrawsWhenAsked(REGISTERED_ENVS["PushCube-v1"].cls):
+    """Every look at it draws from all generators and counts."""
+
+    looks = 0
+
+    def evaluate(self) -> dict:
+        self.looks += 1
+        drawn = torch.rand(self.num_envs) + float(np.random.rand() + random.random())
+        drawn = drawn + torch.tensor(self._batched_episode_rng.normal(), dtype=torch.float32)
+        return {**super().evaluate(), "drawn": drawn, "looks": torch.full((self.num_envs,), self.looks)}
+
+
+def test_judging_the_present_moment_leaves_nothing_behind() -> None:
+    env = TaskEnv(make_env(DrawsWhenAsked, EnvOptions(3, "cpu", render=False)), 50)
+    env.reset(seed=0)
+    env.step(np.zeros((3, 8), np.float32))
+    first, again = env.judge(), env.judge(np.zeros((3, 8), np.float32))
+    assert not first.reward.any() and first.action is None and again.reward.all()
+    for name in ("drawn", "looks"):
+        assert np.array_equal(first.evaluate[name], again.evaluate[name]), name
+    assert len({*first.evaluate["drawn"].tolist()}) == 3
+    assert np.array_equal(env.step(np.zeros((3, 8), np.float32)).evaluate["drawn"], first.evaluate["drawn"])
+    env.close()
+
+
+class TellsOfEach(REGISTERED_ENVS["PushCube-v1"].cls):
+    """Env 1 succeeds and env 2 fails from the start; of env 0 one part of the observation is lost."""
+
+    def evaluate(self) -> dict:
+        numbers = torch.arange(self.num_envs)
+        return {"success": numbers == 1, "fail": numbers == 2}
+
+    def _get_obs_extra(self, info: dict) -> dict:
+        lost = torch.zeros(self.num_envs, 2)
+        lost[0, 1] = torch.nan
+        return {"lost": lost, "sound": torch.zeros(self.num_envs), "number": torch.zeros(self.num_envs, 1)}
+
+
+@pytest.mark.parametrize("obs_mode", ["state", "state_dict"])
+def test_what_a_task_says_of_each_env_is_told_of_that_env(obs_mode: str) -> None:
+    options = EnvOptions(4, "cpu", render=False, kwargs={"obs_mode": obs_mode})
+    env = TaskEnv(make_env(TellsOfEach, options), 50)
+    for step in (env.reset(seed=0), env.step(np.zeros((4, 8), np.float32)), env.judge()):
+        assert step.terminated.tolist() == [False, True, True, False]
+        assert step.sound_obs is not None and step.sound_obs.tolist() == [False, True, True, True]
+        assert not step.truncated.any()
+    env.close()
+
+
+def test_a_scene_that_a_reset_builds_anew_is_the_one_that_is_read_and_acted_on() -> None:
+    env = opened("PushCube-v1", 2, control_mode="pd_joint_pos")
+    env.reset(seed=0)
+    old, scene = env.parts, env.env.scene
+    step = env.reset(seed=1, options={"reconfigure": True})
+    assert env.env.scene is not scene and env.table.scene is env.env.scene
+    assert env.parts is not old and env.parts[0].controller is env.env.agent.controller.controllers["arm"]
+    cube = env.table.names.index("cube")
+    assert np.array_equal(step.poses[:, cube, :3], env.env.obj.pose.p.numpy())
+    start = env.env.agent.robot.qpos.clone()
+    env.step(actions.hold_action(env.parts, 2))
+    assert (env.env.agent.robot.qpos - start).abs().max() < 0.02
+    env.close()
+
+
+def test_a_seed_is_kept_to_where_resets_without_one_draw_their_own() -> None:
+    env = opened("PushCube-v1", 3, enhanced_determinism=True)
+    env.reset(seed=0)
+    env.reset(seed=[40, 41], env_idx=[2, 1])
+    assert env.episode_seeds.tolist() == [0, 41, 40]
+    stock = gym.make(
+        "PushCube-v1", num_envs=1, obs_mode="state", render_backend="none", enhanced_determinism=True
+    ).unwrapped
+    stock.reset(seed=41)
+    assert torch.equal(env.env.obj.pose.p[1], stock.obj.pose.p[0])
+    before = env.episode_seeds.tolist()
+    env.reset(env_idx=[2])
+    assert env.episode_seeds[:2].tolist() == before[:2] and env.episode_seeds[2] != before[2]
+    stock.close()
+    env.close()
+
+
+@pytest.mark.parametrize("wrong", [[], [N], [-1], [0, 99], [1, 1]])
 def test_env_indices_that_are_not_there_are_refused(push: TaskEnv, wrong: list[int]) -> None:
     with pytest.raises((ValueError, IndexError)):
         push.reset(env_idx=wrong)

@@ -65,7 +65,7 @@ def test_two_callers_at_once_wait_for_each_other() -> None:
     assert sums == [2000, 2000]
 
 
-def test_a_forked_child_gets_threads_of_its_own() -> None:
+def test_a_forked_child_gets_threads_of_its_own(child_process: None) -> None:
     env_threads().run(lambda _: None, 4, 2)
     child = os.fork()
     if child == 0:

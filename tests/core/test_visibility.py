@@ -29,6 +29,8 @@ from workbench.core.visibility import (
     small_size,
 )
 
+pytestmark = pytest.mark.usefixtures("renderer")
+
 N = 3
 SENSOR = ("sensor", "base_camera")
 PEOPLE = ("human", "render_camera")
@@ -159,6 +161,33 @@ def test_a_cut_object_and_one_out_of_view_are_told_apart(env: Any) -> None:
     assert seen(beside, "cube").cut[0] and seen(beside, "cube").pixels[0] > 0
     assert not seen(away, "cube").cut[0] and seen(away, "cube").pixels[0] == 0
     assert np.isnan(seen(away, "cube").hidden_share[0]) and seen(away, "cube").summary().seen == 0
+
+
+def test_an_object_that_reaches_any_of_the_four_borders_is_cut_and_one_that_stops_short_of_it_is_not(
+    env: Any,
+) -> None:
+    x, y, _ = cube_at(env, 1)
+    # Straight down from 0.4 m a pixel is 5 mm wide, and the picture is not square.
+    down = looking(LookAt((x, y, 0.4), (x, y, 0.0)), width=48, height=40, fov=0.5)
+
+    def from_there(axis: int, by: float) -> ObjectSeen:
+        at = np.array([x, y, 0.4])
+        at[axis] += by
+        position: Any = tuple(map(float, at))
+        return seen(judge_placement(env, Placement(replace(down, position=position)), [1]), "cube")
+
+    for axis in (0, 1):
+        for side in (-1, 1):
+            assert not from_there(axis, 0).cut[0] and from_there(axis, side * 0.2).alone[0] == 0
+            whole, cut = 0.0, 0.13
+            while cut - whole > 0.002:
+                middle = (whole + cut) / 2
+                thing = from_there(axis, side * middle)
+                whole, cut = (whole, middle) if thing.cut[0] or thing.alone[0] == 0 else (middle, cut)
+            # Just before it is cut there is one row of pixels between it and the border.
+            near, over = from_there(axis, side * whole), from_there(axis, side * cut)
+            assert near.margin[0] == pytest.approx(1 / 40) and over.margin[0] == 0, (axis, side)
+            assert over.alone[0] > 0.5 * near.alone[0] > 10
 
 
 def test_a_smaller_picture_has_the_same_view_and_counts_the_cameras_own_pixels(env: Any) -> None:

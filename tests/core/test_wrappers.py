@@ -37,7 +37,8 @@ from mani_skill.utils.wrappers import (
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 import workbench
-from workbench.core.render_device import keep_render_device
+
+pytestmark = pytest.mark.thorough
 
 N = 4
 SMALL = {"sensor_configs": {"width": 32, "height": 32}}
@@ -47,8 +48,6 @@ SMALL_HUMAN = {"human_render_camera_configs": {"width": 64, "height": 48}}
 def made(task: Any = "PushCube-v1", num_envs: int = N, render: bool = False, **kwargs: Any) -> Any:
     if not render:
         kwargs["render_backend"] = "none"
-    else:
-        keep_render_device("cpu")
     return workbench.make(task, num_envs, backend="cpu", **kwargs)
 
 
@@ -158,7 +157,7 @@ def test_partial_resets_are_refused_where_the_scene_is_rebuilt() -> None:
     env.close()
 
 
-def test_a_goal_that_is_hidden_moves_with_a_partial_reset() -> None:
+def test_a_goal_that_is_hidden_moves_with_a_partial_reset(renderer: None) -> None:
     # Hidden, an object stands 99999 m away and its pose is kept aside: a reset has to write there.
     env = ManiSkillVectorEnv(
         made("PickCube-v1", 3, render=True, obs_mode="rgb+state", max_episode_steps=3, **SMALL)
@@ -185,7 +184,7 @@ def record(env: Any, tmp_path: Path, **kwargs: Any) -> Any:
     return RecordEpisode(env, str(tmp_path), trajectory_name="episodes", **{"save_video": False, **kwargs})
 
 
-def test_recorded_episodes_are_what_happened(tmp_path: Path) -> None:
+def test_recorded_episodes_are_what_happened(child_process: None, tmp_path: Path) -> None:
     env = ManiSkillVectorEnv(record(made(max_episode_steps=5), tmp_path), ignore_terminations=True)
     obs, _ = env.reset(seed=[3, 4, 5, 6])
     seen, actions, states = [obs], [], [env.base_env.get_state_dict()]
@@ -221,7 +220,7 @@ def test_recorded_episodes_are_what_happened(tmp_path: Path) -> None:
             assert trajectory["truncated"][:].tolist() == [False] * 4 + [True] * (env_of != 2)
 
 
-def test_stock_maniskill_replays_what_was_recorded(tmp_path: Path) -> None:
+def test_stock_maniskill_replays_what_was_recorded(child_process: None, tmp_path: Path) -> None:
     """With ManiSkill's own tool, in its own single CPU env, from the recorded first state."""
     env = record(made(num_envs=2, max_episode_steps=6), tmp_path)
     env.reset(seed=[3, 4])
@@ -253,7 +252,7 @@ def test_stock_maniskill_replays_what_was_recorded(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("with_text", [False, True])
-def test_videos_of_all_envs_side_by_side(tmp_path: Path, with_text: bool) -> None:
+def test_videos_of_all_envs_side_by_side(renderer: None, tmp_path: Path, with_text: bool) -> None:
     env = made("PickCube-v1", render=True, render_mode="rgb_array", **SMALL_HUMAN)
     with pytest.raises(AssertionError, match="max steps per video"):
         RecordEpisode(env, str(tmp_path), save_trajectory=False)
@@ -278,7 +277,7 @@ def test_videos_of_all_envs_side_by_side(tmp_path: Path, with_text: bool) -> Non
     assert loss < 60 if with_text else loss < 8
 
 
-def test_substeps_are_filmed(tmp_path: Path) -> None:
+def test_substeps_are_filmed(renderer: None, tmp_path: Path) -> None:
     # The wrapper replaces a hook on the env: substeps may then not be done in a row behind its back.
     env = made("MS-CartpoleBalance-v1", 2, render=True, render_mode="rgb_array", **SMALL_HUMAN)
     env = RecordEpisode(

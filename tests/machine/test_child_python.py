@@ -80,7 +80,7 @@ def test_that_rule_sees_each_way_to_start_one(text: str) -> None:
 
 @pytest.mark.parametrize("python_path", [None, "", ":", ":/nowhere", "/nowhere:", "/nowhere::/elsewhere"])
 def test_no_child_has_the_current_folder_on_its_path(
-    python_path: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    child_process: None, python_path: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if python_path is not None:
         monkeypatch.setenv("PYTHONPATH", python_path)
@@ -96,7 +96,7 @@ def test_no_child_has_the_current_folder_on_its_path(
 
 
 def test_the_command_itself_leaves_the_current_folder_out(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    child_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     here = os.getcwd()

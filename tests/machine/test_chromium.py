@@ -14,7 +14,7 @@ def test_the_chromium_of_this_machine_tells_its_version(chromium_path: str) -> N
 
 
 def test_ubuntus_stub_for_the_snap_is_not_taken_for_a_browser(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    child_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stub = tmp_path / "chromium-browser"
     stub.write_text("#!/bin/sh\necho 'requires the chromium snap to be installed.' >&2\nexit 10\n")
@@ -25,6 +25,7 @@ def test_ubuntus_stub_for_the_snap_is_not_taken_for_a_browser(
 
 
 def test_a_browser_that_was_named_and_does_not_run_is_not_replaced_by_another(
+    child_process: None,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("PLAYWRIGHT_CHROMIUM", "/nonexistent/chromium")
@@ -32,5 +33,5 @@ def test_a_browser_that_was_named_and_does_not_run_is_not_replaced_by_another(
     assert "/nonexistent/chromium" in how_to_get_chromium()
 
 
-def test_playwrights_own_node_starts() -> None:
+def test_playwrights_own_node_starts(child_process: None) -> None:
     assert driver_complaint() is None

@@ -12,7 +12,7 @@ from workbench.machine.doctor import Finding, diagnose, exit_code, print_report
 
 
 @pytest.fixture(scope="module")
-def findings() -> dict[str, Finding]:
+def findings(child_process: None) -> dict[str, Finding]:
     return {finding.topic: finding for finding in diagnose()}
 
 
@@ -39,14 +39,14 @@ def test_versions_that_must_match_are_shown(findings: dict[str, Finding]) -> Non
 
 
 def test_gpu_physics_is_looked_for_without_fetching_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    child_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HOME", str(tmp_path))
     assert doctor._gpu()
     assert not list(tmp_path.rglob("*PhysX*"))
 
 
-def test_a_gpu_that_works_is_not_taken_unasked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_gpu_that_works_is_not_taken_unasked(child_process: None, monkeypatch: pytest.MonkeyPatch) -> None:
     answer = '{"built": "12.8", "cuda": ["A card"], "why_not": null, "library": "/lib/PhysXGpu.so"}'
     monkeypatch.setattr(doctor, "GPU_QUESTIONS", f"print('{answer}')")
     cuda, physics = doctor._gpu()
@@ -65,7 +65,9 @@ def test_a_taken_port_is_said_with_the_option_to_change_it(monkeypatch: pytest.M
     assert finding.advice and "--port" in finding.advice
 
 
-def test_a_question_that_fails_is_told_and_the_others_are_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_question_that_fails_is_told_and_the_others_are_answered(
+    child_process: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fail() -> list[Finding]:
         raise OSError("no such thing")
 

@@ -10,6 +10,8 @@ import pytest
 from workbench.machine.render_device import driver_files, probe_render_device
 from workbench.machine.software_vulkan import ensure_render_device
 
+pytestmark = pytest.mark.usefixtures("child_process")
+
 
 def test_this_machine_renders_and_the_driver_is_named() -> None:
     probe = probe_render_device()

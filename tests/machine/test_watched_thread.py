@@ -1,22 +1,14 @@
 from __future__ import annotations
 
 import threading
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from tests.drive.waiting import until
 from workbench.authoring.watch import SourceWatcher
 from workbench.machine.watched_thread import listen, say_failure, stop_listening, watched_thread
 from workbench.session.lane import Job, Lane
-
-
-def until(reached: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 20
-    while not reached():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 @pytest.fixture
@@ -71,7 +63,7 @@ def test_a_job_that_fails_unforeseen_is_told_and_the_next_is_done(said: list[str
 
     lane = Lane("lane", lambda: None, failed.append)
     lane.start("counting", broken)
-    until(lambda: bool(failed))
+    until(lambda: failed, "the failure")
     lane.start("counting", lambda job: done.set())
     assert done.wait(20)
     lane.close()
@@ -90,7 +82,7 @@ def test_a_lane_whose_listener_fails_goes_on(said: list[str]) -> None:
 
     lane = Lane("lane", on_change, lambda why: None)
     lane.start("one", lambda job: None)
-    until(lambda: bool(said))
+    until(lambda: said, "a word of it")
     lane.start("two", lambda job: done.set())
     assert done.wait(20)
     lane.close()
@@ -106,7 +98,7 @@ def test_the_watcher_goes_on_after_whatever_fails_in_it(
     watcher.follow([file])
     with monkeypatch.context() as patched:
         patched.setattr("workbench.authoring.watch._read", lambda path: 1 / 0)
-        until(lambda: any("'source-watcher' failed" in text for text in said))
+        until(lambda: any("'source-watcher' failed" in text for text in said), "the end of the watcher")
     file.write_text("x = 2\n")
-    until(lambda: seen == [{file}])
+    until(lambda: seen == [{file}], "the change", seen=lambda: seen)
     watcher.stop()

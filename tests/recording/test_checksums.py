@@ -9,9 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import xxhash
 
-from tests.recording.made import Made
+from tests.drive.episodes import Made
 from workbench.recording.annotations import write_into_description
+from workbench.recording.checksums import check, checksum
 from workbench.recording.library_read import read_found
 from workbench.recording.library_scan import scan_folder
 from workbench.recording.read_episode import UnreadableRecording, read_episode
@@ -81,3 +83,18 @@ def test_tags_are_no_change_and_a_change_on_purpose_is_believed(episode: Made, t
     del said["workbench"]["files"][".h5"]
     files.json.write_text(json.dumps(said))
     assert read_episode(files.json).unread == ()
+
+
+@pytest.mark.parametrize("size", [0, 1, 1 << 20, (1 << 20) + 1, 3_000_000])
+def test_a_checksum_is_of_the_whole_file(tmp_path: Path, size: int) -> None:
+    path = tmp_path / "a.h5"
+    content = np.random.default_rng(size).bytes(size)
+    path.write_bytes(content)
+    found = checksum(path)
+    assert found == {"bytes": size, "xxh3_128": xxhash.xxh3_128(content).hexdigest()}
+    described = {"files": {".h5": found, ".rrd": {"bytes": 5}}}
+    check(path, described)
+    if size:
+        flip(path, size - 1)
+        with pytest.raises(OSError, match="its checksum is not the one"):
+            check(path, described)

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.recording.made import Made, Track
+from tests.drive.episodes import Made, Track
+from tests.drive.waiting import until
 from workbench.core.pictures import CameraInfo
 from workbench.recording import encode_soon
 from workbench.recording.landing import RecordingError
@@ -102,3 +103,41 @@ def test_a_picture_that_cannot_be_encoded_is_told_and_what_came_before_it_is_kep
     writer.close()
     (files,) = recover(tmp_path)
     assert pictures_of(files.json) == [0, 1, 2, 3]
+
+
+def test_what_was_encoded_does_not_wait_any_more(
+    seen: Made, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """However many pictures there were: only where too many wait at once are they encoded by whoever brings them."""
+    picture = np.zeros((30, 40), np.int32)
+    monkeypatch.setattr(encode_soon, "_pool", None)
+    monkeypatch.setattr(encode_soon, "MOST_BYTES", 2 * picture.nbytes)
+    encode, by = encode_soon.encode, []
+
+    def noted(*args: Any) -> bytes:
+        by.append(threading.current_thread())
+        return encode(*args)
+
+    monkeypatch.setattr(encode_soon, "encode", noted)
+    for number in range(8):
+        soon = encode_soon.encode_soon([("picture/0/segmentation", number, "segmentation", picture)])
+        assert [entry.number for entry in soon.result(60)] == [number]
+        # The last picture is done a moment before it is counted so.
+        until(lambda: encode_soon._pool is not None and encode_soon._pool._bytes == 0, "nothing to wait")
+    assert threading.current_thread() not in by and len(by) == 8
+
+
+def test_pictures_are_handed_over_as_soon_as_there_are_enough(
+    seen: Made, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And each time anew: a thread that is woken for each takes longer than the pictures."""
+    picture = np.zeros((30, 40), np.int32)
+    monkeypatch.setattr(encode_soon, "_pool", None)
+    monkeypatch.setattr(encode_soon, "_TOGETHER_BYTES", 3 * picture.nbytes)
+    first = encode_soon.encode_soon([])
+    soons = [first]
+    for number in range(7):
+        soons.append(encode_soon.encode_soon([("picture/0/segmentation", number, "segmentation", picture)]))
+    until(lambda: all(soon.done() for soon in soons[:7]), "six pictures")
+    assert encode_soon._pool is not None and encode_soon._pool._gathered == soons[7:]
+    soons[7].result(60)

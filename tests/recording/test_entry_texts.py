@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.core.test_entries import ENTRIES
-from tests.recording.made import Made
+from tests.drive.episodes import Made
 from tests.recording.read_rrd import read_rrd
 from tests.recording.verify_rrd import verify_rrd
 from workbench.core.entries import split_entries
@@ -82,7 +82,7 @@ def test_what_changes_too_often_is_named_and_not_kept_further() -> None:
     assert tracks["a"] == ((0, said("x")),)
 
 
-def test_numbers_texts_and_both_come_back(make_episode: Maker, tmp_path: Path) -> None:
+def test_numbers_texts_and_both_come_back(child_process: None, make_episode: Maker, tmp_path: Path) -> None:
     number = OtherEntry("float", numbers=np.array(0.5))
     states: list[Others] = [
         {"best": OtherEntry("None", ("None",)), "goal": OtherEntry("list", numbers=np.arange(2))},

@@ -23,7 +23,7 @@ import rerun as rr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.recording.made import Made, Track
+from tests.drive.episodes import Made, Track
 from tests.recording.verify_rrd import verify_rrd
 from workbench.core.geometry import Mesh
 from workbench.core.pictures import CameraInfo, Picture
@@ -104,7 +104,7 @@ def test_files_that_exist_are_never_written_over(make_episode: Maker, tmp_path: 
 
 
 def test_names_are_kept_apart_without_hard_links(
-    make_episode: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    child_process: None, make_episode: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: Any) -> None:
         raise OSError(errno.EPERM, "Operation not permitted")
@@ -242,7 +242,7 @@ def test_a_disk_without_room_leaves_the_journal_or_nothing(
 
 
 @pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
+def small_disk(child_process: None, tmp_path: Path) -> Iterator[Path]:
     """A filesystem of 1 MB."""
     folder = tmp_path / "disk"
     folder.mkdir()
@@ -275,7 +275,9 @@ def test_a_full_disk_is_said_and_what_was_recorded_is_found_when_there_is_room(
     assert not (small_disk / FOLDER).exists()
 
 
-def test_finishing_again_helps_once_there_is_room(make_episode: Maker, tmp_path: Path) -> None:
+def test_finishing_again_helps_once_there_is_room(
+    child_process: None, make_episode: Maker, tmp_path: Path
+) -> None:
     episode = wide(make_episode)
     writer = episode.writer(tmp_path)
     for row in episode.rows():

@@ -23,6 +23,8 @@ from workbench.recording.mp4 import Encoding, write_mp4
 from workbench.recording.read_episode import read_episode
 from workbench.recording.scene_eye import Eye, usual_eye
 
+pytestmark = pytest.mark.usefixtures("child_process")
+
 
 @pytest.fixture(scope="module")
 def episode(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> Episode:

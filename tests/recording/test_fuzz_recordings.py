@@ -34,6 +34,8 @@ from workbench.recording.row import EpisodeRow
 from workbench.recording.unreadable import UnreadableRecording
 from workbench.session.review_events import happenings
 
+pytestmark = pytest.mark.usefixtures("child_process")
+
 SEED = int(os.environ.get("WORKBENCH_FUZZ_SEED", "0"))
 MOST_SECONDS = 60.0
 """Of one damaged recording, all in all; against hanging, not a measure."""

@@ -21,6 +21,8 @@ from workbench.recording.library import Library, LibraryError
 from workbench.recording.read_episode import UnreadableRecording, read_episode
 from workbench.session.review_rows import read_row
 
+pytestmark = pytest.mark.usefixtures("child_process")
+
 
 @pytest.fixture(scope="module")
 def episode(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> Episode:

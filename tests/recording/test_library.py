@@ -24,8 +24,8 @@ from hypothesis import strategies as st
 from mani_skill.utils.wrappers.record import RecordEpisode
 from PIL import Image
 
+from tests.drive.episodes import Made
 from tests.recording.library_files import describe, jpeg
-from tests.recording.made import Made
 from workbench.recording.library import Library, LibraryError
 from workbench.recording.library_index import LibraryIndex, index_path
 from workbench.recording.library_read import read_found
@@ -33,6 +33,8 @@ from workbench.recording.library_row import Entry, LibraryRow, facts_as_dict, fa
 from workbench.recording.library_scan import Found, scan_folder
 from workbench.recording.read_episode import read_episode
 from workbench.recording.reading import read_rows
+
+pytestmark = pytest.mark.usefixtures("child_process")
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,7 @@ from mani_skill.trajectory.utils import dict_to_list_of_dicts
 from mani_skill.utils.wrappers.record import RecordEpisode
 from numpy.typing import NDArray
 
-from tests.recording.made import Made
+from tests.drive.episodes import Made
 from workbench.core.geometry import SceneGeometry
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.read_episode import (

@@ -28,6 +28,8 @@ from workbench.recording.library_scan import scan_folder
 from workbench.recording.read_episode import read_episode
 from workbench.recording.unreadable import UnreadableRecording
 
+pytestmark = pytest.mark.usefixtures("child_process")
+
 
 @pytest.fixture
 def library(tmp_path: Path) -> Iterator[Library]:

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rerun.chunk import RrdReader
 
-from tests.session.recordings import made, write
+from tests.drive.episodes import made, write
 from workbench.core.shared_shapes import SharedShapes
 from workbench.recording import layout, rerun_pictures
 from workbench.recording.episode import CameraTrack, Episode
@@ -146,7 +146,7 @@ def test_meshes_of_one_scene_are_read_once(tmp_path: Path) -> None:
 
 
 def test_the_same_scene_written_by_another_process_is_shared_as_well(
-    tmp_path: Path, fresh_chunks: Callable[[], None]
+    child_process: None, tmp_path: Path, fresh_chunks: Callable[[], None]
 ) -> None:
     shapes = SharedShapes()
     found = []

@@ -19,7 +19,7 @@ from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 from PIL import Image
 
-from tests.recording.made import Made, Track
+from tests.drive.episodes import Made, Track
 from tests.recording.read_rrd import Column, read_rrd
 from tests.recording.verify_rrd import verify_rrd
 from workbench.core.geometry import Visual
@@ -63,11 +63,13 @@ def every_step(column: Column) -> tuple[NDArray, NDArray]:
     return steps, np.stack(column.values)[np.searchsorted(column.steps, steps, side="right") - 1]
 
 
-def test_rerun_itself_finds_nothing_wrong(written: tuple[Made, Path, Entities]) -> None:
+def test_rerun_itself_finds_nothing_wrong(child_process: None, written: tuple[Made, Path, Entities]) -> None:
     assert verify_rrd(written[1]) is None
 
 
-def test_a_damaged_file_is_found_out(written: tuple[Made, Path, Entities], tmp_path: Path) -> None:
+def test_a_damaged_file_is_found_out(
+    child_process: None, written: tuple[Made, Path, Entities], tmp_path: Path
+) -> None:
     broken = tmp_path / "broken.rrd"
     broken.write_bytes(written[1].read_bytes()[:-2000])
     assert verify_rrd(broken)

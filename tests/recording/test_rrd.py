@@ -17,7 +17,7 @@ import pytest
 import rerun as rr
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
-from tests.recording.made import Made
+from tests.drive.episodes import Made
 from tests.recording.verify_rrd import verify_rrd
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.machine.child_python import child_environment, python_command
@@ -29,7 +29,9 @@ from workbench.recording.survey import JournalReader
 Maker = Callable[..., Made]
 
 
-def test_a_disk_that_is_full_at_any_byte_is_an_error_of_the_disk(make_episode: Maker, tmp_path: Path) -> None:
+def test_a_disk_that_is_full_at_any_byte_is_an_error_of_the_disk(
+    child_process: None, make_episode: Maker, tmp_path: Path
+) -> None:
     """Also where the last that it takes is a part of the blueprint, or of the index."""
     episode = make_episode(30, action=np.random.default_rng(0).random((30, 1)).astype(np.float32))
     writer = episode.writer(tmp_path)
@@ -63,7 +65,7 @@ def test_a_disk_that_is_full_at_any_byte_is_an_error_of_the_disk(make_episode: M
 
 
 def test_whoever_has_turned_rerun_off_still_gets_the_whole_recording(
-    make_episode: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    child_process: None, make_episode: Maker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RERUN", "off")
     episode = make_episode()
@@ -75,7 +77,7 @@ def test_whoever_has_turned_rerun_off_still_gets_the_whole_recording(
 
 
 def test_threads_that_write_episodes_of_one_scene_share_its_meshes(
-    make_episode: Maker, tmp_path: Path
+    child_process: None, make_episode: Maker, tmp_path: Path
 ) -> None:
     """A scene that names its bodies by env has more entities of one mesh than are kept."""
     envs = 80
@@ -120,7 +122,9 @@ def test_threads_that_write_episodes_of_one_scene_share_its_meshes(
         assert visual.bodies.tolist() == [found.info.env_index]
 
 
-def test_a_material_of_whole_numbers_leaves_those_behind_it_as_they_are(tmp_path: Path) -> None:
+def test_a_material_of_whole_numbers_leaves_those_behind_it_as_they_are(
+    child_process: None, tmp_path: Path
+) -> None:
     # In a process of its own: rerun takes the type of the first value for all that follow.
     program = """
 import sys

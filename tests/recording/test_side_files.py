@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from tests.recording.made import Made
-from tests.session.recordings import made, write
+from tests.drive.episodes import Made, made, write
 from workbench.recording.read_episode import read_episode
-from workbench.recording.side_files import side_files, side_files_in_words
+from workbench.recording.side_files import place_of, side_files, side_files_in_words
 
 TEXT = """
 '''See notes.txt.'''
@@ -64,6 +64,36 @@ def test_what_has_changed_or_gone_since_is_said(task: Path) -> None:
     assert "is not there" in side_files_in_words("task.py", recorded), "read where the task is not"
     assert "is not there" in side_files_in_words(str(task), {"../../etc/hostname": "0" * 12})
     assert side_files_in_words(str(task), {}) == ""
+
+
+@pytest.mark.parametrize(
+    "name", ["../beside.txt", "a/../../beside.txt", "..", "/etc/hostname", "", ".", "./"]
+)
+def test_what_lies_outside_the_tasks_folder_is_nowhere(tmp_path: Path, name: str) -> None:
+    assert place_of(tmp_path, name) is None
+    assert place_of(None, "a.txt") is None and place_of(tmp_path, "a/b.txt") == tmp_path / "a" / "b.txt"
+
+
+def test_a_file_outside_is_not_said_to_be_as_then(task: Path) -> None:
+    """Whoever shares a recording learns nothing of the files of whoever opens it."""
+    outside = task.parent.parent / "outside.txt"
+    outside.write_text("mine")
+    try:
+        hashed = side_files(str(outside.with_name("task.py")), {"": "load('outside.txt')"})["outside.txt"]
+        assert "is not there" in side_files_in_words(str(task), {"../outside.txt": hashed})
+        assert "is not there" in side_files_in_words(str(task), {str(outside): hashed})
+    finally:
+        outside.unlink()
+
+
+def test_a_file_that_changed_within_its_second_is_another(task: Path) -> None:
+    recorded = side_files(str(task), {str(task): "load('notes.txt')"})
+    path = task.parent / "notes.txt"
+    before = path.stat()
+    path.write_text("MINE")
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
+    assert path.stat().st_size == before.st_size
+    assert "notes.txt has changed since" in side_files_in_words(str(task), recorded)
 
 
 def test_a_recording_says_them(tmp_path: Path) -> None:

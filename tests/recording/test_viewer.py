@@ -20,6 +20,8 @@ from workbench.recording.rerun_command import quiet_environment, rerun_command
 from workbench.recording.rerun_process import await_port, end, free_port
 from workbench.recording.viewer import has_screen, open_window
 
+pytestmark = pytest.mark.usefixtures("child_process")
+
 
 @pytest.fixture(scope="module")
 def file(recorded: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -100,6 +102,9 @@ def test_what_cannot_be_opened_is_said(tmp_path: Path) -> None:
         open_window([])
     with pytest.raises(FileNotFoundError, match=r"none\.rrd is not a file"):
         open_window([tmp_path / "none.rrd"])
+    (tmp_path / "task.py").touch()
+    with pytest.raises(ValueError, match=r"task\.py is no \.rrd file"):
+        open_window([tmp_path / "task.py"])
 
 
 @pytest.mark.skipif(os.name != "posix", reason="looks at X11 and Wayland")

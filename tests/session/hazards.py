@@ -7,7 +7,7 @@ import re
 import shutil
 from pathlib import Path
 
-from tests.session.conftest import TASKS
+from tests.drive.session import TASKS
 from workbench.session.messages import Stepped
 
 _MISCHIEF = """

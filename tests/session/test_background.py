@@ -22,7 +22,7 @@ from workbench.session.record_workers import _said
 
 @pytest.mark.parametrize("what", ["garbage", pytest.param("half", marks=pytest.mark.slow)])
 def test_a_process_that_sends_garbage_ends_its_job_and_the_next_can_have_another(
-    tmp_path: Path, what: str
+    child_process: None, tmp_path: Path, what: str
 ) -> None:
     file = write_task(tmp_path)
     provoke(file, "import", what)

@@ -11,12 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.session.conftest import wait_until
+from tests.drive.session import step, wait_until
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.session.messages import CameraRequest, TaskOptions
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera, StudioView
 from workbench.session.view import SessionView
+
+pytestmark = pytest.mark.usefixtures("child_process")
 
 BASE: CameraKey = ("sensor", "base_camera")
 PEOPLE: CameraKey = ("human", "render_camera")
@@ -279,9 +281,7 @@ def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved
 def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session: Session) -> None:
     session.reset()
     wait_until(session, lambda v: not v.step.elapsed_steps.any(), "a fresh episode")
-    for step in range(1, 5):
-        session.step()
-        wait_until(session, lambda v, step=step: v.step.elapsed_steps[0] == step, "a step")
+    step(session, 4)
     session.studio.judge_steps(BASE)
     studio = settled(session, lambda s: len(s.report_moments) == 5, "five moments")
     assert [moment.step for moment in studio.report_moments] == [0, 1, 2, 3, 4]

@@ -10,13 +10,17 @@ from pathlib import Path
 
 import pytest
 
-from tests.session.conftest import wait_until
+from tests.drive.session import wait_until
 from tests.session.test_camera_studio import BASE, camera, moved, said
+from workbench.authoring.camera_source import Refusal, SourceEdit
 from workbench.core.camera_settings import CallSite, CameraKey, CameraSettings, differences
-from workbench.session.camera_writing import Wish, copy, plan
+from workbench.session.camera_writing import CameraWriting, Wish, copy, plan
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
 from workbench.session.studio_view import Writing
+from workbench.ui.camera_change import writing_html
+
+pytestmark = pytest.mark.usefixtures("child_process")
 
 LIMITED = '''
 
@@ -134,7 +138,11 @@ def test_changes_are_taken_back_one_after_the_other_also_when_a_plan_came_betwee
     for wanted in (texts[1], texts[0]):
         wait_until(session, said(lambda s: s.writing.stage == "checked"), "the change that can be taken back")
         studio.file.undo_write()
-        wait_until(session, said(lambda s: "as it was before." in s.writing.message), "the file of before")
+        wait_until(
+            session,
+            said(lambda s: s.writing.stage == "undone" and not s.writing.loading),
+            "the file of before",
+        )
         assert task_file.read_text() == wanted
         studio.file.drop_plan()
     wait_until(session, said(lambda s: s.writing.stage == "none"), "nothing left")
@@ -215,7 +223,7 @@ def test_a_change_is_not_taken_back_out_of_a_file_that_moved_on(session: Session
     edited = task_file.read_text() + "# more\n"
     task_file.write_text(edited)
     studio.file.undo_write()
-    view = wait_until(session, said(lambda s: s.writing.message.startswith("Not done:")), "why not")
+    view = wait_until(session, said(lambda s: s.writing.refusal is not None), "why not")
     assert "was edited since" in view.studio.writing.message and view.studio.writing.stage == "checked"
     assert task_file.read_text() == edited
     studio.file.drop_plan()
@@ -236,7 +244,9 @@ def test_a_camera_that_comes_out_otherwise_is_an_error_and_is_taken_back(
     )
     assert "fov=0.7" in task_file.read_text() and there(session, BASE).fov == 0.8
     studio.file.undo_write()
-    wait_until(session, said(lambda s: "as it was before." in s.writing.message), "the file of before")
+    wait_until(
+        session, said(lambda s: s.writing.stage == "undone" and not s.writing.loading), "the file of before"
+    )
     assert task_file.read_text() == before
     studio.back_to_file(BASE)
     studio.file.drop_plan()
@@ -255,9 +265,7 @@ def test_a_change_with_which_the_file_does_not_load_says_so_and_is_taken_back(
     assert view.problem is not None and "too narrow" in view.problem.message
     assert there(session, BASE).fov == 1.0, "the version before goes on"
     studio.file.undo_write()
-    wait_until(
-        session, lambda v: v.problem is None and "as it was before." in v.studio.writing.message, "it back"
-    )
+    wait_until(session, lambda v: v.problem is None and v.studio.writing.stage == "undone", "it back")
     assert task_file.read_text() == before
 
 
@@ -282,3 +290,18 @@ def test_a_read_only_file_may_be_copied_and_one_with_modules_beside_it_may_not(
         assert file is None and told.message.startswith("Not copied: gone.py cannot be read")
     finally:
         task_file.chmod(0o644)
+
+
+def test_what_was_not_done_is_said_until_something_else_happens() -> None:
+    key: CameraKey = ("sensor", "base_camera")
+    edit = SourceEdit("/author/task.py", "a = 1\n", "a = 2\n", (), None)
+    refused = Refusal("task.py was edited since the camera was written into it")
+    for stage in ("written", "undone"):
+        writing = CameraWriting()
+        writing.wish = Wish("edit", key, None)
+        message = f"Not done: {refused.reason}."
+        writing.view = Writing(stage, key, "edit", edit, refused, message, loading=True)
+        writing.failed_to_load()
+        assert "does not load" in writing.view.message and writing.view.refusal is None
+        html = writing_html(writing.view, stale=False)
+        assert "edited since" not in html and "does not load" in html

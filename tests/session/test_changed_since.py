@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from tests.session.recordings import made
+from tests.drive.episodes import made
 from workbench.session.changed_since import ChangesOnDisk, changed_on_disk, changed_since
 
 THEN = "import numpy as np\n\nSIZE = 1\n\n\nclass Push:\n    def evaluate(self):\n        return {}\n"

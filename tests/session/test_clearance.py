@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from tests.session.recordings import begin, made, write
+from tests.drive.episodes import begin, made, write
 from workbench.authoring.reference import RecordedTask
 from workbench.authoring.task_content import TaskContent, read_content
 from workbench.authoring.trust import STORE_FILE, TrustStore
@@ -113,7 +113,9 @@ def test_what_was_recorded_here_is_not_asked_about_also_with_another_text_today(
     assert asked(todays(recording)) == [] and asked(as_recorded(recording)) == []
 
 
-def test_what_was_recorded_elsewhere_is_asked_about_with_file_hash_and_modules(foreign: Path) -> None:
+def test_what_was_recorded_elsewhere_is_asked_about_with_file_hash_and_modules(
+    child_process: None, foreign: Path
+) -> None:
     file = foreign.parents[1] / "push.py"
     (question,) = asked(todays(foreign))
     assert question.file == str(file) and not question.trusted_before and not question.followed
@@ -437,7 +439,9 @@ def test_without_a_folder_to_keep_it_in_it_is_asked_every_run_and_recording_goes
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can become a user without a home")
-def test_a_user_without_a_home_has_no_folder_and_nothing_is_made_in_the_current_one(tmp_path: Path) -> None:
+def test_a_user_without_a_home_has_no_folder_and_nothing_is_made_in_the_current_one(
+    child_process: None, tmp_path: Path
+) -> None:
     tmp_path.chmod(0o777)
     program = (
         "import os, workbench.authoring.trust as trust, workbench.authoring.task_content as content\n"
@@ -461,7 +465,7 @@ def test_a_user_without_a_home_has_no_folder_and_nothing_is_made_in_the_current_
     assert not (tmp_path / "~").exists()
 
 
-def test_answers_of_several_processes_are_all_kept(tmp_path: Path) -> None:
+def test_answers_of_several_processes_are_all_kept(child_process: None, tmp_path: Path) -> None:
     context = multiprocessing.get_context("fork")
     processes = [context.Process(target=_trust_many, args=(k,)) for k in range(3)]
     for process in processes:

@@ -14,7 +14,7 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.session.conftest import wait_until
+from tests.drive.session import wait_until
 from tests.session.debug_client import DebugClient
 from workbench.cli import main
 from workbench.machine.child_python import child_environment, python_command
@@ -48,7 +48,9 @@ def port() -> int:
 
 
 @pytest.fixture
-def session(task_file: Path, tmp_path: Path, port: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Session]:
+def session(
+    child_process: None, task_file: Path, tmp_path: Path, port: int, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Session]:
     """Its worker waits for a debugger before it loads the task."""
     monkeypatch.setattr(kept_worker, "_BUSY", HANGS)
     monkeypatch.setattr(kept_worker, "_LOAD_WAITS", HANGS)
@@ -63,6 +65,7 @@ def session(task_file: Path, tmp_path: Path, port: int, monkeypatch: pytest.Monk
     session.close()
 
 
+@pytest.mark.slow
 def test_a_debugger_holds_the_worker_as_long_as_it_likes(
     session: Session, task_file: Path, port: int
 ) -> None:

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
+from tests.drive.session import wait_until
 from workbench.session.messages import CameraRequest, TaskOptions
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 
-from .conftest import wait_until
+pytestmark = pytest.mark.usefixtures("child_process")
 
 TASK = """
 from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv

@@ -196,3 +196,82 @@ def test_a_worker_that_comes_back_at_the_same_moment_begins_no_episode() -> None
         ours.add(Stepped(result([step] * N, [1] * N, [NO] * N, [False] * N), np.zeros(N, bool)))
     ours.add(Stepped(result([3] * N, [1] * N, [NO] * N, [False] * N), np.ones(N, bool)))
     assert ours.rows().total.tolist() == [3] * N
+
+
+def odd(steps: list[int], envs: tuple[int, ...]) -> StepResult:
+    """A step in which the cube of these envs is thrown, and lies where it lay in the others."""
+    step = result(steps, [1] * N, [NO] * N, [False] * N)
+    poses = step.poses.copy()
+    poses[list(envs), 3, 0] += 100.0 * np.array(steps)[list(envs)]
+    return StepResult(**{**step.__dict__, "poses": poses})
+
+
+def followed(*steps: tuple[StepResult, tuple[int, ...], Restored | None]) -> tuple[EnvTable, History]:
+    """A table and its history, which were told of these: result, envs that jumped, and where to."""
+    ours, history = table(), History(N, 10**9)
+    first = Stepped(result([0] * N, [0] * N, [NO] * N, [False] * N), np.ones(N, bool))
+    for one in (first, *(told(*step) for step in steps)):
+        history.add(one, 0)
+        ours.add(one, history)
+    return ours, history
+
+
+def told(step: StepResult, jumped: tuple[int, ...], restored: Restored | None) -> Stepped:
+    mask = np.zeros(N, bool)
+    mask[list(jumped)] = True
+    if not jumped:
+        step = StepResult(**{**step.__dict__, "action": np.zeros((N, 2), np.float32)})
+    return Stepped(step, mask, restored=restored)
+
+
+def outlier_steps(ours: EnvTable) -> dict[int, list[int]]:
+    return {env: [o.step for o in seen] for env, seen in ours.rows().outliers.items()}
+
+
+def test_what_was_odd_goes_with_the_moment_that_an_env_is_put_to() -> None:
+    ours, history = followed(
+        (odd([1, 1, 1], ()), (), None),
+        (odd([2, 2, 2], (1,)), (), None),
+        (odd([3, 3, 3], (1,)), (), None),
+        # Env 0 goes on from env 1's second step, env 1 from its own first, which was well.
+        (odd([2, 1, 3], (0,)), (0, 1), Restored((0, 1), (1, 1), 2, None, {})),
+    )
+    assert outlier_steps(ours) == {0: [2], 1: [2]}
+    put = Restored((1,), (1,), 1, None, {})
+    back = told(odd([2, 1, 3], (0,)), (1,), put)
+    history.add(back, 0)
+    ours.add(back, history)
+    assert outlier_steps(ours) == {0: [2]}
+    more = told(odd([3, 2, 4], (0, 1)), (), None)
+    history.add(more, 0)
+    ours.add(more, history)
+    assert outlier_steps(ours) == {0: [2], 1: [2]}, "once for env 0, and anew for env 1"
+    assert ours.rows().total.tolist() == [3, 2, 4]
+
+
+def test_an_episode_that_was_odd_and_is_left_while_it_runs_is_the_last_one_with_its_steps() -> None:
+    ours, _ = followed(
+        (odd([1, 1, 1], ()), (), None),
+        (odd([2, 2, 2], (1,)), (), None),
+        (odd([3, 3, 3], (1,)), (), None),
+        (odd([0, 0, 3], ()), (0, 1), None),
+    )
+    rows = ours.rows()
+    assert rows.last.steps.tolist() == [-1, 3, -1] and rows.last.total.tolist() == [0, 3, 0]
+    assert rows.last.outcome.tolist() == [Outcome.RUNNING] * N
+    assert list(rows.last.outliers) == [1] and rows.outliers == {}
+    assert rows.ended.tolist() == [0] * N
+
+
+def test_the_episode_before_stays_an_envs_own_whoevers_moment_it_is_put_to() -> None:
+    ours, _ = followed(
+        (odd([1, 1, 1], (0, 1)), (), None),
+        (odd([0, 0, 1], ()), (0, 1), None),
+        (odd([1, 1, 2], (0,)), (), None),
+        (odd([0, 1, 2], ()), (0,), None),
+        (odd([1, 1, 2], ()), (0, 1), Restored((0, 1), (0, 0), 3, None, {})),
+    )
+    rows = ours.rows()
+    assert rows.last.steps.tolist() == [1, 1, -1]
+    assert {env: [o.step for o in seen] for env, seen in rows.last.outliers.items()} == {0: [1], 1: [1]}
+    assert outlier_steps(ours) == {0: [1], 1: [1]}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from tests.session.recordings import appended, made
+from tests.drive.episodes import appended, made
 from workbench.recording.episode_writer import EpisodeFiles
 from workbench.session.episode_files import EpisodeFinisher
 from workbench.session.episodes import GatheredEpisode

@@ -6,13 +6,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import psutil
 import pytest
 
+from tests.drive.waiting import until
 from workbench.machine.child_python import child_environment, python_command
 from workbench.machine.process_tree import (
     children,
@@ -68,7 +68,7 @@ def main(how, *_):
 
 
 @pytest.fixture
-def begin(tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
+def begin(child_process: None, tmp_path: Path) -> Iterator[Callable[..., subprocess.Popen[bytes]]]:
     begun: list[subprocess.Popen[bytes]] = []
     (tmp_path / "family_member.py").write_text(_MEMBER)
 
@@ -98,19 +98,12 @@ def gone(processes: list[psutil.Process]) -> bool:
     return not psutil.wait_procs(processes, timeout=10)[1]
 
 
-def until(reached: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 20
-    while not reached():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
 @pytest.mark.parametrize(("how", "code"), [("exit", 3), ("crash", -signal.SIGSEGV), ("group", 5)])
 def test_what_detached_itself_goes_with_the_worker_and_the_exit_code_is_the_workers(
     begin: Callable[..., subprocess.Popen[bytes]], how: str, code: int
 ) -> None:
     keeper = begin(how)
-    until(lambda: len(family(keeper.pid)) == 4)
+    until(lambda: len(family(keeper.pid)) == 4, "the whole family")
     all_of_it = members(keeper.pid)
     assert {process.name() for process in all_of_it} >= {"sleep"}
     assert keeper.stdin is not None
@@ -155,7 +148,7 @@ def test_a_keeper_that_was_stopped_is_not_waited_for(
         process.kill()
 
 
-def test_a_server_that_is_killed_leaves_no_family(tmp_path: Path) -> None:
+def test_a_server_that_is_killed_leaves_no_family(child_process: None, tmp_path: Path) -> None:
     (tmp_path / "family_member.py").write_text(_MEMBER)
     (tmp_path / "server.py").write_text(
         "import os, subprocess, sys, time\n"
@@ -171,7 +164,7 @@ def test_a_server_that_is_killed_leaves_no_family(tmp_path: Path) -> None:
     assert server.stdout is not None
     # The member's stdin is at its end: it goes on to sleep.
     assert server.stdout.readline() == b"ready\n"
-    until(lambda: len(family(server.pid)) == 5)
+    until(lambda: len(family(server.pid)) == 5, "the whole family")
     all_of_it = members(server.pid)
     server.kill()
     server.wait()
@@ -182,7 +175,7 @@ def test_the_memory_of_a_family_counts_what_is_shared_once(
     begin: Callable[..., subprocess.Popen[bytes]],
 ) -> None:
     keeper = begin("share")
-    until(lambda: len(family(keeper.pid)) == 6)
+    until(lambda: len(family(keeper.pid)) == 6, "the whole family")
     everyone = family(keeper.pid)[1:]
     assert sum(map(resident_memory, everyone)) > 5 * 64 * 2**20
     together = proportional_memory(everyone)
@@ -207,7 +200,7 @@ def test_a_main_thread_that_ended_below_others_is_seen(begin: Callable[..., subp
     assert keeper.stdin is not None
     keeper.stdin.write(b"\n")
     keeper.stdin.close()
-    until(lambda: main_thread_ended(worker))
+    until(lambda: main_thread_ended(worker), "the end of its main thread")
     assert keeper.poll() is None
     end_family(keeper)
     assert not main_thread_ended(worker)

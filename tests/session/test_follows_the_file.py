@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.session.conftest import wait_until
+from tests.drive.session import wait_until
 from workbench.session.session import Session
 
 

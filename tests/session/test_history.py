@@ -1,5 +1,7 @@
 """The log of moments: what it keeps, what it lets go, and what it says happened."""
 
+# pyright: reportOptionalMemberAccess=false
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -7,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workbench.core.pictures import Picture
+from workbench.core.pictures import CameraKind, Picture
 from workbench.core.step import StepResult
 from workbench.session.episode_moments import moments_of_episode
 from workbench.session.history import FAIL, NOT_A_NUMBER, RESET, SUCCESS, TRUNCATED, WENT_BACK, History
@@ -45,8 +47,8 @@ def _mask(envs: tuple[int, ...]) -> np.ndarray:
     return mask
 
 
-def picture(env: int, size: int = 64) -> Picture:
-    return Picture("eye", "sensor", env, np.zeros(7, np.float32), np.zeros((size, size, 3), np.uint8))
+def picture(env: int, size: int = 64, kind: CameraKind = "sensor", name: str = "eye") -> Picture:
+    return Picture(name, kind, env, np.zeros(7, np.float32), np.zeros((size, size, 3), np.uint8))
 
 
 def filled(count: int, limit: int = 10**9, part: int = 0) -> History:
@@ -102,6 +104,127 @@ def test_pictures_belong_to_the_moment_that_they_show_and_fill_half_at_most() ->
     assert 0 < len(pictured) < 29 and pictured[-1] == 28
     assert len(history) == 30, "steps are not dropped for pictures"
     assert sum(64 * 64 * 3 for _ in pictured) <= limit / 2
+
+
+def test_a_camera_that_moved_outdates_its_own_pictures_and_not_those_of_its_namesake() -> None:
+    history = filled(4)
+    kinds: tuple[CameraKind, ...] = ("sensor", "human")
+    for serial in (1, 2):
+        shown = tuple(picture(env, kind=kind) for env in (0, 1) for kind in kinds)
+        history.add_pictures(PastPictures(serial, (*shown, picture(0, name="hand"))))
+    history.camera_moved("human", "eye")
+    for serial in (1, 2):
+        assert history.at(serial).outdated == {(0, "human", "eye"), (1, "human", "eye")}
+    history.add_pictures(PastPictures(1, (picture(1, kind="human"),)))
+    assert history.at(1).outdated == {(0, "human", "eye")}
+    assert history.at(2).outdated == {(0, "human", "eye"), (1, "human", "eye")}
+
+
+def test_a_picture_that_takes_the_place_of_another_is_counted_once_and_with_its_moment_not_at_all() -> None:
+    history = filled(3)
+    empty = history.used
+    history.add_pictures(PastPictures(1, (picture(0), picture(1))))
+    two = history.used - empty
+    history.add_pictures(PastPictures(1, (picture(0, 32),)))
+    assert two == 2 * (300 + 64 * 64 * 3) and history.used - empty == two - 3 * (64 * 64 - 32 * 32)
+    history.limit = 1
+    history.add(stepped(3), 3)
+    assert (len(history), history.first, history.last) == (1, 3, 3)
+    assert history.used == history.at(3).size, "the newest stays, and nothing of what went is counted"
+
+
+def test_pictures_come_some_steps_late_and_belong_to_the_step_of_their_number() -> None:
+    history = filled(300)
+    history.add_pictures(Pictures((picture(0), picture(1), picture(2)), 5.0, (299, 100, 98)))
+    assert [m.serial for m in history.between(0, 299) if m.pictures] == [100, 299]
+    assert list(history.at(100).pictures) == [(1, "sensor", "eye")]
+    history.add_pictures(PastPictures(5000, (picture(0),)))
+
+
+def test_the_oldest_pictures_go_first_and_are_gone_for_good() -> None:
+    history = filled(10, 200_000)
+    for serial in (5, 2, 7, 8):
+        for env in range(N):
+            history.add_pictures(PastPictures(serial, (picture(env),)))
+    assert [m.serial for m in history.between(0, 9) if m.pictures] == [7, 8]
+    assert all(len(history.at(serial).pictures) == N for serial in (7, 8))
+    history.add_pictures(PastPictures(2, (picture(1),)))
+    assert list(history.at(2).pictures) == [(1, "sensor", "eye")]
+
+
+def test_a_moment_that_is_gone_back_to_has_the_reward_of_its_record_in_each_env() -> None:
+    history = filled(1)
+    for number in (1, 2, 3):
+        step = stepped(number)
+        step.step.reward[:] = [10 * number, 10 * number + 1, 10 * number + 2]
+        history.add(step, number)
+    jump = stepped(4, jumped=(0, 2), restored=Restored((2, 0), (1, 2), 2, None, {}))
+    moment = history.add(jump, 4)
+    assert moment.step.reward.tolist() == [22, 31, 21]
+    gone = stepped(5, jumped=(1,), restored=Restored((1,), (0,), -7, None, {}))
+    assert np.array_equal(history.add(gone, 5).step.reward, [22, np.nan, 21], equal_nan=True)
+
+
+def test_a_worker_that_came_back_with_the_moment_at_which_the_last_one_died_keeps_its_reward() -> None:
+    history = filled(4)
+    again = stepped(3, jumped=(0, 1, 2))
+    again.step.elapsed_steps[1] = 0
+    moment = history.add(again, 3)
+    assert np.array_equal(moment.step.reward, [3, np.nan, 3], equal_nan=True)
+
+
+def test_a_moment_put_there_that_has_success_already_is_none_anew() -> None:
+    history = filled(1)
+    history.add(stepped(1, success=(0,)), 1)
+    history.add(stepped(2), 2)
+    back = Restored((0, 2), (0, 0), 1, None, {})
+    history.add(stepped(1, jumped=(0, 2), success=(0, 2), restored=back), 2)
+    history.add(stepped(2, success=(0, 1, 2), truncated=(2,)), 3)
+    assert history.events(0, 1, 9) == [(1, SUCCESS), (3, WENT_BACK)]
+    assert history.events(1, 1, 9) == [(4, SUCCESS)]
+    assert history.events(2, 1, 9) == [(3, WENT_BACK), (4, TRUNCATED)]
+
+
+def test_what_was_judged_anew_counts_its_bytes_once() -> None:
+    history = filled(3)
+    before, first = history.used, history.at(2).step
+    for reward in (7.0, 8.0):
+        history.renew_last(replace(first, reward=np.full(N, reward, np.float32)))
+    grown = history.used - before
+    assert 0 < grown < 2500
+    history.limit = 1
+    history.add(stepped(3), 3)
+    assert history.used == history.at(3).size
+
+
+def test_the_newest_reset_has_no_reward_whatever_a_newer_version_says() -> None:
+    history = filled(1)
+    renewed = history.renew_last(replace(history.at(0).step, reward=np.ones(N, np.float32)))
+    assert np.isnan(renewed.reward).all() and np.isnan(history.rewards(0, 0, 0)).all()
+    empty = History(N, 10**9)
+    assert empty.renew_last(renewed) is renewed and len(empty) == 0
+
+
+def test_the_rewards_of_an_episode_come_through_what_it_was_put_back_to() -> None:
+    history = filled(5)
+    history.add(stepped(5, jumped=(0,), restored=Restored((0,), (1,), 2, None, {})), 5)
+    history.add(stepped(6), 6)
+    assert history.rewards_until(0, 6, 100).tolist() == [1, 2, 6]
+    assert history.rewards_until(1, 6, 100).tolist() == [1, 2, 3, 4, 6]
+    assert history.rewards_until(1, 6, 2).tolist() == [4, 6]
+    history.add(stepped(0, jumped=(1,)), 6)
+    assert history.rewards_until(1, 7, 100).tolist() == []
+
+
+def test_serials_go_on_from_the_history_before() -> None:
+    history = History(N, 10**9, first_serial=70)
+    assert (history.first, history.last, len(history), history.next_serial) == (70, 69, 0, 70)
+    assert history.at(70) is None and history.stretches(0) == []
+    history.add(stepped(0, jumped=(0, 1, 2), keys=(1,), new={1: b"p"}), 0)
+    history.add(stepped(1, success=(2,)), 1)
+    assert history.at(69) is None and history.at(72) is None and history.at(71).number == 1
+    assert history.events(2, 0, 99) == [(70, RESET), (71, SUCCESS)]
+    assert history.rewards(2, 71, 99).tolist() == [1.0]
 
 
 def test_events_are_the_first_success_of_an_episode_truncations_and_jumps() -> None:
@@ -248,3 +371,59 @@ def way(history: History, env: int, serial: int) -> tuple[int, int, int]:
     found = history.way_to(env, serial, 100)
     assert found is not None
     return found.start, found.source, len(found.actions)
+
+
+def test_what_may_happen_can_happen_at_once() -> None:
+    flags = (RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, NOT_A_NUMBER)
+    assert all(sum(bool(one & other) for other in flags) == 1 for one in flags)
+
+
+def test_the_newest_moment_is_kept_whatever_it_takes_and_only_that() -> None:
+    history = filled(3, limit=0)
+    assert (history.first, history.last, len(history)) == (2, 2, 1)
+
+
+def test_pictures_that_fill_just_the_half_are_all_kept() -> None:
+    history = filled(5)
+    before = history.used
+    history.add_pictures(PastPictures(0, (picture(0),)))
+    each = history.used - before
+    assert each > 64 * 64 * 3
+    exact, less = History(N, 8 * each), History(N, 8 * each - 2)
+    for one in (exact, less):
+        one.add(stepped(0), 0)
+        for env in range(4):
+            one.add_pictures(PastPictures(0, (replace(picture(0), env=env),)))
+    assert [len(moment.pictures) for one in (exact, less) for moment in one.between(0, 0)] == [4, 0]
+
+
+def test_a_picture_is_counted_once_and_given_back_with_its_moment() -> None:
+    history = filled(2)
+    without = history.used
+    history.add_pictures(PastPictures(0, (picture(0),)))
+    with_one = history.used
+    for _ in range(3):
+        history.add_pictures(PastPictures(0, (picture(0),)))
+    assert history.used == with_one, "one in the place of another"
+    history.add_pictures(PastPictures(0, (picture(0, 128),)))
+    assert history.used - with_one == 3 * (128**2 - 64**2)
+    history.limit = 2 * (history.used - without)  # room for the picture, until its moment is dropped
+    for number in range(2, 50):
+        history.add(stepped(number), number)
+    assert history.first > 0
+    assert history.used == sum(moment.size for moment in history.between(0, 99))
+
+
+def test_the_step_of_a_task_without_a_robot_keeps_its_reward() -> None:
+    history = filled(1)
+    for number in (1, 2):
+        step = stepped(number)
+        history.add(replace(step, step=replace(step.step, action=None)), number)
+    assert history.rewards(0, 1, 2).tolist() == [1, 2]
+
+
+def test_a_task_that_only_fails_has_its_failures_told() -> None:
+    history = filled(1)
+    step = stepped(1)
+    history.add(replace(step, step=replace(step.step, evaluate={"fail": _mask((1,))})), 1)
+    assert (history.events(1, 1, 1), history.events(0, 1, 1)) == ([(1, FAIL)], [])

@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 import os
 import signal
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.session.conftest import TASKS, wait_until
+from tests.drive.session import TASKS, live_session, wait_until
+from tests.drive.waiting import until
 from workbench.session.history import Moment
-from workbench.session.judge import FILE_SAVED, JudgementView
-from workbench.session.messages import TaskOptions
+from workbench.session.judge import JudgementView, StoppedBy
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 
@@ -82,12 +81,10 @@ class Desk:
 
 
 @pytest.fixture(scope="module")
-def desk(task_file: Path) -> Iterator[Desk]:
+def desk(child_process: None, task_file: Path) -> Iterator[Desk]:
     recordings = task_file.parent / "recordings"
-    session = Session(str(task_file), TaskOptions(num_envs=N), recordings=recordings)
-    wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
-    yield Desk(session, task_file)
-    session.close()
+    with live_session(task_file, recordings, num_envs=N) as session:
+        yield Desk(session, task_file)
 
 
 @pytest.fixture
@@ -181,7 +178,7 @@ def test_the_next_save_takes_the_place_of_a_judgement_while_the_worker_plays_on(
     desk.note()
     desk.edit(REWARD, f"{REWARD} * 4")
     stopped = desk.judged("stopped")
-    assert stopped.why == FILE_SAVED and stopped.done < stopped.total
+    assert stopped.stopped_by is StoppedBy.SAVE and stopped.done < stopped.total
     view = desk.judged("done")
     for env in range(N):
         curve = session.judged_curve("reward", env)
@@ -191,12 +188,11 @@ def test_the_next_save_takes_the_place_of_a_judgement_while_the_worker_plays_on(
 
 
 def test_a_judgement_that_loops_for_ever_can_be_stopped_and_the_next_one_runs(desk: Desk, record) -> None:
-    loop = f"while {IN_THE_JUDGE} and int(self.elapsed_steps.max()) > 20: pass"
+    loops = desk.file.with_name("loops")
+    loop = f"while {IN_THE_JUDGE} and int(self.elapsed_steps.max()) > 20: open({str(loops)!r}, 'w').close()"
     desk.edit(REWARD, f"{loop}\n        {REWARD}")
     desk.judged("judging")
-    seen = -1
-    while seen != (seen := desk.session.view().judgement.serial):
-        time.sleep(1.5)  # until nothing comes any more: it loops
+    until(loops.exists, "the loop")
     desk.note()
     process = desk.session._judge.pid
     desk.session.stop_judging()

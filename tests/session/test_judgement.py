@@ -95,11 +95,11 @@ def test_differences_are_those_that_plain_loops_find(seed: int, rows: int, envs:
     found = {(d.env, d.first): (d.success, d.returns) for d in summary.differences}
     assert found == wanted
     assert summary.differing == len(wanted)
-    order = [(d.success[0] != d.success[1], abs(d.returns[1] - d.returns[0])) for d in summary.differences]
-    moved = [flag for flag, _ in order]
-    assert moved == sorted(moved, reverse=True) or any(
-        d.success[0] == d.success[1] for d in summary.differences
-    )
+    order = [
+        (2 * (d.success[0] != d.success[1]) + (d.fail[0] != d.fail[1]), abs(d.returns[1] - d.returns[0]))
+        for d in summary.differences
+    ]
+    assert order == sorted(order, reverse=True)
     for difference in summary.differences:
         assert jumped[difference.at].any() is np.False_ or jumped[difference.at, difference.env]
 

@@ -34,7 +34,9 @@ def dump_of(file: Path, what: str) -> str:
 
 
 @pytest.mark.parametrize("name", ["task.py", "Äufgabe 工 'x'.py"])
-def test_the_authors_line_is_found_whatever_the_file_is_called(tmp_path: Path, name: str) -> None:
+def test_the_authors_line_is_found_whatever_the_file_is_called(
+    child_process: None, tmp_path: Path, name: str
+) -> None:
     file = tmp_path / name
     frames = parse_stack(dump_of(file, "faulthandler.dump_traceback(all_threads=False)"))
     assert [frame.function for frame in frames] == ["deep", "evaluate", "<module>"]
@@ -44,7 +46,7 @@ def test_the_authors_line_is_found_whatever_the_file_is_called(tmp_path: Path, n
     assert author_frame(frames, ["/elsewhere.py"]) is None
 
 
-def test_a_crash_says_what_it_was(tmp_path: Path) -> None:
+def test_a_crash_says_what_it_was(child_process: None, tmp_path: Path) -> None:
     file = tmp_path / "task.py"
     dump = dump_of(file, "ctypes.string_at(0)")
     assert fatal_error(dump) == "Segmentation fault"
@@ -60,7 +62,7 @@ def test_a_death_without_words_says_what_was_being_done() -> None:
     assert (problem.file, problem.line, problem.traceback) == (None, None, "")
 
 
-def test_lines_are_those_of_the_version_that_ran(tmp_path: Path) -> None:
+def test_lines_are_those_of_the_version_that_ran(child_process: None, tmp_path: Path) -> None:
     file = tmp_path / "task.py"
     frames = parse_stack(dump_of(file, "faulthandler.dump_traceback(all_threads=False)"))
     ran = file.read_text()

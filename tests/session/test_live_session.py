@@ -11,21 +11,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.drive.session import start_over, step, wait_until
 from tests.recording.verify_rrd import verify_rrd
-from tests.session.conftest import wait_until
 from workbench.recording.read_properties import read_properties
 from workbench.session.messages import CameraRequest
 from workbench.session.session import Session
 
+DRAWS = True
+
 
 def settle(session: Session) -> None:
-    session.pause()
     session.set_action_source("random")
     session.set_episode_end("reset")
-    session.set_seed(0)
-    wait_until(
-        session, lambda v: not v.playing and v.step is not None and not v.step.elapsed_steps.any(), "rest"
-    )
+    start_over(session)
 
 
 def test_a_single_step_moves_every_env_once(session: Session) -> None:
@@ -54,9 +52,7 @@ def test_playing_goes_on_until_paused(session: Session) -> None:
 
 def test_resetting_one_env_leaves_the_other(session: Session) -> None:
     settle(session)
-    for count in (1, 2, 3):
-        session.step()
-        wait_until(session, lambda v, n=count: v.step.elapsed_steps[0] == n, f"step {count}")
+    step(session, 3)
     before = session.view().step
     session.reset((1,))
     after = wait_until(session, lambda v: v.step.elapsed_steps[1] == 0, "the reset of env 1").step

@@ -203,28 +203,28 @@ def test_the_version_that_ran_is_brought_back_although_another_class_is_asked_fo
     state = running()
     assert state.task is not None and state.step is not None
     task = replace(
-        state.task, chosen="One", others=("Two",), file="/work/push.py", source_files=("/work/push.py",)
+        state.task, chosen="One", others=("Two",), file="/home/me/push.py", source_files=("/home/me/push.py",)
     )
-    state.reference, state.own_file = "/work/push.py", Path("/work/push.py")
+    state.reference, state.own_file = "/home/me/push.py", Path("/home/me/push.py")
     state.loaded(Loaded(task, state.step, {}), restored=False, stale=False)
     assert state.choices == ("One", "Two")
     assert state.choose_class("Two") and state.choices == ("Two", "One")
-    assert state.load_request(Wanted(None, None)).task == "/work/push.py:Two"
-    assert state.load_request(Wanted({"/work/push.py": "text"}, None)).task == "/work/push.py:One"
+    assert state.load_request(Wanted(None, None)).task == "/home/me/push.py:Two"
+    assert state.load_request(Wanted({"/home/me/push.py": "text"}, None)).task == "/home/me/push.py:One"
     state.loaded(Loaded(task, state.step, {}), restored=True, stale=True)
     assert state.choices == ("Two", "One"), "it is still what saves bring in"
     assert state.choose_class("One")
 
     tried = replace(task, in_place_of="Two")
-    state.reference = "/work/push.py"
+    state.reference = "/home/me/push.py"
     state.loaded(Loaded(tried, state.step, {}), restored=False, stale=False)
-    assert state.load_request(Wanted(None, None)).task == "/work/push.py:One"
+    assert state.load_request(Wanted(None, None)).task == "/home/me/push.py:One"
 
 
 def test_a_file_that_a_recording_named_is_what_was_agreed_to_until_it_is_saved() -> None:
-    agreed = RecordedTask("Push-v1", "/work/push.py", "Push", {"/work/push.py": "text"})
+    agreed = RecordedTask("Push-v1", "/home/me/push.py", "Push", {"/home/me/push.py": "text"})
     state = LiveState(agreed, TaskOptions(), 2**20)
-    assert state.own_file == Path("/work/push.py")
+    assert state.own_file == Path("/home/me/push.py")
     assert state.load_request(Wanted(None, None)).task is agreed
     state.file_is_edited()
-    assert state.load_request(Wanted(None, None)).task == "/work/push.py:Push"
+    assert state.load_request(Wanted(None, None)).task == "/home/me/push.py:Push"

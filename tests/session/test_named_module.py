@@ -12,9 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.session.conftest import TASKS, wait_until
+from tests.drive.session import TASKS, wait_until
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
+
+pytestmark = pytest.mark.usefixtures("child_process")
 
 COMMAND = Path(sys.executable).with_name("workbench")
 PLAIN = {"render_backend": "none"}

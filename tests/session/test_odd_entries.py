@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import workbench
+from tests.drive.session import wait_until
 from tests.recording.verify_rrd import verify_rrd
-from tests.session.conftest import wait_until
 from tests.session.odd_entries import TEXT, write_task
 from tests.session.recorded_runs import opened
 from workbench.core.step import OtherEntry, StepResult
@@ -27,6 +27,8 @@ from workbench.session.review_events import curves
 from workbench.session.session import Session
 from workbench.session.step_back import run_of
 from workbench.ui.review_as_session import step_of
+
+pytestmark = pytest.mark.usefixtures("child_process")
 
 N, STEPS = 3, 5
 SPEC: Any = {"backend": "cpu", "render_backend": "none", "reward_mode": "dense", "obs_mode": "state"}

@@ -21,6 +21,8 @@ import numpy as np
 import pytest
 from mani_skill.utils.wrappers.record import RecordEpisode
 
+from tests.drive.session import rescored
+from tests.drive.waiting import until
 from workbench.cli import main
 from workbench.exit_codes import Exit
 from workbench.recording.library import Library
@@ -31,11 +33,12 @@ from workbench.session.recorded_scene import SceneProcess, SceneWanted
 from workbench.session.recorded_scene_worker import make
 from workbench.session.rescore import find_episodes
 from workbench.session.rescore_all import RescoreOptions, rescore_all
-from workbench.session.rescorer import Rescorer, RescoreView
+from workbench.session.rescorer import Rescorer
 from workbench.session.review import Review
 from workbench.ui.rescore_panel import status_html
 
-PATIENCE = 120.0
+pytestmark = pytest.mark.usefixtures("child_process")
+
 TEXT = (Path(__file__).parents[2] / "tasks" / "push_cube.py").read_text()
 HELPER = "OPENED = open(__file__ + '.ran', 'a').write('x')\n"
 
@@ -111,14 +114,9 @@ def test_a_path_in_place_of_an_id_is_not_loaded_when_its_row_is_opened(stock: Pa
     review = Review(library, make_scene=SceneProcess())
     try:
         library.watch()
-        deadline = time.monotonic() + PATIENCE
-        while not library.rows() and time.monotonic() < deadline:
-            time.sleep(0.05)
-        (row,) = library.rows()
+        (row,) = until(library.rows, "its row")
         review.open((row.id,))
-        while "no env" not in "".join(one.scene for one in review.view().opened):
-            assert time.monotonic() < deadline, review.view().opened
-            time.sleep(0.05)
+        until(lambda: "no env" in "".join(one.scene for one in review.view().opened), "the word for it")
     finally:
         review.close()
         library.close()
@@ -254,10 +252,10 @@ def test_on_a_page_it_is_asked_and_a_no_leaves_the_others(foreign: Path, recorde
     rescorer = Rescorer(Clearances(ask=ask))
     try:
         rescorer.start(find_episodes((foreign / "recordings",)))
-        view = until(rescorer, "failed")
+        view = rescored(rescorer, "failed")
         assert "is not trusted" in view.why and not ran(foreign)
         rescorer.start(find_episodes((foreign / "recordings",)))
-        view = until(rescorer, "done", "failed")
+        view = rescored(rescorer, "done", "failed")
         assert view.state == "done" and len(view.verdicts) == 2, view
         (said,) = view.hidden
         assert f"{foreign / 'numpy.py'} has the name of a library" in said and said in unescape(
@@ -280,21 +278,10 @@ def test_a_question_on_a_page_can_be_withdrawn(foreign: Path) -> None:
     rescorer = Rescorer(Clearances(ask=ask))
     try:
         rescorer.start(find_episodes((foreign / "recordings",)))
-        deadline = time.monotonic() + PATIENCE
-        while not asking:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
+        until(lambda: asking, "the question")
         assert rescorer.view.state == "asking"
         rescorer.stop()
-        until(rescorer, "stopped")
+        rescored(rescorer, "stopped")
     finally:
         rescorer.close()
     assert len(asking) == 1 and not ran(foreign)
-
-
-def until(rescorer: Rescorer, *states: str) -> RescoreView:
-    deadline = time.monotonic() + PATIENCE
-    while rescorer.view.state not in states:
-        assert time.monotonic() < deadline, rescorer.view
-        time.sleep(0.02)
-    return rescorer.view

@@ -7,18 +7,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from tests.session.conftest import TASKS, wait_until
-from tests.ui.scenes import description, step_of, table_scene
-from workbench.session.env_table import EnvTable, Outcome
+from tests.drive.session import TASKS, live_session, wait_until
+from workbench.session.env_table import Outcome
 from workbench.session.history import NOT_A_NUMBER
-from workbench.session.messages import Stepped, TaskOptions
-from workbench.session.outliers import FASTEST, Kind, OutlierWatch, lowest_still_point
+from workbench.session.messages import TaskOptions
+from workbench.session.outliers import Kind
 from workbench.session.session import Session
 
 BROKEN = '''
@@ -88,7 +85,7 @@ class OneOfEachEnv(BaseEnv):
 
 
 @pytest.fixture(scope="module")
-def one_of_each(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+def one_of_each(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
     folder: Path = tmp_path_factory.mktemp("author")
     (folder / "one_of_each.py").write_text(BROKEN)
     session = Session(
@@ -147,58 +144,11 @@ def test_outliers_of_an_episode_are_those_of_the_last_one_after_a_reset(one_of_e
     assert rows.outliers.keys() == before.outliers.keys() - {2}
 
 
-def test_a_healthy_task_played_hard_has_none(tmp_path: Path) -> None:
-    session = Session(str(TASKS / "push_cube.py"), TaskOptions(num_envs=4), recordings=tmp_path)
-    try:
-        wait_until(session, lambda v: v.task is not None, "the load")
+def test_a_healthy_task_played_hard_has_none(child_process: None, tmp_path: Path) -> None:
+    with live_session(TASKS / "push_cube.py", tmp_path, num_envs=4) as session:
         session.set_speed(math.inf)
         session.play()
         wait_until(session, lambda v: session.env_rows().ended.sum() >= 8, "eight episodes")
         rows = session.env_rows()
         assert not rows.outliers and not rows.last.outliers
         assert session.term_curves().terms.keys() == {"reach", "push", "end"}
-    finally:
-        session.close()
-
-
-def test_a_body_that_a_reset_puts_elsewhere_has_not_moved() -> None:
-    geometry, poses = table_scene(2)
-    table = EnvTable(description(geometry), step_of(poses))
-    there = poses.copy()
-    there[0, 3, 0] += 100.0
-    moved = replace(step_of(there), elapsed_steps=np.array([0, 7], np.int32))
-    table.add(Stepped(moved, np.array([True, False])))
-    table.add(Stepped(replace(moved, elapsed_steps=np.array([1, 8], np.int32)), np.zeros(2, bool)))
-    assert not table.rows().outliers
-    back = replace(step_of(poses), elapsed_steps=np.array([2, 9], np.int32))
-    table.add(Stepped(back, np.zeros(2, bool)))
-    assert [o.kind for o in table.rows().outliers[0]] == [Kind.FAST]
-
-
-def test_poses_that_are_lost_are_named_and_bodies_that_were_never_there_are_not() -> None:
-    geometry, poses = table_scene(2)
-    poses[0, 2] = np.nan  # env 0 has no hand
-    watch = OutlierWatch(geometry, step_of(poses), 0.05, "dense")
-    assert watch.look(step_of(poses)) == []
-    lost = poses.copy()
-    lost[1, 3] = np.nan
-    [sight] = watch.look(step_of(lost))
-    assert sight.envs.tolist() == [False, True] and sight.reason(1) == "the pose of cube is NaN"
-
-
-def test_a_speed_below_the_limit_is_none() -> None:
-    geometry, poses = table_scene(1)
-    for speed, expected in ((0.99 * FASTEST, []), (1.01 * FASTEST, [Kind.FAST])):
-        watch = OutlierWatch(geometry, step_of(poses), 0.05, "dense")
-        there = poses.copy()
-        there[0, 3, 1] += speed * 0.05
-        assert [sight.kind for sight in watch.look(step_of(there))] == expected
-
-
-def test_the_lowest_still_point_is_the_ground_whichever_way_its_mesh_is_turned() -> None:
-    geometry, poses = table_scene(1)
-    assert lowest_still_point(geometry, poses) == pytest.approx(-0.9205)
-    poses[0, 0] = [0, 0, 0.5, 0, 1, 0, 0]  # half a turn about x
-    assert lowest_still_point(geometry, poses) == pytest.approx(0.5 + 0.9195)
-    loose = replace(geometry, body_kinds=("kinematic",) * 4)
-    assert lowest_still_point(loose, poses) == -np.inf

@@ -68,5 +68,5 @@ def test_the_rate_is_that_of_the_last_second() -> None:
     rate = Rate()
     for i in range(100):
         rate.tick(i * 0.02)
-    assert rate.per_second(1.98) == pytest.approx(50, rel=0.02)
+    assert rate.per_second(1.98) == pytest.approx(50)
     assert rate.per_second(10.0) == 0.0

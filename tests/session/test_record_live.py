@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,11 +10,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from tests.session.conftest import TASKS, wait_until
+from tests.drive.session import TASKS, live_session, step, wait_until
 from workbench.authoring.load import load_task
 from workbench.recording.episode import Episode
 from workbench.recording.read_episode import read_episode
-from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 
@@ -23,22 +21,12 @@ STEPS = 4
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+def session(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
     folder = tmp_path_factory.mktemp("task")
-    shutil.copy(TASKS / "push_cube.py", folder)
-    options = TaskOptions(num_envs=2, seed=5)
-    session = Session(str(folder / "push_cube.py"), options, recordings=folder / "recordings")
-    wait_until(session, lambda view: view.state == "paused", "the first load")
-    yield session
-    session.close()
-
-
-def steps_made(session: Session, count: int) -> None:
-    """Make so many control steps of all envs, one by one."""
-    for _ in range(count):
-        then = session.view().step_serial + 1
-        session.step()
-        wait_until(session, lambda view, then=then: view.step_serial >= then, "a step")
+    # Small pictures: drawn in software, those of 512 by 512 take most of the time.
+    (folder / "push_cube.py").write_text((TASKS / "push_cube.py").read_text().replace("512", "64"))
+    with live_session(folder / "push_cube.py", folder / "recordings", seed=5, draw=True) as session:
+        yield session
 
 
 def elapsed(view: SessionView) -> int:
@@ -75,10 +63,11 @@ def assert_same(one: Episode, other: Episode) -> None:
                 np.testing.assert_array_equal(pictures[i], others[i], err_msg=f"{modality} {i}")
 
 
+@pytest.mark.slow
 def test_what_was_kept_after_the_fact_is_what_recording_it_gave(session: Session) -> None:
     session.start_recording()
     wait_until(session, lambda view: view.recording.active and view.recording.waiting == 0, "the recording")
-    steps_made(session, STEPS)
+    step(session, STEPS)
     view = wait_until(session, lambda view: view.recording.steps == 2 * STEPS, "the steps")
     assert view.recording.bytes_written > 0
     session.stop_recording()
@@ -132,18 +121,18 @@ def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> N
 def test_the_next_episode_waits_for_its_reset_and_ends_with_it(session: Session) -> None:
     before = session.view().recording.episodes_written
     session.start_recording((1,), next_episode=True)
-    steps_made(session, 1)
+    step(session, 1)
     view = wait_until(session, lambda view: view.recording.waiting == 1, "the waiting")
     assert view.recording.active and view.recording.steps == 0
     session.reset((1,))
     wait_until(session, lambda view: view.recording.waiting == 0, "the reset")
-    steps_made(session, 1)
+    step(session, 1)
     session.set_action_source("zero")
-    steps_made(session, 1)
+    step(session, 1)
     session.reset((1,))
     wait_until(session, lambda view: not view.recording.active, "its end")
     session.set_action_source("random")
-    steps_made(session, 1)
+    step(session, 1)
     (*_, episode) = written(session, before + 1)
     assert episode.length == 2 and episode.info.acted_by == ((0, "random"), (1, "zero"))
 
@@ -155,7 +144,7 @@ def test_a_moment_whose_beginning_is_gone_is_refused_in_a_sentence(session: Sess
     session.past.seek(session.view().timeline.last)
     assert first == 0  # the history is whole, so what is refused is an episode without a step
     session._state.timeline.history.limit = 1  # type: ignore[union-attr]
-    steps_made(session, 2)
+    step(session, 2)
     session.keep_past((0,))
     view = wait_until(session, lambda view: view.recording.keeping.failed, "the refusal")
     assert "its beginning is no longer in memory" in view.recording.keeping.said
@@ -172,7 +161,7 @@ def test_a_folder_that_cannot_be_written_to_is_told_and_stops_nothing(
     session.start_recording((0,))
     view = wait_until(session, lambda view: view.recording.problem is not None, "the problem")
     assert not view.recording.active and "is not a folder" in str(view.recording.problem)
-    steps_made(session, 2)
+    step(session, 2)
     assert session.view().problem is None
     folder.unlink()
     aside.rename(folder)

@@ -17,6 +17,8 @@ from workbench.recording.episode import Episode
 from workbench.recording.read_episode import read_maniskill
 from workbench.session.recorded_scene import SceneError, SceneProcess
 
+pytestmark = pytest.mark.usefixtures("child_process")
+
 STEPS = 6
 
 

@@ -2,35 +2,31 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
+import threading
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from tests.session.recordings import begin, made
+from tests.drive.episodes import begin, made
+from tests.drive.waiting import until
 from workbench.machine.watched_thread import listen, stop_listening
+from workbench.session import record_live
 from workbench.session.messages import Stepped
 from workbench.session.record_live import LiveRecorder
 from workbench.ui.record_panel import recording_html
 
 
-def until(reached: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 20
-    while not reached():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
-def test_an_episode_that_was_mended_is_named_on_the_page_and_in_the_terminal(tmp_path: Path) -> None:
+def test_an_episode_that_was_mended_is_named_on_the_page_and_in_the_terminal(
+    child_process: None, tmp_path: Path
+) -> None:
     begin(tmp_path, made(5, seed=8))
     said: list[str] = []
     recorder = LiveRecorder(tmp_path, lambda: None, lambda envs: None, said.append)
     try:
-        until(lambda: bool(said))
+        until(lambda: said, "a word of it")
         (rrd,) = tmp_path.glob("*.rrd")
         assert said == [f"1 episode that an earlier session left half written was mended: {rrd}"]
         assert recorder.status().recovered == (str(rrd),)
@@ -53,12 +49,50 @@ def test_a_step_that_cannot_be_recorded_ends_the_recording_with_a_sentence_and_n
         stepped = Stepped(step, np.ones(1, bool))
         for _ in range(2):
             recorder.start(task, (0,))
-            until(lambda: recorder._gatherer is not None)
+            until(lambda: recorder._gatherer is not None, "the gatherer")
             recorder.take(stepped)
-            until(lambda: recorder.status().problem is not None)
+            until(lambda: recorder.status().problem is not None, "the problem")
             assert not recorder.status().active
             assert str(recorder.status().problem).startswith("the recording ended: ")
         assert said[0].startswith("A step could not be recorded: AttributeError")
     finally:
         recorder.close()
         stop_listening(said.append)
+
+
+def step_of(size: int, env_steps: int = 1) -> Stepped:
+    """A step that begins no episode, of some more bytes than `size`."""
+    step: Any = SimpleNamespace(poses=np.zeros((1, 1, 7), np.float32), reward=np.zeros(1), evaluate={})
+    step.action, step.elapsed_steps = np.zeros((1, 1)), np.full(1, env_steps)
+    return Stepped(step, np.zeros(1, bool), snapshot=bytes(size))
+
+
+def test_what_the_disk_has_taken_does_not_wait_any_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However much a recording holds in all: it ends only where too much waits at once, and the next begins anew."""
+    monkeypatch.setattr(record_live, "_MOST_WAITING", 10_500)
+    go = threading.Event()
+    go.set()
+    recorder = LiveRecorder(tmp_path, lambda: None if go.wait(20) else None, lambda envs: None)
+    try:
+        for _ in range(2):
+            recorder.start(cast(Any, SimpleNamespace()), (0,))
+            for _ in range(30):
+                until(recorder._queue.empty, "the steps to be taken")
+                recorder.take(step_of(1000))
+                assert recorder.status().problem is None
+            until(recorder._queue.empty, "the steps to be taken")
+            go.clear()
+            recorder.start(cast(Any, SimpleNamespace()), (0,))  # whose thread now waits in `on_change`
+            taken = 0
+            while recorder.status().active and taken < 100:
+                recorder.take(step_of(1000))
+                taken += 1
+            assert 9 <= taken <= 11
+            assert "the disk is slower than the simulation" in str(recorder.status().problem)
+            go.set()
+            until(recorder._queue.empty, "the steps to be taken")
+    finally:
+        go.set()
+        recorder.close()

@@ -17,6 +17,8 @@ from workbench.core.recorded_state import apart, misfits, read_states
 from workbench.session.open_task import OpenedTask, step_checked
 from workbench.session.relive import arrive
 
+pytestmark = pytest.mark.thorough
+
 N, STEPS = 3, 44
 TASKS = Path(__file__).parents[2] / "tasks"
 

@@ -13,9 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.session.conftest import wait_until
+from tests.drive.session import wait_until
 from workbench.session.session import Session
 from workbench.session.view import SessionView
+
+DRAWS = True
 
 SECOND_TASK = '''
 

@@ -14,6 +14,8 @@ from workbench.recording.read_episode import read_episode, read_maniskill
 from workbench.session.messages import TaskOptions
 from workbench.session.record import RecordOptions, record
 
+pytestmark = pytest.mark.usefixtures("child_process")
+
 HERE = Path(__file__).parent
 POLICIES = {
     "PickCube-v1": HERE / "lifter.py",

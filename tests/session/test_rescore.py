@@ -16,6 +16,8 @@ from workbench.recording.episode import Episode, EpisodeInfo
 from workbench.session.rescore_messages import Verdict
 from workbench.session.rescore_run import rescore
 
+pytestmark = pytest.mark.thorough
+
 TASKS = Path(__file__).parents[2] / "tasks"
 TEXT = (TASKS / "push_cube.py").read_text()
 STEPS = 30

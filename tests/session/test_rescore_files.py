@@ -7,7 +7,6 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-import time
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +16,7 @@ import numpy as np
 import pytest
 from mani_skill.utils.wrappers.record import RecordEpisode
 
+from tests.drive.session import rescored
 from tests.session.recorded_runs import opened
 from workbench.authoring.problem import TaskError
 from workbench.cli import main
@@ -29,14 +29,15 @@ from workbench.session.record import RecordOptions, record
 from workbench.session.relive import arrive
 from workbench.session.rescore import find_episodes
 from workbench.session.rescore_all import RescoreOptions, rescore_all
-from workbench.session.rescorer import Rescorer, RescoreView
+from workbench.session.rescorer import Rescorer
 from workbench.session.step_back import run_of
+
+pytestmark = pytest.mark.usefixtures("child_process")
 
 TASKS = Path(__file__).parents[2] / "tasks"
 TEXT = (TASKS / "push_cube.py").read_text()
 REWARD = "return self.compute_dense_reward(obs, action, info) / 3"
 STEPS, EPISODES = 12, 3
-PATIENCE = 120.0
 
 
 @pytest.fixture(scope="module")
@@ -237,42 +238,33 @@ def test_wrong_arguments_are_refused_in_a_sentence(author: Path, capsys: pytest.
 # --- for a page ----------------------------------------------------------------------------------------
 
 
-def until(rescorer: Rescorer, *states: str) -> RescoreView:
-    deadline = time.monotonic() + PATIENCE
-    while time.monotonic() < deadline:
-        if rescorer.view.state in states:
-            return rescorer.view
-        time.sleep(0.05)
-    raise AssertionError(f"{states} did not come: {rescorer.view}")
-
-
 def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path, foreign: Path) -> None:
     rescorer = Rescorer()
     try:
         edit(author, REWARD, f"{REWARD} * 2")
         rescorer.start(find_episodes((author / "recordings",)))
-        view = until(rescorer, "done", "failed")
+        view = rescored(rescorer, "done", "failed")
         assert view.why == "" and len(view.verdicts) == view.total == EPISODES
         assert view.steps == EPISODES * STEPS and all(verdict.differs for verdict in view.verdicts)
         assert words.summary(view.verdicts).startswith("3 of 3 episodes differ")
 
         edit(author, REWARD, "return 1 / 0")
         rescorer.start(find_episodes((author / "recordings",)))
-        view = until(rescorer, "failed", "done")
+        view = rescored(rescorer, "failed", "done")
         assert "could not be opened" in view.why and "ZeroDivisionError" in view.problem.message
         rescorer.start(find_episodes((author / "recordings", foreign)))
-        view = until(rescorer, "done", "failed")
+        view = rescored(rescorer, "done", "failed")
         assert view.state == "done"
         assert ["ZeroDivisionError" in v.why_not for v in view.verdicts] == [True] * EPISODES + [False] * 2
         rescorer.start(find_episodes((author / "recordings",)), recorded_source=True)
-        view = until(rescorer, "done", "failed")
+        view = rescored(rescorer, "done", "failed")
         assert view.why == "" and not any(verdict.differs for verdict in view.verdicts)
 
         edit(author, REWARD, "import time; time.sleep(1000)")
         rescorer.start(find_episodes((author / "recordings",)))
-        until(rescorer, "loading")
+        rescored(rescorer, "loading")
         rescorer.stop()
-        until(rescorer, "stopped")
+        rescored(rescorer, "stopped")
     finally:
         rescorer.close()
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -14,7 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.session.recordings import made, poses_of, write
+from tests.drive.episodes import made, poses_of, write
+from tests.drive.waiting import until
 from workbench.core.shared_shapes import SharedShapes
 from workbench.recording.episode import Episode
 from workbench.recording.library import Library
@@ -70,17 +70,14 @@ def review_of(**episodes: Episode | Exception) -> tuple[Review, Shelf]:
     return Review(shelf, shelf.read, clock=shelf.clock), shelf  # type: ignore[arg-type]
 
 
-def until(review: Review, reached: Callable[[ReviewView], bool], what: str) -> ReviewView:
-    deadline = time.monotonic() + 60.0
-    while not reached(review.view()):
-        assert time.monotonic() < deadline, f"{what} did not come: {review.view()}"
-        time.sleep(0.01)
+def reach(review: Review, reached: Callable[[ReviewView], bool], what: str) -> ReviewView:
+    until(lambda: reached(review.view()), what, seen=review.view)
     return review.view()
 
 
 def opened(review: Review, *ids: str) -> ReviewView:
     review.open(ids)
-    return until(
+    return reach(
         review, lambda view: [o.id for o in view.opened] == list(ids) and not view.loading, "opening"
     )
 
@@ -153,7 +150,7 @@ def test_the_older_one_comes_first_and_they_can_change_places(monkeypatch: pytes
         old=made(6, written_at="2026-11-21T10:00:00+00:00"),
     )
     review.open(["new", "old"])
-    view = until(review, lambda view: len(view.opened) == 2 and not view.loading, "opening")
+    view = reach(review, lambda view: len(view.opened) == 2 and not view.loading, "opening")
     assert [one.id for one in view.opened] == ["old", "new"] and view.selected == 0
     review.select(1)
     review.seek(3)
@@ -173,7 +170,7 @@ def test_what_cannot_be_read_is_said_and_the_rest_opens() -> None:
         d=OSError("gone"),
     )
     review.open(["a", "b", "c", "d", "e"])
-    view = until(review, lambda view: bool(view.opened) and not view.loading, "the one that can be read")
+    view = reach(review, lambda view: bool(view.opened) and not view.loading, "the one that can be read")
     assert [o.id for o in view.opened] == ["a"]
     said = " ".join(view.problems)
     assert (
@@ -183,14 +180,14 @@ def test_what_cannot_be_read_is_said_and_the_rest_opens() -> None:
     )
     assert "not in the folder any more" in said
     review.open(["b"])
-    view = until(review, lambda view: not view.loading and len(view.problems) == 1, "its problem")
+    view = reach(review, lambda view: not view.loading and len(view.problems) == 1, "its problem")
     assert [o.id for o in view.opened] == ["a"], "what was open stays"
 
 
 def test_more_than_can_be_open_are_left_out_with_a_word() -> None:
     review, _ = review_of(**{f"e{i}": made(2) for i in range(MOST_OPEN + 3)})
     review.open([f"e{i}" for i in range(MOST_OPEN + 3)])
-    view = until(review, lambda view: bool(view.opened), "opening")
+    view = reach(review, lambda view: bool(view.opened), "opening")
     assert len(view.opened) == MOST_OPEN and f"At most {MOST_OPEN}" in view.problems[0]
 
 
@@ -198,12 +195,18 @@ def test_what_is_open_at_once_may_take_so_much_memory_and_no_more() -> None:
     shelf, held = Shelf({f"e{i}": made(2) for i in range(6)}), []
 
     def read(row: Row, shapes: SharedShapes) -> Episode:
-        held.append(np.ones(2**23))
+        held.append(64 * 2**20)
         return shelf.read(row, shapes)
 
-    review = Review(shelf, read, clock=shelf.clock, most_bytes=100 * 2**20)  # type: ignore[arg-type]
+    review = Review(
+        shelf,  # type: ignore[arg-type]
+        read,  # type: ignore[arg-type]
+        clock=shelf.clock,
+        most_bytes=100 * 2**20,
+        memory=lambda: 2**30 + sum(held),  # that of this process is of all tests before, and may fall
+    )
     review.open([f"e{i}" for i in range(6)])
-    view = until(review, lambda v: bool(v.problems) and not v.loading, "the word for it")
+    view = reach(review, lambda v: bool(v.problems) and not v.loading, "the word for it")
     assert len(view.opened) == 2 == len(held)
     assert "and 3 more were not opened: those before take 100 MB" in view.problems[0]
     review.close()
@@ -242,7 +245,7 @@ def test_the_first_are_seen_while_others_are_read(monkeypatch: pytest.MonkeyPatc
     review = Review(shelf, read, clock=shelf.clock)  # type: ignore[arg-type]
     review.open("abcde", state=4)
     assert reached.wait(60)
-    view = until(review, lambda view: len(view.opened) == 3, "the first three")
+    view = reach(review, lambda view: len(view.opened) == 3, "the first three")
     assert view.loading == "opening 4 of 5: file d" and view.position == 4
     review.select(1)
     review.seek(15)
@@ -253,7 +256,7 @@ def test_the_first_are_seen_while_others_are_read(monkeypatch: pytest.MonkeyPatc
     review.seek(15)
     review.toggle_play()
     go_on.set()
-    view = until(review, lambda view: not view.loading, "the others")
+    view = reach(review, lambda view: not view.loading, "the others")
     assert [o.id for o in view.opened] == ["b", "c", "d", "e"], "what was closed does not come back"
     assert (view.selected, view.position, view.playing, view.last) == (0, 15, True, 30)
     assert "first success" in view.alignments
@@ -291,7 +294,7 @@ def test_waits_for_the_next_position_while_it_plays() -> None:
     assert serial > seen.serial and real.view().position > seen.position
 
 
-def test_real_files_come_back_with_scene_pictures_and_numbers(tmp_path: Path) -> None:
+def test_real_files_come_back_with_scene_pictures_and_numbers(child_process: None, tmp_path: Path) -> None:
     write(tmp_path, made(4, success_from=3))
     library = Library(tmp_path)
     library.refresh()
@@ -311,7 +314,7 @@ def test_real_files_come_back_with_scene_pictures_and_numbers(tmp_path: Path) ->
     library.close()
 
 
-def test_half_a_recording_and_a_broken_one(tmp_path: Path) -> None:
+def test_half_a_recording_and_a_broken_one(child_process: None, tmp_path: Path) -> None:
     """Without its .rrd there is neither scene nor picture; with half of one a sentence."""
     half = write(tmp_path, made(4, seed=1))
     half.with_suffix(".rrd").unlink()
@@ -324,10 +327,10 @@ def test_half_a_recording_and_a_broken_one(tmp_path: Path) -> None:
     rows = {row.seed: row for row in library.rows()}
     review = Review(library)
     review.open([rows[1].id, rows[2].id])
-    view = until(review, lambda view: bool(view.opened) and not view.loading, "the half one")
+    view = reach(review, lambda view: bool(view.opened) and not view.loading, "the half one")
     assert [o.id for o in view.opened] == [rows[1].id]
     assert not view.opened[0].has_scene and view.opened[0].length == 4
-    until(review, lambda view: "no scene" in view.opened[0].scene, "the word for it")
+    reach(review, lambda view: "no scene" in view.opened[0].scene, "the word for it")
     assert len(view.problems) == 1 and rows[2].name in view.problems[0]
     library.close()
 

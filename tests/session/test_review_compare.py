@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tests.session.recordings import BODY, geometry_of, made, poses_of
+from tests.drive.episodes import BODY, geometry_of, made, poses_of
 from workbench.session.review_compare import ARM, Difference, difference, distances, source_changes
 
 

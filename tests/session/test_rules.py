@@ -13,6 +13,7 @@ from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 from mani_skill.utils.registration import register_env
 from mani_skill.utils.structs.pose import Pose
 
+from tests.drive.session import wait_until
 from workbench.authoring.problem import Problem, TaskError
 from workbench.core.actions import hold_action
 from workbench.core.rules import Finding
@@ -22,8 +23,6 @@ from workbench.session.open_task import OpenedTask, open_task, reset_checked, st
 from workbench.session.record import RecordOptions, record
 from workbench.session.reload import Running, load_version
 from workbench.session.session import Session
-
-from .conftest import wait_until
 
 TASK = """
 import torch
@@ -174,7 +173,7 @@ def test_what_the_task_can_live_with_is_a_row_and_the_task_opens(
     ],
 )
 def test_a_reward_of_whole_numbers_opens_is_told_and_is_recorded(
-    reward: str, kind: str, tmp_path: Path
+    child_process: None, reward: str, kind: str, tmp_path: Path
 ) -> None:
     """Stock ManiSkill hands it on, and so does `workbench.make`."""
     file, told = write(STANDS.format(reward=reward), tmp_path), []
@@ -322,7 +321,7 @@ def test_a_scene_that_is_built_anew_has_its_own_rows(desk: Desk) -> None:
 # --- the page ------------------------------------------------------------------------------------------
 
 
-def test_the_page_keeps_the_mark_until_the_file_is_mended(tmp_path: Path) -> None:
+def test_the_page_keeps_the_mark_until_the_file_is_mended(child_process: None, tmp_path: Path) -> None:
     file, events = tmp_path / "task.py", []
     counts = STANDS.format(reward="torch.arange(self.num_envs) % 2 == 1")
     file.write_text(TASK.format(body=LOST + counts))

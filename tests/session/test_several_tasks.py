@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.session.conftest import TASKS, wait_until
+from tests.drive.session import TASKS, wait_until
 from workbench.authoring.problem import TaskError
 from workbench.session.messages import Load, TaskOptions
 from workbench.session.open_task import open_task
@@ -74,7 +74,9 @@ def test_a_base_class_is_not_opened_in_place_of_its_tasks(file: Path) -> None:
     assert caught.value.classes[0] == "TwoEnv"
 
 
-def test_the_chooser_stays_while_the_one_that_was_tried_fails(file: Path, tmp_path: Path) -> None:
+def test_the_chooser_stays_while_the_one_that_was_tried_fails(
+    child_process: None, file: Path, tmp_path: Path
+) -> None:
     file.write_text(tasks("OneEnv", "TwoEnv", broken=("TwoEnv",)))
     session = Session(f"{file}:TwoEnv", OPTIONS, recordings=tmp_path / "recordings")
     try:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.session.conftest import TASKS, wait_until
+from tests.drive.session import TASKS, live_session, step, wait_until
 from tests.session.recorded_runs import opened, reaching, record
 from workbench.core.recorded_run import RecordedRun
 from workbench.recording.episode import EpisodeInfo
@@ -42,32 +43,24 @@ poses: list[np.ndarray] = []
 
 
 @pytest.fixture(scope="module")
-def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+def live(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
     folder = tmp_path_factory.mktemp("author")
     file = folder / "push_cube.py"
     file.write_text((TASKS / "push_cube.py").read_text())
-    session = Session(str(file), TaskOptions(num_envs=N), recordings=folder / "recordings")
-    session.select_env(ENV)
-    wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
-    session.select_env(ENV)
-    session.set_action_source("sliders")
-    yield session
-    session.close()
+    with live_session(file, folder / "recordings", num_envs=N) as session:
+        session.select_env(ENV)
+        session.set_action_source("sliders")
+        yield session
 
 
 def into(session: Session, run: RecordedRun, everywhere: bool = False) -> SessionView:
-    last = session.view().timeline.last
-    session.step_back(run, everywhere)
-    return wait_until(
-        session, lambda v: bool(v.timeline.last > last and v.timeline.arrived), "the recorded state"
-    )
+    number = session.step_back(run, everywhere)
+    return wait_until(session, lambda v: v.timeline.entered == number, "the recorded state")
 
 
-def step(session: Session, action: np.ndarray) -> SessionView:
-    last = session.view().timeline.last
+def step_with(session: Session, action: np.ndarray) -> SessionView:
     session.set_sliders(tuple(float(x) for x in action))
-    session.step()
-    return wait_until(session, lambda v: v.timeline.last > last, "a step")
+    return step(session)
 
 
 @pytest.mark.parametrize("state", [0, 23])
@@ -82,7 +75,7 @@ def test_the_live_env_stands_in_the_recorded_state_and_goes_on_from_there_as_it_
     assert np.array_equal(view.step.poses[others], before.poses[others], equal_nan=True)
     assert "to the last bit" in view.timeline.arrived and view.timeline.not_carried == ()
     for t in range(state, state + 6):
-        view = step(live, run.action[t])
+        view = step_with(live, run.action[t])
         assert np.array_equal(view.step.poses[ENV], poses[t + 1], equal_nan=True)
         assert view.step.reward[ENV] == run.reward[t]
 
@@ -96,6 +89,9 @@ def test_it_is_a_jump_that_undo_takes_back(live: Session, run: RecordedRun) -> N
     view = wait_until(live, lambda v: v.timeline.last > last, "the way back")
     assert np.allclose(view.step.poses[ENV], stood, atol=1e-6, equal_nan=True)
     assert view.timeline.arrived == ""
+    # The same recorded moment again is another arrival.
+    before = view.timeline.entered
+    assert into(live, run.until(10)).timeline.entered == before + 1
 
 
 def test_all_envs_can_go_there(live: Session, run: RecordedRun) -> None:
@@ -121,7 +117,7 @@ def test_code_that_raises_on_the_way_leaves_the_envs_where_they_were(live: Sessi
     assert view.timeline.last == last
     file.write_text(text)
     wait_until(live, lambda v: v.task.source[str(file)] == text, "the text as it was")
-    moved = step(live, np.zeros(8)).step.poses
+    moved = step_with(live, np.zeros(8)).step.poses
     assert np.nanmax(np.abs(moved - stood)[..., :3]) < 0.02
 
 
@@ -131,9 +127,8 @@ def test_what_changed_since_it_was_recorded_is_told_on_arrival(live: Session, ru
         "tanh(5 * distance)", "tanh(distance)"
     )
     assert then != text
-    last = live.view().timeline.last
-    live.step_back(run.until(3), source_file="push_cube.py", source={"push_cube.py": then})
-    view = wait_until(live, lambda v: v.timeline.last > last and bool(v.timeline.arrived), "the state")
+    number = live.step_back(run.until(3), source_file="push_cube.py", source={"push_cube.py": then})
+    view = wait_until(live, lambda v: v.timeline.entered == number, "the state")
     told = (
         "an episode, step 3 (changed since: GOAL_RADIUS, compute_dense_reward): its actions were made again"
     )
@@ -199,17 +194,24 @@ def test_the_recorded_text_is_opened_in_a_folder_that_goes_again(tmp_path: Path)
         pass
 
 
-def test_files_beside_the_task_are_there_as_they_are_today_and_outlive_the_folder(tmp_path: Path) -> None:
+def test_files_beside_the_task_are_there_as_they_are_today_and_outlive_the_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     file = tmp_path / "author" / "push_cube.py"
     (file.parent / "meshes").mkdir(parents=True)
     file.write_text((TASKS / "push_cube.py").read_text())
     (file.parent / "meshes" / "part.obj").write_text("today's")
     (tmp_path / "secret").write_text("")
-    names = ("meshes/part.obj", "meshes/gone.obj", "../secret", str(tmp_path / "secret"))
+    above = ("../secret", "meshes/../../secret", str(tmp_path / "secret"))
+    names = ("meshes/part.obj", "meshes/gone.obj", *above)
     with recorded_source(info(file, side_files=dict.fromkeys(names, "0" * 12))) as reference:
         folder = Path(reference.rpartition(":")[0]).parent
         assert (folder / "meshes" / "part.obj").read_text() == "today's"
         assert {path.name for path in folder.rglob("*")} == {"push_cube.py", "meshes", "part.obj"}
+        assert list(temporary.iterdir()) == [folder], "and nothing beside the folder"
     assert not folder.exists()
     assert (file.parent / "meshes" / "part.obj").read_text() == "today's"
 

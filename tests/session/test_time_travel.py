@@ -11,8 +11,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from tests.session.conftest import wait_until
-from workbench.session.messages import CameraRequest, Request, TaskOptions
+from tests.drive.session import live_session, start_over, step, wait_until
+from workbench.session.messages import CameraRequest, Request
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 
@@ -20,13 +20,9 @@ N = 3
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
-    session = Session(
-        "PickCube-v1", TaskOptions(num_envs=N), recordings=tmp_path_factory.mktemp("recordings")
-    )
-    wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
-    yield session
-    session.close()
+def session(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+    with live_session("PickCube-v1", tmp_path_factory.mktemp("recordings"), num_envs=N, draw=True) as session:
+        yield session
 
 
 def fresh(session: Session) -> int:
@@ -35,18 +31,7 @@ def fresh(session: Session) -> int:
     session.set_episode_end("reset")
     session.set_action_source("sliders")
     session.set_sliders((0.3, -0.4, 0.2, 0.6, -0.1, 0.5, 0.2, -1.0))
-    before = session.view().timeline.last
-    session.set_seed(0)
-    view = wait_until(session, lambda v: v.timeline.last > before and not v.playing, "the reset")
-    return view.timeline.last
-
-
-def run(session: Session, steps: int) -> SessionView:
-    for _ in range(steps):
-        last = session.view().timeline.last
-        session.step()
-        view = wait_until(session, lambda v, n=last: v.timeline.last > n, "a step")
-    return view
+    return start_over(session).timeline.last
 
 
 def after(session: Session, ask) -> SessionView:
@@ -76,7 +61,7 @@ def sent(session: Session, monkeypatch: pytest.MonkeyPatch) -> list[Request]:
 
 def test_scrubbing_shows_what_was_and_sends_nothing_to_the_worker(session: Session, sent) -> None:
     start = fresh(session)
-    run(session, 5)
+    step(session, 5)
     sent.clear()
     for serial in (*range(start, start + 6), *range(start + 5, start - 1, -1)):
         session.past.seek(serial)
@@ -95,22 +80,22 @@ def test_scrubbing_shows_what_was_and_sends_nothing_to_the_worker(session: Sessi
 
 def test_a_step_or_play_shows_what_is_live_again(session: Session) -> None:
     start = fresh(session)
-    run(session, 2)
+    step(session, 2)
     session.past.seek(start)
-    view = run(session, 1)
+    view = step(session, 1)
     assert view.timeline.shown is None and view.step.elapsed_steps[0] == 3
 
 
 def test_branches_from_one_moment_are_what_was_to_the_last_bit(session: Session) -> None:
     start = fresh(session)
-    run(session, 8)
+    step(session, 8)
     branches = []
     for _ in range(2):
         session.past.seek(start + 3)
         view = after(session, lambda: session.past.go_on("all"))
         assert view.step.elapsed_steps.tolist() == [3] * N
         assert is_close(view.step.poses, poses(session, start + 3))
-        run(session, 5)
+        step(session, 5)
         last = session.view().timeline.last
         branches.append(np.stack([poses(session, serial) for serial in range(last - 4, last + 1)]))
     assert np.array_equal(branches[0], branches[1], equal_nan=True)
@@ -121,7 +106,7 @@ def test_branches_from_one_moment_are_what_was_to_the_last_bit(session: Session)
 
 def test_one_env_goes_back_alone(session: Session) -> None:
     start = fresh(session)
-    run(session, 4)
+    step(session, 4)
     before = session.view().step
     session.select_env(1)
     session.past.seek(start + 1)
@@ -135,7 +120,7 @@ def test_one_env_goes_back_alone(session: Session) -> None:
 
 def test_one_envs_moment_is_put_into_all(session: Session) -> None:
     start = fresh(session)
-    run(session, 3)
+    step(session, 3)
     session.select_env(2)
     session.past.seek(start + 2)
     view = after(session, lambda: session.past.go_on("into all"))
@@ -148,11 +133,11 @@ def test_one_envs_moment_is_put_into_all(session: Session) -> None:
 
 def test_the_future_that_was_left_can_be_returned_to(session: Session) -> None:
     start = fresh(session)
-    run(session, 6)
+    step(session, 6)
     left = session.view().step
     session.past.seek(start + 2)
     after(session, lambda: session.past.go_on("all"))
-    run(session, 2)
+    step(session, 2)
     assert session.view().timeline.undo == "going back of all"
     view = after(session, session.past.undo)
     assert is_close(view.step.poses, left.poses)
@@ -161,10 +146,10 @@ def test_the_future_that_was_left_can_be_returned_to(session: Session) -> None:
 
 def test_a_reset_can_be_taken_back_and_the_one_before_it_too(session: Session) -> None:
     fresh(session)
-    run(session, 3)
+    step(session, 3)
     first = session.view().step
     after(session, lambda: session.reset((0, 1)))
-    run(session, 2)
+    step(session, 2)
     second = session.view().step
     after(session, lambda: session.reset(None))
     view = after(session, session.past.undo)
@@ -176,11 +161,11 @@ def test_a_reset_can_be_taken_back_and_the_one_before_it_too(session: Session) -
 
 def test_undo_leaves_alone_what_has_jumped_on_since(session: Session) -> None:
     fresh(session)
-    run(session, 3)
+    step(session, 3)
     after(session, lambda: session.reset((0, 1)))
-    run(session, 2)
+    step(session, 2)
     after(session, lambda: session.reset((1,)))
-    view = run(session, 1)
+    view = step(session, 1)
     assert view.step.elapsed_steps.tolist() == [3, 1, 6]
     assert view.timeline.undo == "reset of env 0"
     view = after(session, session.past.undo)
@@ -199,7 +184,7 @@ def test_undo_leaves_alone_what_has_jumped_on_since(session: Session) -> None:
 def test_a_moment_without_an_action_has_the_reward_of_its_record_or_none(session: Session) -> None:
     start = fresh(session)
     assert np.isnan(session.view().step.reward).all()
-    rewards = [run(session, 1).step.reward for _ in range(4)]
+    rewards = [step(session, 1).step.reward for _ in range(4)]
     view = after(session, lambda: session.reset((1,)))
     assert np.isnan(view.step.reward[1]) and np.array_equal(view.step.reward[[0, 2]], rewards[3][[0, 2]])
     session.past.seek(start + 2)
@@ -216,30 +201,30 @@ def test_a_moment_without_an_action_has_the_reward_of_its_record_or_none(session
 def test_a_recording_ends_where_one_goes_back(session: Session) -> None:
     start = fresh(session)
     written = session.view().recording.episodes_written
-    run(session, 1)
+    step(session, 1)
     last = session.view().timeline.last
     session.start_recording((0,))
     wait_until(session, lambda v: v.timeline.last > last, "the fresh episode")
-    run(session, 3)
+    step(session, 3)
     session.past.seek(start + 1)
     after(session, lambda: session.past.go_on("this"))
     view = wait_until(session, lambda v: v.recording.episodes_written == written + 1, "the file")
     assert view.recording.active and view.recording.problem is None
-    run(session, 1)
+    step(session, 1)
     assert session.view().recording.steps == 0, "what was not begun by a reset is not recorded"
     session.stop_recording()
 
 
 def test_the_newest_snapshot_is_a_plain_pickle(session: Session) -> None:
     fresh(session)
-    run(session, 2)
+    step(session, 2)
     snapshot = pickle.loads(session._state.newest_moment())
     assert snapshot.num_envs == N and snapshot.memory.elapsed_steps.tolist() == [2] * N
 
 
 def test_a_moment_without_a_picture_is_drawn_as_it_was(session: Session) -> None:
     start = fresh(session)
-    view = run(session, 12)
+    view = step(session, 12)
     human = next(c for c in view.task.cameras if c.kind == "human")
     wanted = CameraRequest(human.name, "human", ("rgb",))
     session.watch_cameras((wanted,))

@@ -17,8 +17,8 @@ import numpy as np
 import psutil
 import pytest
 
+from tests.drive.session import live_session, step, wait_until
 from tests.recording.verify_rrd import verify_rrd
-from tests.session.conftest import wait_until
 from tests.session.hazards import calm, edit, line_of, provoke, write_task
 from workbench.recording.read_properties import read_properties
 from workbench.session.interrupts import INTERRUPT_SIGNAL
@@ -27,6 +27,8 @@ from workbench.session.messages import TaskOptions
 from workbench.session.process import signal_main_thread
 from workbench.session.session import Session
 from workbench.session.view import SessionView
+
+pytestmark = pytest.mark.usefixtures("child_process")
 
 LIMIT = 2 * 2**30
 
@@ -38,15 +40,9 @@ def risky_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def risky_session(risky_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
-    session = Session(
-        str(risky_file),
-        TaskOptions(num_envs=2),
-        recordings=tmp_path_factory.mktemp("recordings"),
-        worker=WorkerOptions(memory_limit=LIMIT),
-    )
-    wait_until(session, lambda view: view.task is not None, "the first load")
-    yield session
-    session.close()
+    limited = WorkerOptions(memory_limit=LIMIT)
+    with live_session(risky_file, tmp_path_factory.mktemp("recordings"), worker=limited) as session:
+        yield session
 
 
 @pytest.fixture
@@ -57,9 +53,7 @@ def session(risky_session: Session, risky_file: Path) -> Iterator[Session]:
     steps = session.view().step_serial
     session.reset()
     wait_until(session, lambda v: v.step_serial > steps and not v.step.elapsed_steps.any(), "the reset")
-    for count in (1, 2, 3):
-        session.step()
-        wait_until(session, lambda v, n=count: v.step.elapsed_steps[0] == n, f"step {count}")
+    step(session, 3)
     wait_until(session, lambda v: v.problem is None and v.busy is None, "calm")
     yield session
     calm(risky_file)
@@ -90,7 +84,8 @@ def test_a_loop_in_a_step_is_told_and_can_be_left_with_its_traceback(
     session.play()
     session.interrupt()
     view = wait_until(session, lambda v: v.problem is not None and v.busy is None, "the interrupt")
-    assert view.problem.stage == place and "Interrupted: stopped by hand after" in view.problem.message
+    assert view.problem.stage == place and view.problem.interrupted
+    assert "Interrupted: stopped by hand after" in view.problem.message
     assert view.problem.file == str(risky_file) and f'hazard("{place}")' in view.problem.traceback
     calm(risky_file)
     # Nothing of the step that was left remains: the next one is the one that it would have been.
@@ -259,7 +254,8 @@ def test_a_recording_loses_nothing_but_the_step_under_way(session: Session, risk
 def test_a_file_that_never_loaded_costs_one_worker_and_is_waited_for(tmp_path: Path) -> None:
     file = write_task(tmp_path)
     provoke(file, "import", "abort")
-    session = Session(str(file), TaskOptions(num_envs=1), recordings=tmp_path / "recordings")
+    options = TaskOptions(num_envs=1, env_kwargs={"render_backend": "none"})
+    session = Session(str(file), options, recordings=tmp_path / "recordings")
     view = wait_until(session, lambda v: v.state == "error" and session.worker_pid is not None, "the death")
     assert "SIGABRT" in view.problem.message and view.problem.code == "_os.abort()" and view.task is None
     waiting = session.worker_pid

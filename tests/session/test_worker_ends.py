@@ -12,10 +12,12 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.session.conftest import wait_until
+from tests.drive.session import live_session, wait_until
 from tests.session.hazards import calm, edit, line_of, provocation, provoke, write_task
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
+
+pytestmark = pytest.mark.usefixtures("child_process")
 
 
 @pytest.fixture(scope="module")
@@ -25,12 +27,8 @@ def risky_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def risky_session(risky_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
-    session = Session(
-        str(risky_file), TaskOptions(num_envs=1), recordings=tmp_path_factory.mktemp("recordings")
-    )
-    wait_until(session, lambda view: view.task is not None, "the first load")
-    yield session
-    session.close()
+    with live_session(risky_file, tmp_path_factory.mktemp("recordings"), num_envs=1) as session:
+        yield session
 
 
 @pytest.fixture
@@ -189,7 +187,8 @@ def test_a_task_that_goes_to_another_folder_is_reloaded_and_recorded_as_before(
     file = write_task(tmp_path)
     (tmp_path / "act.py").write_text("def zero(obs):\n    import torch\n    return torch.zeros(1, 8)\n")
     monkeypatch.chdir(tmp_path)
-    session = Session("risky.py", TaskOptions(num_envs=1), recordings=Path("recordings"))
+    options = TaskOptions(num_envs=1, env_kwargs={"render_backend": "none"})
+    session = Session("risky.py", options, recordings=Path("recordings"))
     try:
         before = wait_until(session, lambda v: v.task is not None, "the task")
         provoke(file, "evaluate", "chdir")

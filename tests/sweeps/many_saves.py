@@ -23,8 +23,8 @@ import tyro
 from playwright.sync_api import Page, expect
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.browser.opened import TASK, page_on
 from tests.browser.test_charts import drawn
+from tests.drive.page import TASK, browser_at, page_on
 from workbench.machine.chromium import find_chromium
 
 Kind = Literal["good", "NaN", "rebuilding", "broken"]
@@ -83,7 +83,14 @@ def main(options: Options) -> None:
     with tempfile.TemporaryDirectory() as name:
         file = Path(shutil.copy(TASK, name))
         good = file.read_text()
-        with page_on(file, "--num-envs", str(options.num_envs), chromium=chromium) as (page, errors, opened):
+        with (
+            browser_at(chromium) as browser,
+            page_on(file, "--num-envs", str(options.num_envs), browser=browser, drawn=True, spare=True) as (
+                page,
+                errors,
+                opened,
+            ),
+        ):
             page.get_by_role("button", name="Play", exact=True).click()
             page.get_by_role("tab", name="Reward").click()
             expect(page.locator(".uplot canvas").first).to_be_visible(timeout=300_000)

@@ -25,7 +25,7 @@ from playwright.sync_api import Page, sync_playwright
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from tests.benchmarks.page_rate import COUNT, TASK, play_to_pause, prepare, timed_click
 from tests.benchmarks.page_rate import Options as PageOptions
-from tests.browser.opened import launch, new_page, open_workbench
+from tests.drive.page import launch, new_page, open_workbench
 from tests.ui.tabs import Tab, open_deaf_tab, tabs_of
 from workbench.machine.chromium import find_chromium, how_to_get_chromium
 

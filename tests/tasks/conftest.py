@@ -10,7 +10,6 @@ from typing import Any
 
 import gymnasium as gym
 import pytest
-import sapien
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 FOLDER = Path(__file__).parents[2] / "tasks"
@@ -30,15 +29,6 @@ def example_tasks() -> None:
         gym.registry.pop(env_id, None)
         REGISTERED_ENVS.pop(env_id, None)
         import_file(name)
-
-
-@pytest.fixture(scope="session")
-def render_system() -> object:
-    """Kept alive, because with the last one go the shaders: 5 s for each env instead of 0.2 s."""
-    try:
-        return sapien.render.RenderSystem(sapien.Device("cpu"))
-    except RuntimeError as exc:
-        pytest.skip(f"this machine has no render device: {exc}")
 
 
 @pytest.fixture

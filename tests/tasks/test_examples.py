@@ -99,7 +99,7 @@ def test_unsupported_rewards_are_refused_and_not_made_up(make: Make) -> None:
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_it_builds_and_steps_with_rendering(name: str, make: Make, render_system: object) -> None:
+def test_it_builds_and_steps_with_rendering(name: str, make: Make, renderer: None) -> None:
     env = make(name, render_backend="cpu")
     env.reset(seed=0)
     _, reward, terminated, _, info = env.step(env.action_space.sample())

@@ -108,7 +108,7 @@ def test_the_fetch_robot_can_do_it_too(make: Make, mani_skill_log: list[str]) ->
     assert not [line for line in mani_skill_log if "pose" in line or "supported" in line]
 
 
-def test_pictures_tell_where_to_push_and_not_where_the_cube_is(make: Make, render_system: object) -> None:
+def test_pictures_tell_where_to_push_and_not_where_the_cube_is(make: Make, renderer: None) -> None:
     obs, _ = make("push_cube", render_backend="cpu", obs_mode="rgb").reset(seed=0)
     assert set(obs["extra"]) == {"tcp_pose", "goal_pos"}
     assert obs["sensor_data"]["base_camera"]["rgb"].shape == (1, 128, 128, 3)
@@ -116,7 +116,7 @@ def test_pictures_tell_where_to_push_and_not_where_the_cube_is(make: Make, rende
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_sensor_camera_sees_cube_and_target_and_nothing_far_away(
-    seed: int, make: Make, render_system: object
+    seed: int, make: Make, renderer: None
 ) -> None:
     env = make("push_cube", render_backend="cpu", obs_mode="rgb+depth+segmentation")
     obs, _ = env.reset(seed=seed)
@@ -131,7 +131,7 @@ def test_the_sensor_camera_sees_cube_and_target_and_nothing_far_away(
     assert (blue[:, 2] > blue[:, 0] + 40).all()
 
 
-def test_the_camera_for_people_shows_robot_cube_and_target(make: Make, render_system: object) -> None:
+def test_the_camera_for_people_shows_robot_cube_and_target(make: Make, renderer: None) -> None:
     env = make("push_cube", render_backend="cpu", render_mode="rgb_array")
     env.reset(seed=0)
     picture = env.render()
@@ -144,7 +144,7 @@ def test_the_camera_for_people_shows_robot_cube_and_target(make: Make, render_sy
     assert picture.float().std() > 30
 
 
-def test_reward_terms_pass_through_the_wrappers_of_mani_skill(tmp_path: Path) -> None:
+def test_reward_terms_pass_through_the_wrappers_of_mani_skill(child_process: None, tmp_path: Path) -> None:
     env: Any = workbench.make(
         "WorkbenchPushCube-v1", 2, backend="cpu", render_backend="none", max_episode_steps=3
     )

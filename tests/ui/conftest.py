@@ -1,9 +1,16 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 import viser
+
+from tests.drive.panels import Clock, Panels
+from tests.drive.scripted import Evaluate, scripted
+from tests.drive.session import wait_until
+from workbench.session.messages import TaskOptions
+from workbench.session.session import Session
 
 
 @pytest.fixture
@@ -12,3 +19,34 @@ def server() -> Iterator[viser.ViserServer]:
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     yield server
     server.stop()
+
+
+@pytest.fixture
+def panels(server: viser.ViserServer) -> Panels:
+    """What that server shows, and a person's hand on it."""
+    return Panels(server)
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def scripted_session(tmp_path: Path) -> Iterator[Callable[..., Session]]:
+    """Makes sessions on a worker that answers with the table scene; each has loaded it."""
+    made: list[Session] = []
+
+    def make(num_envs: int, *evaluate: Evaluate) -> Session:
+        options = TaskOptions(num_envs=num_envs)
+        worker = scripted(num_envs, *evaluate)
+        session = Session(
+            str(tmp_path / "push.py"), options, recordings=tmp_path / "kept", make_worker=worker
+        )
+        made.append(session)
+        wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
+        return session
+
+    yield make
+    for session in made:
+        session.close()

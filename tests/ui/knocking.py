@@ -16,6 +16,7 @@ from websockets.sync.connection import Connection
 
 from workbench.ui.door import Door
 from workbench.ui.gate import cookie_name
+from workbench.ui.viser_seam import element_id
 
 PROTOCOL = f"viser-v{viser.__version__}"
 CAMERA = {
@@ -99,7 +100,7 @@ def say(connection: Connection, message: object) -> None:
 
 
 def claim(handle: viser.GuiInputHandle, value: object, prop: str = "value") -> dict:
-    return {"type": "GuiUpdateMessage", "uuid": handle._impl.uuid, "updates": {prop: value}}
+    return {"type": "GuiUpdateMessage", "uuid": element_id(handle), "updates": {prop: value}}
 
 
 def until(condition: Callable[[], object]) -> None:

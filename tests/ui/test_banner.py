@@ -3,11 +3,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-import viser
 
+from tests.drive.panels import Panels
 from tests.ui.scenes import EMPTY, problem, running
 from workbench.ui.banner import DOING, Banner, banner_html
 
+RESTART = "Start a new worker"
 EVIL = "<img src=x onerror=alert(1)><script>alert(2)</script>\"'&"
 
 
@@ -35,31 +36,32 @@ def test_problem_without_file_line_or_traceback_is_shown_too() -> None:
     assert "The task" in html and "<details>" not in html and "<pre" not in html
 
 
-def test_comes_with_the_problem_and_leaves_with_it(server: viser.ViserServer) -> None:
-    asked: list[str] = []
-    banner = Banner(server, lambda: asked.append("reload"), lambda: asked.append("restart"))
-    panel = banner._panel
+def test_comes_with_the_problem_and_leaves_with_it(panels: Panels) -> None:
+    banner = Banner(panels.server, lambda: None, lambda: None)
+    part = panels.part("Problem")
     banner.draw(running(2))
-    assert not panel.visible
+    assert not part.seen
     banner.draw(running(2, problem=problem(), problem_serial=1, state="error"))
-    assert panel.visible
-    assert not banner._restart.visible
+    assert part.seen
+    assert not panels.shows(RESTART)
     banner.draw(running(2))
-    assert not panel.visible
+    assert not part.seen
 
 
-def test_traceback_that_someone_opened_is_not_written_again(server: viser.ViserServer) -> None:
-    banner = Banner(server, lambda: None, lambda: None)
+def test_traceback_that_someone_opened_is_not_written_again(panels: Panels) -> None:
+    banner = Banner(panels.server, lambda: None, lambda: None)
     view = running(2, problem=problem(), problem_serial=1, state="error")
     banner.draw(view)
-    banner._html.content = "opened"
+    panels.htmls()[0].content = "opened"
     banner.draw(replace(view, step_serial=99))
-    assert banner._html.content == "opened"
+    assert panels.html() == "opened"
     banner.draw(replace(view, problem=problem("ValueError: other"), problem_serial=2))
-    assert "ValueError: other" in banner._html.content
+    assert "ValueError: other" in panels.html()
 
 
-def test_dead_worker_can_be_started_again(server: viser.ViserServer) -> None:
-    banner = Banner(server, lambda: None, lambda: None)
+def test_dead_worker_can_be_started_again(panels: Panels) -> None:
+    asked: list[str] = []
+    banner = Banner(panels.server, lambda: None, lambda: asked.append("restart"))
     banner.draw(replace(EMPTY, problem=problem(), problem_serial=1, state="stopped"))
-    assert banner._restart.visible
+    panels.press(RESTART)
+    assert asked == ["restart"]

@@ -2,8 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import viser
-
+from tests.drive.panels import Panels
 from tests.ui.scenes import EMPTY, problem, running
 from workbench.session.last_words import Busy, busy_at
 from workbench.ui.banner import Banner, banner_html
@@ -15,9 +14,11 @@ EVIL = "<img src=x onerror=alert(1)><script>alert(2)</script>"
 LOOP = Busy(6.4, "in evaluate", "/home/me/push.py", 88, "while True:", "Traceback ...")
 
 
-def a_banner(server: viser.ViserServer) -> tuple[BusyBanner, list[str]]:
+def a_banner(panels: Panels) -> tuple[BusyBanner, list[str]]:
     asked: list[str] = []
-    return BusyBanner(server, lambda: asked.append("interrupt"), lambda: asked.append("restart")), asked
+    return BusyBanner(
+        panels.server, lambda: asked.append("interrupt"), lambda: asked.append("restart")
+    ), asked
 
 
 def test_says_what_takes_long_where_and_for_how_long() -> None:
@@ -31,62 +32,66 @@ def test_everything_of_the_author_s_is_escaped() -> None:
     assert "<script" not in html and "<img" not in html
 
 
-def test_comes_after_a_while_and_goes_when_it_is_over(server: viser.ViserServer) -> None:
-    banner, _ = a_banner(server)
+def test_comes_after_a_while_and_goes_when_it_is_over(panels: Panels) -> None:
+    banner, _ = a_banner(panels)
     banner.draw(running(2, busy=replace(LOOP, seconds=SHOWN_AFTER - 1)))
-    assert not banner._panel.visible
+    assert not panels.part("Busy").seen
     banner.draw(running(2, busy=LOOP))
-    assert banner._panel.visible and banner._interrupt.visible and not banner._traceback.visible
+    assert panels.part("Busy").seen and panels.shows("Interrupt") and "Traceback" not in panels.html()
     banner.draw(running(2))
-    assert not banner._panel.visible
+    assert not panels.part("Busy").seen
 
 
 def test_what_cannot_be_interrupted_offers_no_interrupt_and_shows_where_it_is(
-    server: viser.ViserServer,
+    panels: Panels,
 ) -> None:
-    banner, _ = a_banner(server)
+    banner, _ = a_banner(panels)
     banner.draw(running(2, busy=replace(LOOP, deaf=True)))
-    assert not banner._interrupt.visible and banner._restart.visible
-    assert banner._traceback.visible and "Traceback ..." in banner._traceback.content
+    assert not panels.shows("Interrupt") and panels.shows("Restart")
+    assert "Traceback ..." in panels.html()
 
 
-def test_stands_instead_of_the_banner_of_a_problem(server: viser.ViserServer) -> None:
-    banner = Banner(server, lambda: None, lambda: None)
+def test_stands_instead_of_the_banner_of_a_problem(panels: Panels) -> None:
+    banner = Banner(panels.server, lambda: None, lambda: None)
     view = running(2, problem=problem(), problem_serial=1, state="error")
     banner.draw(replace(view, busy=LOOP))
-    assert not banner._panel.visible
+    assert not panels.part("Problem").seen
     banner.draw(view)
-    assert banner._panel.visible and "KeyError" in banner._html.content
+    assert panels.part("Problem").seen and "KeyError" in panels.html()
 
 
 def test_a_worker_that_gets_ready_is_not_the_author_s_and_leaves_the_reason_in_sight(
-    server: viser.ViserServer,
+    panels: Panels,
 ) -> None:
     ready = busy_at(21.0, "warming up", "", (), deaf=False)
     view = running(2, busy=ready, problem=problem(), problem_serial=1, state="starting", playing=False)
-    busy, _ = a_banner(server)
-    died = Banner(server, lambda: None, lambda: None)
+    busy, _ = a_banner(panels)
+    died = Banner(panels.server, lambda: None, lambda: None)
     busy.draw(view)
     died.draw(view)
-    assert not busy._panel.visible and died._panel.visible
+    assert not panels.part("Busy").seen and panels.part("Problem").seen
     text = render("status_line", **status_values(view))
     assert "a new worker is getting ready" in text and "busy" not in text
     assert not busy_at(21.0, "stepping", "", (), deaf=False).getting_ready
 
 
 def test_an_interrupt_is_not_called_a_failure() -> None:
-    html = banner_html(problem("Interrupted: stopped by hand after 6.1 s"), running(2))
+    html = banner_html(
+        replace(problem("Interrupted: stopped by hand after 6.1 s"), interrupted=True), running(2)
+    )
     assert "was interrupted in evaluate" in html and "failed" not in html
+    named = banner_html(problem("Interrupted: what the author calls it"), running(2))
+    assert "was interrupted" not in named
 
 
-def test_a_worker_s_death_says_when_all_is_back(server: viser.ViserServer) -> None:
-    banner = Banner(server, lambda: None, lambda: None)
+def test_a_worker_s_death_says_when_all_is_back(panels: Panels) -> None:
+    banner = Banner(panels.server, lambda: None, lambda: None)
     died = replace(problem("the worker process was killed by SIGSEGV"), stage="worker")
     view = running(2, problem=died, problem_serial=1, state="starting", playing=False)
     banner.draw(view)
-    assert "Another worker takes over" in banner._html.content
+    assert "Another worker takes over" in panels.html()
     banner.draw(replace(view, state="paused"))
-    assert "is back where it was" in banner._html.content
+    assert "is back where it was" in panels.html()
 
 
 def test_the_status_line_says_busy_with_what_and_claims_no_rate() -> None:

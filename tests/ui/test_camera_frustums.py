@@ -3,9 +3,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import viser
 import viser.transforms
 
+from tests.drive.panels import Panels
 from tests.ui.scenes import camera
 from workbench.core.pictures import CameraKind, Picture
 from workbench.ui.camera_frustums import CameraFrustums, frustum_pose
@@ -22,28 +22,30 @@ def test_camera_that_looks_along_x_looks_along_opencv_s_z() -> None:
     np.testing.assert_allclose(position, [11, 2, 3])
 
 
-def test_frustums_follow_their_pictures_and_leave_with_them(server: viser.ViserServer) -> None:
-    frustums = CameraFrustums(server)
+def test_frustums_follow_their_pictures_and_leave_with_them(panels: Panels) -> None:
+    frustums = CameraFrustums(panels.server)
     cameras = (camera("base"), camera("hand"))
     offset = np.zeros(3, np.float32)
     pictures: dict[tuple[CameraKind, str], Picture] = {
         ("sensor", name): Picture(name, "sensor", 0, POSE, GREY) for name in ("base", "hand")
     }
     frustums.draw(cameras, pictures, offset)
-    assert len(frustums._drawn) == 2
+    assert len(panels.nodes("/cameras/")) == 2
     moved = Picture("base", "sensor", 0, POSE + [1, 0, 0, 0, 0, 0, 0], GREY)
     frustums.draw(cameras, {("sensor", "base"): moved}, offset)
-    assert list(frustums._drawn) == [("sensor", "base")]
-    np.testing.assert_allclose(frustums._drawn["sensor", "base"].position, [2, 2, 3])
+    (base,) = panels.nodes("/cameras/")
+    assert base.name == "/cameras/sensor base"
+    np.testing.assert_allclose(base.position, [2, 2, 3])
     wider = replace(camera("base"), fovy=1.5, width=12)
     frustums.draw((wider,), {("sensor", "base"): moved}, offset)
-    assert (frustums._drawn["sensor", "base"].fov, frustums._drawn["sensor", "base"].aspect) == (1.5, 2.0)
+    (base,) = panels.nodes("/cameras/")
+    assert (base.fov, base.aspect) == (1.5, 2.0)
     frustums.draw((), {("sensor", "base"): moved}, offset)
-    assert frustums._drawn == {}
+    assert panels.nodes("/cameras/") == []
 
 
-def test_the_nearest_frustum_that_a_ray_meets_is_the_one_pressed(server: viser.ViserServer) -> None:
-    frustums = CameraFrustums(server)
+def test_the_nearest_frustum_that_a_ray_meets_is_the_one_pressed(panels: Panels) -> None:
+    frustums = CameraFrustums(panels.server)
     behind = POSE + [0.3, 0, 0, 0, 0, 0, 0]
     pictures: dict[tuple[CameraKind, str], Picture] = {
         ("sensor", "base"): Picture("base", "sensor", 0, POSE, GREY),
@@ -60,7 +62,7 @@ def test_the_nearest_frustum_that_a_ray_meets_is_the_one_pressed(server: viser.V
     frustums.draw(
         (camera("base"),), {("sensor", "base"): pictures["sensor", "base"]}, np.zeros(3, np.float32), size=0.1
     )
-    handle = frustums._drawn["sensor", "base"]
+    (handle,) = panels.nodes("/cameras/")
     y = np.tan(handle.fov / 2)
     corner = np.array([y * handle.aspect, y, 1.0]) * 0.1 / np.cbrt(y * y * handle.aspect / 3)
     turn = viser.transforms.SO3(handle.wxyz)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from workbench.ui.checked import checked_choice, checked_int, checked_number, checked_text
-from workbench.ui.control_values import check_value, name_for_refusals
+from workbench.ui.control_values import check_value, name_control
 
 unhurried = settings(deadline=None)  # a busy machine is no failure
 anything = st.one_of(
@@ -132,6 +132,6 @@ def test_a_text_is_one_short_line_or_refused(value, longest):
 
 def test_a_control_without_a_label_is_named_in_a_refusal(server: viser.ViserServer) -> None:
     slider = server.gui.add_slider("", min=-3, max=0, step=1, initial_value=0)
-    name_for_refusals(slider, "step of the past")
+    name_control(slider, "step of the past")
     with pytest.raises(ValueError, match="^The step of the past goes from -3 to 0"):
         check_value(slider, 7)

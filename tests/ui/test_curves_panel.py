@@ -1,8 +1,8 @@
 from __future__ import annotations
 
 import numpy as np
-import viser
 
+from tests.drive.panels import Clock, Panels
 from tests.ui.scenes import running
 from workbench.session.view import Curves
 from workbench.ui.curves_panel import CurvesPanel, curve_data
@@ -36,44 +36,43 @@ def test_single_env_has_one_line() -> None:
     assert curve_data(past.tick, past.reward, 0)[1] == ("env 0",)
 
 
-def test_other_env_shows_its_own_past(server: viser.ViserServer) -> None:
-    panel = CurvesPanel(server)
+def test_other_env_shows_its_own_past(panels: Panels, clock: Clock) -> None:
+    panel = CurvesPanel(panels.server, clock)
     past = curves(50, 4)
     panel.draw(running(4, curves=past, selected_env=0))
-    panel._drawn_at = 0.0
+    clock.passes()
     panel.draw(running(4, curves=past, selected_env=3))
-    chart = panel._reward.handle
-    assert chart is not None
+    chart = panels.charts()[0]
     assert len(chart.data[0]) == 50
     np.testing.assert_array_equal(chart.data[2], past.reward[:, 3])
     assert chart.series[2].get("label") == "env 3"
 
 
-def test_task_without_success_has_no_curve_of_it(server: viser.ViserServer) -> None:
-    panel = CurvesPanel(server)
+def test_task_without_success_has_no_curve_of_it(panels: Panels) -> None:
+    panel = CurvesPanel(panels.server)
     panel.draw(running(4, curves=curves(50, 4, success=None)))
-    assert panel._reward.handle is not None and panel._success.handle is None
-    assert not panel._empty.visible
+    assert [chart.title for chart in panels.charts()] == ["reward"]
+    assert "Curves appear" not in panels.html()
 
 
-def test_without_a_past_nothing_is_drawn(server: viser.ViserServer) -> None:
-    panel = CurvesPanel(server)
+def test_without_a_past_nothing_is_drawn(panels: Panels) -> None:
+    panel = CurvesPanel(panels.server)
     panel.draw(running(4, curves=None))
     panel.draw(running(4, curves=curves(1, 4)))
-    assert panel._reward.handle is None and panel._success.handle is None
-    assert panel._empty.visible
+    assert panels.charts() == [] and "Curves appear with the second step." in panels.html()
+    panel.draw(running(4, curves=curves(2, 4, serial=2)))
+    assert len(panels.charts()) == 2 and "Curves appear" not in panels.html()
 
 
-def test_envs_whose_reward_is_nan_are_counted_and_left_out_of_the_mean(server: viser.ViserServer) -> None:
+def test_envs_whose_reward_is_nan_are_counted_and_left_out_of_the_mean(panels: Panels, clock: Clock) -> None:
     past = curves(50, 4)
     past.reward[40:, :3] = np.nan
-    panel = CurvesPanel(server)
+    panel = CurvesPanel(panels.server, clock)
     panel.draw(running(4, curves=past, selected_env=0))
-    chart = panel._reward.handle
-    assert chart is not None
+    chart = panels.charts()[0]
     np.testing.assert_array_equal(chart.data[1][40:], past.reward[40:, 3])
     assert np.isnan(chart.data[2][40:]).all()
-    assert "NaN in 3 of 4 envs; the mean is of the others" in panel._lost.content and panel._lost.visible
-    panel._drawn_at = 0.0
+    assert "NaN in 3 of 4 envs; the mean is of the others" in panels.html()
+    clock.passes()
     panel.draw(running(4, curves=curves(50, 4, serial=2)))
-    assert not panel._lost.visible
+    assert "NaN" not in panels.html()

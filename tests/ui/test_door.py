@@ -15,8 +15,8 @@ import pytest
 import viser
 import viser._messages
 import viser.infra._infra
-from playwright.sync_api import sync_playwright
 
+from tests.drive.page import page_at
 from workbench.terminal import say_addresses
 from workbench.ui import door as door_module
 from workbench.ui import listening, viser_seam
@@ -131,6 +131,13 @@ def test_options_that_cannot_be_are_refused(options):
         DoorOptions(**options)
 
 
+@pytest.mark.parametrize("port", [0, 1, 65535])
+def test_every_port_that_there_is_can_be_asked_for(port):
+    assert DoorOptions(port=port).port == port
+    with pytest.raises(ValueError, match="Port 65536 does not exist"):
+        DoorOptions(port=65536)
+
+
 def test_a_page_without_a_token_opens_at_its_plain_address():
     door = open_door(DoorOptions(port=0, token=False))
     try:
@@ -207,7 +214,7 @@ def test_closing_frees_the_port_and_ends_the_thread(door):
     socket.create_server(("127.0.0.1", door.port)).close()
 
 
-def test_nothing_is_printed_but_by_us():
+def test_nothing_is_printed_but_by_us(child_process: None):
     # In a process of its own: what is printed at its exit counts too.
     code = (
         "from workbench.ui.door import open_door, DoorOptions\n"
@@ -366,7 +373,7 @@ def test_the_refusal_page_says_what_to_do_and_asks_nothing_of_the_network(door):
 
 
 @pytest.mark.browser
-def test_a_real_browser_opens_the_page_with_nothing_to_complain_of(door, tmp_path):
+def test_a_real_browser_opens_the_page_with_nothing_to_complain_of(door, browser):
     """With one of each thing that the page's policy could break: blobs, data, workers, wasm, eval."""
     import numpy as np
     import trimesh
@@ -402,15 +409,7 @@ def test_a_real_browser_opens_the_page_with_nothing_to_complain_of(door, tmp_pat
     connected = threading.Event()
     server.on_client_connect(lambda client: connected.set())
 
-    complaints: list[str] = []
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path="/usr/bin/chromium",
-            args=["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"],
-        )
-        page = browser.new_page(viewport={"width": 640, "height": 480})
-        page.on("console", lambda m: complaints.append(m.text) if m.type == "error" else None)
-        page.on("pageerror", lambda error: complaints.append(str(error)))
+    with page_at(browser, "about:blank", 640, 480, drawn=True) as (page, complaints):
         page.on(
             "requestfailed",
             lambda request: complaints.append(f"{request.url[:100]} {request.failure}"),
@@ -426,7 +425,6 @@ def test_a_real_browser_opens_the_page_with_nothing_to_complain_of(door, tmp_pat
         page.wait_for_timeout(3000)  # let everything load that could be blocked
         page.reload(wait_until="domcontentloaded")  # by the cookie alone
         page.wait_for_selector("#from-html", timeout=60_000)
-        browser.close()
     assert complaints == []
 
 

@@ -9,6 +9,7 @@ import http.server
 import socket
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from urllib.parse import quote
 
 import msgspec
@@ -18,8 +19,8 @@ import viser
 import viser._messages
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from playwright.sync_api import Page, sync_playwright
 
+from tests.drive.page import page_at
 from tests.ui.knocking import (
     CAMERA,
     PROTOCOL,
@@ -40,6 +41,7 @@ from workbench.ui.door import Door, DoorOptions, open_door
 from workbench.ui.gate import Admitted, Asked, Entered, Gate, Refused, cookie_name, host_is_ours, judge
 from workbench.ui.page_guard import PageGuard
 from workbench.ui.told_rarely import ToldRarely
+from workbench.ui.viser_seam import element_id
 
 unhurried = settings(deadline=None)  # a busy machine is no failure
 
@@ -389,7 +391,7 @@ def test_no_client_can_upload(door, bystander):
             connection,
             {
                 "type": "FileTransferStartUpload",
-                "source_component_uuid": upload._impl.uuid,
+                "source_component_uuid": element_id(upload),
                 "transfer_uuid": "t",
                 "filename": "../../etc/passwd",
                 "mime_type": "text/plain",
@@ -401,7 +403,7 @@ def test_no_client_can_upload(door, bystander):
             connection,
             {
                 "type": "FileTransferPart",
-                "source_component_uuid": upload._impl.uuid,
+                "source_component_uuid": element_id(upload),
                 "transfer_uuid": "t",
                 "part_index": 0,
                 "content": b"x" * 1000,
@@ -515,7 +517,9 @@ def judged(door: Door, raw: bytes) -> None:
             assert guard.admits(raw) in (True, False)
         guard.close()
 
-    asyncio.run(judge_it())
+    # On a thread of its own: Playwright's loop may be at rest on this one.
+    with ThreadPoolExecutor(1) as thread:
+        thread.submit(asyncio.run, judge_it()).result()
 
 
 def test_what_only_the_server_says_is_dropped_from_a_client(door, bystander):
@@ -568,24 +572,11 @@ def hostile_site(html: str, handshakes: list[str] | None = None) -> Iterator[int
         thread.join()
 
 
-@contextlib.contextmanager
-def chromium() -> Iterator[Page]:
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path="/usr/bin/chromium",
-            args=["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"],
-        )
-        try:
-            yield browser.new_page(viewport={"width": 640, "height": 480})
-        finally:
-            browser.close()
-
-
 @pytest.mark.browser
-def test_a_link_cannot_send_our_page_to_another_server(door, monkeypatch):
+def test_a_link_cannot_send_our_page_to_another_server(door, browser, monkeypatch):
     """``?websocket=`` is viser's; what such a server sends would run as our page, with our cookie."""
     came: list[str] = []
-    with hostile_site("", came) as port, chromium() as page:
+    with hostile_site("", came) as port, page_at(browser, "about:blank", 640, 480) as (page, _):
         page.goto(door.url, wait_until="domcontentloaded")
         link = f"http://127.0.0.1:{door.port}/?websocket=ws://127.0.0.1:{port}"
         with monkeypatch.context() as without_policy:
@@ -602,7 +593,7 @@ def test_a_link_cannot_send_our_page_to_another_server(door, monkeypatch):
 
 
 @pytest.mark.browser
-def test_pages_of_other_sites_cannot_use_the_browser_that_is_logged_in(door):
+def test_pages_of_other_sites_cannot_use_the_browser_that_is_logged_in(door, browser):
     """The browser holds the cookie. ``127.0.0.1`` on another port is the same *site* to it, so there the
     cookie is sent along; ``localhost`` is another site."""
     target = f"127.0.0.1:{door.port}"
@@ -625,7 +616,7 @@ def test_pages_of_other_sites_cannot_use_the_browser_that_is_logged_in(door):
     """
     attack = attack.replace("TARGET", target).replace("PROTOCOL", PROTOCOL)
     refused = {"socket": "refused", "fetch": "refused", "image": "refused"}
-    with hostile_site(attack) as port, chromium() as page:
+    with hostile_site(attack) as port, page_at(browser, "about:blank", 640, 480) as (page, _):
         page.goto(door.url, wait_until="domcontentloaded")
         until(lambda: page.wait_for_timeout(50) or door.server.get_clients())
         # The attack itself works: from our own page it gets through.

@@ -1,80 +1,95 @@
-"""The table's HTML and what its hidden buttons do, on a real session without a browser."""
+"""The table's HTML and what its hidden buttons do, on a session with a hand-made scene, without a browser."""
 
 from __future__ import annotations
 
 import re
-import shutil
-from collections.abc import Iterator
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass
 
+import numpy as np
 import pytest
-import viser
 
-from tests.session.conftest import TASKS, wait_until
-from workbench.session.messages import TaskOptions
+from tests.drive.panels import Clock, Panels
+from tests.drive.session import wait_until
 from workbench.session.session import Session
 from workbench.ui.env_panel import MOST_ROWS, EnvPanel
-from workbench.ui.viser_seam import element_id
 
 
-@pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
-    folder = tmp_path_factory.mktemp("author")
-    file = Path(shutil.copy(TASKS / "minimal.py", folder / "minimal.py"))
-    file.write_text(
-        file.read_text().replace('{"success":', '{"<b>odd</b>": self.elapsed_steps % 2 == 1, "success":')
-    )
-    options = TaskOptions(num_envs=MOST_ROWS + 6, env_kwargs={"render_backend": "none"})
-    session = Session(str(file), options, recordings=folder / "kept")
-    view = wait_until(session, lambda v: v.task is not None or v.problem is not None, "the load")
-    assert view.task is not None, view.problem
-    yield session
-    session.close()
+def odd(elapsed: np.ndarray) -> dict[str, np.ndarray]:
+    return {"<b>odd</b>": elapsed % 2 == 1, "success": np.zeros(len(elapsed), bool)}
 
 
-def press(panel: EnvPanel, server: viser.ViserServer, key: object) -> None:
-    """As the browser does: the button with this id."""
-    uuid = panel._presses._ids[key]  # type: ignore[index]
-    handle = server.gui._gui_input_handle_from_uuid[uuid]
-    assert element_id(handle) == uuid  # type: ignore[arg-type]
-    for callback in handle._impl.update_cb:
-        callback(viser.GuiEvent(None, None, handle))  # type: ignore[arg-type]
+@pytest.fixture
+def session(scripted_session: Callable[..., Session]) -> Session:
+    return scripted_session(MOST_ROWS + 6, odd)
 
 
-def shown(panel: EnvPanel, session: Session) -> list[int]:
-    panel.draw(session.view())
-    return [int(env) for env in re.findall(r'data-env="(\d+)"', panel._handle.content)]
+@dataclass
+class Envs:
+    """The table on a page."""
+
+    panel: EnvPanel
+    panels: Panels
+    session: Session
+
+    def shown(self) -> list[int]:
+        self.panel.draw(self.session.view())
+        return [int(env) for env in re.findall(r'data-env="(\d+)"', self.panels.html())]
 
 
-def test_pages_filters_and_rows_are_pressed(server: viser.ViserServer, session: Session) -> None:
-    panel = EnvPanel(server, session)
-    assert shown(panel, session) == list(range(MOST_ROWS))
-    press(panel, server, "on")
-    assert shown(panel, session) == list(range(MOST_ROWS, MOST_ROWS + 6))
-    press(panel, server, ("env", MOST_ROWS + 2))
-    assert session.view().selected_env == MOST_ROWS + 2
+@pytest.fixture
+def envs(panels: Panels, session: Session, clock: Clock) -> Envs:
+    return Envs(EnvPanel(panels.server, session, clock), panels, session)
+
+
+def test_pages_filters_and_rows_are_pressed(envs: Envs) -> None:
+    view = envs.session.view
+    assert envs.shown() == list(range(MOST_ROWS))
+    envs.panels.press("on")
+    assert envs.shown() == list(range(MOST_ROWS, MOST_ROWS + 6))
+    envs.panels.press(f"env {MOST_ROWS + 2}")
+    assert view().selected_env == MOST_ROWS + 2
     # Nothing ended and nothing is odd, so there is no moment to go to.
-    assert session.view().timeline.shown is None
-    press(panel, server, "on")
-    assert shown(panel, session) == list(range(MOST_ROWS, MOST_ROWS + 6))
-    press(panel, server, ("filter", "failed"))
-    assert shown(panel, session) == [] and "In no env did the last episode fail" in panel._handle.content
-    press(panel, server, ("filter", "all"))
-    press(panel, server, ("sort", "env"))
-    assert shown(panel, session) == list(range(MOST_ROWS + 5, 5, -1))
+    assert view().timeline.shown is None
+    envs.panels.claim(
+        "on", True, "button"
+    )  # it is pressed on a page that was drawn before the last one was shown
+    assert envs.shown() == list(range(MOST_ROWS, MOST_ROWS + 6))
+    envs.panels.press("filter failed")
+    assert envs.shown() == [] and "In no env did the last episode fail" in envs.panels.html()
+    envs.panels.press("filter all")
+    envs.shown()
+    envs.panels.press("sort env")
+    assert envs.shown() == list(range(MOST_ROWS + 5, 5, -1))
 
 
-def test_names_of_entries_are_escaped(server: viser.ViserServer, session: Session) -> None:
-    panel = EnvPanel(server, session)
-    panel.draw(session.view())
-    assert "&lt;b&gt;odd" in panel._handle.content and "<b>odd" not in panel._handle.content
+def test_names_of_entries_are_escaped(envs: Envs) -> None:
+    envs.shown()
+    assert "&lt;b&gt;odd" in envs.panels.html() and "<b>odd" not in envs.panels.html()
 
 
 def test_a_table_that_has_not_changed_is_not_sent_again(
-    server: viser.ViserServer, session: Session, monkeypatch: pytest.MonkeyPatch
+    envs: Envs, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    panel = EnvPanel(server, session)
-    panel.draw(session.view())
-    panel._drawn_at = 0.0
-    monkeypatch.setattr(session, "env_rows", lambda: pytest.fail("asked for rows again"))
-    panel.draw(session.view())
+    envs.shown()
+    clock.passes()
+    monkeypatch.setattr(envs.session, "env_rows", lambda: pytest.fail("asked for rows again"))
+    envs.shown()
+
+
+def test_a_step_is_in_the_table_a_moment_later_and_a_chosen_env_at_once(envs: Envs, clock: Clock) -> None:
+    envs.shown()
+    before = envs.panels.html()
+    envs.session.step()
+    wait_until(envs.session, lambda view: view.timeline.last == 1, "a step")
+    envs.shown()
+    assert envs.panels.html() == before, "it was drawn a moment ago"
+    envs.panels.press("env 3")
+    envs.shown()
+    assert "wb-selected" in envs.panels.html() and envs.panels.html() != before
+    envs.session.step()
+    wait_until(envs.session, lambda view: view.timeline.last == 2, "another step")
+    before = envs.panels.html()
+    clock.passes()
+    envs.shown()
+    assert envs.panels.html() != before

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
 import threading
 from collections.abc import Iterator
-from pathlib import Path
 
 import msgspec
 import pytest
@@ -15,8 +13,10 @@ from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.connection import Connection
 
-from tests.session.conftest import TASKS, wait_until
-from tests.session.recordings import made, write
+from tests.drive.episodes import made, write
+from tests.drive.panels import inputs_of
+from tests.drive.scripted import scripted
+from tests.drive.session import wait_until
 from tests.ui.knocking import claim, client, say, until
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
@@ -50,16 +50,17 @@ class Served:
 
     def controls(self) -> list[viser.GuiInputHandle]:
         gui = self.door.server.gui
-        return list(gui._gui_input_handle_from_uuid.values())  # type: ignore[arg-type]
+        return inputs_of(gui)
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("recordings")
     write(folder, made(5))
-    task = Path(shutil.copy(TASKS / "minimal.py", tmp_path_factory.mktemp("author")))
     door = open_door(DoorOptions(port=0))
-    session = Session(str(task), TaskOptions(num_envs=2), recordings=folder)
+    session = Session(
+        str(folder / "push.py"), TaskOptions(num_envs=2), recordings=folder, make_worker=scripted(2)
+    )
     place = Workplace(door.server, folder, session)
     place.pages.start("live")
     wait_until(session, lambda view: view.task is not None, "the task")

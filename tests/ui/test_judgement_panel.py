@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
 import pytest
-import viser
 
+from tests.drive.panels import Clock, Panels
 from tests.ui.scenes import running
 from workbench.authoring.problem import Problem
 from workbench.session.judge import JudgementView
@@ -64,15 +64,25 @@ class RecordedSession:
         self.asked.append(("stop",))
 
 
+@dataclass
+class Judging:
+    """The panel on a page, and the session that it asks."""
+
+    panel: JudgementPanel
+    session: RecordedSession
+    panels: Panels
+    clock: Clock
+
+    def draw(self, judged: JudgementView, **changes: Any) -> None:
+        self.clock.passes()
+        timeline = TimelineView(first=0, last=1000)
+        self.panel.draw(running(40, judgement=judged, **{"timeline": timeline, **changes}))
+
+
 @pytest.fixture
-def panel(server: viser.ViserServer) -> JudgementPanel:
-    return JudgementPanel(server, cast(Any, RecordedSession()))
-
-
-def draw(panel: JudgementPanel, judged: JudgementView, **changes: Any) -> None:
-    panel._drawn_at = 0.0
-    timeline = TimelineView(first=0, last=1000)
-    panel.draw(running(40, judgement=judged, **{"timeline": timeline, **changes}))
+def judging(panels: Panels, clock: Clock) -> Judging:
+    session = RecordedSession()
+    return Judging(JudgementPanel(panels.server, cast(Any, session), clock), session, panels, clock)
 
 
 @pytest.mark.parametrize(
@@ -133,61 +143,61 @@ def test_a_problem_is_told_with_file_and_line_and_escaped() -> None:
     assert "<b>" not in html and "&lt;b&gt;" in html
 
 
-def test_nothing_is_shown_before_the_first_judgement(panel: JudgementPanel) -> None:
-    draw(panel, JudgementView())
-    assert not any(h.visible for h in (panel._status, panel._stop, panel._name, panel._list))
-    assert panel._chart.handle is None
+def test_nothing_is_shown_before_the_first_judgement(judging: Judging) -> None:
+    judging.draw(JudgementView())
+    assert not any(judging.panels.shows(name) for name in ("Stop judging", "Curve"))
+    assert judging.panels.html("wb-again") == "" and judging.panels.charts() == []
 
 
-def test_only_what_runs_can_be_stopped(panel: JudgementPanel) -> None:
+def test_only_what_runs_can_be_stopped(judging: Judging) -> None:
     for state, stoppable in (("loading", True), ("judging", True), ("done", False), ("failed", False)):
-        draw(panel, done(None, state=state, serial=hash(state)))
-        assert panel._stop.visible == stoppable and panel._status.visible
+        judging.draw(done(None, state=state, serial=hash(state)))
+        assert judging.panels.shows("Stop judging") == stoppable and judging.panels.html("wb-again")
 
 
-def test_the_new_line_lies_over_the_recorded_one(panel: JudgementPanel) -> None:
-    draw(panel, done(summary(episode(3))), selected_env=3)
-    assert panel._chart.handle is not None and panel._chart.handle.visible
-    _, old, new = panel._chart.handle.data
+def test_the_new_line_lies_over_the_recorded_one(judging: Judging) -> None:
+    judging.draw(done(summary(episode(3))), selected_env=3)
+    (chart,) = judging.panels.charts()
+    _, old, new = chart.data
     assert (old == 3).all() and (new == 6).all()
-    assert [series.get("label") for series in panel._chart.handle.series] == [
+    assert [series.get("label") for series in chart.series] == [
         "step",
         "as recorded",
         "judged again",
     ]
-    draw(panel, done(summary(), serial=2), selected_env=3)
-    assert not panel._chart.handle.visible and not panel._name.visible
+    judging.draw(done(summary(), serial=2), selected_env=3)
+    assert judging.panels.charts() == [] and not judging.panels.shows("Curve")
 
 
-def test_a_choice_that_is_none_draws_the_reward(panel: JudgementPanel) -> None:
-    draw(panel, done(summary(episode(1))))
-    panel._name.value = "../../etc"
-    draw(panel, done(summary(episode(1)), serial=2))
-    assert panel._chart.handle is not None and str(panel._chart.handle.title).startswith("reward of env")
+def test_a_choice_that_is_none_draws_the_reward(judging: Judging) -> None:
+    judging.draw(done(summary(episode(1))))
+    judging.panels.claim("Curve", "../../etc")
+    judging.draw(done(summary(episode(1)), serial=2))
+    assert [str(chart.title)[:13] for chart in judging.panels.charts()] == ["reward of env"]
 
 
-def test_rows_go_to_their_moment_and_forgotten_moments_only_to_their_env(panel: JudgementPanel) -> None:
-    session = cast(Any, panel._session)
-    draw(panel, done(summary(*(episode(env) for env in range(MOST_ROWS + 3)))))
-    assert f"1 to {MOST_ROWS} of {MOST_ROWS + 3}" in panel._list.content
-    panel._go(2)
-    panel._turn(MOST_ROWS)
-    panel._go(2)
-    panel._go(3)  # there is no such row on the last part
+def test_rows_go_to_their_moment_and_forgotten_moments_only_to_their_env(judging: Judging) -> None:
+    session = judging.session
+    judging.draw(done(summary(*(episode(env) for env in range(MOST_ROWS + 3)))))
+    assert f"1 to {MOST_ROWS} of {MOST_ROWS + 3}" in judging.panels.html()
+    judging.panels.press("row 2")
+    judging.panels.press("on")
+    judging.panels.press("row 2")
+    judging.panels.claim("row 3", True, "button")  # there is no such row on the last part
     assert session.asked == [("show", 2, 25), ("show", MOST_ROWS + 2, 10 * (MOST_ROWS + 2) + 5)]
     session.shown = running(40, timeline=TimelineView(first=500, last=1000))
-    panel._turn(-MOST_ROWS)
-    panel._go(0)
+    judging.panels.press("back")
+    judging.panels.press("row 0")
     assert session.asked[-1] == ("select", 0)
 
 
-def test_the_key_goes_round(panel: JudgementPanel) -> None:
-    session = cast(Any, panel._session)
-    panel.go_to_difference(1)
+def test_the_key_goes_round(judging: Judging) -> None:
+    session = judging.session
+    judging.panel.go_to_difference(1)
     assert session.asked == []
-    draw(panel, done(summary(episode(0), episode(1))))
+    judging.draw(done(summary(episode(0), episode(1))))
     for wanted in (("show", 0, 5), ("show", 1, 15), ("show", 0, 5)):
-        panel.go_to_difference(1)
+        judging.panel.go_to_difference(1)
         assert session.asked[-1] == wanted
         session.shown = running(
             40, selected_env=wanted[1], timeline=TimelineView(first=0, last=1000, shown=wanted[2])

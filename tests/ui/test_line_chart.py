@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import viser
 
+from tests.drive.panels import Panels
 from workbench.ui.line_chart import CURSOR, STEP, TAKING_TURNS, YES_OR_NO, LineChart, line, span_of, with_gaps
 
 SERIES = (STEP, line("one", "#228be6", 1.8))
@@ -34,9 +35,9 @@ def test_new_data_go_to_the_same_chart_and_other_lines_to_another(server: viser.
         assert chart.handle is not before
 
 
-def test_charts_take_turns_in_one_place_and_one_is_shown(server: viser.ViserServer) -> None:
-    folder = server.gui.add_folder(None)
-    upper, lower = LineChart(server, folder, 150), LineChart(server, folder, 150)
+def test_charts_take_turns_in_one_place_and_one_is_shown(panels: Panels) -> None:
+    folder = panels.server.gui.add_folder(None)
+    upper, lower = LineChart(panels.server, folder, 150), LineChart(panels.server, folder, 150)
     upper.draw("reward", (X, Y), SERIES)
     lower.draw("success", (X, Y), SERIES)
     seen = [upper.handle]
@@ -45,10 +46,10 @@ def test_charts_take_turns_in_one_place_and_one_is_shown(server: viser.ViserServ
         assert upper.handle is not None and lower.handle is not None and upper.handle not in seen[-2:]
         assert upper.handle.title == f"reward of env {env}" and upper.handle.order < lower.handle.order
         seen.append(upper.handle)
-        assert [chart.visible for chart in upper._charts] == [False] * (len(upper._charts) - 1) + [True]
-    assert len(upper._charts) == TAKING_TURNS
+        assert sorted(panels.charts(), key=lambda chart: chart.order) == [upper.handle, lower.handle]
+    assert len(panels.charts(hidden=True)) == TAKING_TURNS + 1
     upper.hide()
-    assert not any(chart.visible for chart in upper._charts)
+    assert panels.charts() == [lower.handle]
 
 
 def test_yes_or_no_has_one_range_and_numbers_that_of_the_data() -> None:

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
-import viser
-
+from tests.drive.panels import Clock, Panels
 from tests.ui.scenes import running
 from workbench.session.kept_worker import Vitals
 from workbench.session.printed import NOTHING_PRINTED, Printed, PrintedLine
@@ -12,12 +11,6 @@ LINES = (
     PrintedLine("stderr", "a Warning"),
     PrintedLine("stdout", "done"),
 )
-
-
-def draw(panel: LogPanel, printed: Printed) -> str:
-    panel._drawn_at = 0.0
-    panel.draw(running(2, printed=printed))
-    return panel._html.content
 
 
 def test_lines_stand_in_order_with_their_stream() -> None:
@@ -50,17 +43,25 @@ def test_what_was_printed_is_text() -> None:
     assert "<script" not in html
 
 
-def test_held_still_it_waits_and_cleared_it_does_not(server: viser.ViserServer) -> None:
+def test_held_still_it_waits_and_cleared_it_does_not(panels: Panels, clock: Clock) -> None:
     cleared: list[bool] = []
-    panel = LogPanel(server, lambda: cleared.append(True))
-    draw(panel, NOTHING_PRINTED)
-    assert not panel._filter.visible and not panel._clear.visible
-    assert "reward" in draw(panel, Printed(1, LINES[:1], 0))
-    panel._hold.value = True
-    assert "Warning" not in draw(panel, Printed(2, LINES[:2], 0))
-    panel._on_clear(lambda: cleared.append(True))
-    assert panel._filter.visible
-    assert cleared and "Nothing printed" in draw(panel, Printed(3, (), 0))
+    panel = LogPanel(panels.server, lambda: cleared.append(True), clock)
+
+    def drawn(printed: Printed) -> str:
+        clock.passes()
+        panel.draw(running(2, printed=printed))
+        return panels.html()
+
+    drawn(NOTHING_PRINTED)
+    assert not panels.shows("Filter") and not panels.shows("Clear")
+    assert "reward" in drawn(Printed(1, LINES[:1], 0))
+    panels.set("Hold still", True)
+    assert "Warning" not in drawn(Printed(2, LINES[:2], 0))
+    panels.set("Filter", "Warn")
+    assert "Warning" in drawn(Printed(2, LINES[:2], 0)), "the filter is of what stands there"
+    assert panels.shows("Filter")
+    panels.press("Clear")
+    assert cleared and "Nothing printed" in drawn(Printed(3, (), 0))
 
 
 def test_memory_is_said_of_both_processes() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.recording.made import Made, Track
+from tests.drive.episodes import Made, Track
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo
 from workbench.recording.episode import EpisodeInfo
@@ -17,6 +17,8 @@ from workbench.recording.scene_eye import Eye
 from workbench.recording.sources import Source, sources_among
 from workbench.ui.make_shared import Wanted
 from workbench.ui.making import Making, MakingView, decode, encode
+
+pytestmark = pytest.mark.usefixtures("child_process")
 
 
 @pytest.fixture(scope="module")

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import viser
 import websockets.sync.client
 
-from tests.session.conftest import TASKS, wait_until
+from tests.drive.panels import Clock, Panels
+from tests.drive.session import TASKS, wait_until
 from tests.ui.tabs import handshake, messages_in
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
+from workbench.session.view import SessionView
 from workbench.ui.page import Page
+from workbench.ui.run_panel import RESET_ALL
 
 
 @pytest.fixture(scope="module")
@@ -22,69 +26,93 @@ def task_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return Path(shutil.copy(TASKS / "minimal.py", tmp_path_factory.mktemp("author") / "minimal.py"))
 
 
+@dataclass
+class Opened:
+    """A page, its session and what it shows."""
+
+    page: Page
+    session: Session
+    panels: Panels
+    clock: Clock
+
+    def draw(self) -> None:
+        self.clock.passes()
+        self.page.redraw()
+
+    def load(self) -> SessionView:
+        view = wait_until(self.session, lambda view: view.task is not None, "the load")
+        self.draw()
+        return view
+
+    def banner(self) -> bool:
+        return self.panels.part("Problem").seen
+
+
 @pytest.fixture(scope="module")
-def page(task_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+def opened(
+    child_process: None, task_file: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Opened]:
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     session = Session(
         str(task_file), TaskOptions(num_envs=3), recordings=tmp_path_factory.mktemp("recordings")
     )
-    page = Page(server, session)
+    panels, clock = Panels(server), Clock()
+    page = Page(server, session, clock=clock)
     page.redraw()
-    yield page
+    yield Opened(page, session, panels, clock)
     session.close()
     server.stop()
 
 
-def test_says_what_it_waits_for_and_then_shows_the_scene(page: Page) -> None:
+def test_says_what_it_waits_for_and_then_shows_the_scene(opened: Opened) -> None:
     # The fixture drew it before there was a task.
-    assert page._run._play.disabled
-    assert not page._run._transport.visible
-    view = wait_until(page._session, lambda view: view.task is not None, "the first load")
-    page.redraw()
-    assert not page._run._play.disabled
-    assert page._run._transport.visible
-    assert page._run._env.handle.max == 2
-    names = " ".join(handle.name for handle in page._scene.handles)
-    assert "cube" in names and "panda_hand" in names and "ground" in names
-    assert "3 envs" in page._status._handle.content
-    assert view.task is not None and len(page._run._sliders._controls) == len(view.task.actions)
+    run = opened.panels.part("Run")
+    assert run.control("Play").disabled and not run.offers(RESET_ALL)
+    view = opened.load()
+    assert not run.control("Play").disabled and run.offers(RESET_ALL)
+    assert run.control("Selected").max == 2
+    assert all(opened.panels.bodies(name) for name in ("cube", "panda_hand", "ground"))
+    assert "3 envs" in opened.panels.html("wb-status")
+    run.set("Source", "sliders")
+    wait_until(opened.session, lambda view: view.action_source == "sliders", "the sliders")
+    opened.draw()
+    assert view.task is not None and all(run.shows(action.name) for action in view.task.actions)
+    run.set("Source", "hold still")
 
 
-def test_a_step_moves_the_robots_and_fills_the_numbers(page: Page) -> None:
-    wait_until(page._session, lambda view: view.task is not None, "the load")
-    page.redraw()
-    hand = next(handle for handle in page._scene.handles if "panda_hand" in handle.name)
+def test_a_step_moves_the_robots_and_fills_the_numbers(opened: Opened) -> None:
+    opened.load()
+    hand = opened.panels.bodies("panda_hand")[0]
     before = hand.batched_positions.copy()
-    page._session.set_action_source("random")
-    serial = page._session.view().step_serial
-    page._session.step()
-    wait_until(page._session, lambda view: view.step_serial > serial, "a step")
-    page._numbers._drawn_at = 0.0
-    page.redraw()
+    opened.session.set_action_source("random")
+    serial = opened.session.view().step_serial
+    opened.session.step()
+    wait_until(opened.session, lambda view: view.step_serial > serial, "a step")
+    opened.draw()
     assert (hand.batched_positions != before).any(axis=1).all()
-    assert "success" in page._numbers._handle.content
-    assert "of 3" in page._numbers._handle.content
+    assert "success" in opened.panels.part("Reward").html()
+    assert "of 3" in opened.panels.part("Reward").html()
 
 
-def test_selecting_an_env_moves_its_mark(page: Page) -> None:
-    wait_until(page._session, lambda view: view.task is not None, "the load")
-    page._session.select_env(2)
-    page.redraw()
-    assert page._mark._label is not None and page._mark._label.text == "env 2"
-    assert page._run._env.handle.value == 2
-    page._run.select_neighbour(1)
-    assert page._session.view().selected_env == 0
+def test_selecting_an_env_moves_its_mark(opened: Opened) -> None:
+    opened.load()
+    opened.session.select_env(2)
+    opened.draw()
+    assert opened.panels.labels() == ["env 2"]
+    assert opened.panels.control("Selected").value == 2
+    opened.panels.command("Next env")
+    assert opened.session.view().selected_env == 0
 
 
 def test_what_a_press_changes_on_the_panels_comes_apart_from_the_view(
-    page: Page, monkeypatch: pytest.MonkeyPatch
+    opened: Opened, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A browser applies a batch with anything of the view in it at its next frame of the view, which may take long.
-    wait_until(page._session, lambda view: view.task is not None, "the load")
+    opened.load()
     monkeypatch.setattr("workbench.ui.redraw_loop.SENT_WITHIN", 10.0)
-    page._session.select_env(0)
-    page.redraw()
-    address, options = handshake(f"http://127.0.0.1:{page._server.get_port()}")
+    opened.session.select_env(0)
+    opened.draw()
+    address, options = handshake(f"http://127.0.0.1:{opened.panels.server.get_port()}")
     with websockets.sync.client.connect(address, **options) as connection:
 
         def kinds_until(last: str) -> list[set[str]]:
@@ -96,42 +124,43 @@ def test_what_a_press_changes_on_the_panels_comes_apart_from_the_view(
             return batches
 
         kinds_until("ReplayDoneMessage")
-        page._session.select_env(1)
-        page.redraw()
+        opened.session.select_env(1)
+        opened.draw()
         *panels, view = kinds_until("SceneNodeUpdateMessage")
     assert any("GuiUpdateMessage" in batch for batch in panels)
     assert "GuiUpdateMessage" not in view
 
 
-def test_one_env_alone_is_one_instance_of_each_shape(page: Page) -> None:
-    wait_until(page._session, lambda view: view.task is not None, "the load")
-    page._view_panel.toggle_only_selected()
-    page.redraw()
-    hand = next(handle for handle in page._scene.handles if "panda_hand" in handle.name)
+def test_one_env_alone_is_one_instance_of_each_shape(opened: Opened) -> None:
+    opened.load()
+    opened.panels.command("Show all envs or the selected one")
+    opened.draw()
+    hand = opened.panels.bodies("panda_hand")[0]
     assert hand.batched_positions.shape == (1, 3)
-    assert page._mark._label is None
-    page._view_panel.toggle_only_selected()
-    page.redraw()
-    assert all(len(h.batched_positions) == 3 for h in page._scene.handles if "panda_hand" in h.name)
+    assert opened.panels.labels() == []
+    opened.panels.command("Show all envs or the selected one")
+    opened.draw()
+    assert all(len(h.batched_positions) == 3 for h in opened.panels.bodies("panda_hand"))
 
 
-def test_broken_file_is_said_and_the_scene_stays(page: Page, task_file: Path) -> None:
+def test_broken_file_is_said_and_the_scene_stays(opened: Opened, task_file: Path) -> None:
     good = task_file.read_text(encoding="utf-8")
-    wait_until(page._session, lambda view: view.task is not None, "the load")
-    page.redraw()
-    shown = page._scene.handles
+    opened.load()
+    shown = opened.panels.bodies("")
     task_file.write_text(good.replace("self.cube.pose.p", "self.cube.pose.nothing"), encoding="utf-8")
-    view = wait_until(page._session, lambda view: view.problem is not None, "the problem")
-    page.redraw()
-    assert page._banner._panel.visible
-    assert view.problem is not None and f"minimal.py:{view.problem.line}" in page._banner._html.content
-    assert "nothing" in page._banner._html.content
-    assert all(new is old for new, old in zip(page._scene.handles, shown, strict=True))
+    view = wait_until(opened.session, lambda view: view.problem is not None, "the problem")
+    opened.draw()
+    assert opened.banner()
+    assert (
+        view.problem is not None and f"minimal.py:{view.problem.line}" in opened.panels.part("Problem").html()
+    )
+    assert "nothing" in opened.panels.part("Problem").html()
+    assert all(new is old for new, old in zip(opened.panels.bodies(""), shown, strict=True))
     task_file.write_text(good, encoding="utf-8")
     wait_until(
-        page._session, lambda view: view.problem is None and view.task_serial > 1, "the mended version"
+        opened.session, lambda view: view.problem is None and view.task_serial > 1, "the mended version"
     )
-    page.redraw()
-    assert not page._banner._panel.visible
+    opened.draw()
+    assert not opened.banner()
     # The same shapes are not sent again.
-    assert all(new is old for new, old in zip(page._scene.handles, shown, strict=True))
+    assert all(new is old for new, old in zip(opened.panels.bodies(""), shown, strict=True))

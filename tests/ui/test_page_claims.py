@@ -23,6 +23,7 @@ from workbench.ui import page_guard
 from workbench.ui.client_messages import KINDS, MAX_BYTES
 from workbench.ui.control_values import LONGEST_LINE
 from workbench.ui.door import Door, DoorOptions, open_door
+from workbench.ui.viser_seam import element_id
 
 unhurried = settings(
     deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -52,7 +53,7 @@ def bystander(door: Door) -> Iterator[Callable[[], None]]:
         for frame in connection:
             assert isinstance(frame, bytes)
             for message in messages_in(frame):
-                if message["type"] == "GuiUpdateMessage" and message["uuid"] == box._impl.uuid:
+                if message["type"] == "GuiUpdateMessage" and message["uuid"] == element_id(box):
                     heard.append(message["updates"]["value"])
 
     with client(door) as reader, client(door) as other:
@@ -223,11 +224,11 @@ def test_the_page_that_sent_it_is_told_and_shown_the_true_value(
             if "NotificationShowMessage" not in kinds:
                 return False
             later = told[kinds.index("NotificationShowMessage") :]
-            return any(m.get("uuid") == control._impl.uuid and "value" in m["updates"] for m in later)
+            return any(m.get("uuid") == element_id(control) and "value" in m["updates"] for m in later)
 
         until(shown)
     value = control.value
-    values = [m["updates"]["value"] for m in told if m.get("uuid") == control._impl.uuid and "updates" in m]
+    values = [m["updates"]["value"] for m in told if m.get("uuid") == element_id(control) and "updates" in m]
     assert values[-1] == (list(value) if isinstance(value, tuple) else value)
     bodies = [m["props"]["body"] for m in told if m["type"] == "NotificationShowMessage"]
     assert bodies == [sentence]

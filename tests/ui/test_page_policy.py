@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 from collections.abc import Iterator
 
@@ -12,8 +11,9 @@ import trimesh
 import trimesh.visual
 import trimesh.visual.material
 from PIL import Image
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Page
 
+from tests.drive.page import page_at
 from tests.ui.knocking import ask, until
 from workbench.ui import page_policy
 from workbench.ui.door import Door, DoorOptions, open_door
@@ -49,18 +49,6 @@ def filled(door: Door) -> Door:
     server.scene.add_camera_frustum("/frustum", fov=1.0, aspect=1.0, image=np.zeros((8, 8, 3), np.uint8))
     server.scene.configure_environment_map("city", background=True)
     return door
-
-
-@contextlib.contextmanager
-def chromium(path: str) -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=path, args=["--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"]
-        )
-        try:
-            yield browser
-        finally:
-            browser.close()
 
 
 def complaints_of(page: Page) -> list[str]:
@@ -101,7 +89,7 @@ def test_every_reply_isolates_the_page_and_gives_it_no_devices(door):
 
 
 @pytest.mark.browser
-def test_code_that_came_into_the_page_as_html_does_not_run(door, chromium_path):
+def test_code_that_came_into_the_page_as_html_does_not_run(door, browser):
     attacks = (
         '<img src="/none" onerror="document.title=\'ran\'">',
         "<svg onload=\"document.title='ran'\"></svg>",
@@ -113,9 +101,7 @@ def test_code_that_came_into_the_page_as_html_does_not_run(door, chromium_path):
         "<style onload=\"document.title='ran'\"></style><base href='//evil.example/'>",
     )
     handle = door.server.gui.add_html("".join(attacks) + "<p id='there'>x</p>")
-    with chromium(chromium_path) as browser:
-        page = browser.new_page()
-        page.goto(door.url, wait_until="domcontentloaded")
+    with page_at(browser, door.url) as (page, _):
         page.wait_for_selector("#there", timeout=60_000)
         page.evaluate("document.getElementById('link').click(); document.getElementById('click').click()")
         page.evaluate(
@@ -128,12 +114,10 @@ def test_code_that_came_into_the_page_as_html_does_not_run(door, chromium_path):
 
 
 @pytest.mark.browser
-def test_a_page_whose_token_was_renewed_says_what_to_do(chromium_path):
+def test_a_page_whose_token_was_renewed_says_what_to_do(browser):
     door = open_door(DoorOptions(port=0))
     try:
-        with chromium(chromium_path) as browser:
-            page = browser.new_page()
-            page.goto(door.url, wait_until="domcontentloaded")
+        with page_at(browser, door.url) as (page, _):
             until(lambda: page.wait_for_timeout(50) or door.server.get_clients())
             door.renew_token()
             page.wait_for_selector("text=Open the address that the terminal shows", timeout=60_000)
@@ -145,7 +129,7 @@ def test_a_page_whose_token_was_renewed_says_what_to_do(chromium_path):
 
 @pytest.mark.browser
 @pytest.mark.slow
-def test_each_exception_is_needed(filled, chromium_path, monkeypatch):
+def test_each_exception_is_needed(filled, browser, monkeypatch):
     # 'self' means ws: too in Chromium, but not in every browser; connect-src 'self' is what let_in.js asks when the
     # connection is lost, see the test above.
     elsewhere = {("connect-src", source) for source in ("'self'", "ws://{authority}", "wss://{authority}")}
@@ -156,33 +140,32 @@ def test_each_exception_is_needed(filled, chromium_path, monkeypatch):
         for source in sources.split()
         if source != "'none'" and name != "frame-ancestors" and (name, source) not in elsewhere
     ]
-    with chromium(chromium_path) as browser:
 
-        def load() -> list[str]:
-            page = browser.new_page(viewport={"width": 640, "height": 480})
-            complaints = complaints_of(page)
-            page.goto(filled.url, wait_until="domcontentloaded")
-            pressed = False
-            # The first complaint is enough; to have none takes as long as everything needs to load.
-            for _ in range(80):
-                page.wait_for_timeout(100)
-                if complaints:
-                    break
-                if not pressed and page.query_selector("#press"):
-                    page.dispatch_event("#press", "pointerdown")
-                    pressed = True
-            page.close()
-            return complaints
+    def load() -> list[str]:
+        page = browser.new_page(viewport={"width": 640, "height": 480})
+        complaints = complaints_of(page)
+        page.goto(filled.url, wait_until="domcontentloaded")
+        pressed = False
+        # The first complaint is enough; to have none takes as long as everything needs to load.
+        for _ in range(80):
+            page.wait_for_timeout(100)
+            if complaints:
+                break
+            if not pressed and page.query_selector("#press"):
+                page.dispatch_event("#press", "pointerdown")
+                pressed = True
+        page.close()
+        return complaints
 
-        assert load() == []
-        needless = []
-        for name, source in exceptions:
-            others = " ".join(other for other in DIRECTIVES[name].split() if other != source) or "'none'"
-            handler = next((one for one in HANDLERS if source == f"'{page_policy.hash_of(one)}'"), None)
-            if handler is not None and handler != "wb.press(event)":
-                continue  # each is in a template: the test above
-            with monkeypatch.context() as without:
-                without.setitem(DIRECTIVES, name, others)
-                if not load():
-                    needless.append(f"{name} {source}")
-        assert needless == []
+    assert load() == []
+    needless = []
+    for name, source in exceptions:
+        others = " ".join(other for other in DIRECTIVES[name].split() if other != source) or "'none'"
+        handler = next((one for one in HANDLERS if source == f"'{page_policy.hash_of(one)}'"), None)
+        if handler is not None and handler != "wb.press(event)":
+            continue  # each is in a template: the test above
+        with monkeypatch.context() as without:
+            without.setitem(DIRECTIVES, name, others)
+            if not load():
+                needless.append(f"{name} {source}")
+    assert needless == []

@@ -5,56 +5,39 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import viser
 
-from tests.session.conftest import TASKS, wait_until
-from tests.session.recordings import begin, made, write
-from workbench.session.messages import TaskOptions
+from tests.drive.episodes import begin, made, write
+from tests.drive.panels import Panels, held_by
+from tests.drive.session import wait_until
+from tests.drive.waiting import until
+from tests.ui.tabs import tabs_of
 from workbench.session.session import Session
-from workbench.ui.page import Page
 from workbench.ui.put_together import Workplace
-from workbench.ui.review_page import ReviewPage
 
 SWAPS = 20
 
 
 @pytest.fixture
-def place(tmp_path: Path, server: viser.ViserServer) -> Iterator[Workplace]:
+def place(
+    child_process: None, tmp_path: Path, server: viser.ViserServer, scripted_session: Callable[..., Session]
+) -> Iterator[Workplace]:
     write(tmp_path, made(5))
-    session = Session(str(TASKS / "minimal.py"), TaskOptions(num_envs=2), recordings=tmp_path)
-    place = Workplace(server, tmp_path, session)
+    place = Workplace(server, tmp_path, scripted_session(2))
     yield place
     place.close()
-    session.close()
-
-
-def counts(server: viser.ViserServer) -> dict[str, int]:
-    # viser keeps a word for each thing that went until the next page comes, and sweeps them together then.
-    server._run_garbage_collector(force=True)
-    gui = server.gui
-    return {
-        "inputs": len(gui._gui_input_handle_from_uuid),
-        "containers": len(gui._container_handle_from_uuid),
-        "panels": len(gui._panel_handle_from_uuid),
-        "commands": len(gui._command_handle_from_uuid),
-        "nodes": len(server.scene._handle_from_node_name),
-        "clicks": len(server.scene._scene_pointer_cb),
-        "messages": len(server._websock_server._broadcast_buffer.message_from_id),
-    }
 
 
 @pytest.mark.slow
 def test_twenty_swaps_leave_nothing_and_the_session_lives_on(
-    place: Workplace, server: viser.ViserServer
+    place: Workplace, server: viser.ViserServer, panels: Panels
 ) -> None:
     session = place.session
     assert session is not None
-    wait_until(session, lambda view: view.task is not None, "the task")
     place.pages.start("live")
     session.play()
     seen: dict[str, list[dict[str, int]]] = {"live": [], "review": []}
@@ -63,10 +46,10 @@ def test_twenty_swaps_leave_nothing_and_the_session_lives_on(
         which = "review" if number % 2 == 0 else "live"
         place.pages.show(which)
         assert place.pages.wait_for(which, timeout=60)
-        page = place.pages._page
-        assert isinstance(page, (Page, ReviewPage))
-        page.redraw()
-        seen[which].append(counts(server))
+        with tabs_of(f"http://127.0.0.1:{server.get_port()}") as tabs:
+            tab = tabs.open()
+            until(lambda tab=tab: tab.open and panels.html("wb-status"), f"the {which} page, drawn")
+        seen[which].append(held_by(server))
         threads.append(threading.active_count())
     for found in seen.values():
         # The first of each may draw what the next ones have at once.
@@ -79,7 +62,7 @@ def test_twenty_swaps_leave_nothing_and_the_session_lives_on(
 
 
 def test_an_episode_whose_writer_was_killed_is_mended_and_said(
-    tmp_path: Path, server: viser.ViserServer
+    child_process: None, tmp_path: Path, server: viser.ViserServer
 ) -> None:
     begin(tmp_path, made(5, seed=8))
     place = Workplace(server, tmp_path)
@@ -91,7 +74,7 @@ def test_an_episode_whose_writer_was_killed_is_mended_and_said(
         place.close()
 
 
-def test_serving_the_pages_needs_no_simulator() -> None:
+def test_serving_the_pages_needs_no_simulator(child_process: None) -> None:
     said = subprocess.run(
         [sys.executable, "-c", "import sys, workbench.page_command; print(*sys.modules)"],
         check=True,
@@ -99,13 +82,6 @@ def test_serving_the_pages_needs_no_simulator() -> None:
         text=True,
     ).stdout.split()
     assert not {"torch", "sapien", "mani_skill", "libcst"} & set(said)
-
-
-def until(reached: Callable[[], bool], what: str) -> None:
-    deadline = time.monotonic() + 60
-    while not reached():
-        assert time.monotonic() < deadline, f"{what} did not come"
-        time.sleep(0.02)
 
 
 def test_what_is_open_in_the_review_is_open_when_one_comes_back(place: Workplace) -> None:

@@ -12,10 +12,11 @@ from pathlib import Path
 import pytest
 import rerun as rr
 import rerun.blueprint as rrb
-from playwright.sync_api import Request, sync_playwright
+from playwright.sync_api import Browser, Request
 from rerun.chunk import LazyChunkStream
 
-from tests.browser.opened import until
+from tests.drive.page import page_at
+from tests.drive.waiting import until
 from workbench.recording.blueprint_in_file import add_blueprint, blueprint_stream, encode_blueprint
 from workbench.recording.rerun_chunks import static_chunk
 from workbench.recording.web_viewer import VIEWER_FILES, web_viewer_folder
@@ -138,7 +139,7 @@ def test_a_recordings_name_is_text_and_no_script(door: Door, pages: RerunPages, 
 
 
 def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
-    door: Door, pages: RerunPages, recording: Path, chromium_path: str
+    door: Door, pages: RerunPages, recording: Path, browser: Browser
 ) -> None:
     library = door.server.gui.add_panel()
     with library.add_tab("Library"):
@@ -155,12 +156,7 @@ def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
     threading.Thread(target=draw, daemon=True).start()
     asked: list[Request] = []
     failed: dict[str, str | None] = {}
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=chromium_path,
-            args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
-        )
-        tab = browser.new_page(viewport={"width": 1280, "height": 720})
+    with page_at(browser, "about:blank", 1280, 720, drawn=True) as (tab, _):
         tab.on("request", lambda request: asked.append(request))
         tab.on("requestfailed", lambda request: failed.update({request.url: request.failure}))
         tab.goto(door.url)
@@ -181,7 +177,6 @@ def test_the_page_opens_the_recording_beside_the_scene_and_asks_nobody_else(
         assert tab.evaluate("document.activeElement.tagName") != "IFRAME", "the keys are the page's"
         tab.get_by_role("button", name="Close rerun").click()
         tab.locator("iframe.wb-rerun").wait_for(state="detached")
-        browser.close()
     stopping.set()
     ours = f"http://127.0.0.1:{door.port}/"
     foreign = {

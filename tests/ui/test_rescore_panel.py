@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
-import viser
 
-from tests.session.recordings import made, write
+from tests.drive.episodes import made, write
+from tests.drive.panels import Clock, Panels
+from tests.drive.waiting import until
 from workbench.authoring.problem import Problem
 from workbench.recording.library import Library
 from workbench.session import rescore_words as words
 from workbench.session.rescore_messages import EpisodeFile, Verdict
-from workbench.session.rescorer import Rescorer, RescoreView
+from workbench.session.rescorer import RescoreView
 from workbench.session.review import Review
 from workbench.ui.rescore_panel import MOST_ROWS, RescoreChoices, RescorePanel, in_order, status_html
 from workbench.ui.step_in import episode_files
@@ -99,7 +99,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def library(folder: Path) -> Iterator[Library]:
+def library(child_process: None, folder: Path) -> Iterator[Library]:
     library = Library(folder)
     library.refresh()
     yield library
@@ -113,63 +113,86 @@ def review(library: Library) -> Iterator[Review]:
     review.close()
 
 
+class Told:
+    """Stands where what judges again stands for the panel: what it has told last."""
+
+    def __init__(self) -> None:
+        self.view = RescoreView()
+
+    def stop(self) -> None:
+        raise AssertionError("nobody asked for that")
+
+
+@dataclass
+class Rescoring:
+    """The panel on a page, with what it is told."""
+
+    panel: RescorePanel
+    panels: Panels
+    clock: Clock
+    review: Review
+    choices: RescoreChoices
+    told: Told
+
+    def draw(self, told: RescoreView) -> None:
+        self.told.view = told
+        self.clock.passes()
+        self.panel.draw(self.review.view())
+
+
 @pytest.fixture
-def panel(server: viser.ViserServer, library: Library, review: Review) -> Iterator[RescorePanel]:
-    rescorer = Rescorer()
-    yield RescorePanel(
-        server, rescorer, review, lambda ids: episode_files(library, ids), RescoreChoices(True, False)
+def rescoring(panels: Panels, library: Library, review: Review, clock: Clock) -> Rescoring:
+    told, choices = Told(), RescoreChoices(True, False)
+    panel = RescorePanel(
+        panels.server,
+        cast(Any, told),
+        review,
+        lambda ids: episode_files(library, ids),
+        choices,
+        clock=clock,
     )
-    rescorer.close()
-
-
-def draw(panel: RescorePanel, told: RescoreView) -> None:
-    panel._rescorer._view = told
-    panel._drawn_at = 0.0
-    panel.draw(panel._review.view())
+    return Rescoring(panel, panels, clock, review, choices, told)
 
 
 def test_a_row_opens_its_episode_at_the_first_difference(
-    panel: RescorePanel, library: Library, review: Review
+    rescoring: Rescoring, library: Library, review: Review
 ) -> None:
     rows = {row.seed: row for row in library.rows()}
     given = [
         verdict(rows[seed].id, seed=seed, first_difference=seed + 1, returns=(0.0, float(seed)))
         for seed in (1, 2, 3)
     ]
-    draw(panel, RescoreView("done", 1, 3, tuple(given)))
-    assert "3 of 3 episodes differ" in panel._status.content and panel._list.content.index("seed 3") > 0
-    assert not panel._begin.visible and not panel._stop.visible
-    panel._go(1)  # by the change of their returns: 3, 2, 1
-    deadline = time.monotonic() + 60
-    while not review.view().opened:
-        assert time.monotonic() < deadline, review.view().problems
-        time.sleep(0.01)
+    rescoring.draw(RescoreView("done", 1, 3, tuple(given)))
+    assert "3 of 3 episodes differ" in rescoring.panels.html() and "seed 3" in rescoring.panels.html()
+    assert not any(rescoring.panels.shows(name) for name in ("Judge what is open", "Stop"))
+    rescoring.panels.press("row 1")  # by the change of their returns: 3, 2, 1
+    until(lambda: review.view().opened, "the recording", seen=lambda: review.view().problems)
     view = review.view()
     assert view.opened[0].id == rows[2].id and view.states == (3,)
-    draw(panel, replace(panel._rescorer.view, serial=2))
-    assert panel._chart.handle is not None and panel._chart.handle.visible and panel._begin.visible
-    assert "wb-selected" in panel._list.content
+    rescoring.draw(replace(rescoring.told.view, serial=2))
+    assert len(rescoring.panels.charts()) == 1 and rescoring.panels.shows("Judge what is open")
+    assert "wb-selected" in rescoring.panels.html()
 
 
-def test_a_long_list_is_turned_a_page_at_a_time(panel: RescorePanel) -> None:
+def test_a_long_list_is_turned_a_page_at_a_time(rescoring: Rescoring) -> None:
     many = tuple(verdict(str(k), first_difference=1, returns=(0.0, 99.0 - k), seed=k) for k in range(23))
-    draw(panel, RescoreView("done", 1, 23, many))
+    rescoring.draw(RescoreView("done", 1, 23, many))
     assert (
-        panel._list.content.count('data-press="') == MOST_ROWS + 2 and "1 to 10 of 23" in panel._list.content
+        rescoring.panels.html().count('data-press="') == MOST_ROWS + 2
+        and "1 to 10 of 23" in rescoring.panels.html()
     )
-    panel._turn(MOST_ROWS)
-    panel._turn(MOST_ROWS)
-    panel._turn(MOST_ROWS)
-    draw(panel, RescoreView("done", 2, 23, many))
-    assert "21 to 23 of 23" in panel._list.content
+    rescoring.panels.press("on")
+    rescoring.panels.press("on")
+    rescoring.panels.press("on")
+    rescoring.draw(RescoreView("done", 2, 23, many))
+    assert "21 to 23 of 23" in rescoring.panels.html()
 
 
-def test_what_a_page_sends_as_its_choice_may_be_anything(panel: RescorePanel) -> None:
-    assert panel._code.value == "as recorded"
-    panel._code.value = "today's"
-    panel._states.value = True
-    panel._chosen()
-    assert panel._choices == RescoreChoices(False, True)
+def test_what_a_page_sends_as_its_choice_may_be_anything(rescoring: Rescoring) -> None:
+    assert rescoring.panels.control("Code").value == "as recorded"
+    rescoring.panels.set("Recorded states", True)
+    rescoring.panels.claim("Code", "../../etc")
+    assert rescoring.choices == RescoreChoices(False, True)
 
 
 def test_recordings_that_are_gone_are_not_judged(library: Library) -> None:

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import re
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
 import viser
 
-from tests.session.recordings import made, write
+from tests.drive.episodes import made, write
+from tests.drive.panels import Clock, Panels
+from tests.drive.waiting import until
 from workbench.core.step import OtherEntry
 from workbench.recording.library import Library
 from workbench.session.review import Review
+from workbench.ui import ground_numbers
+from workbench.ui.env_layout import EnvLayout
 from workbench.ui.review_page import ReviewOffers, ReviewPage
-
-Opener = Callable[..., None]
+from workbench.ui.review_panel import GHOSTS, GO_LIVE
 
 
 @pytest.fixture(scope="module")
@@ -28,138 +31,154 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@dataclass
+class Shown:
+    """The review on a page."""
+
+    page: ReviewPage
+    review: Review
+    library: Library
+    panels: Panels
+    clock: Clock
+
+    def draw(self) -> None:
+        self.clock.passes()
+        self.page.redraw()
+
+    def open(self, *seeds: int) -> None:
+        rows = {row.seed: row.id for row in self.library.rows()}
+        self.review.open([rows[seed] for seed in seeds])
+        until(
+            lambda: len(self.review.view().opened) == len(seeds) and not self.review.view().loading,
+            "what was opened",
+            seen=lambda: self.review.view().problems,
+        )
+        self.draw()
+
+    def chart(self, title: str) -> viser.GuiUplotHandle:
+        (chart,) = (chart for chart in self.panels.part("Curves").charts() if chart.title == title)
+        return chart
+
+
 @pytest.fixture
-def page(folder: Path, server: viser.ViserServer) -> Iterator[ReviewPage]:
+def shown(child_process: None, folder: Path, panels: Panels, clock: Clock) -> Iterator[Shown]:
     library = Library(folder)
     library.refresh()
     review = Review(library)
-    page = ReviewPage(server, review, library, ReviewOffers(on_step_back=lambda id, state: None))
-    yield page
+    offers = ReviewOffers(on_step_back=lambda id, state: None)
+    yield Shown(
+        ReviewPage(panels.server, review, library, offers, clock=clock), review, library, panels, clock
+    )
     review.close()
     library.close()
 
 
-def library_of(page: ReviewPage) -> Library:
-    assert page._library is not None
-    return page._library._library
+SLIDER = "step of the timeline"
 
 
-def open_seeds(page: ReviewPage, *seeds: int) -> None:
-    rows = {row.seed: row.id for row in library_of(page).rows()}
-    page._review.open([rows[seed] for seed in seeds])
-    deadline = time.monotonic() + 60
-    while len(page._review.view().opened) != len(seeds) or page._review.view().loading:
-        assert time.monotonic() < deadline, page._review.view().problems
-        time.sleep(0.01)
-    draw(page)
+def test_says_what_to_do_while_nothing_is_open(shown: Shown) -> None:
+    shown.draw()
+    assert "Choose one in the library" in shown.panels.part("Review").html()
+    assert not shown.panels.part("Timeline").seen and not shown.panels.shows("Play")
+    assert not shown.panels.is_folded("Library") and "nothing open" in shown.panels.html("wb-status")
 
 
-def draw(page: ReviewPage) -> None:
-    # Each part is drawn as often as can be read; a test does not wait for that.
-    page._curves._drawn_at = page._curves._numbers_at = 0.0
-    page._cameras._drawn_at = page._told_at = 0.0
-    page.redraw()
-
-
-def test_says_what_to_do_while_nothing_is_open(page: ReviewPage) -> None:
-    page.redraw()
-    assert "Choose one in the library" in page._panel._list.content
-    assert not page._timeline._panel.visible and not page._panel._play.visible
-    assert page._library_open and "nothing open" in page._status.content
-
-
-def test_an_opened_recording_fills_every_part(page: ReviewPage) -> None:
-    open_seeds(page, 1)
-    cube = next(handle for handle in page._in_3d.bodies.handles if "cube" in handle.name)
+def test_an_opened_recording_fills_every_part(shown: Shown) -> None:
+    shown.open(1)
+    cube = shown.panels.bodies("cube")[0]
     assert np.allclose(cube.batched_positions[:, 0], 0.0)
-    page._review.seek(7)
-    draw(page)
-    draw(page)  # the Cameras tab has asked for its pictures meanwhile
+    shown.review.seek(7)
+    shown.draw()
+    shown.draw()  # the Cameras tab has asked for its pictures meanwhile
     assert np.allclose(cube.batched_positions[:, 0], 0.07)
-    assert page._timeline._slider.handle.max == 10 and page._timeline._slider.handle.value == 7
-    assert "step 7 / 10" in page._timeline._strip.content and "success" in page._timeline._strip.content
-    assert "success" in page._curves._numbers.content
-    chart = page._curves._charts["reward"].handle
-    assert chart is not None and chart.title == "reward"
-    image = next(iter(page._cameras._cameras.values())).images["rgb"]
+    assert shown.panels.control(SLIDER).max == 10 and shown.panels.control(SLIDER).value == 7
+    assert "step 7 / 10" in shown.panels.html("wb-timeline") and "success" in shown.panels.html("wb-timeline")
+    assert "success" in shown.panels.part("Curves").html("wb-numbers")
+    assert shown.chart("reward")
+    image = shown.panels.part("Cameras").images()[0]
     assert abs(int(np.asarray(image.image).mean()) - 140) <= 3
-    assert page._panel._live.visible and not page._panel._arrange.visible
-    assert "open two" in page._compare._html.content.lower()
+    assert shown.panels.shows(GO_LIVE) and not shown.panels.shows("Draw them")
+    assert "open two" in shown.panels.part("Compare").html().lower()
 
 
-def test_two_recordings_are_compared_and_aligned(page: ReviewPage) -> None:
-    open_seeds(page, 1, 2)
-    assert page._panel.ghosts and page._panel._arrange.visible
-    page._review.seek(5)
-    draw(page)
-    ghost = [h for h in page._in_3d.bodies.handles if "cube" in h.name]
+def test_two_recordings_are_compared_and_aligned(shown: Shown, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown.open(1, 2)
+    assert shown.panels.control("Draw them").value == GHOSTS and shown.panels.shows("Draw them")
+    shown.review.seek(5)
+    shown.draw()
+    ghost = shown.panels.bodies("cube")
     assert sorted(float(h.batched_positions[0, 0]) for h in ghost if h.visible) == pytest.approx([0.05, 0.15])
-    assert "They part at step 1" in page._compare._html.content
-    assert "reward = 2" in page._compare._html.content
-    chart = page._curves._charts["reward"].handle
-    assert chart is not None and len(chart.series) == 4, "step, two lines and the dot"
-    page._panel.toggle_arrangement()
-    draw(page)
-    (cubes,) = (h for h in page._in_3d.bodies.handles if "cube" in h.name)
-    assert len(cubes.batched_positions) == 2 and page._in_3d._mark._label is not None
-    assert page._in_3d._mark._label.text == "A, seed 1"
-    numbers = page._in_3d._numbers
-    assert numbers._drawn is not None and numbers._drawn[1] == ("", "B")
-    page._review.align("first success")
-    draw(page)
-    assert "B has no success" in page._panel._never.content
-    assert page._timeline._slider.handle.min == -7
+    assert "They part at step 1" in shown.panels.part("Compare").html()
+    assert "reward = 2" in shown.panels.part("Compare").html()
+    assert len(shown.chart("reward").series) == 4, "step, two lines and the dot"
+    written: list[tuple[str, ...]] = []
+    real = ground_numbers.ground_glb
+
+    def noted(layout: EnvLayout, words: Sequence[str]) -> bytes:
+        written.append(tuple(words))
+        return real(layout, words)
+
+    monkeypatch.setattr(ground_numbers, "ground_glb", noted)
+    shown.panels.command("Over each other or side by side")
+    shown.draw()
+    (cubes,) = shown.panels.bodies("cube")
+    assert len(cubes.batched_positions) == 2 and shown.panels.labels() == ["A, seed 1"]
+    assert written == [("", "B")] and shown.panels.nodes("/labels")
+    shown.review.align("first success")
+    shown.draw()
+    assert "B has no success" in shown.panels.part("Review").html()
+    assert shown.panels.control(SLIDER).min == -7
 
 
-def test_pressing_a_row_of_the_comparison_goes_there(page: ReviewPage) -> None:
-    open_seeds(page, 1, 2)
-    assert re.search(r'data-press="[^"]+"', page._compare._html.content)
-    page._review.seek(9)
-    page._compare._go(0)
-    assert page._review.view().position == 1
+def test_pressing_a_row_of_the_comparison_goes_there(shown: Shown) -> None:
+    shown.open(1, 2)
+    assert re.search(r'data-press="[^"]+"', shown.panels.part("Compare").html())
+    shown.review.seek(9)
+    shown.panels.part("Compare").press("0")
+    assert shown.review.view().position == 1
 
 
-def test_a_name_with_markup_in_it_is_text(page: ReviewPage, folder: Path, tmp_path: Path) -> None:
+def test_a_name_with_markup_in_it_is_text(shown: Shown, folder: Path, tmp_path: Path) -> None:
     evil = made(3, seed=9, task="<script>alert(1)</script>")
     write(folder, evil)
-    library_of(page).refresh()
-    open_seeds(page, 9)
-    for html in (page._panel._list, page._status, page._panel._facts, page._timeline._strip):
-        assert "<script>alert" not in html.content
+    shown.library.refresh()
+    shown.open(9)
+    said = shown.panels.html()
+    assert "<script>alert" not in said and said.count("&lt;script&gt;alert") >= 2
 
 
-def test_what_is_not_per_env_is_shown_marked_and_drawn(page: ReviewPage, folder: Path) -> None:
+def test_what_is_not_per_env_is_shown_marked_and_drawn(shown: Shown, folder: Path) -> None:
     for seed in (11, 12):
         odd = made(4, seed=seed)
         odd.batch = {"progress: all": np.linspace(0, 1, 5), "goal": np.ones((5, 2)) * seed}
         odd.texts = {"phase": ((0, OtherEntry("str", ("reach",))), (2, OtherEntry("str", ("push",))))}
         odd.evaluate["reward"] = np.arange(5.0)
         write(folder, odd, pictures=False)
-    library_of(page).refresh()
-    open_seeds(page, 11)
-    numbers = page._curves._numbers.content
+    shown.library.refresh()
+    shown.open(11)
+    numbers = shown.panels.part("Curves").html("wb-numbers")
     assert "reach" in numbers and numbers.count("not per env</span>") == 3
-    page._review.seek(3)
-    draw(page)
-    assert "push" in page._curves._numbers.content and "0.750" in page._curves._numbers.content
+    shown.review.seek(3)
+    shown.draw()
+    assert "push" in shown.panels.part("Curves").html("wb-numbers") and "0.750" in shown.panels.part(
+        "Curves"
+    ).html("wb-numbers")
     line = "progress: all (not per env)"
-    assert {line, "reward (evaluate)"} <= set(page._curves._entry.options)
-    page._curves._wish, page._curves._entry.value = line, line
-    page._review.seek(4)
-    draw(page)
-    chart = page._curves._charts["also"].handle
-    assert chart is not None and chart.title == line
-    np.testing.assert_array_equal(chart.data[1], np.linspace(0, 1, 5))
-    open_seeds(page, 11, 12)
+    assert {line, "reward (evaluate)"} <= set(shown.panels.control("Also").options)
+    shown.panels.set("Also", line)
+    shown.review.seek(4)
+    shown.draw()
+    np.testing.assert_array_equal(shown.chart(line).data[1], np.linspace(0, 1, 5))
+    shown.open(11, 12)
     words = "Not compared, since they are not numbers of this env alone: progress: all, goal, phase."
-    assert words in page._compare._html.content
+    assert words in shown.panels.part("Compare").html()
 
 
-def test_many_recordings_stand_side_by_side(page: ReviewPage, folder: Path) -> None:
+def test_many_recordings_stand_side_by_side(shown: Shown, folder: Path) -> None:
     for seed in range(20, 26):
         write(folder, made(3, seed=seed), pictures=False)
-    library_of(page).refresh()
-    open_seeds(page, *range(20, 26))
-    assert not page._panel.ghosts and not page._panel._arrange.visible
-    (cubes,) = (h for h in page._in_3d.bodies.handles if "cube" in h.name)
+    shown.library.refresh()
+    shown.open(*range(20, 26))
+    assert not shown.panels.shows("Draw them")
+    (cubes,) = shown.panels.bodies("cube")
     assert len(cubes.batched_positions) == 6

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tests.session.recordings import BODY, geometry_of, made, poses_of
+from tests.drive.episodes import BODY, geometry_of, made, poses_of
 from workbench.recording.episode import Episode
 from workbench.session.review_events import happenings
 from workbench.session.review_view import Opened

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Browser
 
+from tests.drive.page import page_at
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.recording.episode import Episode, EpisodeInfo
 from workbench.ui.scene_html import write_scene_html
@@ -49,17 +50,12 @@ def episode() -> Episode:
     )
 
 
-def test_it_plays_without_a_server(episode: Episode, tmp_path: Path, chromium_path: str) -> None:
+def test_it_plays_without_a_server(episode: Episode, tmp_path: Path, browser: Browser) -> None:
     path, done = tmp_path / "a.html", []
     write_scene_html(path, episode, on_progress=done.append)
     assert done == sorted(done) and done[-1] == 1.0
     asked: list[str] = []
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(
-            executable_path=chromium_path,
-            args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
-        )
-        tab = browser.new_page(viewport={"width": 320, "height": 240})
+    with page_at(browser, "about:blank", 320, 240, drawn=True) as (tab, _):
         tab.on("request", lambda request: asked.append(request.url))
         tab.goto(path.as_uri())
         time_shown = tab.locator("input").first
@@ -80,7 +76,6 @@ def test_it_plays_without_a_server(episode: Episode, tmp_path: Path, chromium_pa
             tab.locator(".mantine-Slider-root").first.click(position={"x": x, "y": 5})
             tab.wait_for_function(DRAWN, arg=before)
             before = caption.inner_text()
-        browser.close()
     assert [url for url in asked if not url.startswith(("file:", "data:", "blob:"))] == []
 
 

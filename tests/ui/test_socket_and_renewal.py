@@ -26,6 +26,7 @@ from workbench.machine.child_python import child_environment, python_command
 from workbench.ui import listening
 from workbench.ui.door import Door, DoorError, DoorOptions, open_door
 from workbench.ui.gate import cookie_name
+from workbench.ui.viser_seam import element_id
 
 
 @pytest.fixture
@@ -91,7 +92,7 @@ def test_a_websocket_works_over_it(door):
         max_size=None,
         close_timeout=0.2,
     ) as connection:
-        update = {"type": "GuiUpdateMessage", "uuid": box._impl.uuid, "updates": {"value": True}}
+        update = {"type": "GuiUpdateMessage", "uuid": element_id(box), "updates": {"value": True}}
         connection.send(msgspec.msgpack.encode(update))
         until(lambda: box.value)
 
@@ -256,7 +257,7 @@ def until_line(process: subprocess.Popen[str], wanted: Callable[[str], bool]) ->
     pytest.fail("it ended without the line")
 
 
-def test_the_command_renews_at_a_signal_and_ends_at_another(tmp_path, folder):
+def test_the_command_renews_at_a_signal_and_ends_at_another(child_process: None, tmp_path, folder):
     place = folder / "review.sock"
     process = subprocess.Popen(
         [*python_command("-m", "workbench.cli"), "review", str(tmp_path), "--socket", str(place)],
@@ -279,7 +280,7 @@ def test_the_command_renews_at_a_signal_and_ends_at_another(tmp_path, folder):
         process.communicate()
 
 
-def test_the_palette_of_the_page_renews_and_the_page_is_closed(tmp_path):
+def test_the_palette_of_the_page_renews_and_the_page_is_closed(child_process: None, tmp_path):
     process = subprocess.Popen(
         [*python_command("-m", "workbench.cli"), "review", str(tmp_path), "--port", "0"],
         stdout=subprocess.PIPE,

@@ -2,22 +2,25 @@ from __future__ import annotations
 
 import viser
 
+from tests.drive.panels import Panels
 from tests.ui.scenes import table_scene
 from workbench.ui.env_layout import lay_out
 from workbench.ui.stage import Stage
 
 
-def test_bodies_and_light_outlive_a_page_and_nothing_else_does(server: viser.ViserServer) -> None:
+def test_bodies_and_light_outlive_a_page_and_nothing_else_does(panels: Panels) -> None:
+    server = panels.server
     stage = Stage(server)
     geometry, poses = table_scene(2)
     layout = lay_out(geometry, poses)
     stage.scene.build(geometry, layout, poses)
     bodies = stage.scene.handles
-    label = server.scene.add_label("/labels/0", "A")
+    server.scene.add_label("/labels/0", "A")
     server.scene.add_frame("/labels/0/below")
     stage.clear()
-    assert label._impl.removed and not any(body._impl.removed for body in bodies)
-    names = set(server.scene._handle_from_node_name)
+    nodes = panels.nodes("")
+    assert panels.labels() == [] and {*map(id, bodies)} <= {*map(id, nodes)}
+    names = [node.name for node in nodes]
     assert {name.split("/")[1] for name in names if name} <= {"envs", "floor", "lights", "WorldAxes"}
     assert any(name.startswith("/lights/") for name in names)
     # The next page draws the same: nothing of it is sent again.

@@ -1,10 +1,8 @@
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 
-import viser
-
+from tests.drive.panels import Panels
 from tests.ui.scenes import EMPTY, problem, running
 from tests.ui.test_env_strip import rows_of
 from workbench.session.outliers import Kind, Outlier
@@ -55,29 +53,27 @@ def test_the_selected_envs_place_in_its_episode_is_said() -> None:
 
 
 def test_flagged_envs_stand_in_the_line_while_it_runs_and_a_press_leads_to_the_first(
-    server: viser.ViserServer,
+    panels: Panels,
 ) -> None:
     """A reward that was NaN in most envs left a green "running"."""
     lost = Outlier(Kind.NOT_A_NUMBER, 3, "the reward is <b>NaN</b>")
     rows, went = rows_of(outliers={4: (lost,), 2: (lost,)}), []
-    line = StatusLine(server, lambda: rows, lambda: went.append("first"))
+    line = StatusLine(panels.server, lambda: rows, lambda: went.append("first"))
     line.draw(running(6))
-    content = line._standing.content
+    (standing,) = (html for html in panels.htmls() if "data-press" in html.content)
+    content = standing.content
     assert "2 of 6 envs flagged: the reward is &lt;b&gt;NaN" in content and "In env 2, step 3:" in content
-    assert "wb-running wb-marked" in line._handle.content and line._standing.visible
+    assert "wb-running wb-marked" in panels.html()
     line.draw(running(6, steps_per_second=21.0))
-    assert line._standing.content is content, "it stays under the finger that presses"
-    (pressed,) = re.findall(r'data-press="([^"]+)"', content)
-    button = server.gui._gui_input_handle_from_uuid[pressed]
-    for callback in button._impl.update_cb:
-        callback(viser.GuiEvent(None, None, button))  # type: ignore[arg-type]
+    assert standing.content is content, "it stays under the finger that presses"
+    panels.press("flagged")
     assert went == ["first"]
 
 
-def test_no_env_flagged_is_no_mark(server: viser.ViserServer) -> None:
-    line = StatusLine(server, lambda: rows_of(outliers={}), lambda: None)
+def test_no_env_flagged_is_no_mark(panels: Panels) -> None:
+    line = StatusLine(panels.server, lambda: rows_of(outliers={}), lambda: None)
     line.draw(running(6))
-    assert not line._standing.visible and "wb-marked" not in line._handle.content
+    assert "data-press" not in panels.html() and "wb-marked" not in panels.html()
     assert flagged_text(rows_of(outliers={})) is None
 
 

@@ -1,115 +1,151 @@
-"""The timeline on a real session and a real server, drawn without a browser."""
-
-# pyright: reportOptionalMemberAccess=false
+"""The timeline on a page, on a session with a hand-made scene, drawn without a browser."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
+from dataclasses import dataclass
 
+import numpy as np
 import pytest
-import viser
 
-from tests.session.conftest import TASKS, wait_until
-from workbench.session.messages import TaskOptions
+from tests.drive.panels import Clock, Panels
+from tests.drive.session import wait_until
+from tests.drive.waiting import until
 from workbench.session.session import Session
-from workbench.ui import timeline_panel as panels
+from workbench.session.timeline import TimelineView
+from workbench.ui import timeline_panel as panel
+from workbench.ui.controls import Control
 from workbench.ui.page import Page
 
-
-@pytest.fixture(scope="module")
-def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
-    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
-    session = Session(
-        str(TASKS / "minimal.py"), TaskOptions(num_envs=3), recordings=tmp_path_factory.mktemp("recordings")
-    )
-    page = Page(server, session)
-    wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
-    yield page
-    session.close()
-    server.stop()
+SLIDER = "step of the past"
 
 
-def drawn(page: Page) -> panels.TimelinePanel:
-    panel = page._timeline
-    panel._range_at = panel._strip_at = 0.0
-    page.redraw()
-    return panel
+@dataclass
+class Lived:
+    """A session with a past, and its page."""
+
+    session: Session
+    page: Page
+    panels: Panels
+    clock: Clock
+
+    @property
+    def past(self) -> TimelineView:
+        return self.session.view().timeline
+
+    def draw(self) -> None:
+        self.clock.passes()
+        self.page.redraw()
+
+    def step(self, count: int) -> None:
+        for _ in range(count):
+            last = self.past.last
+            self.session.step()
+            wait_until(self.session, lambda view, n=last: view.timeline.last > n, "a step")
+        self.draw()
+
+    def ends(self) -> tuple[int, int, int]:
+        slider = self.panels.control(SLIDER)
+        return slider.min, slider.max, slider.value
+
+    def strip(self) -> str:
+        return self.panels.html("wb-timeline")
+
+    def hand(self) -> np.ndarray:
+        (hand, *_) = self.panels.bodies("arm hand")
+        return hand.batched_positions.copy()
 
 
-def step(page: Page, count: int) -> None:
-    for _ in range(count):
-        last = page._session.view().timeline.last
-        page._session.step()
-        wait_until(page._session, lambda view, n=last: view.timeline.last > n, "a step")
+@pytest.fixture
+def lived(panels: Panels, clock: Clock, scripted_session: Callable[..., Session]) -> Lived:
+    session = scripted_session(3)
+    return Lived(session, Page(panels.server, session, clock=clock), panels, clock)
 
 
-def test_it_is_there_from_the_first_moment_and_offers_only_what_can_be_done(page: Page) -> None:
-    panel = page._timeline
-    assert not panel._panel.visible, "the page was not drawn yet"
-    assert drawn(page)._panel.visible
-    step(page, 4)
-    drawn(page)
-    assert (panel._slider.handle.min, panel._slider.handle.max, panel._slider.handle.value) == (-4, 0, 0)
-    assert not panel._travel.visible, "nobody is in the past"
-    assert panel._walk.options == panels.WALK, "nothing was before the first reset"
-    assert "live" in panel._strip.content
+def test_it_is_there_from_the_first_moment_and_offers_only_what_can_be_done(lived: Lived) -> None:
+    assert not lived.panels.part("Timeline").seen, "the page was not drawn yet"
+    lived.draw()
+    assert lived.panels.part("Timeline").seen
+    lived.step(4)
+    assert lived.ends() == (-4, 0, 0)
+    assert not lived.panels.shows("way to go on"), "nobody is in the past"
+    assert lived.panels.control("step to take").options == panel.WALK, "nothing was before the first reset"
+    assert "live" in lived.strip()
 
 
-def test_a_past_moment_is_in_the_view_the_numbers_and_the_status_line(page: Page) -> None:
-    step(page, 2)
-    newest = page._session.view().timeline.last
-    drawn(page)
-    page._timeline._seek(-2)
-    page._numbers._drawn_at = page._status._drawn_at = 0.0
-    panel = drawn(page)
-    assert page._session.view().timeline.shown == newest - 2
-    hand = next(handle for handle in page._scene.handles if "panda_hand" in handle.name)
-    moment = page._session._state.timeline.history.at(newest - 2)
-    body = page._session.view().task.geometry.body_names.index("panda/panda_hand")
-    assert (hand.batched_wxyzs == moment.step.poses[:, body, 3:]).all()
-    assert "2 steps ago" in page._status._handle.content
-    assert "2 steps ago" in panel._strip.content
-    assert panel._travel.options == ("Go on from here: env 0", "all envs", "env 0 into all envs")
-    assert panel._travel.visible and panel._slider.handle.value in (-2, 0)
-    page._timeline.go_live()
-    assert "live" in drawn(page)._strip.content
+def test_a_past_moment_is_in_the_view_the_numbers_and_the_status_line(lived: Lived) -> None:
+    lived.step(2)
+    there = lived.hand()
+    lived.step(2)
+    assert not np.array_equal(lived.hand(), there)
+    lived.panels.set(SLIDER, -2)
+    lived.draw()
+    assert lived.past.shown == 2
+    assert np.array_equal(lived.hand(), there)
+    assert "2 steps ago" in lived.panels.html("wb-status") and "2 steps ago" in lived.strip()
+    travel = lived.panels.control("way to go on")
+    assert travel.options == ("Go on from here: env 0", "all envs", "env 0 into all envs")
+    assert lived.panels.shows("way to go on") and lived.ends() == (-4, 0, -2)
+    lived.panels.command("What is live")
+    lived.draw()
+    assert "live" in lived.strip() and not lived.panels.shows("way to go on")
 
 
-def test_zoom_to_episode_takes_the_slider_to_where_the_episode_began(page: Page) -> None:
-    last = page._session.view().timeline.last
-    page._session.reset()
-    wait_until(page._session, lambda view: view.timeline.last > last, "the reset")
-    step(page, 3)
-    page._timeline._on_walk(panels.EPISODE)
-    panel = drawn(page)
-    assert panel._slider.handle.min == -3
-    assert panel._walk.options[-2:] == (panels.EVERYTHING, "undo reset of all")
-    page._timeline._on_walk(panels.EVERYTHING)
-    assert drawn(page)._slider.handle.min < -3
-    page._timeline._on_walk("undo reset of all")
-    wait_until(page._session, lambda view: view.step.elapsed_steps[0] > 3, "the episode before")
+def test_going_on_puts_the_envs_that_were_named_back(lived: Lived) -> None:
+    lived.step(4)
+    lived.panels.choose(panel.LAST_STEP)
+    lived.panels.choose(panel.LAST_STEP)
+    lived.draw()
+    lived.panels.choose("Go on from here: env 0")
+    view = wait_until(lived.session, lambda view: view.timeline.last == 5, "the jump")
+    assert view.step is not None and view.step.elapsed_steps.tolist() == [2, 4, 4]
+    lived.draw()
+    lived.panels.choose(panel.LAST_STEP)
+    lived.draw()
+    lived.panels.choose("all envs")
+    view = wait_until(lived.session, lambda view: view.timeline.last == 6, "the other jump")
+    assert view.step is not None and view.step.elapsed_steps.tolist() == [4, 4, 4]
 
 
-def test_an_arrow_that_a_slider_took_is_not_taken_twice(page: Page) -> None:
-    drawn(page)
-    newest = page._session.view().timeline.last
-    page._timeline.go_live()
-    panels.Control._last_touch = -1e9
-    page._timeline.step_by(-1)
-    assert page._session.view().timeline.shown == newest - 1
-    panels.Control._last_touch = panels.time.monotonic()
-    page._timeline.step_by(-1)
-    assert page._session.view().timeline.shown == newest - 1
-    panels.Control._last_touch = -1e9
-    page._timeline.go_live()
+def test_zoom_to_episode_takes_the_slider_to_where_the_episode_began(lived: Lived) -> None:
+    lived.step(4)
+    last = lived.past.last
+    lived.panels.command("Reset all envs")
+    wait_until(lived.session, lambda view: view.timeline.last > last, "the reset")
+    lived.step(3)
+    lived.panels.choose(panel.EPISODE)
+    lived.draw()
+    assert lived.ends()[0] == -3
+    assert lived.panels.control("step to take").options[-2:] == (panel.EVERYTHING, "undo reset of all")
+    lived.panels.choose(panel.EVERYTHING)
+    lived.draw()
+    assert lived.ends()[0] == -8
+    lived.panels.choose("undo reset of all")
+    view = wait_until(lived.session, lambda view: view.timeline.last == 9, "the episode before")
+    assert view.step is not None and view.step.elapsed_steps.tolist() == [4, 4, 4]
 
 
-def test_a_value_that_no_slider_has_is_refused(page: Page) -> None:
-    for value in (1, 10**12, "0", None, True, 0.5):
-        with pytest.raises(ValueError, match="step of the past"):
-            page._timeline._slider._read(value)
-    page._timeline._seek(-(10**8))
-    assert page._session.view().timeline.shown == page._session.view().timeline.first
-    page._timeline._on_travel("rm -rf")
-    page._timeline._on_walk("rm -rf")
-    page._timeline.go_live()
+def test_an_arrow_that_a_slider_took_is_not_taken_twice(lived: Lived) -> None:
+    lived.step(3)
+    until(lambda: not Control.took_the_key(), "a moment in which nobody touches anything")
+    lived.panels.command("A step back in time")
+    assert lived.past.shown == 2
+    lived.draw()
+    lived.panels.set(SLIDER, -2)
+    lived.panels.command("A step back in time")
+    assert lived.past.shown == 1, "only the slider went back"
+    until(lambda: not Control.took_the_key(), "the key to be over")
+    lived.panels.command("A step back in time")
+    assert lived.past.shown == 0
+
+
+def test_a_value_that_no_slider_has_is_refused(lived: Lived) -> None:
+    lived.step(3)
+    lived.panels.claim(SLIDER, 1)
+    assert lived.panels.client.notices == ["The step of the past goes from -1000000000 to 0."]
+    assert lived.past.shown is None
+    lived.panels.claim(SLIDER, -(10**8))
+    assert lived.past.shown == lived.past.first
+    lived.panels.claim("way to go on", "rm -rf")
+    lived.panels.claim("step to take", "rm -rf")
+    assert lived.past.shown == lived.past.first and lived.past.last == 3

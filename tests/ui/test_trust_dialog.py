@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
-from typing import Any
 
 import pytest
-import viser
 
+from tests.drive.panels import Panels
+from tests.drive.waiting import until
 from workbench.session.clearance import Answer, AskedFile, Question, Since
 from workbench.ui import trust_dialog
 from workbench.ui.trust_dialog import ALWAYS, DO_NOT, ONCE, TrustDialog, question_html
 
-PUSH = AskedFile("/work/push.py", "0123456789ab", "import helper\n")
+PUSH = AskedFile("/home/me/push.py", "0123456789ab", "import helper\n")
 HELPER = AskedFile("helper.py", "ba9876543210", "A = 1\n")
 PLAIN = Question("Push-v1", False, (PUSH, HELPER))
 
@@ -34,113 +33,83 @@ def asked(
     return future
 
 
-def buttons(server: viser.ViserServer) -> dict[str, Any]:
-    """Those of the window, by their labels."""
-    handles = server.gui._gui_input_handle_from_uuid.values()
-    return {handle.label: handle for handle in handles if isinstance(handle, viser.GuiButtonHandle)}
-
-
-def window_with(server: viser.ViserServer, text: str) -> dict[str, Any]:
-    deadline = time.monotonic() + 20
-    while text not in shown(server) or ALWAYS not in buttons(server):
-        assert time.monotonic() < deadline, f"no window with {text}"
-        time.sleep(0.01)
-    return buttons(server)
-
-
-def shown(server: viser.ViserServer) -> str:
-    handles = [
-        child
-        for modal in list(server.gui._modal_handle_from_uuid.values())
-        for child in list(modal._children.values())
-    ]
-    return "".join(child.content for child in handles if isinstance(child, viser.GuiHtmlHandle))
-
-
-def press(handle: Any) -> None:
-    for callback in list(handle._impl.update_cb):
-        callback(viser.GuiEvent(None, None, handle))
+def window_with(panels: Panels, text: str) -> None:
+    until(lambda: text in panels.html() and panels.shows(ALWAYS), f"the window with {text}")
 
 
 @pytest.fixture
-def dialog(server: viser.ViserServer) -> TrustDialog:
-    return TrustDialog(server)
+def dialog(panels: Panels) -> TrustDialog:
+    return TrustDialog(panels.server)
 
 
 @pytest.mark.parametrize(
     ("label", "answer"), [(DO_NOT, Answer.NO), (ONCE, Answer.ONCE), (ALWAYS, Answer.ALWAYS)]
 )
 def test_a_press_is_the_answer_and_the_window_goes(
-    dialog: TrustDialog, server: viser.ViserServer, label: str, answer: Answer
+    dialog: TrustDialog, panels: Panels, label: str, answer: Answer
 ) -> None:
     future = asked(dialog)
-    press(window_with(server, "/work/push.py")[label])
+    window_with(panels, "/home/me/push.py")
+    panels.press(label)
     assert future.result(20) is answer
-    assert not buttons(server) and not server.gui._modal_handle_from_uuid
-    assert not server.gui._command_handle_from_uuid, "Escape is free again"
+    assert not panels.shows(label) and panels.html() == ""
+    assert panels.commands() == [], "Escape is free again"
 
 
 def test_only_the_first_answer_counts_and_none_comes_before_its_question(
-    dialog: TrustDialog, server: viser.ViserServer
+    dialog: TrustDialog, panels: Panels
 ) -> None:
     future = asked(dialog)
-    old = window_with(server, "/work/push.py")
-    press(old[DO_NOT])
-    press(old[ALWAYS])
+    window_with(panels, "/home/me/push.py")
+    refuse, allow, allow_again = (panels.press_late(label) for label in (DO_NOT, ALWAYS, ALWAYS))
+    refuse()
+    allow()
     assert future.result(20) is Answer.NO
-    second = asked(dialog, about("/work/other.py"))
-    window_with(server, "/work/other.py")
-    press(old[ALWAYS])
+    second = asked(dialog, about("/home/me/other.py"))
+    window_with(panels, "/home/me/other.py")
+    allow_again()
     assert not second.done()
-    press(buttons(server)[DO_NOT])
+    panels.press(DO_NOT)
     assert second.result(20) is Answer.NO
 
 
-def test_escape_is_a_no(dialog: TrustDialog, server: viser.ViserServer) -> None:
+def test_escape_is_a_no(dialog: TrustDialog, panels: Panels) -> None:
     future = asked(dialog)
-    window_with(server, "/work/push.py")
-    (escape,) = server.gui._command_handle_from_uuid.values()
-    for callback in list(escape._impl.trigger_cb):  # type: ignore[attr-defined]
-        callback(None)  # type: ignore[arg-type]
+    window_with(panels, "/home/me/push.py")
+    panels.command(DO_NOT)
     assert future.result(20) is Answer.NO
 
 
-def test_questions_come_one_after_the_other(dialog: TrustDialog, server: viser.ViserServer) -> None:
+def test_questions_come_one_after_the_other(dialog: TrustDialog, panels: Panels) -> None:
     futures = {name: asked(dialog, about(name)) for name in ("a.py", "b.py", "c.py")}
     order = []
     for _ in futures:
-        deadline = time.monotonic() + 20
-        while not (names := [name for name in futures if name in shown(server)]):
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
-        (name,) = names
+        (name,) = until(lambda: [name for name in futures if name in panels.html()], "the next question")
         order.append(name)
-        press(window_with(server, name)[ONCE])
+        window_with(panels, name)
+        panels.press(ONCE)
         assert futures[name].result(20) is Answer.ONCE
     assert set(order) == set(futures)
 
 
-def test_a_page_that_is_rebuilt_shows_the_question_again(
-    dialog: TrustDialog, server: viser.ViserServer
-) -> None:
+def test_a_page_that_is_rebuilt_shows_the_question_again(dialog: TrustDialog, panels: Panels) -> None:
     future = asked(dialog)
-    window_with(server, "/work/push.py")
-    with server.atomic():
-        server.gui.reset()
-    press(window_with(server, "/work/push.py")[ONCE])
+    window_with(panels, "/home/me/push.py")
+    with panels.server.atomic():
+        panels.server.gui.reset()
+    window_with(panels, "/home/me/push.py")
+    panels.press(ONCE)
     assert future.result(20) is Answer.ONCE
 
 
-def test_what_is_withdrawn_and_what_is_asked_at_the_end_is_a_no(
-    dialog: TrustDialog, server: viser.ViserServer
-) -> None:
+def test_what_is_withdrawn_and_what_is_asked_at_the_end_is_a_no(dialog: TrustDialog, panels: Panels) -> None:
     stop = threading.Event()
     future = asked(dialog, PLAIN, stop.is_set)
-    window_with(server, "/work/push.py")
+    window_with(panels, "/home/me/push.py")
     stop.set()
-    assert future.result(20) is Answer.NO and not buttons(server)
+    assert future.result(20) is Answer.NO and not panels.shows(ALWAYS)
     future = asked(dialog)
-    window_with(server, "/work/push.py")
+    window_with(panels, "/home/me/push.py")
     dialog.close()
     assert future.result(20) is Answer.NO and asked(dialog).result(20) is Answer.NO
 

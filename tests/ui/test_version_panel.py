@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import Any, cast
 
-import viser
-
+from tests.drive.panels import Panels
 from tests.ui.scenes import problem, running
 from workbench.session.messages import ReloadReport
 from workbench.ui.version_panel import MOST_SHOWN, VersionPanel, took, version_html
@@ -47,20 +46,20 @@ def test_before_the_first_reload_it_says_what_saving_does() -> None:
     assert version_html(None, loaded=False).strip() == ""
 
 
-def test_while_the_file_is_broken_the_broken_save_is_what_it_speaks_of(server: viser.ViserServer) -> None:
+def test_while_the_file_is_broken_the_broken_save_is_what_it_speaks_of(panels: Panels) -> None:
     """It spoke of the good save before, as if that were what had just been saved."""
-    panel = VersionPanel(server, cast(Any, StillSession()))
+    panel = VersionPanel(panels.server, cast(Any, StillSession()))
     good = ReloadReport("patched", "only evaluate changed", 43.2)
     panel.draw(running(4, reload=good))
-    assert "not loaded" not in panel._html.content
+    assert "not loaded" not in panels.html()
     panel.draw(running(4, reload=good, stale=True, state="error", refused=problem()))
-    told = panel._html.content
+    told = panels.html()
     assert (
         told.index("not loaded") < told.index("The version before it goes on") < told.index("only evaluate")
     )
     assert "push.py, line 88" in told and "KeyError" in told
     panel.draw(running(4, reload=good, stale=True, state="loading", refused=problem()))
-    assert "not loaded" not in panel._html.content  # another one is being tried
+    assert "not loaded" not in panels.html()  # another one is being tried
 
 
 def test_times_are_short() -> None:
@@ -79,12 +78,12 @@ def test_what_the_author_should_know_stands_there_before_and_after_a_reload() ->
 
 
 def test_the_tasks_of_a_file_can_be_chosen_while_the_one_that_was_asked_for_fails(
-    server: viser.ViserServer,
+    panels: Panels,
 ) -> None:
-    panel = VersionPanel(server, cast(Any, StillSession()))
+    panel = VersionPanel(panels.server, cast(Any, StillSession()))
     panel.draw(running(4))
-    assert not panel._task.handle.visible
+    assert not panels.shows("Task")
     failed = running(4, task=None, state="error", refused=problem(), choices=("TwoEnv", "OneEnv"))
     panel.draw(failed)
-    assert panel._task.handle.visible and panel._task.handle.value == "TwoEnv"
-    assert panel._task.handle.options == ("OneEnv", "TwoEnv")
+    assert panels.shows("Task") and panels.control("Task").value == "TwoEnv"
+    assert panels.control("Task").options == ("OneEnv", "TwoEnv")

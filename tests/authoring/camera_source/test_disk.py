@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import os
 import stat
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -134,3 +136,91 @@ def test_an_installed_file_is_not_written_through_a_link(tmp_path: Path) -> None
     refused = apply(planned(tmp_path / "task.py"))
     assert isinstance(refused, Refusal) and "installed" in refused.reason
     assert path.read_text() == SOURCE
+
+
+def test_a_save_while_the_edit_is_written_is_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "task.py"
+    path.write_text(SOURCE)
+    edit = planned(path)
+    sync = os.fsync
+
+    def saved_meanwhile(descriptor: int) -> None:
+        sync(descriptor)
+        path.write_text(SOURCE + "# more\n")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", saved_meanwhile)
+        refused = apply(edit)
+    assert isinstance(refused, Refusal) and "saved by somebody else just now" in refused.reason
+    assert path.read_text() == SOURCE + "# more\n"
+    assert os.listdir(tmp_path) == ["task.py"]
+
+
+@pytest.mark.parametrize(
+    ("call", "number"),
+    [("fsync", errno.ENOSPC), ("replace", errno.EIO), ("chmod", errno.EROFS), ("chown", errno.EIO)],
+)
+def test_an_edit_that_cannot_be_written_leaves_the_file_and_nothing_else(
+    tmp_path: Path, call: str, number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "task.py"
+    path.write_text(SOURCE)
+    edit = planned(path)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, call, failing(number))
+        for _ in range(2):
+            refused = apply(edit)
+            assert isinstance(refused, Refusal) and os.strerror(number) in refused.reason
+    assert path.read_text() == SOURCE and os.listdir(tmp_path) == ["task.py"]
+    assert apply(edit) is None and path.read_text() == edit.new_text
+    with monkeypatch.context() as patch:
+        patch.setattr(os, call, failing(number))
+        assert isinstance(revert(edit), Refusal)
+    assert path.read_text() == edit.new_text and os.listdir(tmp_path) == ["task.py"]
+
+
+def test_a_file_of_another_owner_in_the_group_is_written_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "task.py"
+    path.write_text(SOURCE)
+    edit = planned(path)
+    monkeypatch.setattr(os, "chown", failing(errno.EPERM))
+    assert apply(edit) is None and path.read_text() == edit.new_text
+
+
+@pytest.mark.parametrize("taken_back", [True, False])
+def test_of_two_files_the_first_is_taken_back_when_the_second_fails(
+    tmp_path: Path, taken_back: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, other = tmp_path / "one.py", tmp_path / "other.py"
+    one.write_text("a = 1\n")
+    other.write_text("b = 1\n")
+    edit = SourceEdit(
+        str(one), "a = 1\n", "a = 2\n", (), None, (FileChange(str(other), "b = 1\n", "b = 2\n"),)
+    )
+    calls, replace = [], os.replace
+
+    def fail_later(source: str, target: Path) -> None:
+        calls.append(target.name)
+        if target == other or (len(calls) > 1 and not taken_back):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        replace(source, target)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", fail_later)
+        refused = apply(edit)
+    assert calls == ["one.py", "other.py", "one.py"]
+    assert isinstance(refused, Refusal) and "other.py cannot be written" in refused.reason
+    assert ("one.py could not be put back" in refused.reason) is not taken_back
+    assert one.read_text() == ("a = 1\n" if taken_back else "a = 2\n")
+    assert other.read_text() == "b = 1\n" and sorted(os.listdir(tmp_path)) == ["one.py", "other.py"]
+
+
+def failing(number: int) -> Callable[..., None]:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    return fail

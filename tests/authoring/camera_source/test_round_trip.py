@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 
 import pytest
 from hypothesis import assume, given, settings
@@ -105,3 +106,37 @@ def test_a_point_that_the_camera_was_aimed_at_is_written() -> None:
     elsewhere = plan_edit({FILE: source}, "cam", before, after, target=(1.0, 1.0, 1.0))
     assert isinstance(elsewhere, SourceEdit) and elsewhere.settings is not None
     assert angle_between(elsewhere.settings.quaternion, after.quaternion) <= math.radians(0.01)
+
+
+@pytest.mark.parametrize("name", ["a list, positional to the end", "one config, positional"])
+def test_a_camera_that_is_turned_keeps_the_distance_of_what_it_looks_at(name: str) -> None:
+    source = WRITTEN[name]
+    before = real_settings({FILE: source}, "cam")
+    old_eye, old_target = _look_at_numbers(source)
+    for eye, point in ((old_eye, (1.5, 0.25, 0.3)), ((0.5, 0.25, 0.75), (-0.5, -2.0, 0.7))):
+        after = dataclasses.replace(before, position=eye, quaternion=unit(look_at(eye, point)))
+        plan = plan_edit({FILE: source}, "cam", before, after)
+        assert isinstance(plan, SourceEdit)
+        new_eye, new_target = _look_at_numbers(plan.new_text)
+        assert math.dist(new_eye, eye) < 1e-4
+        assert math.dist(new_eye, new_target) == pytest.approx(math.dist(old_eye, old_target), abs=2e-4)
+
+
+def test_a_target_that_was_at_the_eye_comes_to_stand_before_it() -> None:
+    source = WRITTEN["a list, positional to the end"].replace(
+        "target=[-0.1, 0, 0.1]", "target=[0.29, 0, 0.6]"
+    )
+    before = real_settings({FILE: source}, "cam")
+    eye = before.position
+    after = dataclasses.replace(before, quaternion=unit(look_at(eye, (eye[0], 2.0, 0.5))))
+    plan = plan_edit({FILE: source}, "cam", before, after)
+    assert isinstance(plan, SourceEdit)
+    new_eye, new_target = _look_at_numbers(plan.new_text)
+    assert math.dist(new_eye, new_target) == pytest.approx(0.1, abs=2e-4)
+
+
+def _look_at_numbers(source: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    found = re.search(r"look_at\((?:eye=)?\[(.*?)\], (?:target=)?\[(.*?)\]\)", source)
+    assert found is not None, source
+    eye, target = (tuple(float(number) for number in text.split(",")) for text in found.groups())
+    return eye, target

@@ -248,10 +248,33 @@ def test_an_intrinsic_takes_the_place_of_a_fov_and_back() -> None:
         assert real_settings({FILE: back.new_text}, uid) == back.settings == before
 
 
-def test_the_server_process_gets_no_simulator_by_it() -> None:
+def test_the_server_process_gets_no_simulator_by_it(child_process: None) -> None:
     code = (
         "import sys, workbench.authoring.camera_source\n"
         "print({'torch', 'sapien', 'mani_skill'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+def test_a_change_that_another_camera_would_make_too_is_refused() -> None:
+    source = HEADER + dedent(
+        """\
+        from places import EYE as ONE
+        from places import EYE as OTHER
+
+
+        class Task(Base):
+            @property
+            def _default_sensor_configs(self):
+                return [
+                    CameraConfig("cam", sapien.Pose(ONE), 64, 64, 1.0),
+                    CameraConfig("hand", sapien.Pose(OTHER), 64, 64, 1.0),
+                ]
+        """
+    )
+    sources = {FILE: source, "/author/places.py": PLACES}
+    before = real_settings(sources, "cam")
+    plan = plan_edit(sources, "cam", before, higher(before))
+    assert isinstance(plan, Refusal) and "of the camera hand as well" in plan.reason
+    assert "p=[0.5, 0.0, 0.75]" in plan.snippet

@@ -1,0 +1,111 @@
+"""Rotations in plain numbers, by the account of transforms3d and ManiSkill."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from mani_skill.utils import sapien_utils
+from mani_skill.utils.geometry.rotation_conversions import matrix_to_quaternion
+from torch import as_tensor
+from transforms3d.euler import euler2quat
+from transforms3d.quaternions import quat2mat
+
+from workbench.authoring.camera_source.rotations import (
+    angle_between,
+    from_euler,
+    from_matrix,
+    look_at,
+    matrix,
+    to_euler,
+    unit,
+)
+
+turns = st.floats(-2 * math.pi, 2 * math.pi)
+parts = st.floats(-1, 1)
+quaternions = st.tuples(parts, parts, parts, parts).filter(lambda q: math.hypot(*q) > 0.1)
+
+
+@settings(deadline=None, max_examples=60)
+@given(turns, turns, turns)
+def test_euler_angles_are_those_of_transforms3d(roll: float, pitch: float, yaw: float) -> None:
+    assert from_euler(roll, pitch, yaw) == pytest.approx(tuple(euler2quat(roll, pitch, yaw)), abs=1e-12)
+
+
+@settings(deadline=None, max_examples=60)
+@given(quaternions)
+def test_a_quaternion_becomes_the_matrix_of_transforms3d_and_back(quaternion: tuple[float, ...]) -> None:
+    assert np.allclose(matrix(quaternion), quat2mat(quaternion), atol=1e-12)
+    assert angle_between(from_matrix(matrix(quaternion)), quaternion) < 1e-7
+
+
+@settings(deadline=None, max_examples=60)
+@given(quaternions)
+def test_a_matrix_in_single_precision_becomes_maniskills_quaternion(quaternion: tuple[float, ...]) -> None:
+    single = matrix(quaternion).astype(np.float32)
+    wanted = matrix_to_quaternion(as_tensor(single)).tolist()
+    assume(abs(wanted[0]) > 1e-5)  # else rounding decides which of two opposite ones it is
+    assert from_matrix(single) == pytest.approx(tuple(wanted), abs=1e-6)
+
+
+@settings(deadline=None, max_examples=60)
+@given(quaternions, quaternions)
+def test_the_angle_between_two_orientations_is_that_of_the_rotation_from_one_to_the_other(
+    a: tuple[float, ...], b: tuple[float, ...]
+) -> None:
+    cosine = (np.trace(quat2mat(a).T @ quat2mat(b)) - 1) / 2
+    assert math.cos(angle_between(a, b)) == pytest.approx(cosine, abs=1e-9)
+    assert angle_between(a, [-part for part in a]) < 1e-7
+
+
+@settings(deadline=None, max_examples=100)
+@given(turns, turns, turns, st.tuples(turns, turns, turns))
+def test_angles_of_a_quaternion_are_its_own_and_near_the_old_ones(
+    roll: float, pitch: float, yaw: float, near: tuple[float, float, float]
+) -> None:
+    quaternion = from_euler(roll, pitch, yaw)
+    found = to_euler(quaternion, near)
+    assert angle_between(from_euler(*found), quaternion) < 1e-5
+    # Of an orientation there is no closer triple than the one that made it.
+    apart = sum(abs(a - b) for a, b in zip(found, near, strict=True))
+    given_apart = sum(abs(a - b) for a, b in zip((roll, pitch, yaw), near, strict=True))
+    level = abs(math.cos(pitch)) > 1e-3
+    assert not level or apart <= given_apart + 1e-6
+
+
+@settings(deadline=None, max_examples=100)
+@given(turns, st.sampled_from((-1, 1)), turns, turns)
+def test_straight_up_or_down_the_yaw_stays_and_the_roll_has_the_turn(
+    roll: float, side: int, yaw: float, old_yaw: float
+) -> None:
+    quaternion = from_euler(roll, side * math.pi / 2, yaw)
+    found = to_euler(quaternion, (0.25, side * math.pi / 2, old_yaw))
+    assert angle_between(from_euler(*found), quaternion) < 1e-6
+    assert found[1] == pytest.approx(side * math.pi / 2) and found[2] == pytest.approx(old_yaw)
+    assert abs(found[0] - 0.25) <= math.pi + 1e-6
+
+
+points = st.tuples(*[st.floats(-4, 4)] * 3)
+
+
+@settings(deadline=None, max_examples=60)
+@given(points, points, st.sampled_from(((0, 0, 1), (0, 0, -2), (0, 1, 0), (0.5, 0.5, 0.5))))
+def test_look_at_is_maniskills(
+    eye: tuple[float, ...], target: tuple[float, ...], up: tuple[float, ...]
+) -> None:
+    ahead = np.subtract(target, eye)
+    # Almost along `up`, rounding alone decides; where the real part is none, of which sign all is.
+    assume(np.linalg.norm(np.cross(ahead, up)) > 1e-2 * np.linalg.norm(ahead) > 1e-5)
+    wanted = sapien_utils.look_at(eye, target, up).raw_pose[0, 3:].tolist()
+    assume(abs(wanted[0]) > 1e-4)
+    assert look_at(eye, target, up) == pytest.approx(tuple(wanted), abs=2e-5)
+
+
+def test_a_quaternion_without_direction_is_refused() -> None:
+    assert unit((0, 0, 3, 4)) == (0, 0, 0.6, 0.8)
+    for wrong in ((0, 0, 0, 0), (math.nan, 0, 0, 1), (math.inf, 0, 0, 1)):
+        with pytest.raises(ValueError, match="no orientation"):
+            unit(wrong)

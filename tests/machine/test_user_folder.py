@@ -1,0 +1,202 @@
+"""The user's configuration folder: a file is changed whole or not at all, and nothing is left beside it."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import psutil
+import pytest
+
+from workbench.machine import user_folder as module
+from workbench.machine.user_folder import (
+    MOST_BYTES,
+    NoUserFolder,
+    create_private,
+    locked,
+    read_private,
+    set_aside,
+    user_folder,
+    write_private,
+)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    return tmp_path / "config" / "workbench"
+
+
+@contextmanager
+def full_disk() -> Iterator[None]:
+    """No file can grow, as far as the kernel is concerned."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def failing(monkeypatch: pytest.MonkeyPatch, call: str) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(os, call, fail)
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_what_is_written_is_read_by_this_user_alone(folder: Path) -> None:
+    assert read_private("a.json") is None
+    write_private("a.json", b"one")
+    write_private("a.json", b"two")
+    assert read_private("a.json") == b"two" and names(folder) == ["a.json"]
+    assert folder.stat().st_mode & 0o777 == 0o700 and (folder / "a.json").stat().st_mode & 0o777 == 0o600
+    assert not create_private("a.json", b"three") and read_private("a.json") == b"two"
+    assert create_private("b", b"three") and read_private("b") == b"three"
+    assert (folder / "b").stat().st_mode & 0o777 == 0o600
+    assert set_aside("b") == folder / "b.broken" and read_private("b") is None
+    assert names(folder) == ["a.json", "b.broken"]
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_a_write_that_fails_leaves_the_old_content_and_nothing_else(
+    folder: Path, call: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_private("a.json", b"one")
+    with monkeypatch.context() as patch:
+        failing(patch, call)
+        for _ in range(2):
+            with pytest.raises(OSError, match="Input/output"):
+                write_private("a.json", b"two")
+    assert read_private("a.json") == b"one" and names(folder) == ["a.json"]
+
+
+@pytest.mark.parametrize("call", ["fsync", "link"])
+def test_a_new_file_that_cannot_be_made_leaves_nothing(
+    folder: Path, call: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        failing(patch, call)
+        with pytest.raises(OSError, match="Input/output"):
+            create_private("key", b"one")
+    assert names(folder) == []
+    assert create_private("key", b"two")
+
+
+@pytest.mark.parametrize("write", [write_private, create_private])
+def test_a_full_disk_leaves_nothing(folder: Path, write: Callable[[str, bytes], object]) -> None:
+    write_private("a.json", b"one")
+    with full_disk(), pytest.raises(OSError) as caught:
+        write("b.json", b"x" * 100)
+    assert caught.value.errno == errno.EFBIG
+    assert read_private("a.json") == b"one" and names(folder) == ["a.json"]
+
+
+def test_no_descriptor_is_left_open(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_private("a.json", b"one")
+    before = psutil.Process().num_fds()
+    for call in ("fsync", "replace"):
+        with monkeypatch.context() as patch, pytest.raises(OSError):
+            failing(patch, call)
+            write_private("a.json", b"two")
+    read_private("a.json")
+    with locked("a.json"):
+        pass
+    with pytest.raises(ZeroDivisionError), locked("a.json"):
+        _ = 1 / 0
+    assert psutil.Process().num_fds() == before
+
+
+def test_a_lock_lets_one_at_a_time_in(folder: Path) -> None:
+    inside, seen = [0], []
+
+    def work() -> None:
+        for _ in range(50):
+            with locked("a.json"):
+                inside[0] += 1
+                seen.append(inside[0])
+                content = read_private("count") or b"0"
+                write_private("count", str(int(content) + 1).encode())
+                inside[0] -= 1
+
+    threads = [threading.Thread(target=work) for _ in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    assert set(seen) == {1} and read_private("count") == b"150"
+    with locked("other"), locked("a.json"):
+        pass  # of another name, another lock
+    assert names(folder) == ["a.json.lock", "count", "other.lock"]
+    assert (folder / "a.json.lock").stat().st_mode & 0o777 == 0o600
+
+
+@pytest.mark.parametrize("mode", [0o620, 0o602])
+def test_what_others_may_write_is_not_read(folder: Path, mode: int) -> None:
+    write_private("a.json", b"one")
+    (folder / "a.json").chmod(mode)
+    with pytest.raises(NoUserFolder, match=r"others than this user may write to .*a\.json"):
+        read_private("a.json")
+    (folder / "a.json").chmod(0o644)
+    assert read_private("a.json") == b"one"
+    folder.chmod(0o700 | mode & 0o022)
+    for use in (lambda: read_private("a.json"), lambda: write_private("a.json", b"two"), lambda: _enter("a")):
+        with pytest.raises(NoUserFolder, match="chmod go-w"):
+            use()
+    folder.chmod(0o755)
+    assert read_private("a.json") == b"one"
+
+
+def _enter(name: str) -> None:
+    with locked(name):
+        pass
+
+
+def test_what_belongs_to_another_user_is_not_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_private("a.json", b"one")
+    me = os.geteuid()
+    # Another user cannot be had here; one who is not the owner can.
+    monkeypatch.setattr(module.os, "geteuid", lambda: me + 4711)
+    if me == 0:
+        assert read_private("a.json") == b"one"  # root's
+        os.chown(folder / "a.json", 4710, -1)
+    with pytest.raises(NoUserFolder, match="another user"):
+        read_private("a.json")
+
+
+def test_what_is_no_ordinary_file_is_not_read(folder: Path) -> None:
+    write_private("large", b"")
+    os.truncate(folder / "large", MOST_BYTES + 1)
+    os.mkfifo(folder / "pipe", 0o600)
+    (folder / "folder").mkdir(0o700)
+    for name in ("large", "pipe", "folder"):
+        before = psutil.Process().num_fds()
+        with pytest.raises(NoUserFolder, match="no ordinary file"):
+            read_private(name)
+        assert psutil.Process().num_fds() == before
+    os.truncate(folder / "large", MOST_BYTES)
+    assert len(read_private("large") or b"") == MOST_BYTES
+
+
+def test_without_a_home_there_is_no_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(
+        module.platformdirs, "user_config_path", lambda *_, **__: Path("relative") / "workbench"
+    )
+    with pytest.raises(NoUserFolder, match="no absolute path"):
+        user_folder()
+
+    def none(*_: object, **__: object) -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(module.platformdirs, "user_config_path", none)
+    with pytest.raises(NoUserFolder, match="no home folder"):
+        user_folder()

@@ -1,0 +1,57 @@
+"""The index is a cache: what is wrong with it is thrown away, what is only held by another process is not."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from pathlib import Path
+
+import pytest
+
+from workbench.recording import library_index
+from workbench.recording.library_index import LibraryIndex
+from workbench.recording.library_row import Facts
+
+SIGNATURE = ".json:5:7"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(library_index, "LOCKED_SECONDS", 0.05)
+    return tmp_path / "recordings"
+
+
+def keep(index: LibraryIndex, *keys: str) -> None:
+    index.store([(key, SIGNATURE, [(Facts(kind="workbench"), key.encode())]) for key in keys])
+
+
+def test_an_index_that_another_process_holds_is_left_as_it_is(folder: Path) -> None:
+    index = LibraryIndex(folder)
+    keep(index, "a", "b")
+    path = index.path
+    assert path is not None
+    inode = os.stat(path).st_ino
+    other = sqlite3.connect(path, isolation_level=None)
+    other.execute("BEGIN EXCLUSIVE")
+    keep(index, "c")
+    assert index.thumbnails([("a", 0)]) == {}
+    other.execute("ROLLBACK")
+    other.close()
+    assert index.load().keys() == {"a", "b"} and os.stat(path).st_ino == inode
+    assert index.thumbnails([("a", 0), ("b", 0), ("c", 0), ("a", 1)]) == {("a", 0): b"a", ("b", 0): b"b"}
+    index.close()
+
+
+def test_what_was_read_again_takes_the_place_of_what_was_kept_and_what_is_gone_goes(folder: Path) -> None:
+    index = LibraryIndex(folder)
+    keep(index, "a", "b", "c")
+    facts = Facts(kind="workbench")
+    index.store([("a", ".json:6:8", [(facts, None), (facts, b"second")])], gone=["b"])
+    index.close()
+    index = LibraryIndex(folder)
+    kept = index.load()
+    assert kept.keys() == {"a", "c"} and kept["a"].signature == ".json:6:8" and len(kept["a"].rows) == 2
+    wanted = [("a", 0), ("a", 1), ("b", 0), ("c", 0)]
+    assert index.thumbnails(wanted) == {("a", 1): b"second", ("c", 0): b"c"}
+    index.close()

@@ -1,0 +1,124 @@
+"""A worker process that has no task, so that it begins in half a second: what a test asks of it, it does to its server.
+
+All else is the real thing: how it begins, its keeper, its pulse, its signals and its line. Started as `worker_start` is.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import multiprocessing.connection
+import os
+import signal
+import sys
+import threading
+import time
+import types
+from typing import Any
+
+from workbench.authoring.problem import Interrupted
+from workbench.session.interrupts import INTERRUPT_SIGNAL, Interrupts
+from workbench.session.messages import (
+    DebuggerListens,
+    Inspect,
+    ListenForDebugger,
+    Load,
+    Loaded,
+    Loading,
+    Quit,
+    WarmedUp,
+    WarmUp,
+)
+from workbench.session.pulse import PulseWriter
+from workbench.session.worker_start import main
+
+
+class SmallWorker:
+    """Answers `Load` with a `Loading` of its name, and does what the section of an `Inspect` says."""
+
+    def __init__(self, line: multiprocessing.connection.Connection, pulse: PulseWriter) -> None:
+        self.line, self.pulse = line, pulse
+        self.interrupts = Interrupts()
+        self.interrupts.install()
+        self.kept: Any = None
+
+    def run(self) -> None:
+        while True:
+            self.pulse.begin("idle")
+            request = self.line.recv()
+            if isinstance(request, Quit):
+                return
+            if isinstance(request, ListenForDebugger):
+                self.line.send(DebuggerListens(request.port, request.wait))
+            if isinstance(request, WarmUp):
+                self.line.send(WarmedUp(0.0))
+            if isinstance(request, Load):
+                self.pulse.begin("loading")
+                self.line.send(Loading(str(request.task)))
+            if isinstance(request, Inspect):
+                try:
+                    self.interrupts.run(functools.partial(self.do, *request.sections[0].partition(" ")))
+                except Interrupted:
+                    self.line.send(Loading("interrupted"))
+
+    def do(self, what: str, _: str, argument: str) -> None:
+        getattr(self, what)(argument)
+
+    def say(self, text: str) -> None:
+        self.line.send(Loading(text))
+
+    def loaded(self, _: str) -> None:
+        nothing: Any = None
+        self.line.send(Loaded(nothing, nothing, {}))
+
+    def work(self, seconds: str) -> None:
+        """Python that lasts so long, and that an interrupt leaves."""
+        self.pulse.begin("stepping")
+        self._pass_time(float(seconds))
+
+    def work_on(self, seconds: str) -> None:
+        """Python that no interrupt leaves."""
+        signal.signal(INTERRUPT_SIGNAL, signal.SIG_IGN)
+        self.work(seconds)
+
+    def held_by_a_debugger(self, seconds: str) -> None:
+        self.pulse.begin("stepping")
+        self.pulse.hold(True)
+        self._pass_time(float(seconds))
+        self.pulse.hold(False)
+
+    def draw(self, seconds: str) -> None:
+        self.pulse.begin("drawing")
+        self._pass_time(float(seconds))
+
+    def last_steps(self, count: str) -> None:
+        """All at once, and then the kernel ends it."""
+        for number in range(int(count)):
+            self.line.send(Loading(f"step {number}"))
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    def leave(self, code: str) -> None:
+        self.pulse.begin("stepping")
+        os._exit(int(code))
+
+    def fill_memory(self, megabytes: str) -> None:
+        self.kept = bytearray(int(megabytes) << 20)
+
+    def nonsense(self, text: str) -> None:
+        self.line.send(text)
+
+    def without_a_main_thread(self, seconds: str) -> None:
+        threading.Thread(target=time.sleep, args=(float(seconds),), daemon=False).start()
+        ctypes.CDLL(None).pthread_exit(None)
+
+    def _pass_time(self, seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            pass
+
+
+if __name__ == "__main__":
+    instead: Any = types.ModuleType("workbench.session.worker")
+    instead.work = lambda fd, pulse: SmallWorker(multiprocessing.connection.Connection(fd), pulse).run()
+    sys.modules["workbench.session.worker"] = instead
+    main()
