@@ -98,6 +98,12 @@ def steps_of(record: list[Moment]) -> list[Moment]:
     return [moment for moment in record if not moment.jumped.any()]
 
 
+def episodes_of(record: list[Moment]) -> int:
+    """Those of all envs that have a step: how many a fast machine plays before it is paused is not known."""
+    begins = np.array([moment.jumped for moment in record])
+    return int((begins[:-1] & ~begins[1:]).sum())
+
+
 def test_a_reward_that_is_doubled_is_judged_as_the_double_to_the_last_bit(desk: Desk, record) -> None:
     desk.edit(REWARD, f"{REWARD} * 2")
     view = desk.judged()
@@ -108,7 +114,7 @@ def test_a_reward_that_is_doubled_is_judged_as_the_double_to_the_last_bit(desk: 
         np.testing.assert_array_equal(curve.old, rewards[:, env])
         np.testing.assert_array_equal(curve.new, 2 * rewards[:, env])
     assert view.summary.drift_metres == 0 and view.summary.drift_radians == 0
-    assert view.summary.differing == view.summary.episodes == 3 * N
+    assert view.summary.differing == view.summary.episodes == episodes_of(record) >= 3 * N
     assert view.summary.mean_return[1] == pytest.approx(2 * view.summary.mean_return[0])
     assert view.summary.differing_names == {"reward"}
     assert not view.not_carried
@@ -117,7 +123,7 @@ def test_a_reward_that_is_doubled_is_judged_as_the_double_to_the_last_bit(desk: 
 def test_code_that_comes_to_the_same_differs_nowhere(desk: Desk, record) -> None:
     desk.edit(REWARD, f"third = 3\n        {REWARD.replace('3', 'third')}")
     view = desk.judged()
-    assert view.summary.episodes == 3 * N
+    assert view.summary.episodes == episodes_of(record) >= 3 * N
     assert view.summary.differing == 0 and view.summary.differing_names == frozenset()
     assert view.summary.drift_metres == 0
 
@@ -165,7 +171,8 @@ def test_code_that_raises_is_told_with_its_line_and_the_record_stays(desk: Desk,
 
 
 def test_the_next_save_takes_the_place_of_a_judgement_while_the_worker_plays_on(desk: Desk, record) -> None:
-    slow = f"time.sleep(0.1 if {IN_THE_JUDGE} else 0)"
+    calls = desk.file.with_name("calls")
+    slow = f"if {IN_THE_JUDGE}: time.sleep(0.1) or open({str(calls)!r}, 'a').write('.')"
     desk.edit(REWARD, f"{slow}\n        {REWARD} * 2")
     desk.judged("judging")
     session = desk.session
@@ -177,9 +184,9 @@ def test_the_next_save_takes_the_place_of_a_judgement_while_the_worker_plays_on(
     session.pause()
     desk.note()
     desk.edit(REWARD, f"{REWARD} * 4")
-    stopped = desk.judged("stopped")
-    assert stopped.stopped_by is StoppedBy.SAVE and stopped.done < stopped.total
+    # That the first is told as stopped is seen for as long as the process takes to come back, which may be no time.
     view = desk.judged("done")
+    assert len(calls.read_text()) < view.done
     for env in range(N):
         curve = session.judged_curve("reward", env)
         # What was played since the first of the two saves was rewarded twofold when it was recorded.
@@ -197,7 +204,7 @@ def test_a_judgement_that_loops_for_ever_can_be_stopped_and_the_next_one_runs(de
     process = desk.session._judge.pid
     desk.session.stop_judging()
     view = desk.judged("stopped")
-    assert view.done < view.total and "by hand" in view.why
+    assert view.done < view.total and view.stopped_by is StoppedBy.HAND
     wait_until(desk.session, lambda v: desk.session._judge.pid is None, "the end of the process that hangs")
     assert not Path(f"/proc/{process}").exists()
     desk.note()
