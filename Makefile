@@ -74,6 +74,18 @@ test-all: lint
 	done; \
 	[ -z "$$failed" ] || { echo "failed in the order of seed$$failed" >&2; exit 1; }
 
+test-gpu:
+	@if [ -z "$(GPU_PYTHON)" ]; then echo "test-gpu needs Python 3.11 or 3.12; name one: make test-gpu GPU_PYTHON=/path/to/python3.12" >&2; exit 1; fi
+	@$(GPU_PYTHON) tests/gpu/run.py $(if $(WHEELS),--wheels "$(WHEELS)") $(if $(PHYSX_GPU),--physx-gpu "$(PHYSX_GPU)") $(ARGS)
+
+gpu-wheels: set-up
+	@if [ -z "$(WHEELS)" ]; then echo "Which folder? Type: make gpu-wheels WHEELS=DIR" >&2; exit 1; fi
+	@$(BIN)/python tests/gpu/run.py --fetch --wheels "$(WHEELS)" $(if $(FOR_PYTHON),--for-python $(FOR_PYTHON)) $(ARGS)
+
+mutants: set-up-test $(VENV)/.installed-mutants
+	@env_lines=$$($(BIN)/python -m workbench.machine.software_vulkan --export); eval "$$env_lines"; \
+	$(BIN)/python -m tests.mutants $(MODULES) $(ARGS)
+
 lint: set-up-test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .

@@ -86,3 +86,14 @@ def test_a_script_that_is_named_as_a_reason_is_there() -> None:
     reasons = [line for lines in promises().values() for line in lines if line.startswith("- ")]
     scripts = [name for reason in reasons for name in re.findall(r"tests/[\w/]+\.py", reason)]
     assert scripts and [name for name in scripts if not (TESTS.parent / name).is_file()] == []
+
+
+def test_every_target_of_make_that_is_named_is_there() -> None:
+    """A merge has lost three that README and ``make help`` still named."""
+    makefile = (TESTS.parent / "Makefile").read_text()
+    targets = set(re.findall(r"^([a-z-]+):", makefile, flags=re.MULTILINE))
+    for text in (README, makefile):
+        named = set(re.findall(r"(?:`|\"|, )make ([a-z-]+)", text))
+        assert named and named <= targets, named - targets
+    (phony,) = re.findall(r"^\.PHONY: (.*)", makefile, flags=re.MULTILINE)
+    assert set(phony.split()) - {"FORCE"} <= targets
