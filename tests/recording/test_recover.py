@@ -198,6 +198,37 @@ def test_a_strangers_file_under_the_name_is_left_alone(
     assert len(list(tmp_path.iterdir())) == 4
 
 
+@pytest.mark.parametrize("text", ["no JSON", "{}", "[]", '{"workbench": 3}', '{"workbench": {"id": "9"}}'])
+def test_a_strangers_json_under_the_name_is_left_alone(
+    make_episode: Maker, tmp_path: Path, text: str
+) -> None:
+    left(make_episode(2), tmp_path, id="0", written_at="2026-11-21T12:00:00+00:00")
+    (files,) = recover(tmp_path)
+    files.h5.unlink()
+    files.rrd.unlink()
+    files.json.write_text(text)
+    left(make_episode(4), tmp_path, id="1", written_at="2026-11-21T12:00:00+00:00")
+    (others,) = recover(tmp_path)
+    assert others.json.stem == f"{files.json.stem}_2" and read_episode(others.json).length == 4
+    assert files.json.read_text() == text and len(list(tmp_path.iterdir())) == 4
+
+
+@pytest.mark.parametrize("named", [[".h5"], [".h5", ".rrd"]])
+def test_of_a_writer_that_died_between_two_names_only_what_it_named_itself_is_taken_back(
+    make_episode: Maker, tmp_path: Path, named: list[str]
+) -> None:
+    """The first name was another recording's, so it was at the second."""
+    left(make_episode(2), tmp_path, id="0", written_at="2026-11-21T12:00:00+00:00")
+    (first,) = recover(tmp_path)
+    journal = left(make_episode(4), tmp_path, id="1", written_at="2026-11-21T12:00:00+00:00")
+    for suffix in named:
+        journal.with_suffix(suffix).write_text("made, and not named in full")
+        os.link(journal.with_suffix(suffix), tmp_path / f"{first.json.stem}_2{suffix}")
+    (second,) = recover(tmp_path)
+    assert second.json.stem == f"{first.json.stem}_2"
+    assert lengths(tmp_path) == {"0": 2, "1": 4}
+
+
 def test_two_of_one_name_become_two(make_episode: Maker, tmp_path: Path) -> None:
     for number, steps in enumerate((2, 4)):
         left(make_episode(steps), tmp_path, id=f"{number}", written_at="2026-11-21T12:00:00+00:00")
