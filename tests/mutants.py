@@ -45,7 +45,8 @@ PROTECTED = {
     "recording/recover": "recording/test_recover.py",
     "recording/trash": "recording/test_trash.py",
     "authoring/registry": "authoring/test_registry.py",
-    "authoring/modules": "authoring/test_load.py",
+    "authoring/modules": "authoring/test_load.py authoring/test_task_content.py authoring/test_library_names.py"
+    " authoring/test_named_modules.py",
     "core/snapshot": "core/test_snapshot.py",
     "core/partial_reset": "core/test_partial_reset.py",
     "core/task_env": "core/test_task_env.py",
