@@ -25,7 +25,7 @@ from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 import workbench
 from workbench.core.cpu_state import CpuEnvState, plan_cpu_state
 from workbench.core.fresh_physics import renew_physics
-from workbench.core.snapshot import restore_snapshot, take_snapshot
+from workbench.core.snapshot import begin_anew, in_this_state, restore_snapshot, take_snapshot
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env
 
 pytestmark = pytest.mark.thorough
@@ -135,6 +135,49 @@ def test_a_restore_differs_from_the_uninterrupted_run_only_by_what_physx_forgets
         from_live, by_forgetting = (difference(live[0][env], run[0][env]) for run in (restored, forgotten))
         assert difference(restored[0][env], forgotten[0][env]) < 1e-4, env
         assert from_live <= by_forgetting + 1e-4, env
+
+
+# The seed of the test above: without a new beginning the uninterrupted run goes another way.
+def test_from_an_exact_point_a_restore_goes_on_as_the_run_that_was_not_interrupted(stack: BaseEnv) -> None:
+    stack.reset(seed=list(range(218, 218 + N)))
+    after(stack, random_actions(stack, 5, 218))
+    begin_anew(stack, [1, 4, 5])
+    snapshot = take_snapshot(stack)
+    actions = random_actions(stack, 4, 219)
+    live = after(stack, actions)
+    restore_snapshot(stack, snapshot)
+    restored = after(stack, actions)
+    same = [all(a[env] == b[env] for a, b in zip(live, restored, strict=True)) for env in range(N)]
+    assert same[1] and same[4] and same[5]
+    assert not all(same), "nothing touches anything: the test would prove nothing"
+
+
+def test_whether_an_env_is_where_another_was_is_told_to_the_last_bit(pick: BaseEnv) -> None:
+    pick.reset(seed=list(range(N)))
+    after(pick, random_actions(pick, 3, 0))
+    begin_anew(pick, list(range(N)))
+    snapshot = take_snapshot(pick, [5, 2])
+    assert [in_this_state(pick, i, snapshot, 2) for i in range(N)] == [i == 2 for i in range(N)]
+    assert [in_this_state(pick, i, snapshot, 5) for i in range(N)] == [i == 5 for i in range(N)]
+    after(pick, random_actions(pick, 1, 1))
+    assert not in_this_state(pick, 2, snapshot, 2)
+    restore_snapshot(pick, snapshot, [2, 0], source=2)
+    assert in_this_state(pick, 2, snapshot, 2) and in_this_state(pick, 0, snapshot, 2)
+    cube = pick.cube.pose.raw_pose
+    cube[2, 0] = torch.nextafter(cube[2, 0], torch.tensor(2.0))
+    pick.cube.set_pose(Pose.create(cube))
+    pick.scene._gpu_apply_all()
+    pick.scene._gpu_fetch_all()
+    assert not in_this_state(pick, 2, snapshot, 2) and in_this_state(pick, 0, snapshot, 2)
+
+
+def test_an_env_has_the_seed_of_the_episode_that_it_goes_on_with(pick: BaseEnv) -> None:
+    env = TaskEnv(pick, 50)
+    env.reset(seed=[20, 21, 22, 23, 24, 25])
+    snapshot = take_snapshot(pick, [4, 1])
+    env.reset(seed=[30, 31, 32, 33, 34, 35])
+    restore_snapshot(pick, snapshot, [0, 4], source=[1, 4])
+    assert env.episode_seeds.tolist() == [21, 31, 32, 33, 24, 35]
 
 
 @PROPERTY
