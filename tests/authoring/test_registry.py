@@ -125,6 +125,21 @@ def test_taking_a_load_back_leaves_what_a_newer_one_put_under_the_name() -> None
     assert [dict(table) for table in registry._TABLES] == before
 
 
+def test_a_load_that_came_back_once_does_not_take_a_name_that_a_newer_one_has_since() -> None:
+    before = [dict(table) for table in registry._TABLES]
+    first, old = _registered("AuthorRegistry-v1")
+    first.undo()
+    first.redo()
+    assert env_registration.REGISTERED_ENVS["AuthorRegistry-v1"].cls is old
+    second, new = _registered("AuthorRegistry-v1")
+    first.undo()
+    first.redo()
+    assert env_registration.REGISTERED_ENVS["AuthorRegistry-v1"].cls is new
+    second.undo()
+    first.undo()
+    assert [dict(table) for table in registry._TABLES] == before
+
+
 def test_tasks_and_robots_are_classes_of_their_kind_and_not_the_base_itself() -> None:
     task = env_registration.REGISTERED_ENVS["PickCube-v1"].cls
     assert [registry.is_task(what) for what in (task, BaseEnv, Panda, dict, task.__name__, None)] == [

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator
-from typing import get_args
+from typing import Any, get_args
 
 import gymnasium as gym
 import mani_skill.envs  # noqa: F401  registers the ids
@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 
+from tests.core.single_env_judge import Bare
 from workbench.core import actions, backends
 from workbench.core.assets import MissingAssets
 from workbench.core.backends import BackendUnavailable, choose_backend, why_no_gpu_simulation
@@ -157,6 +158,45 @@ def test_what_a_task_says_of_each_env_is_told_of_that_env(obs_mode: str) -> None
         assert step.terminated.tolist() == [False, True, True, False]
         assert step.sound_obs is not None and step.sound_obs.tolist() == [False, True, True, True]
         assert not step.truncated.any()
+    env.close()
+
+
+class TellsOfTheRoom(TellsOfEach):
+    """What is of no env in particular stands in its observation too."""
+
+    def _get_obs_extra(self, info: dict) -> dict:
+        room = {"size": torch.full((3,), torch.nan), "height": torch.tensor(torch.inf)}
+        return {**super()._get_obs_extra(info), **room, "numbers": torch.arange(self.num_envs)}
+
+
+def test_what_is_no_batch_of_floats_is_sound() -> None:
+    options = EnvOptions(4, "cpu", render=False, rules="off", kwargs={"obs_mode": "state_dict"})
+    env = TaskEnv(make_env(TellsOfTheRoom, options), 50)
+    step = env.reset(seed=0)
+    assert step.sound_obs is not None and step.sound_obs.tolist() == [False, True, True, True]
+    env.close()
+
+
+def test_two_restores_of_one_snapshot_go_on_alike_to_the_last_bit() -> None:
+    env = opened("PickCube-v1")
+    env.reset(seed=0)
+    state = env.env.get_state_dict()
+    state["actors"]["cube"][:, :3] = env.env.agent.tcp.pose.p
+    env.env.set_state_dict(state)
+    chosen = np.random.default_rng(0).uniform(-1, 1, (22, N, 8)).astype(np.float32)
+    chosen[..., -1] = -1
+    for action in chosen[:10]:
+        held = env.step(action)
+    assert held.evaluate["is_grasped"].any(), "what is touched is what a physics with a past remembers"
+    snapshot, ends = env.snapshot(), []
+    for times in (5, 6, 7):
+        env.restore(snapshot)
+        for action in chosen[10:]:
+            env.step(action)
+        ends.append([system.pack() for system in env.env.scene.px.systems])
+        for _ in range(times):
+            env.step(-chosen[times])  # lets go
+    assert ends[0] == ends[1] == ends[2]
     env.close()
 
 
@@ -303,6 +343,39 @@ def test_a_gpu_is_simulated_on_only_where_it_is_asked_for(monkeypatch: pytest.Mo
     assert backends.gpu_left_alone("auto") is None
 
 
-def test_a_number_of_envs_below_one_is_refused() -> None:
-    with pytest.raises(ValueError, match="at least 1"):
-        EnvOptions(num_envs=0)
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ({"num_envs": 0}, "num_envs must be at least 1, not 0"),
+        ({"backend": "tpu"}, "backend must be one of auto, cpu, gpu, not 'tpu'"),
+        ({"threads": 0}, "threads must be at least 1, or None for all cores, not 0"),
+        ({"rules": "sometimes"}, "sometimes"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(wrong: dict, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        EnvOptions(**wrong)
+    assert EnvOptions(threads=1).threads == 1 and EnvOptions(num_envs=1).num_envs == 1
+
+
+class OnlyDense(Bare):
+    SUPPORTED_REWARD_MODES = ("normalized_dense", "dense", "none")
+
+    def __init__(self, *args: Any, calm: int = 0, **kwargs: Any) -> None:
+        self.calm = calm
+        super().__init__(*args, **kwargs)
+
+    def compute_dense_reward(self, obs: Any, action: Any, info: dict) -> torch.Tensor:
+        return torch.ones(self.num_envs)
+
+
+def test_what_is_named_goes_before_what_a_task_is_registered_with_and_that_before_its_reward() -> None:
+    def made(registered: dict | None, **named: object) -> Any:
+        env = make_env(OnlyDense, EnvOptions(2, "cpu", render=False, kwargs=named), default_kwargs=registered)
+        env.close()
+        return env
+
+    assert (made(None).reward_mode, made(None).calm) == ("dense", 0)
+    assert (made({"calm": 1}).reward_mode, made({"calm": 1}).calm) == ("dense", 1)
+    both = made({"calm": 1, "reward_mode": "none", "num_envs": 5}, calm=2)
+    assert (both.reward_mode, both.calm, both.num_envs) == ("none", 2, 2)
