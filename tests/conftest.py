@@ -21,6 +21,9 @@ os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="workbench-test-config-"
 import psutil
 import pytest
 
+# Until the tests begin: what they import is no garbage, and neither are they. It takes a third of the time to collect them.
+gc.disable()
+
 pytest_plugins = ["tests.drive.tiers"]
 
 if TYPE_CHECKING:
@@ -80,8 +83,8 @@ def task_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session", autouse=True)
 def imported_modules_are_not_searched_for_garbage() -> None:
     """BaseEnv calls ``gc.collect()`` whenever it builds or closes: 0.25 s each over torch's own objects."""
-    gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session", autouse=True)

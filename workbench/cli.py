@@ -19,6 +19,7 @@ import tyro
 
 from workbench.exit_codes import Exit
 from workbench.machine.guarded_terminal import guard_terminal
+from workbench.machine.quick_imports import quick_imports
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.task_arguments import Backend, Rules, history_bytes, imported, task_options
 from workbench.terminal import err, print_finding, print_problem, refuse, say
@@ -163,9 +164,10 @@ def record(
     if (why := why_not_there(task)) is not None:
         return refuse(why)
     use_private_driver()
-    from workbench.record_command import record_in_terminal
-    from workbench.session.debugger import debug_here
-    from workbench.session.record import RecordOptions
+    with quick_imports():
+        from workbench.record_command import record_in_terminal
+        from workbench.session.debugger import debug_here
+        from workbench.session.record import RecordOptions
 
     try:
         options = task_options(num_envs, backend, seed, env, rules, imports)
@@ -269,7 +271,8 @@ def rescore(
         trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it. Without
             it, and without a terminal to ask in, nothing is run and the exit code is 4.
     """
-    from workbench.rescore_command import run_rescore
+    with quick_imports():
+        from workbench.rescore_command import run_rescore
 
     if task is not None and recorded_source:
         return refuse("--task and --recorded-source name two versions to judge with: give one of them")

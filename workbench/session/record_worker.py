@@ -12,6 +12,7 @@ from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
 
 from workbench.machine.guarded_terminal import guard_terminal
+from workbench.machine.quick_imports import quick_imports
 from workbench.session.breakpoints import ONE_PROCESS, refuse_breakpoints
 from workbench.session.family import begin_family
 
@@ -72,8 +73,9 @@ class _FarDealing:
 def _work(connection: Connection) -> None:
     # PhysX and the software renderer take a thread for each core that the process may use.
     os.sched_setaffinity(0, connection.recv())
-    from workbench.authoring.problem import TaskError, nobody_presses_ctrl_c
-    from workbench.session.record import run_episodes, with_given_actions
+    with quick_imports():
+        from workbench.authoring.problem import TaskError, nobody_presses_ctrl_c
+        from workbench.session.record import run_episodes, with_given_actions
 
     nobody_presses_ctrl_c()
     what: RecordOptions = connection.recv()

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from workbench.machine.quick_imports import quick_imports
 from workbench.session.recorded_scene import Said, SceneFailed, SceneMade, SceneWanted
 
 if TYPE_CHECKING:
@@ -63,10 +64,11 @@ def main(socket: str) -> None:
 
 def make(wanted: SceneWanted) -> TaskEnv:
     """One env of the recorded task, as it was made for the recording."""
-    from workbench.authoring.load import import_modules, load_task
-    from workbench.authoring.problem import TaskError
-    from workbench.authoring.reference import RecordedTask
-    from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+    with quick_imports():
+        from workbench.authoring.load import import_modules, load_task
+        from workbench.authoring.problem import TaskError
+        from workbench.authoring.reference import RecordedTask
+        from workbench.core.task_env import EnvOptions, TaskEnv, make_env
 
     try:
         import_modules(wanted.imports)

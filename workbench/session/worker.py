@@ -15,7 +15,6 @@ the author's code is called, and left, in `held_task`.
 
 from __future__ import annotations
 
-import gc
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -33,7 +32,6 @@ from workbench.core.camera_configs import note_camera_sites
 from workbench.core.inspect_env import inspect_env
 from workbench.core.step import StepResult
 from workbench.machine.current_folder import CurrentFolder
-from workbench.session import rescore_run
 from workbench.session.acting import Acting
 from workbench.session.camera_messages import (
     DrawCamera,
@@ -302,6 +300,9 @@ class Worker:
             self._line.send(judge_moments(self._held.opened, request))
 
     def _rescore(self, request: Rescore) -> None:
+        # Not for every worker: it brings rerun and what reads recordings, a third of a second.
+        from workbench.session import rescore_run
+
         if self._held.opened is not None:
             rescore_run.answer(self._held.opened, request, self._line.send)
 
@@ -474,10 +475,6 @@ def work(connection: int, pulse: PulseWriter) -> None:
     # The tensors hold a few thousand numbers: threads over them only wait for each other (measured:
     # 16 PickCube envs ran 2.8 times faster with one thread than with two).
     torch.set_num_threads(1)
-    # BaseEnv collects garbage at every build and close, and would look through torch's and ManiSkill's modules
-    # each time: 0.25 s, most of a reload of 16 envs.
-    gc.collect()
-    gc.freeze()
     note_camera_sites()
     nobody_presses_ctrl_c()
     Worker(Connection(connection), pulse).run()

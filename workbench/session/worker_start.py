@@ -18,6 +18,7 @@ import traceback
 from pathlib import Path
 from typing import NoReturn
 
+from workbench.machine.quick_imports import quick_imports
 from workbench.session.family import begin_family
 
 
@@ -44,7 +45,8 @@ def main() -> None:
         refuse_breakpoints(OPEN_WITH_DEBUG)
     code = 0
     try:
-        from workbench.session.worker import work
+        with quick_imports():
+            from workbench.session.worker import work
 
         work(connection, pulse)
     except BaseException:

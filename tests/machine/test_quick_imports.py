@@ -1,0 +1,33 @@
+"""While a process imports, garbage is not looked for; afterwards it is, and not among what was imported."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Iterator
+
+import pytest
+
+from workbench.machine.quick_imports import quick_imports
+
+
+@pytest.fixture
+def nothing_frozen() -> Iterator[None]:
+    frozen = gc.get_freeze_count()
+    gc.unfreeze()
+    yield
+    if frozen:
+        gc.freeze()
+
+
+@pytest.mark.usefixtures("nothing_frozen")
+def test_garbage_is_left_alone_meanwhile_and_looked_for_afterwards() -> None:
+    with quick_imports():
+        assert not gc.isenabled() and gc.get_freeze_count() == 0
+    assert gc.isenabled() and gc.get_freeze_count() > 10_000
+
+
+@pytest.mark.usefixtures("nothing_frozen")
+def test_an_import_that_fails_is_the_callers_and_garbage_is_looked_for() -> None:
+    with pytest.raises(ModuleNotFoundError), quick_imports():
+        import no_such_module  # noqa: F401  # pyright: ignore[reportMissingImports]
+    assert gc.isenabled()
