@@ -252,6 +252,22 @@ def test_a_journal_that_its_writer_removes_meanwhile_is_not_claimed(
     assert len(descriptors()) == len(before) - 1, "its own"
 
 
+def test_a_lock_that_the_disk_refuses_is_told_and_holds_nothing(
+    journal: Journal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Network drives may have none."""
+
+    def refuse(descriptor: int, how: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    journal.close()
+    before = descriptors()
+    monkeypatch.setattr(journals.fcntl, "flock", refuse)
+    with pytest.raises(OSError, match="No locks available"):
+        claim(journal.path)
+    assert descriptors() == before
+
+
 def test_a_disk_that_does_not_give_what_was_written_is_no_end(
     journal: Journal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -318,3 +334,39 @@ def test_threads_write_all_journals_and_end_with_the_last(
         journal.close()
     thread.join(20)
     assert not thread.is_alive()
+
+
+def test_what_is_held_back_is_written_to_all_journals_before_the_disk_is_waited_for_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(journals, "_keeper", type(journals._keeper)())
+    monkeypatch.setattr(journals, "SYNC_SECONDS", 0.01)
+    three: list[Journal] = []
+    seen: list[list[list[bytes]]] = []
+    fsync = os.fsync
+
+    class HoldsBack:
+        flushed = False
+
+        def flush(self) -> None:
+            if not self.flushed:
+                for number, journal in enumerate(three):
+                    journal.put("row", 0, bytes([number]))
+            self.flushed = True
+
+    def noted(descriptor: int) -> None:
+        if holder.flushed:
+            seen.append([rows(journal.path) for journal in three])
+        fsync(descriptor)
+
+    holder = HoldsBack()
+    monkeypatch.setattr(os, "fsync", noted)
+    three += [Journal(tmp_path / f"{number}.arrow") for number in range(3)]
+    journals.before_writing(holder.flush)
+    deadline = time.monotonic() + 10
+    while len(seen) < 3:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    assert seen[0] == [[b"\0"], [b"\1"], [b"\2"]]
+    for journal in three:
+        journal.close()
