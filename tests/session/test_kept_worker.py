@@ -43,6 +43,7 @@ class Minded:
         self.greeting: list[Request] = []
         self.fails = 0
         """So many events cannot be taken."""
+        self.taking: Callable[[Event], None] = lambda event: None
         self.worker = KeptWorker(
             options,
             WarmUp(OPTIONS),
@@ -59,6 +60,7 @@ class Minded:
         return [do(f"say hello {self.greeted}"), *self.greeting]
 
     def _take(self, event: Event) -> None:
+        self.taking(event)
         if self.fails:
             self.fails -= 1
             raise ValueError("no such step")
@@ -284,6 +286,28 @@ def test_an_event_that_cannot_be_taken_ends_the_worker_and_not_the_thread(
     assert "no such step" in caplog.text
 
 
+def test_of_the_last_that_a_worker_sent_what_cannot_be_taken_is_told_and_a_new_one_comes(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    with minded() as one:
+        pid = one.worker.pid
+
+        def taking(event: Event) -> None:
+            if event.activity == "step 0":  # type: ignore[union-attr]
+                one.until(lambda: not Path(f"/proc/{pid}").exists(), "its end")  # all that it said is there
+                one.worker.replace()
+                time.sleep(kept_worker._LOOK)  # a look is due now, which finds that it is to be replaced
+            if event.activity == "step 2":  # type: ignore[union-attr]
+                raise ValueError("no such step")
+
+        one.taking = taking
+        one.worker.send(do("last_steps 5"))
+        assert one.until_dead().why == "was ended by hand"
+        assert one.said == ["hello 1", "step 0", "step 1"]
+        one.until_greeted(2)
+    assert "The last that a worker sent could not be taken" in caplog.text and "no such step" in caplog.text
+
+
 def test_a_greeting_that_fails_loses_the_worker_and_is_tried_again(caplog: pytest.LogCaptureFixture) -> None:
     with minded() as one:
         greet = one.worker._greet
@@ -341,6 +365,11 @@ def test_stop_ends_the_thread_and_a_worker_that_hangs() -> None:
     assert pid is not None
     one.until(lambda: not Path(f"/proc/{pid}").exists(), "its end")
     assert [thread.name for thread in threading.enumerate() if thread.name == "session"] == []
+
+
+def test_nothing_is_kept_beside_the_worker_that_nobody_asked_for() -> None:
+    kept = WorkerOptions()
+    assert (kept.spare, kept.memory_limit, kept.debug_port, kept.debug_wait) == (False, None, None, False)
 
 
 def test_a_spare_takes_the_place_of_one_that_died(monkeypatch: pytest.MonkeyPatch) -> None:
