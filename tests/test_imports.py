@@ -59,3 +59,21 @@ def test_the_page_is_the_only_part_that_knows_viser() -> None:
         or (isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "viser")
     }
     assert knowing == {"ui"}
+
+
+TESTS = Path(__file__).parent
+
+
+def test_nothing_is_imported_from_a_test() -> None:
+    """Whoever changes a test would change others, and the file would be run for a helper of a line."""
+    names = {file.stem for file in TESTS.rglob("*.py") if file.name.startswith("test_")}
+    assert "test_imports" in names
+    wrong = [
+        f"{file.relative_to(TESTS)}:{node.lineno} imports {name}"
+        for file in TESTS.rglob("*.py")
+        for node in ast.walk(ast.parse(file.read_text()))
+        if isinstance(node, (ast.Import, ast.ImportFrom))
+        for name in [getattr(node, "module", None), *(alias.name for alias in node.names)]
+        if name and set(name.split(".")) & names
+    ]
+    assert wrong == []

@@ -18,9 +18,9 @@ import pytest
 from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.utils.registration import REGISTERED_ENVS
 
+from tests.authoring.refusal import refused
 from workbench.authoring import registry
 from workbench.authoring.load import LoadedTask, load_task, take_back, with_late_imports
-from workbench.authoring.problem import Problem, TaskError
 
 Write = Callable[..., Path]
 
@@ -32,12 +32,6 @@ class PushEnv(BaseEnv):
     def evaluate(self):
         return {}
 """
-
-
-def refused(reference: str | Path, **kwargs: dict[str, str]) -> Problem:
-    with pytest.raises(TaskError) as caught:
-        load_task(str(reference), **kwargs)
-    return caught.value.problem
 
 
 def tables() -> list[dict]:

@@ -10,7 +10,7 @@ import pytest
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 from tests.authoring.conftest import Write
-from tests.authoring.test_load import refused
+from tests.authoring.refusal import refused
 from workbench.authoring import library_names
 from workbench.authoring.load import class_of_module, import_modules, load_task, take_back
 from workbench.authoring.named_modules import find_module

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.authoring.conftest import Write
-from tests.authoring.test_load import refused
+from tests.authoring.refusal import refused
 from workbench.authoring.load import load_task, take_back
 
 ROBOTS = """

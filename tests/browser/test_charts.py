@@ -10,33 +10,16 @@ import viser
 from numpy.typing import NDArray
 from playwright.sync_api import Browser, Page, expect
 
+from tests.drive.charts import drawn
 from tests.drive.page import page_at
 from tests.drive.panels import Clock
 from tests.drive.waiting import until
 from tests.ui.scenes import running
 from workbench.session.view import Curves
 from workbench.ui.curves_panel import REDRAW_EVERY, CurvesPanel
-from workbench.ui.line_chart import SELECTED_COLOUR
 
 pytestmark = pytest.mark.browser
 ENVS = 3
-COLUMNS_OF = """([colour]) => {
-    const canvas = document.querySelector(".uplot canvas");
-    if (!canvas || !canvas.width) return [];
-    const { width, height } = canvas;
-    const pixels = canvas.getContext("2d").getImageData(0, 0, width, height).data;
-    const [red, green, blue] = [1, 3, 5].map((at) => parseInt(colour.slice(at, at + 2), 16));
-    const found = [];
-    for (let x = 0; x < width; x++) {
-        for (let y = 0; y < height; y++) {
-            const at = 4 * (y * width + x);
-            const far = Math.abs(pixels[at] - red) + Math.abs(pixels[at + 1] - green) + Math.abs(pixels[at + 2] - blue);
-            if (pixels[at + 3] > 127 && far < 60) { found.push(x / width); break; }
-        }
-    }
-    return found;
-}"""
-"""Which columns of the first chart, as shares of its width, have a pixel of a colour."""
 
 
 @pytest.fixture
@@ -53,10 +36,6 @@ def past(first: int, last: int, lost: tuple[int, int] = (0, 0)) -> Curves:
     reward[(tick >= lost[0]) & (tick < lost[1]), 0] = np.nan
     flags = np.zeros_like(reward)
     return Curves(last, tick, reward, flags, flags.astype(bool))
-
-
-def drawn(page: Page) -> NDArray[np.float64]:
-    return np.array(page.evaluate(COLUMNS_OF, [SELECTED_COLOUR]))
 
 
 def widest_gap(columns: NDArray[np.float64]) -> float:

@@ -15,16 +15,8 @@ import sapien
 import torch
 from mani_skill.utils.structs.pose import Pose
 
+from tests.core.by_hand import BOX, box, by_hand
 from tests.core.single_env_judge import Bare, batch_of, follow
-
-BOX = [0.05, 0.05, 0.05]
-
-
-def box(env: Any, name: str, half_size: list[float] = BOX, pose: Any = None, kind: str = "dynamic") -> Any:
-    builder = env.scene.create_actor_builder()
-    builder.add_box_collision(half_size=half_size)
-    builder.initial_pose = sapien.Pose() if pose is None else pose
-    return builder.build(name) if kind == "dynamic" else getattr(builder, f"build_{kind}")(name)
 
 
 class Table(Bare):
@@ -88,31 +80,6 @@ MJCF = """<mujoco model="pendulum"><worldbody><body name="cart" pos="0 0 1">
 <body name="pole"><joint name="hinge" type="hinge" axis="0 1 0" damping="0.01"/>
 <geom name="pole" type="capsule" fromto="0 0 0 0.1 0 0.5" size="0.03" mass="0.2"/></body>
 </body></worldbody></mujoco>"""
-
-
-def by_hand(env: Any, joints: int, name: str = "chain", scene_idxs: list[int] | None = None) -> Any:
-    """A chain of links that hang from a fixed base, joined by `joints` hinges."""
-    builder = env.scene.create_articulation_builder()
-    if scene_idxs is not None:
-        builder.set_scene_idxs(scene_idxs)
-    parent = builder.create_link_builder()
-    parent.set_name("base")
-    parent.add_box_collision(half_size=BOX)
-    for i in range(joints):
-        parent = builder.create_link_builder(parent)
-        parent.set_name(f"link{i}")
-        parent.set_joint_name(f"hinge{i}")
-        parent.add_box_collision(pose=sapien.Pose([0.15, 0, 0]), half_size=[0.1, 0.03, 0.03])
-        parent.set_joint_properties(
-            "revolute",
-            limits=[[-2.0, 2.0]],
-            pose_in_parent=sapien.Pose([0.1 if i == 0 else 0.3, 0, 0], [0.7071068, 0, 0, 0.7071068]),
-            pose_in_child=sapien.Pose([0, 0, 0], [0.7071068, 0, 0, 0.7071068]),
-            friction=0.05,
-            damping=0.02,
-        )
-    builder.initial_pose = sapien.Pose([0, 0, 1])
-    return builder.build(name, fix_root_link=True)
 
 
 class Swinging(Bare):

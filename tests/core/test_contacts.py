@@ -16,8 +16,8 @@ import torch
 from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
+from tests.core.by_hand import box
 from tests.core.single_env_judge import Bare, batch_of, put_in_same_state, single
-from tests.core.test_actors_and_articulations import box
 from workbench.core.body_table import build_body_table
 from workbench.core.contact_list import Contact, list_contacts
 from workbench.core.task_env import TaskEnv

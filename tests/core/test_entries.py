@@ -17,6 +17,7 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 import workbench
+from tests.drive.entries import ENTRIES, Mute
 from tests.session.odd_entries import write_task
 from workbench.authoring.load import load_task
 from workbench.core.entries import MOST_ENTRIES, MOST_LETTERS, split_entries
@@ -25,11 +26,6 @@ from workbench.core.task_env import EnvOptions, TaskEnv, make_env
 
 N = 4
 EACH = torch.arange(float(N))
-
-
-class Mute:
-    def __repr__(self) -> str:
-        raise KeyError("nothing to be said")
 
 
 class Chatty:
@@ -149,29 +145,6 @@ def test_columns_are_copies_that_the_next_step_does_not_change() -> None:
     value += 1
     number += 1
     assert columns["each"].tolist() == [0, 1, 2, 3] and others["mean"].numbers == 1
-
-
-LEAF = st.one_of(
-    st.none(),
-    st.booleans(),
-    st.integers(),
-    st.floats(),
-    st.complex_numbers(),
-    st.text(st.characters(), max_size=6),
-    st.binary(max_size=4),
-    st.lists(st.one_of(st.integers(), st.text(max_size=2), st.none(), st.floats()), max_size=5),
-    st.builds(
-        lambda shape, dtype: torch.ones(shape, dtype=dtype),
-        st.lists(st.integers(0, 5), max_size=3).map(tuple),
-        st.sampled_from([torch.bool, torch.int32, torch.float32, torch.bfloat16, torch.complex64]),
-    ),
-    st.builds(object),
-    st.builds(Mute),
-)
-KEY = st.one_of(st.text(st.characters(), max_size=4), st.integers(), st.none(), st.tuples(st.integers()))
-ENTRIES = st.dictionaries(
-    KEY, st.recursive(LEAF, lambda inner: st.dictionaries(KEY, inner, max_size=3), max_leaves=6), max_size=5
-)
 
 
 @given(ENTRIES, st.integers(1, 5))

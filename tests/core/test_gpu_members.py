@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 import sapien.physx as physx
 
+from tests.core.collision import Collision
 from tests.core.single_env_judge import batch_of
-from tests.core.test_physics_settings import Collision
 
 MEMBERS = sorted(name for name in dir(physx.PhysxGpuSystem) if not name.startswith("_"))
 REFUSED = {"gpu_set_cuda_stream", "set_scene_offset", "set_scene_collision_id"}

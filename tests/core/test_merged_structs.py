@@ -15,8 +15,8 @@ import torch
 from mani_skill.utils.structs import Actor, Articulation, Link
 from mani_skill.utils.structs.pose import Pose
 
+from tests.core.by_hand import box, by_hand
 from tests.core.single_env_judge import Bare, batch_of, follow
-from tests.core.test_actors_and_articulations import box, by_hand
 from workbench.core.contact_list import list_contacts
 
 

@@ -15,7 +15,7 @@ import sapien
 from mani_skill.sensors.camera import CameraConfig
 
 from tests.core.single_env_judge import batch_of
-from tests.core.test_mounted_cameras import RENDERED, Watched, pictures
+from tests.core.watched import RENDERED, Watched, pictures
 from workbench.core.camera_configs import settings_of
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.exchange import exchange_cameras

@@ -13,7 +13,7 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.core.test_entries import ENTRIES
+from tests.drive.entries import ENTRIES
 from tests.drive.episodes import Made
 from tests.recording.read_rrd import read_rrd
 from tests.recording.verify_rrd import verify_rrd

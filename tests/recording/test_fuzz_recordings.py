@@ -21,7 +21,7 @@ import numpy as np
 import psutil
 import pytest
 
-from tests.recording.test_safe_h5 import write as write_h5
+from tests.recording.foreign_h5 import write as write_h5
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.recording import reading

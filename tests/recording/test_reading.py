@@ -17,8 +17,8 @@ import numpy as np
 import psutil
 import pytest
 
+from tests.recording.foreign_h5 import write as write_h5
 from tests.recording.library_files import describe
-from tests.recording.test_safe_h5 import write as write_h5
 from workbench.machine.child_python import child_environment, python_command
 from workbench.machine.confinement import landlock_version
 from workbench.recording import reading

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import tracemalloc
 from collections.abc import Callable
@@ -12,27 +11,13 @@ import h5py
 import numpy as np
 import pytest
 
+from tests.recording.foreign_h5 import write
 from workbench.recording.library_read import read_found
 from workbench.recording.library_scan import scan_folder
 from workbench.recording.read_episode import UnreadableRecording, read_maniskill
 from workbench.recording.safe_h5 import DEEPEST, RefusedH5, open_h5
 
 SECRET = b"the secret of another file, thirty-two bytes and more of it......"
-
-
-def write(folder: Path, spoil: Callable[[h5py.Group], None] = lambda group: None) -> Path:
-    """A trajectory of three steps as ManiSkill writes it, less what `spoil` did to it; returns the ``.h5``."""
-    path = folder / "theirs.h5"
-    with h5py.File(path, "w") as file:
-        group = file.create_group("traj_0")
-        group["actions"] = np.zeros((3, 2), np.float32)
-        group["rewards"] = np.ones(3, np.float32)
-        group["terminated"] = group["truncated"] = np.zeros(3, bool)
-        group["env_states/actors/cube"] = np.zeros((4, 13), np.float32)
-        spoil(group)
-    said = {"env_info": {"env_id": "PickCube-v1"}, "episodes": [{"episode_id": 0, "elapsed_steps": 3}]}
-    path.with_suffix(".json").write_text(json.dumps(said))
-    return path
 
 
 def external_link(group: h5py.Group) -> None:

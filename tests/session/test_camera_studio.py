@@ -12,16 +12,14 @@ import numpy as np
 import pytest
 
 from tests.drive.session import step, wait_until
+from tests.session.studio import BASE, PEOPLE, camera, moved, said
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.session.messages import CameraRequest, TaskOptions
 from workbench.session.session import Session
-from workbench.session.studio_view import StudioCamera, StudioView
+from workbench.session.studio_view import StudioView
 from workbench.session.view import SessionView
 
 pytestmark = pytest.mark.usefixtures("child_process")
-
-BASE: CameraKey = ("sensor", "base_camera")
-PEOPLE: CameraKey = ("human", "render_camera")
 
 
 @pytest.fixture(scope="module")
@@ -43,20 +41,10 @@ def session(studio_session: Session) -> Session:
     """At rest, and every camera as the file has it."""
     studio_session.pause()
     studio_session.past.seek(None)
-    for camera in studio_session.view().studio.cameras:
-        studio_session.studio.back_to_file(camera.key)
+    for one in studio_session.view().studio.cameras:
+        studio_session.studio.back_to_file(one.key)
     wait_until(studio_session, lambda v: not v.playing and not moved(v), "rest")
     return studio_session
-
-
-def moved(view: SessionView) -> set[CameraKey]:
-    return {camera.key for camera in view.studio.cameras if camera.moved}
-
-
-def camera(session: Session, key: CameraKey) -> StudioCamera:
-    found = session.view().studio.camera(key)
-    assert found is not None
-    return found
 
 
 def seen_from(key: CameraKey, settings: CameraSettings) -> Callable[[SessionView], bool]:
@@ -71,10 +59,6 @@ def seen_from(key: CameraKey, settings: CameraSettings) -> Callable[[SessionView
         )
 
     return reached
-
-
-def said(what: Callable[[StudioView], bool]) -> Callable[[SessionView], bool]:
-    return lambda view: what(view.studio)
 
 
 def test_a_camera_that_is_dragged_is_seen_from_where_it_came_to_rest_and_is_one_step_of_undo(

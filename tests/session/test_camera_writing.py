@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.drive.session import wait_until
-from tests.session.test_camera_studio import BASE, camera, moved, said
+from tests.session.studio import BASE, camera, moved, said
 from workbench.authoring.camera_source import Refusal, SourceEdit
 from workbench.core.camera_settings import CallSite, CameraKey, CameraSettings, differences
 from workbench.session.camera_writing import CameraWriting, Wish, copy, plan

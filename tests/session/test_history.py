@@ -9,42 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tests.session.moments import N, mask_of, stepped
 from workbench.core.pictures import CameraKind, Picture
-from workbench.core.step import StepResult
 from workbench.session.episode_moments import moments_of_episode
 from workbench.session.history import FAIL, NOT_A_NUMBER, RESET, SUCCESS, TRUNCATED, WENT_BACK, History
 from workbench.session.judgement import Judgement
-from workbench.session.messages import NO_MOMENT, PastPictures, Pictures, Restored, Stepped
-
-N, BODIES = 3, 4
-
-
-def stepped(
-    number: int,
-    jumped: tuple[int, ...] = (),
-    success: tuple[int, ...] = (),
-    truncated: tuple[int, ...] = (),
-    restored: Restored | None = None,
-    keys: tuple[int, ...] | None = None,
-    new: dict[int, bytes] | None = None,
-) -> Stepped:
-    step = StepResult(
-        elapsed_steps=np.full(N, number, np.int32),
-        reward=np.full(N, number, np.float32),
-        terminated=_mask(success),
-        truncated=_mask(truncated),
-        evaluate={"success": _mask(success), "fail": _mask(())},
-        poses=np.zeros((N, BODIES, 7), np.float32),
-        action=None if jumped else np.zeros((N, 2), np.float32),
-    )
-    mask = _mask(jumped)
-    return Stepped(step, mask, (), None, b"body %d" % number, keys, new or {}, number, restored)
-
-
-def _mask(envs: tuple[int, ...]) -> np.ndarray:
-    mask = np.zeros(N, bool)
-    mask[list(envs)] = True
-    return mask
+from workbench.session.messages import NO_MOMENT, PastPictures, Pictures, Restored
 
 
 def picture(env: int, size: int = 64, kind: CameraKind = "sensor", name: str = "eye") -> Picture:
@@ -425,5 +395,5 @@ def test_the_step_of_a_task_without_a_robot_keeps_its_reward() -> None:
 def test_a_task_that_only_fails_has_its_failures_told() -> None:
     history = filled(1)
     step = stepped(1)
-    history.add(replace(step, step=replace(step.step, evaluate={"fail": _mask((1,))})), 1)
+    history.add(replace(step, step=replace(step.step, evaluate={"fail": mask_of((1,))})), 1)
     assert (history.events(1, 1, 1), history.events(0, 1, 1)) == ([(1, FAIL)], [])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.session.test_history import N, stepped
+from tests.session.moments import N, stepped
 from workbench.session.recent_curves import RecentCurves
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.session.test_history import N, stepped
+from tests.session.moments import N, stepped
 from workbench.core.pictures import CameraKind, Picture
 from workbench.session.history import RESET, SUCCESS
 from workbench.session.messages import CameraRequest, PastPictures, Restored, Stepped

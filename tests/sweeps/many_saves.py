@@ -23,7 +23,7 @@ import tyro
 from playwright.sync_api import Page, expect
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from tests.browser.test_charts import drawn
+from tests.drive.charts import drawn
 from tests.drive.page import TASK, browser_at, page_on
 from workbench.machine.chromium import find_chromium
 

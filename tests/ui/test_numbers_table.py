@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from tests.core.test_entries import ENTRIES
+from tests.drive.entries import ENTRIES
 from tests.ui.scenes import step_of, table_scene
 from workbench.core.entries import split_entries
 from workbench.core.step import OtherEntry

@@ -3,8 +3,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from tests.drive.panels import Panels
+from tests.ui.env_rows import rows_of
 from tests.ui.scenes import EMPTY, problem, running
-from tests.ui.test_env_strip import rows_of
 from workbench.session.outliers import Kind, Outlier
 from workbench.ui.fragments import render
 from workbench.ui.status_line import StatusLine, flagged_text, status_values

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import sys
+import tokenize
 import types
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -117,3 +119,8 @@ def close(a: CameraSettings, b: CameraSettings, tolerance: float = 1e-6) -> bool
         b.fov is None,
         b.intrinsic is None,
     )
+
+
+def comments(text: str) -> list[str]:
+    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
+    return [token.string for token in tokens if token.type == tokenize.COMMENT]

@@ -6,9 +6,15 @@ import dataclasses
 
 import pytest
 
-from tests.authoring.camera_source.real_cameras import FILE, HEADER, close, real_configs, settings_of
+from tests.authoring.camera_source.real_cameras import (
+    FILE,
+    HEADER,
+    close,
+    comments,
+    real_configs,
+    settings_of,
+)
 from tests.authoring.camera_source.shapes import REFUSED, WRITTEN
-from tests.authoring.camera_source.test_shapes import comments
 from workbench.authoring.camera_source import (
     Refusal,
     SourceEdit,

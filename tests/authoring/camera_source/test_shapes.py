@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import ast
 import dataclasses
-import io
 import math
-import tokenize
 from collections.abc import Callable
 
 import pytest
 
-from tests.authoring.camera_source.real_cameras import FILE, close, real_configs, real_settings, settings_of
+from tests.authoring.camera_source.real_cameras import (
+    FILE,
+    close,
+    comments,
+    real_configs,
+    real_settings,
+    settings_of,
+)
 from tests.authoring.camera_source.shapes import REFUSED, WRITTEN
 from workbench.authoring.camera_source import Refusal, SourceEdit, plan_edit
 from workbench.authoring.camera_source.rotations import angle_between, look_at, unit
@@ -74,11 +79,6 @@ def near_enough(written: CameraSettings, wanted: CameraSettings) -> bool:
         and (written.width, written.height) == (wanted.width, wanted.height)
         and abs(written.near - wanted.near) <= 1e-4
     )
-
-
-def comments(text: str) -> list[str]:
-    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
-    return [token.string for token in tokens if token.type == tokenize.COMMENT]
 
 
 def untouched(old: str, new: str) -> float:

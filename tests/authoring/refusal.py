@@ -1,0 +1,16 @@
+"""Why a task is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from workbench.authoring.load import load_task
+from workbench.authoring.problem import Problem, TaskError
+
+
+def refused(reference: str | Path, **kwargs: dict[str, str]) -> Problem:
+    with pytest.raises(TaskError) as caught:
+        load_task(str(reference), **kwargs)
+    return caught.value.problem
