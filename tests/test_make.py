@@ -23,6 +23,7 @@ from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 import workbench
+from tests.drive.envs import CPU
 from workbench import gym_env
 from workbench.authoring.problem import TaskError
 from workbench.core.assets import MissingAssets
@@ -32,7 +33,6 @@ from workbench.core.cpu_scene import SIM_BACKEND
 
 pytestmark = pytest.mark.thorough
 
-CPU = {"backend": "cpu", "render_backend": "none"}
 TASKS = Path(__file__).resolve().parents[1] / "tasks"
 README = TASKS.parent / "README.md"
 

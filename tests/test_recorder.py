@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,12 +16,12 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 import workbench
+from tests.drive.envs import CPU
 from workbench.recording.episode import NO_SEED, Episode
 from workbench.recording.read_episode import read_episode, read_maniskill, trajectories
 from workbench.recording.recover import recover
 
 TASKS = Path(__file__).parents[1] / "tasks"
-OPTIONS: Any = {"backend": "cpu", "render_backend": "none"}
 
 
 def episodes_in(folder: Path) -> list[Episode]:
@@ -33,7 +32,7 @@ def episodes_in(folder: Path) -> list[Episode]:
 
 
 def test_auto_resets_end_an_episode_and_begin_the_next(tmp_path: Path) -> None:
-    env = workbench.make("PushCube-v1", 2, max_episode_steps=3, **OPTIONS)
+    env = workbench.make("PushCube-v1", 2, max_episode_steps=3, **CPU)
     env = ManiSkillVectorEnv(workbench.Recorder(env, tmp_path), ignore_terminations=True)
     env.reset(seed=[7, 8])
     for _ in range(4):
@@ -47,7 +46,7 @@ def test_auto_resets_end_an_episode_and_begin_the_next(tmp_path: Path) -> None:
 
 
 def test_the_seed_that_a_reset_draws_itself_is_kept(tmp_path: Path) -> None:
-    env = workbench.make("PushCube-v1", 2, enhanced_determinism=True, **OPTIONS)
+    env = workbench.make("PushCube-v1", 2, enhanced_determinism=True, **CPU)
     env = workbench.Recorder(env, tmp_path, env_idx=[1])
     env.reset(seed=[7, 8])
     env.reset(options={"env_idx": torch.tensor([1])})
@@ -59,7 +58,7 @@ def test_the_seed_that_a_reset_draws_itself_is_kept(tmp_path: Path) -> None:
 
 def test_it_keeps_what_maniskills_own_recorder_keeps(child_process: None, tmp_path: Path) -> None:
     """The same run through both, RecordEpisode around ours: states, actions, rewards and flags are equal."""
-    env = workbench.make(str(TASKS / "push_cube.py"), 2, **OPTIONS)
+    env = workbench.make(str(TASKS / "push_cube.py"), 2, **CPU)
     ours = workbench.Recorder(env, tmp_path / "ours")
     theirs_in = str(tmp_path / "theirs")
     both = RecordEpisode(ours, theirs_in, save_video=False, trajectory_name="run")  # type: ignore[arg-type]
@@ -89,7 +88,7 @@ def test_it_keeps_what_maniskills_own_recorder_keeps(child_process: None, tmp_pa
 def test_a_full_disk_warns_once_and_the_run_goes_on(tmp_path: Path) -> None:
     in_the_way = tmp_path / "recordings"
     in_the_way.write_text("no folder")
-    env = workbench.Recorder(workbench.make("PushCube-v1", 1, **OPTIONS), in_the_way)
+    env = workbench.Recorder(workbench.make("PushCube-v1", 1, **CPU), in_the_way)
     with pytest.warns(UserWarning, match="is not a folder"):
         env.reset(seed=0)
     env.step(env.action_space.sample())
@@ -98,7 +97,7 @@ def test_a_full_disk_warns_once_and_the_run_goes_on(tmp_path: Path) -> None:
 
 
 def test_what_came_before_an_unseen_reset_is_kept(tmp_path: Path) -> None:
-    env = workbench.Recorder(workbench.make("PushCube-v1", 2, **OPTIONS), tmp_path)
+    env = workbench.Recorder(workbench.make("PushCube-v1", 2, **CPU), tmp_path)
     env.reset(seed=0)
     for _ in range(3):
         env.step(env.action_space.sample())
@@ -143,7 +142,7 @@ def test_a_killed_program_loses_a_second(child_process: None, tmp_path: Path) ->
 
 
 def test_a_vector_env_is_refused(tmp_path: Path) -> None:
-    env = ManiSkillVectorEnv(workbench.make("PushCube-v1", 1, **OPTIONS))
+    env = ManiSkillVectorEnv(workbench.make("PushCube-v1", 1, **CPU))
     with pytest.raises(TypeError, match="inside a vector env"):
         workbench.Recorder(env, tmp_path)  # type: ignore[arg-type]
     env.close()

@@ -15,8 +15,8 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils import assets, download_asset
 from mani_skill.utils.registration import REGISTERED_ENVS
 
+from tests.drive.envs import batched
 from workbench.core.assets import MissingAssets, assets_at, refuse_downloads, require_assets, robots_of
-from workbench.core.task_env import EnvOptions, make_env
 
 NOT_HERE = "anymal_c"
 
@@ -116,7 +116,7 @@ def test_a_robot_of_the_authors_own_with_a_wrong_path_is_told_so(tmp_path: Path)
             super().__init__(*args, robot_uids=robot, **kwargs)
 
     with pytest.raises(MissingAssets, match=r"arm\.urdf does not exist.*urdf_path"):
-        make_env(Task, EnvOptions(2, "cpu", render=False))
+        batched(Task)
 
 
 def test_robots_are_those_asked_for_or_the_constructors_default() -> None:

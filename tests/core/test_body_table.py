@@ -4,32 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium as gym
 import mani_skill.envs  # noqa: F401 (registers the tasks)
 import numpy as np
 import pytest
 import sapien
 import torch
-from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
-from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs import Actor, Pose
 
+from tests.drive.envs import batched, stock
 from workbench.core.body_table import BodyTable, build_body_table, read_poses
-from workbench.core.task_env import EnvOptions, make_env
 
 TASKS = ["PickCube-v1", "PushCube-v1", "PegInsertionSide-v1", "MS-CartpoleBalance-v1"]
 
 
-def batched(task: str | type[BaseEnv], num_envs: int = 4) -> BaseEnv:
-    cls = REGISTERED_ENVS[task].cls if isinstance(task, str) else task
-    env = make_env(cls, EnvOptions(num_envs=num_envs, backend="cpu", render=False))
-    env.reset(seed=1)
-    return env
-
-
-def stock(task: str) -> Any:
-    env: Any = gym.make(task, render_backend="none").unwrapped
+def begun(env: Any) -> Any:
     env.reset(seed=1)
     return env
 
@@ -68,7 +57,7 @@ def test_poses_are_those_of_maniskill(task: str, make: Any) -> None:
 @pytest.mark.parametrize("task", TASKS)
 def test_poses_are_those_of_the_physics(task: str) -> None:
     """Against the entities themselves, which know nothing of ManiSkill's tensors."""
-    env = batched(task)
+    env = begun(batched(task, 4))
     table = build_body_table(env)
     env.step(torch.from_numpy(env.action_space.sample()))
     env.reset(options={"env_idx": torch.tensor([1, 3])})
@@ -81,7 +70,7 @@ def test_poses_are_those_of_the_physics(task: str) -> None:
 
 
 def test_names_are_readable_and_kinds_are_right() -> None:
-    env = stock("PickCube-v1")
+    env = begun(stock("PickCube-v1"))
     table = build_body_table(env)
     kind = dict(zip(table.names, table.kinds, strict=True))
     assert kind["cube"] == "dynamic" and kind["ground"] == "static" and kind["goal_site"] == "kinematic"
@@ -91,7 +80,7 @@ def test_names_are_readable_and_kinds_are_right() -> None:
 
 
 def test_objects_that_differ_between_envs_are_one_body() -> None:
-    env = batched("PegInsertionSide-v1")
+    env = begun(batched("PegInsertionSide-v1", 4))
     table = build_body_table(env)
     assert "peg" in table.names and "box_with_hole" in table.names
     assert not [name for name in table.names if name.startswith("peg_")]
@@ -100,7 +89,7 @@ def test_objects_that_differ_between_envs_are_one_body() -> None:
 
 
 def test_a_hidden_body_is_where_it_would_be_seen() -> None:
-    env: Any = batched("PickCube-v1")
+    env: Any = begun(batched("PickCube-v1", 4))
     table = build_body_table(env)
     goal = table.names.index("goal_site")
     shown = read_poses(env, table)
@@ -133,7 +122,7 @@ class SparseBodiesEnv(PushCubeEnv):
 
 
 def test_a_body_that_an_env_lacks_is_nan_there_only() -> None:
-    env = batched(SparseBodiesEnv)
+    env = begun(batched(SparseBodiesEnv, 4))
     table = build_body_table(env)
     missing = np.isnan(read_poses(env, table)).all(axis=-1)
     assert np.argwhere(missing).tolist() == [[1, table.names.index("rare")], [3, table.names.index("rare")]]
@@ -142,14 +131,14 @@ def test_a_body_that_an_env_lacks_is_nan_there_only() -> None:
 
 
 def test_a_view_over_two_bodies_of_one_env_leaves_them_their_names() -> None:
-    env = batched(SparseBodiesEnv, num_envs=2)
+    env = begun(batched(SparseBodiesEnv, 2))
     table = build_body_table(env)
     assert {"left", "right"} < set(table.names) and "pair" not in table.names
     env.close()
 
 
 def test_a_stock_env_may_gain_an_entity() -> None:
-    env = stock("PushCube-v1")
+    env = begun(stock("PushCube-v1"))
     table = build_body_table(env)
     before = read_poses(env, table)
     env.scene.sub_scenes[0].add_entity(sapien.Entity())
@@ -158,7 +147,7 @@ def test_a_stock_env_may_gain_an_entity() -> None:
 
 
 def test_a_table_of_an_old_scene_is_refused() -> None:
-    env = stock("PushCube-v1")
+    env = begun(stock("PushCube-v1"))
     table = build_body_table(env)
     env.reset(seed=0, options={"reconfigure": True})
     with pytest.raises(ValueError, match="build_body_table"):
@@ -167,7 +156,7 @@ def test_a_table_of_an_old_scene_is_refused() -> None:
 
 
 def test_all_envs_in_one_sub_scene_are_refused() -> None:
-    env = stock("PushCube-v1")
+    env = begun(stock("PushCube-v1"))
     env.scene.parallel_in_single_scene = True  # ManiSkill itself allows it only with a GPU
     with pytest.raises(NotImplementedError, match="parallel_in_single_scene"):
         build_body_table(env)

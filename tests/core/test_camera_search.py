@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mani_skill.utils.registration import REGISTERED_ENVS
 
+from tests.drive.envs import batched
 from workbench.core.camera_frames import axes_of
 from workbench.core.camera_search import SearchProgress, SearchSpace, score_of, suggest_cameras
 from workbench.core.camera_settings import CameraSettings
 from workbench.core.take_pictures import segmentation_names
-from workbench.core.task_env import EnvOptions, make_env
 from workbench.core.visibility import Placement, judge_placement, objects_to_see
 
 N = 2
@@ -25,7 +24,7 @@ LOW, HIGH = (-0.8, -0.8, 0.1), (0.8, 0.8, 1.0)
 
 @pytest.fixture(scope="module")
 def env(renderer: None) -> Iterator[Any]:
-    made = make_env(REGISTERED_ENVS["PushCube-v1"].cls, EnvOptions(num_envs=N, backend="cpu"))
+    made = batched("PushCube-v1", N, render=True)
     made.reset(seed=3)
     yield made
     made.close()
@@ -125,7 +124,7 @@ def test_a_camera_on_a_link_is_suggested_places_in_that_links_frame_that_keep_it
 
 def test_one_link_of_an_articulation_can_be_what_must_be_seen(env: Any) -> None:
     assert {t.name: t.links for t in objects_to_see(env) if not t.robot} == {"cube": (), "goal_region": ()}
-    valves = make_env(REGISTERED_ENVS["RotateValveLevel0-v1"].cls, EnvOptions(num_envs=1, backend="cpu"))
+    valves = batched("RotateValveLevel0-v1", 1, render=True)
     try:
         valves.reset(seed=1)
         (valve,) = (thing for thing in objects_to_see(valves) if not thing.robot)

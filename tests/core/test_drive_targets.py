@@ -9,7 +9,8 @@ import sapien
 import torch
 from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
 
-from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+from tests.drive.envs import batched
+from workbench.core.task_env import TaskEnv
 
 N = 4
 
@@ -62,7 +63,7 @@ class Door(PushCubeEnv):
 
 def made(**attributes: Any) -> TaskEnv:
     task = type("Door", (Door,), attributes)
-    return TaskEnv(make_env(task, EnvOptions(N, "cpu", render=False, kwargs={"obs_mode": "state"})))
+    return TaskEnv(batched(task, N))
 
 
 @pytest.mark.parametrize("one_joint", [True, False])

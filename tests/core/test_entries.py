@@ -18,11 +18,12 @@ from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 import workbench
 from tests.drive.entries import ENTRIES, Mute
+from tests.drive.envs import CPU, batched
 from tests.session.odd_entries import write_task
 from workbench.authoring.load import load_task
 from workbench.core.entries import MOST_ENTRIES, MOST_LETTERS, split_entries
 from workbench.core.open_env import open_env
-from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+from workbench.core.task_env import TaskEnv
 
 N = 4
 EACH = torch.arange(float(N))
@@ -178,7 +179,7 @@ def same(ours: Any, stock: Any) -> bool:
 
 
 def test_info_is_what_stock_maniskill_gives(odd_task: Path) -> None:
-    ours: Any = workbench.make(odd_task, 1, backend="cpu", render_backend="none", rules="stop")
+    ours: Any = workbench.make(odd_task, 1, **CPU, rules="stop")
     stock: Any = gym.make("OddEntries-v1", num_envs=1, sim_backend="physx_cpu", render_backend="none")
     for env in (ours, stock):
         env.reset(seed=3)
@@ -195,7 +196,7 @@ def test_info_is_what_stock_maniskill_gives(odd_task: Path) -> None:
 def test_maniskills_wrappers_take_it_from_a_batch(
     child_process: None, odd_task: Path, tmp_path: Path
 ) -> None:
-    env: Any = workbench.make(odd_task, 2, backend="cpu", render_backend="none")
+    env: Any = workbench.make(odd_task, 2, **CPU)
     env = RecordEpisode(env, str(tmp_path), save_video=False)
     env = ManiSkillVectorEnv(env, auto_reset=True, record_metrics=True)
     env.reset(seed=[0, 1])
@@ -216,8 +217,7 @@ class OneTruth:
 @pytest.mark.parametrize("rules", ["off", "stop"])
 def test_one_truth_of_one_env_is_taken_as_stock_takes_it(odd_task: Path, rules: Any) -> None:
     task = type("One", (OneTruth, load_task(str(odd_task)).cls), {})
-    kwargs = {"reward_mode": "sparse"}
-    env = TaskEnv(make_env(task, EnvOptions(1, "cpu", render=False, rules=rules, kwargs=kwargs)))
+    env = TaskEnv(batched(task, 1, rules=rules, reward_mode="sparse"))
     assert env.reset(seed=0).terminated.tolist() == [True]
     step = env.step(None)
     assert step.terminated.tolist() == [True] and step.reward.tolist() == [-1.0]
@@ -227,7 +227,7 @@ def test_one_truth_of_one_env_is_taken_as_stock_takes_it(odd_task: Path, rules: 
 
 def test_a_mean_that_a_built_in_task_returns_is_one_number() -> None:
     # tabletop/pull_cube_tool.py line 213: the mean over all envs.
-    env = workbench.make("PullCubeTool-v1", 2, backend="cpu", render_backend="none", rules="stop")
+    env = workbench.make("PullCubeTool-v1", 2, **CPU, rules="stop")
     task = TaskEnv(open_env(env))
     progress = task.reset(seed=0).others["cube_progress"]
     assert progress.numbers is not None and progress.numbers.shape == ()
@@ -235,7 +235,7 @@ def test_a_mean_that_a_built_in_task_returns_is_one_number() -> None:
 
 
 def test_steps_and_judgements_tell_both_halves(odd_task: Path) -> None:
-    env = workbench.make(odd_task, 3, backend="cpu", render_backend="none", reward_mode="dense")
+    env = workbench.make(odd_task, 3, **CPU, reward_mode="dense")
     task = TaskEnv(open_env(env))
     task.reset(seed=0)
     step = task.step(np.zeros((3, 8), np.float32))

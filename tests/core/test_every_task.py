@@ -10,16 +10,15 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
-from mani_skill.utils.registration import REGISTERED_ENVS
 
+from tests.drive.envs import batched
 from tests.sweeps.exercise_task import exercise
 from tests.sweeps.task_ids import PAGE, page, registered_ids, sweep
 from tests.sweeps.upstream_faults import FAULTS, Fault, where_it_fails
-from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+from workbench.core.task_env import TaskEnv
 
 ROOT = Path(__file__).parents[2]
 WITH_CAMERAS = ("PushCube-v1", "TriFingerRotateCubeLevel4-v1", "MS-CartpoleBalance-v1")
@@ -61,10 +60,7 @@ _EACH = [
 def test_a_fault_of_the_task_is_at_the_line_that_is_named_and_the_error_says_so(
     fault: Fault, env_id: str
 ) -> None:
-    spec = REGISTERED_ENVS[env_id]
-    made = make_env(
-        spec.cls, EnvOptions(4, "cpu", render=False, rules="off"), default_kwargs=spec.default_kwargs
-    )
+    made = batched(env_id, 4, rules="off")
     env = TaskEnv(made)
     env.reset(seed=1)
     act = {"partial reset": lambda: env.reset(seed=5, env_idx=[1, 3]), "get_state": made.get_state}[
@@ -82,10 +78,7 @@ def test_a_fault_of_the_task_is_at_the_line_that_is_named_and_the_error_says_so(
 
 
 def test_the_buffers_that_a_partial_reset_replaced_are_named() -> None:
-    spec = REGISTERED_ENVS["RotateValveLevel0-v1"]
-    env: Any = make_env(
-        spec.cls, EnvOptions(4, "cpu", render=False, rules="off"), default_kwargs=spec.default_kwargs
-    )
+    env = batched("RotateValveLevel0-v1", 4, rules="off")
     with pytest.raises(RuntimeError) as caught:
         env.reset(options={"env_idx": torch.tensor([0, 2, 3])})
     assert "self.rest_qpos: 4 rows before, 3 now" in caught.value.__notes__[0]

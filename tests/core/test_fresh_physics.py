@@ -15,18 +15,11 @@ import sapien.physx as physx
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.building import actors
-from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
+from tests.drive.envs import PICK_CUBE, batched
 from workbench.core.fresh_physics import renew_physics
 from workbench.core.snapshot import restore_snapshot, take_snapshot
-from workbench.core.task_env import EnvOptions, make_env
-
-PICK_CUBE: Any = REGISTERED_ENVS["PickCube-v1"].cls
-
-
-def made(task: Any, num_envs: int, render: bool = False, **kwargs: object) -> BaseEnv:
-    return make_env(task, EnvOptions(num_envs, "cpu", render=render, kwargs={"obs_mode": "state", **kwargs}))
 
 
 def packs(env: BaseEnv) -> list[bytes]:
@@ -34,7 +27,7 @@ def packs(env: BaseEnv) -> list[bytes]:
 
 
 def test_a_grasp_goes_the_same_way_whatever_was_touched_before() -> None:
-    env = made(PICK_CUBE, 6)
+    env = batched(PICK_CUBE, 6)
     env.reset(seed=list(range(6)))
     state = env.get_state_dict()
     state["actors"]["cube"][:, :3] = env.agent.tcp.pose.p
@@ -69,7 +62,7 @@ def test_a_grasp_goes_the_same_way_whatever_was_touched_before() -> None:
 
 
 def test_nothing_but_the_systems_is_new() -> None:
-    env = made(PICK_CUBE, 3)
+    env = batched(PICK_CUBE, 3)
     env.reset(seed=[0, 1, 2])
     for _ in range(3):
         env.step(env.action_space.sample())
@@ -91,15 +84,15 @@ def test_nothing_but_the_systems_is_new() -> None:
 
 
 def test_a_step_is_as_long_as_before() -> None:
-    slow = made(PICK_CUBE, 2, sim_config={"sim_freq": 60, "control_freq": 20})
+    slow = batched(PICK_CUBE, 2, sim_config={"sim_freq": 60, "control_freq": 20})
     renew_physics(slow.scene, [1])
     assert [system.timestep for system in slow.scene.px.systems] == [pytest.approx(1 / 60)] * 2
     slow.close()
 
 
 def test_gravity_is_that_of_the_env_and_the_processs_default_stays() -> None:
-    light = made(PICK_CUBE, 1, sim_config={"scene_config": {"gravity": np.array([0.0, 0.0, -1.0])}})
-    other = made(PICK_CUBE, 1)
+    light = batched(PICK_CUBE, 1, sim_config={"scene_config": {"gravity": np.array([0.0, 0.0, -1.0])}})
+    other = batched(PICK_CUBE, 1)
     renew_physics(light.scene, [0])
     assert light.scene.px.systems[0].config.gravity.tolist() == [0.0, 0.0, -1.0]
     assert np.allclose(physx.get_scene_config().gravity, other.scene.px.systems[0].config.gravity)
@@ -130,7 +123,7 @@ class Leash(PICK_CUBE):
 
 
 def test_a_drive_between_two_bodies_still_holds() -> None:
-    env: Any = made(Leash, 2)
+    env: Any = batched(Leash, 2)
     env.reset(seed=[0, 1])
     for _ in range(3):
         env.step(None)
@@ -143,7 +136,7 @@ def test_a_drive_between_two_bodies_still_holds() -> None:
 
 
 def test_pictures_and_segmentation_are_the_same_after_it(renderer: None) -> None:
-    env: Any = made(PICK_CUBE, 2, render=True, obs_mode="rgb+segmentation")
+    env: Any = batched(PICK_CUBE, 2, render=True, obs_mode="rgb+segmentation")
     env.reset(seed=[0, 1])
     env.step(env.action_space.sample())
     restore_snapshot(env, take_snapshot(env))
@@ -161,7 +154,7 @@ def test_pictures_and_segmentation_are_the_same_after_it(renderer: None) -> None
 def test_memory_is_flat_over_a_thousand_renewals() -> None:
     import psutil
 
-    env = made(PICK_CUBE, 4)
+    env = batched(PICK_CUBE, 4)
     env.reset(seed=[0, 1, 2, 3])
     snapshot = take_snapshot(env)
 

@@ -13,17 +13,16 @@ import mani_skill.envs  # noqa: F401 (registers the tasks)
 import numpy as np
 import pytest
 import torch
-from mani_skill.utils.registration import REGISTERED_ENVS
 
+from tests.drive.envs import PICK_CUBE, batched
 from workbench.core import actions, seams
 from workbench.core.inspect_env import MOST_VALUES, inspect_env
 from workbench.core.inspection import SECTIONS, Inspection
-from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+from workbench.core.task_env import TaskEnv
 
 
 def opened(task: str | type, num_envs: int = 3, steps: int = 4, **kwargs: Any) -> TaskEnv:
-    cls = REGISTERED_ENVS[task].cls if isinstance(task, str) else task
-    env = TaskEnv(make_env(cls, EnvOptions(num_envs, "cpu", render=False, kwargs=kwargs)))
+    env = TaskEnv(batched(task, num_envs, **kwargs))
     env.reset(seed=0)
     rng = np.random.default_rng(0)
     for _ in range(steps):
@@ -120,7 +119,7 @@ def test_the_state_dict_is_taken_apart_by_what_its_numbers_are(pick: TaskEnv) ->
 
 
 def test_looking_does_not_change_how_the_episode_goes_on() -> None:
-    class Counting(REGISTERED_ENVS["PickCube-v1"].cls):
+    class Counting(PICK_CUBE):
         """Its hooks draw random numbers and count, as some tasks' do."""
 
         asked = 0
@@ -160,7 +159,7 @@ def test_only_what_is_asked_is_read_and_it_crosses_a_pipe_without_torch(pick: Ta
 
 
 def test_a_section_that_the_author_broke_does_not_take_the_others_along() -> None:
-    class Broken(REGISTERED_ENVS["PickCube-v1"].cls):
+    class Broken(PICK_CUBE):
         def get_state_dict(self) -> Any:
             if getattr(self, "broken", False):
                 raise KeyError("goal")
@@ -174,7 +173,7 @@ def test_a_section_that_the_author_broke_does_not_take_the_others_along() -> Non
 
 
 def test_large_arrays_are_told_by_their_range() -> None:
-    class Wide(REGISTERED_ENVS["PickCube-v1"].cls):
+    class Wide(PICK_CUBE):
         def _get_obs_extra(self, info: dict) -> dict:
             grid = self.cube.pose.p.new_zeros(self.num_envs, 10 * MOST_VALUES)
             grid[:, -1] = 7

@@ -16,19 +16,17 @@ import numpy as np
 import pytest
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
 from tests.core import draws_goals
+from tests.drive.envs import PICK_CUBE, batched
 from workbench.core.assignments import find_assignment
 from workbench.core.broken_rule import BrokenRule
 from workbench.core.rules import Finding
-from workbench.core.task_env import EnvOptions, make_env
 
 pytestmark = pytest.mark.thorough
 
 N = 3
-PICK_CUBE: Any = REGISTERED_ENVS["PickCube-v1"].cls
 ACTION = np.zeros((N, 8), np.float32)
 Reset = Callable[[Any, torch.Tensor], None]
 
@@ -44,10 +42,7 @@ def task_with(initializes: Reset, **members: Any) -> type[BaseEnv]:
 def found_in(task: type[BaseEnv], rules: Any = "warn", resets: int = 1) -> list[Finding]:
     """What is told of a reset, a step and partial resets of env 1."""
     told: list[Finding] = []
-    options = EnvOptions(
-        N, "cpu", render=False, rules=rules, on_finding=told.append, kwargs={"obs_mode": "none"}
-    )
-    env: Any = make_env(task, options)
+    env = batched(task, N, rules=rules, on_finding=told.append, obs_mode="none")
     try:
         env.reset(seed=[0, 1, 2])
         env.step(ACTION)
@@ -365,8 +360,7 @@ def test_a_reset_without_rules_is_not_traced() -> None:
         seen.append(sys.gettrace())
         self.target = torch.rand(self.num_envs)
 
-    options = EnvOptions(N, "cpu", render=False, rules="off", kwargs={"obs_mode": "none"})
-    env = make_env(task_with(reset), options)
+    env = batched(task_with(reset), N, rules="off", obs_mode="none")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         env.reset(options={"env_idx": torch.tensor([1])})

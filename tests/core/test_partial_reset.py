@@ -13,18 +13,15 @@ import pytest
 import sapien
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
-from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs import Pose
 
 from tests.core.single_env_judge import Bare, batch_of, single
+from tests.drive.envs import PICK_CUBE, batched
 from workbench.core.partial_reset import active_controllers
-from workbench.core.task_env import EnvOptions, make_env
-
-PICK_CUBE: Any = REGISTERED_ENVS["PickCube-v1"].cls
 
 
-def made(task: type[BaseEnv] = PICK_CUBE, num_envs: int = 4, **kwargs: Any) -> Any:
-    return make_env(task, EnvOptions(num_envs, "cpu", render=False, rules="off", kwargs=kwargs))
+def made(task: str | type[BaseEnv] = PICK_CUBE, num_envs: int = 4, **kwargs: Any) -> Any:
+    return batched(task, num_envs, rules="off", **kwargs)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +67,7 @@ def test_a_reset_of_all_resets_all_controllers() -> None:
 
 
 def test_several_robots_and_none_have_their_controllers_found() -> None:
-    two = made(REGISTERED_ENVS["TwoRobotPickCube-v1"].cls, 2)
+    two = made("TwoRobotPickCube-v1", 2)
     assert len(active_controllers(two)) == 4, "an arm and a gripper each"
     two.close()
 

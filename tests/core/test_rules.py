@@ -12,14 +12,13 @@ import mani_skill.envs  # noqa: F401  registers the ids
 import numpy as np
 import pytest
 import torch
-from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
+from tests.drive.envs import CPU, PICK_CUBE, batched
 from workbench.core.broken_rule import MOST_ROWS, BrokenRule, BrokenRules, RuleWarning
 from workbench.core.rules import RULES, Finding, degrees_of
-from workbench.core.task_env import EnvOptions, make_env
+from workbench.core.task_env import EnvOptions
 
-PICK_CUBE: Any = REGISTERED_ENVS["PickCube-v1"].cls
 N = 3
 Hook = Callable[..., None]
 
@@ -125,10 +124,7 @@ def test_what_only_warns_goes_on_to_the_same_bits_as_without_rules(
     task = type("BreaksARule", (PICK_CUBE,), {hook: after})
     states, found = {}, []
     for choice in ("warn", "off"):
-        options = EnvOptions(
-            N, "cpu", render=False, rules=choice, on_finding=found.append, kwargs={"obs_mode": "none"}
-        )
-        env: Any = make_env(task, options)
+        env = batched(task, N, rules=choice, on_finding=found.append, obs_mode="none")
         env.reset(seed=[0, 1, 2])
         states[choice] = []
         for step in range(4):
@@ -195,7 +191,7 @@ def test_of_several_things_lost_at_once_each_is_told() -> None:
 
     found: list[Finding] = []
     task = type("LosesTwo", (PICK_CUBE,), {"_before_control_step": lose})
-    env: Any = make_env(task, EnvOptions(N, "cpu", render=False, on_finding=found.append))
+    env: Any = batched(task, N, on_finding=found.append)
     env.step(np.zeros((N, 8), np.float32))
     env.close()
     assert [("'cube'" in finding.message, "'goal_site'" in finding.message) for finding in found] == [
@@ -216,20 +212,19 @@ def test_make_stops_and_warns_by_rule_unless_told_otherwise() -> None:
             super()._initialize_episode(env_idx, options)
             steps_all(self, env_idx, options)
 
-    options: dict[str, Any] = {"backend": "cpu", "render_backend": "none"}
-    env = workbench.make(Lifts, 2, **options)
+    env = workbench.make(Lifts, 2, **CPU)
     env.reset(seed=0)
     with pytest.warns(RuleWarning, match="physics never sees it") as told:
         env.step(env.action_space.sample())
     assert [warning.filename for warning in told if warning.category is RuleWarning] == [__file__]
     env.close()
-    env = workbench.make(Steps, 2, **options)
+    env = workbench.make(Steps, 2, **CPU)
     env.reset(seed=0)
     with pytest.raises(BrokenRule, match="--rules warn"):
         env.reset(options={"env_idx": torch.tensor([1])})
     env.close()
     for rules, caught in (("warn", 1), ("off", 0)):
-        env = workbench.make(Steps, 2, rules=cast(Any, rules), **options)
+        env = workbench.make(Steps, 2, rules=cast(Any, rules), **CPU)
         env.reset(seed=0)
         with warnings.catch_warnings(record=True) as told:
             warnings.simplefilter("always")

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mani_skill.envs  # noqa: F401  registers the ids
 import pytest
 import sapien.physx as physx
-from mani_skill.utils.registration import REGISTERED_ENVS
 
+from tests.drive.envs import batched
 from workbench.core.scene_limit import free_thread_keys, require_scenes
-from workbench.core.task_env import EnvOptions, make_env
 
 
 def test_each_physx_scene_takes_a_key_and_gives_it_back() -> None:
@@ -25,9 +22,8 @@ def test_each_physx_scene_takes_a_key_and_gives_it_back() -> None:
 
 
 def test_a_batch_that_does_not_fit_is_refused_with_the_number_that_does() -> None:
-    task: Any = REGISTERED_ENVS["PickCube-v1"].cls
     with pytest.raises(ValueError, match=r"num_envs=1024 is more than .* and \d+ are left here"):
-        make_env(task, EnvOptions(1024, "cpu", render=False))
+        batched("PickCube-v1", 1024)
 
 
 def test_what_fits_is_not_refused_and_one_more_is() -> None:

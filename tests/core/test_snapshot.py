@@ -18,26 +18,19 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.building import actors
-from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 import workbench
+from tests.drive.envs import CPU, PICK_CUBE, batched, stock
 from workbench.core.cpu_state import CpuEnvState, plan_cpu_state
 from workbench.core.fresh_physics import renew_physics
 from workbench.core.snapshot import begin_anew, in_this_state, restore_snapshot, take_snapshot
-from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+from workbench.core.task_env import TaskEnv
 
 pytestmark = pytest.mark.thorough
 
 N = 6
-PICK_CUBE: Any = REGISTERED_ENVS["PickCube-v1"].cls
-
-
-def made(task: str | type[BaseEnv], num_envs: int = N, **kwargs: object) -> BaseEnv:
-    cls = REGISTERED_ENVS[task].cls if isinstance(task, str) else task
-    options = {"obs_mode": "state", **kwargs}
-    return make_env(cls, EnvOptions(num_envs, "cpu", render=False, kwargs=options))
 
 
 def random_actions(env: BaseEnv, steps: int, seed: int) -> list[np.ndarray]:
@@ -64,14 +57,14 @@ def difference(one: bytes, other: bytes) -> float:
 
 @pytest.fixture(scope="module")
 def pick() -> Iterator[BaseEnv]:
-    env = made("PickCube-v1")
+    env = batched(PICK_CUBE, N)
     yield env
     env.close()
 
 
 @pytest.fixture(scope="module")
 def stack() -> Iterator[BaseEnv]:
-    env = made("StackCube-v1", control_mode="pd_ee_target_delta_pose")
+    env = batched("StackCube-v1", N, control_mode="pd_ee_target_delta_pose")
     yield env
     env.close()
 
@@ -301,7 +294,7 @@ def test_a_snapshot_can_be_pickled_and_does_not_change_with_its_env(pick: BaseEn
 
 
 def test_a_target_that_a_controller_goes_after_is_restored() -> None:
-    env = made("PickCube-v1", 3, control_mode="pd_joint_target_delta_pos")
+    env = batched("PickCube-v1", 3, control_mode="pd_joint_target_delta_pos")
     env.reset(seed=[0, 1, 2])
     actions = random_actions(env, 5, 0)
     after(env, actions)
@@ -373,7 +366,7 @@ def test_the_processs_generators_go_back_when_every_env_does_in_whichever_order(
 def test_the_processs_generators_stay_where_they_are_for_a_snapshot_of_another_number_of_envs(
     pick: BaseEnv,
 ) -> None:
-    larger = made("PickCube-v1", N + 1)
+    larger = batched("PickCube-v1", N + 1)
     larger.reset(seed=0)
     snapshot = take_snapshot(larger, range(N))
     moved = drawn_next(set_it_on=True)
@@ -398,7 +391,7 @@ def drawn_next(set_it_on: bool = False) -> tuple[float, ...]:
 
 
 def test_joint_forces_are_restored() -> None:
-    env = made("MS-CartpoleBalance-v1", 2, control_mode="pd_joint_delta_pos")
+    env = batched("MS-CartpoleBalance-v1", 2, control_mode="pd_joint_delta_pos")
     env.reset(seed=[0, 1])
     robot = env.agent.robot
     robot.set_qf(torch.full((2, robot.max_dof), 2.0))
@@ -425,7 +418,7 @@ def test_what_slept_sleeps(pick: BaseEnv) -> None:
 @pytest.mark.parametrize("env_id", ["PickCube-v1", "StackCube-v1"])
 def test_whatever_physx_lets_sleep_is_said_to_sleep(env_id: str) -> None:
     """Also with a velocity: neither a cube nor an arm that falls asleep need have lost all of it."""
-    env = made(env_id, 3)
+    env = batched(env_id, 3)
     env.reset(seed=0)
     plan = plan_cpu_state(env)
     bodies = [component for sleepers in plan.sleepers for _, _, component in sleepers]
@@ -478,7 +471,7 @@ def test_a_rebuilt_env_goes_the_same_way(pick: BaseEnv) -> None:
     restore_snapshot(pick, snapshot)
     actions = random_actions(pick, 8, 1)
     reference = after(pick, actions)
-    rebuilt = made("PickCube-v1")
+    rebuilt = batched(PICK_CUBE, N)
     rebuilt.reset(seed=list(range(100, 100 + N)))
     report = restore_snapshot(rebuilt, snapshot)
     assert {"actor cube", "actor goal_site", "articulation panda"} <= set(report.carried)
@@ -492,7 +485,7 @@ def test_an_edited_task_gets_what_still_fits_by_name_and_says_what_does_not(pick
     pick.reset(seed=list(range(N)))
     after(pick, random_actions(pick, 5, 0))
     snapshot = take_snapshot(pick)
-    edited = made(EditedPickCube, 4)
+    edited = batched(EditedPickCube, 4)
     edited.reset(seed=[0, 1, 2, 3])
     ball = edited.ball.pose.raw_pose.clone()
     report = restore_snapshot(edited, snapshot, [0, 2], source=[5, 1])
@@ -510,7 +503,7 @@ def test_an_edited_task_gets_what_still_fits_by_name_and_says_what_does_not(pick
 def test_an_articulation_with_other_joints_is_left_as_it_is(pick: BaseEnv) -> None:
     pick.reset(seed=list(range(N)))
     snapshot = take_snapshot(pick)
-    other = made("PickCube-v1", 2, robot_uids="fetch")
+    other = batched("PickCube-v1", 2, robot_uids="fetch")
     other.reset(seed=[0, 1])
     qpos = other.agent.robot.get_qpos().clone()
     report = restore_snapshot(other, snapshot, [0, 1])
@@ -538,12 +531,10 @@ def test_wrong_envs_are_refused(pick: BaseEnv, env_idx: Any, source: Any, error:
 
 
 def test_a_stock_env_is_refused_in_words() -> None:
-    import gymnasium as gym
-
-    stock = gym.make("PickCube-v1", num_envs=1, render_backend="none").unwrapped
+    single = stock("PickCube-v1")
     with pytest.raises(NotImplementedError, match="workbench.make"):
-        take_snapshot(stock)
-    stock.close()
+        take_snapshot(single)
+    single.close()
 
 
 @pytest.mark.parametrize(
@@ -579,7 +570,7 @@ def test_one_env_may_be_named_by_its_number(pick: BaseEnv) -> None:
 
 
 def test_wrappers_are_looked_through_and_what_is_no_env_is_refused(pick: BaseEnv) -> None:
-    wrapped = workbench.make("PickCube-v1", 2, backend="cpu", render_backend="none")
+    wrapped = workbench.make("PickCube-v1", 2, **CPU)
     vector = ManiSkillVectorEnv(wrapped)
     vector.reset(seed=0)
     assert not restore_snapshot(vector, take_snapshot(wrapped)).not_carried

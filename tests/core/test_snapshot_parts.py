@@ -14,21 +14,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 
+from tests.drive.envs import batched
 from workbench.core import actions
 from workbench.core.cpu_state import CpuEnvState
 from workbench.core.snapshot import Snapshot
 from workbench.core.snapshot_bytes import WholeSnapshot
 from workbench.core.snapshot_parts import PackedSnapshot, SnapshotPacker, unpack_snapshot
-from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+from workbench.core.task_env import TaskEnv
 
 N = 4
 
 
 @pytest.fixture(scope="module")
 def task() -> Iterator[TaskEnv]:
-    task = TaskEnv(make_env(PickCubeEnv, EnvOptions(num_envs=N, backend="cpu", render=False)), 50)
+    task = TaskEnv(batched("PickCube-v1", N), 50)
     yield task
     task.close()
 

@@ -10,17 +10,14 @@ import pytest
 import torch
 from mani_skill.utils import common
 
-from workbench.authoring import registry
+from tests.drive.envs import batched
 from workbench.core.state_columns import read_state_columns
 from workbench.core.state_names import observation_of, states_of
-from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+from workbench.core.task_env import TaskEnv
 
 
 def made(env_id: str, num_envs: int = 3, **kwargs: Any) -> TaskEnv:
-    spec = registry.environment(env_id)
-    assert spec is not None
-    options = EnvOptions(num_envs=num_envs, backend="cpu", render=False, kwargs=kwargs)
-    task = TaskEnv(make_env(spec.cls, options, default_kwargs=dict(spec.default_kwargs)))
+    task = TaskEnv(batched(env_id, num_envs, **kwargs))
     task.reset(seed=0)
     task.step(None)
     return task

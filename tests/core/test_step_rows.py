@@ -11,6 +11,7 @@ import torch
 from mani_skill.utils.structs.pose import Pose
 
 import workbench
+from tests.drive.envs import CPU
 from tests.session.odd_entries import write_task
 from workbench.core import actions, seams
 from workbench.core.open_env import open_env
@@ -20,8 +21,6 @@ from workbench.core.step_rows import ELAPSED, StepRows
 from workbench.core.task_env import TaskEnv
 from workbench.recording.step_ring import StepRing, Steps
 from workbench.session.episodes import batch_columns
-
-OPTIONS: Any = {"backend": "cpu", "render_backend": "none"}
 
 
 @pytest.mark.parametrize(
@@ -37,7 +36,7 @@ def test_steps_told_later_are_those_that_were_read(
     task: str, options: dict[str, Any], tmp_path: Path
 ) -> None:
     odd = task == "odd_entries"
-    env = workbench.make(write_task(tmp_path) if odd else task, 3, **OPTIONS, **options)
+    env = workbench.make(write_task(tmp_path) if odd else task, 3, **CPU, **options)
     env.reset(seed=1)
     held = TaskEnv(open_env(env))
     rows = StepRows(held)

@@ -23,6 +23,7 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.articulation import Articulation
 from mani_skill.utils.structs.pose import Pose
 
+from tests.drive.envs import PICK_CUBE, batched
 from workbench.core.strict import BrokenRule, RuleWarning, WrongReturn
 from workbench.core.strict_system import StrictCpuSystem
 from workbench.core.struct_access import STATE_PROPERTIES, TARGET_SETTERS
@@ -31,13 +32,11 @@ from workbench.core.task_env import EnvOptions, make_env
 pytestmark = pytest.mark.thorough
 
 N = 3
-PICK_CUBE: Any = REGISTERED_ENVS["PickCube-v1"].cls
 Hook = Callable[..., Any]
 
 
 def build(task: type, rules: Any = "stop", num_envs: int = N, **kwargs: Any) -> BaseEnv:
-    options = EnvOptions(num_envs, "cpu", render=False, rules=rules, kwargs={"obs_mode": "state", **kwargs})
-    return make_env(task, options)
+    return batched(task, num_envs, rules=rules, **kwargs)
 
 
 def pick_cube(**hooks: Hook) -> type:
@@ -638,12 +637,7 @@ def test_warn_tells_once_with_the_place_and_goes_on() -> None:
     ],
 )
 def test_built_in_tasks_that_keep_the_rules_hear_nothing(env_id: str) -> None:
-    spec = REGISTERED_ENVS[env_id]
-    env = make_env(
-        spec.cls,
-        EnvOptions(N, "cpu", render=False, rules="stop", kwargs={"obs_mode": "state"}),
-        default_kwargs=spec.default_kwargs,
-    )
+    env = batched(env_id, N, rules="stop", obs_mode="state")
     env.reset(seed=[0, 1, 2])
     for _ in range(5):
         env.step(env.action_space.sample())

@@ -13,15 +13,14 @@ import mani_skill.envs  # noqa: F401  registers the ids
 import numpy as np
 import pytest
 import torch
-from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
+from tests.drive.envs import PUSH_CUBE, batched
 from workbench.core.snapshot import restore_snapshot, take_snapshot
-from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+from workbench.core.task_env import TaskEnv
 from workbench.core.task_members import base_env_members
 
 N = 4
-PUSH_CUBE: Any = REGISTERED_ENVS["PushCube-v1"].cls
 
 
 @dataclass
@@ -114,13 +113,9 @@ class Remembers(PUSH_CUBE):
         return {name: value.clone() for name, value in self.buffers().items()}
 
 
-def made(task: Any = Remembers) -> Any:
-    return make_env(task, EnvOptions(N, "cpu", render=False, kwargs={"obs_mode": "state"}))
-
-
 @pytest.fixture(scope="module")
 def env() -> Iterator[Any]:
-    env = made()
+    env = batched(Remembers, N)
     yield env
     env.close()
 
@@ -163,7 +158,7 @@ def test_what_describes_the_scene_stays_with_its_env(env: Any) -> None:
 
 
 def test_what_was_not_written_yet_goes_back_to_how_it_was_built() -> None:
-    env = made()
+    env = batched(Remembers, N)
     env.reset(seed=[0, 1, 2, 3])
     snapshot = take_snapshot(env)
     env.filled_later += 7
@@ -240,7 +235,7 @@ class Edited(Remembers):
 def test_an_edited_task_keeps_its_constants_and_gets_the_buffers_that_fit(env: Any) -> None:
     env.write(1.0)
     snapshot = take_snapshot(env)
-    edited = made(Edited)
+    edited = batched(Edited, N)
     edited.best_distance[:] = 0
     report = restore_snapshot(edited, snapshot)
     assert edited.threshold == 0.05 and edited.weight == 2.0

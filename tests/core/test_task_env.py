@@ -8,7 +8,6 @@ import random
 from collections.abc import Iterator
 from typing import Any, get_args
 
-import gymnasium as gym
 import mani_skill.envs  # noqa: F401  registers the ids
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 from tests.core.single_env_judge import Bare
+from tests.drive.envs import PUSH_CUBE, batched, stock
 from workbench.core import actions, backends
 from workbench.core.assets import MissingAssets
 from workbench.core.backends import BackendUnavailable, choose_backend, why_no_gpu_simulation
@@ -28,9 +28,7 @@ N = 4
 
 
 def opened(env_id: str, num_envs: int = N, **kwargs: object) -> TaskEnv:
-    spec = REGISTERED_ENVS[env_id]
-    options = EnvOptions(num_envs, "cpu", render=False, kwargs=kwargs)
-    return TaskEnv(make_env(spec.cls, options), spec.max_episode_steps)
+    return TaskEnv(batched(env_id, num_envs, **kwargs), REGISTERED_ENVS[env_id].max_episode_steps)
 
 
 @pytest.fixture(scope="module")
@@ -70,11 +68,11 @@ def test_the_time_limit_truncates(push: TaskEnv) -> None:
 def test_a_seed_for_one_env_starts_the_episode_of_a_stock_single_env(push: TaskEnv) -> None:
     push.reset(seed=0)
     push.reset(seed=123, env_idx=[2])
-    stock = gym.make("PushCube-v1", num_envs=1, obs_mode="state", render_backend="none").unwrapped
-    stock.reset(seed=123)
-    assert torch.equal(push.env.obj.pose.p[2], stock.obj.pose.p[0])
+    single = stock("PushCube-v1")
+    single.reset(seed=123)
+    assert torch.equal(push.env.obj.pose.p[2], single.obj.pose.p[0])
     assert push.episode_seeds.tolist() == [0, 1, 123, 3]
-    stock.close()
+    single.close()
 
 
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -104,15 +102,15 @@ def test_in_whichever_order_envs_are_named_each_starts_from_its_own_seed(push: T
     named = push.reset(seed=[40, 41], env_idx=[2, 0])
     assert push.episode_seeds.tolist() == [41, 1, 40, 3]
     assert np.array_equal(named.poses, ascending.poses, equal_nan=True)
-    stock = gym.make("PushCube-v1", num_envs=1, obs_mode="state", render_backend="none").unwrapped
-    stock.reset(seed=41)
-    assert torch.equal(push.env.obj.pose.p[0], stock.obj.pose.p[0])
+    single = stock("PushCube-v1")
+    single.reset(seed=41)
+    assert torch.equal(push.env.obj.pose.p[0], single.obj.pose.p[0])
     # Its first joints come from numpy's generator, of which ManiSkill keeps one for the whole batch.
-    assert torch.equal(push.env.agent.robot.qpos[0], stock.agent.robot.qpos[0])
-    stock.close()
+    assert torch.equal(push.env.agent.robot.qpos[0], single.agent.robot.qpos[0])
+    single.close()
 
 
-class DrawsWhenAsked(REGISTERED_ENVS["PushCube-v1"].cls):
+class DrawsWhenAsked(PUSH_CUBE):
     """Every look at it draws from all generators and counts."""
 
     looks = 0
@@ -125,7 +123,7 @@ class DrawsWhenAsked(REGISTERED_ENVS["PushCube-v1"].cls):
 
 
 def test_judging_the_present_moment_leaves_nothing_behind() -> None:
-    env = TaskEnv(make_env(DrawsWhenAsked, EnvOptions(3, "cpu", render=False)), 50)
+    env = TaskEnv(batched(DrawsWhenAsked, 3), 50)
     env.reset(seed=0)
     env.step(np.zeros((3, 8), np.float32))
     first, again = env.judge(), env.judge(np.zeros((3, 8), np.float32))
@@ -137,7 +135,7 @@ def test_judging_the_present_moment_leaves_nothing_behind() -> None:
     env.close()
 
 
-class TellsOfEach(REGISTERED_ENVS["PushCube-v1"].cls):
+class TellsOfEach(PUSH_CUBE):
     """Env 1 succeeds and env 2 fails from the start; of env 0 one part of the observation is lost."""
 
     def evaluate(self) -> dict:
@@ -152,8 +150,7 @@ class TellsOfEach(REGISTERED_ENVS["PushCube-v1"].cls):
 
 @pytest.mark.parametrize("obs_mode", ["state", "state_dict"])
 def test_what_a_task_says_of_each_env_is_told_of_that_env(obs_mode: str) -> None:
-    options = EnvOptions(4, "cpu", render=False, kwargs={"obs_mode": obs_mode})
-    env = TaskEnv(make_env(TellsOfEach, options), 50)
+    env = TaskEnv(batched(TellsOfEach, 4, obs_mode=obs_mode), 50)
     for step in (env.reset(seed=0), env.step(np.zeros((4, 8), np.float32)), env.judge()):
         assert step.terminated.tolist() == [False, True, True, False]
         assert step.sound_obs is not None and step.sound_obs.tolist() == [False, True, True, True]
@@ -170,8 +167,7 @@ class TellsOfTheRoom(TellsOfEach):
 
 
 def test_what_is_no_batch_of_floats_is_sound() -> None:
-    options = EnvOptions(4, "cpu", render=False, rules="off", kwargs={"obs_mode": "state_dict"})
-    env = TaskEnv(make_env(TellsOfTheRoom, options), 50)
+    env = TaskEnv(batched(TellsOfTheRoom, 4, rules="off", obs_mode="state_dict"), 50)
     step = env.reset(seed=0)
     assert step.sound_obs is not None and step.sound_obs.tolist() == [False, True, True, True]
     env.close()
@@ -220,15 +216,13 @@ def test_a_seed_is_kept_to_where_resets_without_one_draw_their_own() -> None:
     env.reset(seed=0)
     env.reset(seed=[40, 41], env_idx=[2, 1])
     assert env.episode_seeds.tolist() == [0, 41, 40]
-    stock = gym.make(
-        "PushCube-v1", num_envs=1, obs_mode="state", render_backend="none", enhanced_determinism=True
-    ).unwrapped
-    stock.reset(seed=41)
-    assert torch.equal(env.env.obj.pose.p[1], stock.obj.pose.p[0])
+    single = stock("PushCube-v1", enhanced_determinism=True)
+    single.reset(seed=41)
+    assert torch.equal(env.env.obj.pose.p[1], single.obj.pose.p[0])
     before = env.episode_seeds.tolist()
     env.reset(env_idx=[2])
     assert env.episode_seeds[:2].tolist() == before[:2] and env.episode_seeds[2] != before[2]
-    stock.close()
+    single.close()
     env.close()
 
 
@@ -315,7 +309,7 @@ def test_the_reward_is_the_richest_that_the_class_implements() -> None:
 
     assert default_reward_mode(NoReward) == "sparse"
     assert default_reward_mode(DenseOnly) == "dense"
-    assert default_reward_mode(REGISTERED_ENVS["PushCube-v1"].cls) == "normalized_dense"
+    assert default_reward_mode(PUSH_CUBE) == "normalized_dense"
 
 
 def test_a_task_whose_robot_is_not_downloaded_says_so() -> None:

@@ -11,11 +11,10 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mani_skill.utils.registration import REGISTERED_ENVS
 from mani_skill.utils.structs.pose import Pose
 
+from tests.drive.envs import batched
 from workbench.core.task_buffers import note_scene
-from workbench.core.task_env import EnvOptions, make_env
 from workbench.core.task_members import forget_look, look_over
 
 
@@ -29,8 +28,7 @@ Notes.__module__ = "mani_skill.envs.tasks.tabletop.push_cube"  # as if the task'
 
 @pytest.fixture(scope="module")
 def env() -> Iterator[Any]:
-    task: Any = REGISTERED_ENVS["PushCube-v1"].cls
-    made = make_env(task, EnvOptions(2, "cpu", render=False, kwargs={"obs_mode": "state"}))
+    made = batched("PushCube-v1")
     made.reset(seed=0)
     yield made
     made.close()

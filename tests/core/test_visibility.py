@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 import sapien
 import torch
-from mani_skill.utils.registration import REGISTERED_ENVS
 from numpy.testing import assert_allclose, assert_array_equal
 
+from tests.drive.envs import batched
 from workbench.core.body_table import build_body_table, read_poses
 from workbench.core.camera_frames import LookAt, compose, pose_from_look_at, relative_to, with_pose
 from workbench.core.camera_report import CameraReport, ObjectSeen, join_reports
 from workbench.core.camera_settings import CameraSettings
 from workbench.core.take_pictures import cameras_of, list_cameras, segmentation_names, take_pictures
-from workbench.core.task_env import EnvOptions, make_env
 from workbench.core.visibility import (
     Placement,
     judge_camera,
@@ -38,8 +37,7 @@ FAR_FLOOR = LookAt((-1.5, 0.0, 0.5), (0.0, 0.0, 0.3))
 
 
 def built(task: str, **kwargs: Any) -> Any:
-    options = EnvOptions(num_envs=N, backend="cpu", kwargs={"obs_mode": "rgb+depth+segmentation", **kwargs})
-    env = make_env(REGISTERED_ENVS[task].cls, options)
+    env = batched(task, N, render=True, **{"obs_mode": "rgb+depth+segmentation", **kwargs})
     env.reset(seed=3)
     shape: Any = env.action_space.shape
     env.step(torch.zeros(shape))

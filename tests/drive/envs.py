@@ -10,7 +10,8 @@ import mani_skill.envs  # noqa: F401  registers the ids
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.registration import REGISTERED_ENVS
 
-from workbench.core.rules import Degree, Finding, warn_of
+from workbench.core.broken_rule import warn_of
+from workbench.core.rules import Degree, Finding
 from workbench.core.task_env import EnvOptions, make_env
 
 CPU: Any = {"backend": "cpu", "render_backend": "none"}
