@@ -8,7 +8,6 @@ import re
 import shutil
 import sys
 import tempfile
-import time
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,6 +19,8 @@ os.environ["XDG_CONFIG_HOME"] = tempfile.mkdtemp(prefix="workbench-test-config-"
 
 import psutil
 import pytest
+
+from tests.drive.waiting import until
 
 # Until the tests begin: what they import is no garbage, and neither are they. It takes a third of the time to collect them.
 gc.disable()
@@ -101,10 +102,7 @@ def no_process_left_behind() -> Iterator[None]:
     if "workbench.recording.reading" in sys.modules:
         # It serves the whole process, for as long as that lives.
         sys.modules["workbench.recording.reading"].stop_reading()
-    deadline = time.monotonic() + 10
-    while (left := _children()) and time.monotonic() < deadline:
-        time.sleep(0.2)
-    assert not left, f"tests left processes behind: {left}"
+    until(lambda: not _children(), "the end of all processes that tests started", 10, seen=_children)
 
 
 def _children() -> list[str]:

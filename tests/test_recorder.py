@@ -127,7 +127,7 @@ def test_a_killed_program_loses_a_second(child_process: None, tmp_path: Path) ->
     """Its steps wait in memory to be taken apart together, and a second is for all that waits anywhere."""
     child = subprocess.Popen([sys.executable, "-c", CHILD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
     assert child.stdout is not None and child.stdout.readline() == "begun\n"
-    time.sleep(random.uniform(1.2, 3.0))
+    time.sleep(random.uniform(1.2, 3.0))  # at any moment, when there are steps older than a second
     child.send_signal(signal.SIGKILL)
     killed = time.time()
     made = [line.split() for line in child.stdout.read().splitlines(keepends=True) if line.endswith("\n")]

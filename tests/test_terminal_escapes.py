@@ -14,7 +14,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
@@ -31,6 +30,7 @@ from rich.table import Table
 from rich.text import Text
 
 from tests.drive.episodes import made, write
+from tests.drive.waiting import until
 from tests.ui.tabs import handshake
 from workbench import terminal
 from workbench.authoring.problem import Problem
@@ -88,11 +88,7 @@ class Terminal:
         return self._got.decode(errors="replace").replace("\r\n", "\n")
 
     def wait_for(self, pattern: str, seconds: float = 90.0) -> re.Match[str]:
-        deadline = time.monotonic() + seconds
-        while (found := re.search(pattern, self.text)) is None:
-            assert time.monotonic() < deadline, f"no {pattern!r} in {self.text}"
-            time.sleep(0.05)
-        return found
+        return until(lambda: re.search(pattern, self.text), f"{pattern!r}", seconds, seen=lambda: self.text)
 
     def close(self) -> None:
         self.process.send_signal(signal.SIGINT)

@@ -15,14 +15,14 @@ import signal
 import subprocess
 import sys
 import sysconfig
-import time
 import urllib.request
-from collections.abc import Callable
 from pathlib import Path
 from zipfile import ZipFile
 
 import psutil
 import pytest
+
+from tests.drive.waiting import until
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -91,13 +91,13 @@ def test_a_file_elsewhere_opens_is_served_and_ends_with_ctrl_c(installed: Path, 
             assert process.poll() is None, f"ended with {process.returncode}:\n{log.read_text()}"
             return re.search(pattern, log.read_text())
 
-        address = _wait_for(lambda: printed(r"http://\S+"), 60, log)[0]
+        address = until(lambda: printed(r"http://\S+"), "the address", 60, seen=log.read_text)[0]
         # The token of the first address becomes a cookie, so the client must keep cookies as a browser does.
         client = urllib.request.build_opener(urllib.request.HTTPCookieProcessor(http.cookiejar.CookieJar()))
         with client.open(address, timeout=20) as answer:
             assert answer.status == 200
             assert b"<html" in answer.read().lower()
-        _wait_for(lambda: printed(r"loaded "), 120, log)
+        until(lambda: printed(r"loaded "), "the task", 120, seen=log.read_text)
         family += family[0].children(recursive=True)
         process.send_signal(signal.SIGINT)
         process.wait(timeout=10)
@@ -121,13 +121,3 @@ def _run(command: list[str], folder: Path) -> str:
 
 def _clean_environment() -> dict[str, str]:
     return {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-
-
-def _wait_for(look: Callable[[], re.Match[str] | None], seconds: float, log: Path) -> re.Match[str]:
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        found = look()
-        if found is not None:
-            return found
-        time.sleep(0.1)
-    pytest.fail(f"not printed within {seconds:.0f} s:\n{log.read_text()}")

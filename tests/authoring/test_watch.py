@@ -87,7 +87,7 @@ def backup_and_create(path: Path, text: str) -> None:
 
 def delete_and_create(path: Path, text: str) -> None:
     path.unlink()
-    time.sleep(0.05)
+    time.sleep(0.05)  # an editor takes its time, and the file is seen to be gone
     path.write_text(text)
 
 
@@ -106,7 +106,7 @@ def test_a_burst_of_saves_is_few_calls_and_the_last_content_wins(
 ) -> None:
     for number in range(1, 11):
         file.write_text(f"a = {number}\n")
-        time.sleep(0.005)
+        time.sleep(0.005)  # as a burst comes
     assert calls.until({"task.py": "a = 10\n"}) <= 3
     assert calls.nothing_before(last)
 
@@ -140,7 +140,7 @@ def test_a_file_that_stays_away_is_told_once_and_so_is_its_return(
 def test_a_save_that_truncates_first_is_not_seen_empty(file: Path, last: Path, calls: Calls) -> None:
     with open(file, "w") as opened:
         opened.flush()
-        time.sleep(0.12)
+        time.sleep(0.12)  # so that it is seen empty
         opened.write("a = 1\n")
     assert calls.next() == {"task.py": "a = 1\n"}
     assert calls.nothing_before(last)

@@ -60,7 +60,7 @@ def test_the_curve_is_drawn_through_nan_another_env_and_a_rebuild(
         def draw(curves: Curves, env: int = 0) -> None:
             clock.passes()
             panel.draw(running(ENVS, curves=curves, selected_env=env))
-            page.wait_for_timeout(1000 * REDRAW_EVERY / 4)
+            page.wait_for_timeout(1000 * REDRAW_EVERY / 4)  # as fast as steps come while it plays
 
         for last in range(40, 200, 20):
             draw(past(0, last))

@@ -78,7 +78,7 @@ def test_play_runs_and_pause_stops(calm: Desk) -> None:
     expect(calm.page.get_by_text("paused", exact=True)).to_be_visible()
     calm.tab("Reward")
     stopped = calm.elapsed()
-    time.sleep(1.0)
+    time.sleep(1.0)  # in which it would have gone on
     assert calm.elapsed() == stopped
 
 

@@ -210,7 +210,6 @@ def test_from_the_live_page_to_the_recordings_and_back(folder: Path, browser: Br
         def steps() -> bool:
             # Keys come with the last part of the page.
             page.keyboard.press("s")
-            page.wait_for_timeout(500)
             return page.locator(".wb-status").get_by_text(re.compile(r"step [1-9]")).count() > 0
 
         until(steps, "a step")

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 import pytest
 from playwright.sync_api import Browser, Page
 
+from tests.drive.waiting import until
 from workbench.ui.door import Door, DoorOptions, open_door
 
 pytestmark = pytest.mark.browser
@@ -58,11 +59,13 @@ def show(door: Door, browser: Browser) -> Iterator[Show]:
 
 def draw_until(door: Door, page: Page, reached: str) -> None:
     """Something moves in the view until this is true in the page."""
-    node, deadline = door.server.scene.add_frame("/moved"), time.monotonic() + 60
-    while not page.evaluate(reached):
-        assert time.monotonic() < deadline, f"{reached} did not come"
+    node = door.server.scene.add_frame("/moved")
+
+    def seen() -> bool:
         node.position = (time.monotonic() % 1, 0, 0)
-        page.wait_for_timeout(50)
+        return page.evaluate(reached)
+
+    until(seen, reached)
 
 
 def width(page: Page) -> int:

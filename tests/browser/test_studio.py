@@ -234,18 +234,19 @@ def test_turned_with_the_mouse(page: Page) -> None:
 
 
 def test_a_lens_typed_as_a_matrix_is_written_as_one(page: Page, task_file: Path) -> None:
-    text = task_file.read_text()
+    text, before = task_file.read_text(), picture(page)
     page.get_by_text("Lens and picture", exact=True).click()
     option(page, "Lens as", "intrinsic matrix")
     expect(page.locator(field(page, "fx, fy"))).to_be_visible()
     page.locator(field(page, "fx, fy")).fill("150")
     page.keyboard.press("Enter")
     until(lambda: numbers(page, "fx, fy")[0] == 150, "the focal length")
+    until(lambda: picture(page) not in ("", before), "the picture with it")
+    before = picture(page)
     page.locator(field(page, "cx, cy", 2)).fill("70")
     page.evaluate("document.activeElement.blur()")
-    page.wait_for_timeout(
-        500
-    )  # viser's page sends one message in 50 ms, the last: the number, before the press
+    # The page sends one message in 50 ms, the last: the number goes before the press.
+    until(lambda: picture(page) not in ("", before), "the picture with another centre")
     button(page, "Show the change")
     expect(page.locator(".wb-diff-add").filter(has_text="intrinsic=")).to_contain_text("[150")
     button(page, f"Write it to {FILE}")

@@ -13,6 +13,7 @@ from playwright.sync_api import Browser, expect
 from tests.drive.desk import Desk
 from tests.drive.page import page_on
 from tests.drive.waiting import until
+from workbench.ui.timeline_panel import RANGE_EVERY
 
 pytestmark = pytest.mark.browser
 STEPS = 8
@@ -39,9 +40,8 @@ def desk(opened: Desk) -> Desk:
         opened.press("s")
         opened.comes_to(step)
     opened.timeline_says("live")
-    time.sleep(
-        0.5
-    )  # The slider's range follows a moment later, and would go over a hand that is there already.
+    # The slider's range follows a moment later, and would go over a hand that is there already.
+    time.sleep(RANGE_EVERY)
     return opened
 
 
@@ -73,10 +73,10 @@ def test_the_slider_goes_where_it_is_clicked_and_takes_an_arrow_once(desk: Desk)
     # By its own click, which waits until the panel, whose height has changed, stands still.
     desk.page.locator(SLIDER).last.click()
     desk.comes_to(STEPS // 2)
-    time.sleep(1.5)  # A slider that was touched just now is taken to have had the key itself.
+    time.sleep(1.5)  # a slider that was touched just now is taken to have had the key itself
     desk.page.keyboard.press("ArrowLeft")
     desk.comes_to(STEPS // 2 - 1)
-    time.sleep(1.5)
+    time.sleep(1.5)  # the second step, of a slider that takes the key as well, would come by now
     assert desk.elapsed() == STEPS // 2 - 1
     desk.page.get_by_role("button", name="zoom out").click()
 
@@ -138,10 +138,9 @@ def test_a_number_is_taken_when_it_has_been_typed_and_else_what_holds_is_shown_a
         page.keyboard.press("Tab" if typed == "abc" else "Enter")
         expect(said).to_have_text(says)
         expect(seed).to_have_value("0")
-    # Longer than a seed waits until it is sent: every env would have been reset.
     seed.press("Control+a")
     page.keyboard.type("12")
-    time.sleep(1.0)
+    time.sleep(1.0)  # longer than a seed waits until it is sent: every env would have been reset
     expect(seed).to_have_value("12")
     desk.timeline_says(f"step {STEPS} /")
     page.keyboard.press("Escape")

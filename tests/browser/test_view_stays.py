@@ -30,7 +30,9 @@ def test_keys_do_what_they_say_and_the_view_stays(browser: Browser) -> None:
             before = client.camera.position.copy()
             for key in ("s", "ArrowLeft", "w", "e", "ArrowUp"):
                 page.keyboard.down(key)
-                page.wait_for_timeout(300)  # some frames: viser moves its view as long as the key is down
+                page.wait_for_timeout(
+                    300
+                )  # the time is what is tested: viser moves its view as long as a key is down
                 page.keyboard.up(key)
             until(lambda: stepped.is_set() and walked.is_set(), "the commands")
             # What the view tells of itself comes in order: behind a drag, it has told of all before.

@@ -7,19 +7,19 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from tests.drive.session import wait_until
+from tests.drive.session import live_session, wait_until
 from tests.golden.make import GOLDEN, expected_of, read_folder
 from workbench.cli import main
 from workbench.exit_codes import Exit
 from workbench.recording.library import Library
 from workbench.recording.read_episode import UnreadableRecording, read_episode
-from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
 from workbench.session.step_back import run_of
 
@@ -189,20 +189,18 @@ def test_an_unfinished_one_is_mended_by_the_next_that_records_there(
 
 @pytest.fixture(scope="module")
 def live(place: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
-    session = opened(place.parent / "tasks" / "push" / "push.py", tmp_path_factory)
-    yield session
-    session.close()
+    with opened(place.parent / "tasks" / "push" / "push.py", tmp_path_factory) as session:
+        yield session
 
 
-def opened(task: Path, tmp_path_factory: pytest.TempPathFactory) -> Session:
-    options = TaskOptions(num_envs=2, env_kwargs={"render_backend": "none"})
-    session = Session(str(task), options, recordings=tmp_path_factory.mktemp("recordings"))
-    wait_until(session, lambda view: view.timeline.moments == 1, "the first moment")
-    session.select_env(1)
-    session.set_action_source("sliders")
-    # The recorded episodes end with success: what is seen after their last step would at times be the next episode.
-    session.set_episode_end("continue")
-    return session
+@contextmanager
+def opened(task: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+    with live_session(task, tmp_path_factory.mktemp("recordings")) as session:
+        session.select_env(1)
+        session.set_action_source("sliders")
+        # The recorded episodes end with success: what is seen after their last step would at times be the next episode.
+        session.set_episode_end("continue")
+        yield session
 
 
 def goes_on_as_recorded(session: Session, path: Path, state: int) -> None:
@@ -240,8 +238,5 @@ def test_one_goes_on_live_in_a_task_of_several_modules(
     place: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     (path,) = (place / "several").glob("*.json")
-    session = opened(place.parent / "tasks" / "several" / "task.py", tmp_path_factory)
-    try:
+    with opened(place.parent / "tasks" / "several" / "task.py", tmp_path_factory) as session:
         goes_on_as_recorded(session, path, 4)
-    finally:
-        session.close()

@@ -1,7 +1,6 @@
 import os
 import socket
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -72,6 +71,7 @@ def test_what_is_no_file_is_refused_at_once(
         open_regular_file(path)
 
 
+@pytest.mark.timeout(60)  # a read that waits does so for ever
 def test_a_file_that_becomes_a_pipe_meanwhile_is_not_waited_for(tmp_path: Path) -> None:
     path, stop = tmp_path / "task.py", threading.Event()
 
@@ -85,14 +85,13 @@ def test_a_file_that_becomes_a_pipe_meanwhile_is_not_waited_for(tmp_path: Path) 
     path.write_bytes(b"x")
     thread = threading.Thread(target=exchange)
     thread.start()
-    refused, deadline = 0, time.monotonic() + 10.0
+    refused = 0
     try:
         for _ in range(2000):
             try:
                 assert read_regular_file(path, 10) == b"x"
             except NotARegularFile:
                 refused += 1
-            assert time.monotonic() < deadline
     finally:
         stop.set()
         thread.join()

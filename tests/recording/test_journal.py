@@ -6,13 +6,13 @@ import errno
 import os
 import shutil
 import threading
-import time
 from collections.abc import Iterator
 from concurrent.futures import Future
 from pathlib import Path
 
 import pytest
 
+from tests.drive.waiting import until
 from tests.recording.refused_calls import descriptors, refused
 from workbench.recording import journal as journals
 from workbench.recording.journal import Entry, Journal, claim, read_journal
@@ -326,10 +326,11 @@ def test_threads_write_all_journals_and_end_with_the_last(
     assert thread.daemon, "the end of a process does not wait for it"
     for journal in three:
         journal.put("row", 0, b"x")
-    deadline = time.monotonic() + 10
-    while any(rows(journal.path) != [b"x"] or str(journal.path) not in lasting for journal in three):
-        assert thread.is_alive() and time.monotonic() < deadline
-        time.sleep(0.01)
+    until(
+        lambda: all(rows(journal.path) == [b"x"] and str(journal.path) in lasting for journal in three),
+        "every row on the disk",
+        seen=thread.is_alive,
+    )
     for journal in three:
         journal.close()
     thread.join(20)

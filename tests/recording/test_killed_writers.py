@@ -56,7 +56,7 @@ for episode in range(10**6):
         # What the parent holds it to: this row was appended then.
         sys.stdout.write(f"{episode} {k} {time.time()}\\n")
         sys.stdout.flush()
-        time.sleep(0.002)
+        time.sleep(0.002)  # so much as a step takes
     writer.finish()
     sys.stdout.write(f"{episode} finished\\n")
     sys.stdout.flush()
@@ -76,7 +76,7 @@ def test_a_killed_writer_loses_a_second_of_one_episode(tmp_path: Path, steps: in
             [sys.executable, "-c", CHILD, str(folder), str(steps)], stdout=subprocess.PIPE, text=True
         )
         assert child.stdout is not None and child.stdout.readline() == "begun\n"
-        time.sleep(chance.uniform(0.6, 2.0))
+        time.sleep(chance.uniform(0.6, 2.0))  # at any moment
         child.send_signal(signal.SIGKILL)
         killed = time.time()
         lines = [line.split() for line in child.stdout.read().splitlines() if line]

@@ -8,7 +8,6 @@ import sqlite3
 import subprocess
 import sys
 import tempfile
-import threading
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 from PIL import Image
 
 from tests.drive.episodes import Made
+from tests.drive.waiting import until
 from tests.recording.library_files import describe, jpeg
 from workbench.recording.library import Library, LibraryError
 from workbench.recording.library_index import LibraryIndex, index_path
@@ -386,14 +386,11 @@ def test_the_table_follows_the_folder_by_itself(tmp_path: Path) -> None:
     library.watch()
 
     def wait_for(names: list[str], problem: bool) -> None:
-        done = threading.Event()
-        threading.Timer(30, done.set).start()
-        while not done.is_set():
+        def shown() -> bool:
             view = library.view()
-            if [row.name for row in view.rows] == names and (view.problem is not None) == problem:
-                return
-            library.wait(view.serial, 1.0)
-        raise AssertionError(library.view())
+            return [row.name for row in view.rows] == names and (view.problem is not None) == problem
+
+        until(shown, str(names), seen=library.view)
 
     try:
         wait_for([], problem=True)

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ import numpy as np
 import psutil
 import pytest
 
+from tests.drive.waiting import until
 from tests.recording.foreign_h5 import write as write_h5
 from tests.recording.library_files import describe
 from workbench.machine.child_python import child_environment, python_command
@@ -156,8 +156,7 @@ def test_pictures_go_on_where_the_reader_was_ended_and_where_the_file_is_gone(
     before = camera.rgb[0]
     reader = psutil.Process(reader_of(tmp_path, episodes=True))
     reader.kill()
-    while reader.is_running() and reader.status() != psutil.STATUS_ZOMBIE:
-        time.sleep(0.01)
+    until(lambda: not reader.is_running() or reader.status() == psutil.STATUS_ZOMBIE, "its end")
     np.testing.assert_array_equal(camera.rgb[0], before)
     for file in tmp_path.iterdir():
         if file.is_file():

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.drive.session import wait_until
-from workbench.session.messages import CameraRequest, TaskOptions
-from workbench.session.session import Session
+from tests.drive.session import live_session, wait_until
+from workbench.session.messages import CameraRequest
 from workbench.session.view import SessionView
 
 pytestmark = pytest.mark.usefixtures("child_process")
@@ -37,13 +36,8 @@ CAMERA = ("sensor", "base_camera")
 def test_the_pages_pictures_lack_a_cube_that_evaluate_hides(tmp_path: Path) -> None:
     file = tmp_path / "task.py"
     file.write_text(TASK)
-    session = Session(
-        str(file),
-        TaskOptions(num_envs=2, env_kwargs={"render_backend": "cpu"}),
-        recordings=tmp_path / "recordings",
-    )
-    try:
-        view = wait_until(session, lambda view: view.task is not None, "the first load")
+    with live_session(file, tmp_path / "recordings", draw=True, render_backend="cpu") as session:
+        view = session.view()
         assert view.task is not None
         (cube,) = (number for number, name in view.task.segmentation.items() if name == "cube")
         column = view.task.geometry.body_names.index("cube")
@@ -77,5 +71,3 @@ def test_the_pages_pictures_lack_a_cube_that_evaluate_hides(tmp_path: Path) -> N
         session.past.go_on("all")
         view = wait_until(session, lambda v: v.timeline.last > last and drawn(v, 1), "a picture of now")
         assert view.timeline.shown is None and not shows_cube(view)
-    finally:
-        session.close()

@@ -7,7 +7,6 @@ import random
 import socket
 import struct
 import threading
-import time
 from collections.abc import Iterator
 from multiprocessing.connection import Connection
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.drive.waiting import until
 from workbench.session.message_reader import MOST_BYTES, MessageReader, Unreadable, message_from
 from workbench.session.messages import Event, Loading, Status
 
@@ -65,10 +65,13 @@ def test_messages_come_as_a_connection_sends_them_whatever_their_size(line: Line
     thread = threading.Thread(target=lambda: [sender.send(event) for event in sent])
     thread.start()
     got = []
-    deadline = time.monotonic() + 20
-    while len(got) < len(sent) and time.monotonic() < deadline:
+
+    def all_came() -> bool:
         event = line.reader.receive(0.05)
-        got += [] if event is None else [event]
+        got.extend([] if event is None else [event])
+        return len(got) == len(sent)
+
+    until(all_came, "all messages", seen=lambda: len(got))
     thread.join()
     assert got == sent
     sender.close()

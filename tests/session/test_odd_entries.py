@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 
 import workbench
-from tests.drive.session import wait_until
+from tests.drive.session import live_session, wait_until
 from tests.recording.verify_rrd import verify_rrd
 from tests.session.odd_entries import TEXT, write_task
 from tests.session.recorded_runs import opened
 from workbench.core.step import OtherEntry, StepResult
 from workbench.recording.episode import Episode
 from workbench.recording.read_episode import read_episode
-from workbench.session.messages import TaskOptions
 from workbench.session.relive import arrive
 from workbench.session.rescore_all import RescoreOptions, rescore_all
 from workbench.session.review_events import curves
@@ -154,11 +153,8 @@ def test_a_state_is_gone_into(recordings: Path, file: Path) -> None:
 
 @pytest.fixture(scope="module")
 def session(file: Path) -> Any:
-    options = TaskOptions(2, "cpu", 0, {"render_backend": "none", "reward_mode": "dense"})
-    session = Session(str(file), options, recordings=file.parent / "of_the_page")
-    wait_until(session, lambda view: view.task is not None, "the first load")
-    yield session
-    session.close()
+    with live_session(file, file.parent / "of_the_page", reward_mode="dense") as session:
+        yield session
 
 
 def test_the_page_plays_and_records_it(session: Session, file: Path) -> None:

@@ -10,7 +10,6 @@ import pty
 import select
 import shutil
 import sys
-import time
 from html import unescape
 from pathlib import Path
 from typing import Any
@@ -271,8 +270,7 @@ def test_a_question_on_a_page_can_be_withdrawn(foreign: Path) -> None:
 
     def ask(question: Question, stopped) -> Answer:
         asking.append(question)
-        while not stopped():
-            time.sleep(0.01)
+        until(stopped, "the withdrawal")
         return Answer.NO
 
     rescorer = Rescorer(Clearances(ask=ask))

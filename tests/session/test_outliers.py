@@ -14,7 +14,6 @@ import pytest
 from tests.drive.session import TASKS, live_session, wait_until
 from workbench.session.env_table import Outcome
 from workbench.session.history import NOT_A_NUMBER
-from workbench.session.messages import TaskOptions
 from workbench.session.outliers import Kind
 from workbench.session.session import Session
 
@@ -88,14 +87,8 @@ class OneOfEachEnv(BaseEnv):
 def one_of_each(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
     folder: Path = tmp_path_factory.mktemp("author")
     (folder / "one_of_each.py").write_text(BROKEN)
-    session = Session(
-        str(folder / "one_of_each.py"), TaskOptions(num_envs=8, env_kwargs={"render_backend": "none"}),
-        recordings=folder / "kept",
-    )  # fmt: skip
-    session.set_action_source("hold")
-    try:
-        view = wait_until(session, lambda v: v.task is not None or v.problem is not None, "the load")
-        assert view.task is not None, view.problem
+    with live_session(folder / "one_of_each.py", folder / "kept", num_envs=8) as session:
+        session.set_action_source("hold")
         for count in range(1, 13):
             session.step()
             view = wait_until(
@@ -103,8 +96,6 @@ def one_of_each(child_process: None, tmp_path_factory: pytest.TempPathFactory) -
             )
             assert view.problem is None, view.problem
         yield session
-    finally:
-        session.close()
 
 
 def test_each_kind_is_found_in_the_env_that_does_it_and_nowhere_else(one_of_each: Session) -> None:

@@ -11,6 +11,7 @@ from tests.drive.scripted import Evaluate, scripted
 from tests.drive.session import wait_until
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
+from workbench.ui.door import Door, DoorOptions, open_door
 
 
 @pytest.fixture
@@ -19,6 +20,14 @@ def server() -> Iterator[viser.ViserServer]:
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     yield server
     server.stop()
+
+
+@pytest.fixture
+def door() -> Iterator[Door]:
+    """A door on a free port, with a token."""
+    door = open_door(DoorOptions(port=0))
+    yield door
+    door.close()
 
 
 @pytest.fixture

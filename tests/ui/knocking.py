@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import http.client
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import msgspec
 import pytest
@@ -14,6 +13,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
+from tests.drive.waiting import until
 from workbench.ui.door import Door
 from workbench.ui.gate import cookie_name
 from workbench.ui.viser_seam import element_id
@@ -91,7 +91,7 @@ def client(door: Door) -> Iterator[Connection]:
         close_timeout=0.2,
     ) as connection:
         say(connection, CAMERA)
-        until(lambda: set(door.server.get_clients()) - known)
+        until(lambda: set(door.server.get_clients()) - known, "the client")
         yield connection
 
 
@@ -101,14 +101,6 @@ def say(connection: Connection, message: object) -> None:
 
 def claim(handle: viser.GuiInputHandle, value: object, prop: str = "value") -> dict:
     return {"type": "GuiUpdateMessage", "uuid": element_id(handle), "updates": {prop: value}}
-
-
-def until(condition: Callable[[], object]) -> None:
-    """Wait for what another thread does; a condition that stays false fails the test."""
-    deadline = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < deadline, "it never came about"
-        time.sleep(0.01)
 
 
 def close_code(connection: Connection) -> int:

@@ -26,13 +26,6 @@ from workbench.ui.replies import SCRIPTS, STYLES, folder_handler
 from workbench.web_assets import web_assets_folder
 
 
-@pytest.fixture
-def door():
-    door = open_door(DoorOptions(port=0))
-    yield door
-    door.close()
-
-
 def token_of(door: Door) -> str:
     return door.url.partition("token=")[2]
 
@@ -422,7 +415,8 @@ def test_a_real_browser_opens_the_page_with_nothing_to_complain_of(door, browser
         assert page.evaluate("document.cookie") == ""  # and no script can read it
         (cookie,) = page.context.cookies()
         assert (cookie.get("httpOnly"), cookie.get("sameSite")) == (True, "Strict")
-        page.wait_for_timeout(3000)  # let everything load that could be blocked
+        # Nothing tells that nothing more is refused: what could be has this long to load.
+        page.wait_for_timeout(3000)
         page.reload(wait_until="domcontentloaded")  # by the cookie alone
         page.wait_for_selector("#from-html", timeout=60_000)
     assert complaints == []

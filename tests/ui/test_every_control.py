@@ -17,7 +17,8 @@ from tests.drive.episodes import made, write
 from tests.drive.panels import inputs_of
 from tests.drive.scripted import scripted
 from tests.drive.session import wait_until
-from tests.ui.knocking import claim, client, say, until
+from tests.drive.waiting import until
+from tests.ui.knocking import claim, client, say
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
 from workbench.ui import page_guard
@@ -100,7 +101,7 @@ def claim_all(served: Served, values: tuple[object, ...]) -> None:
                     say(attacker, claim(control, value))
         box = served.door.server.gui.add_checkbox("after", False)
         say(attacker, claim(box, True))
-        until(lambda: box.value)
+        until(lambda: box.value, "what was said last")
         box.remove()
     for control in served.controls():
         msgspec.msgpack.encode(control.value)

@@ -6,25 +6,18 @@ import gzip
 import os
 import socket
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
 import pytest
 
-from tests.ui.knocking import ask, cookie_of, until
-from workbench.ui.door import Door, DoorOptions, open_door
+from tests.drive.waiting import until
+from tests.ui.knocking import ask, cookie_of
+from workbench.ui.door import Door
 from workbench.ui.file_reply import BLOCK, FileReply
 
 LARGE = 48 * 2**20
 """More bytes than the kernel takes of a connection whose other end does not read."""
-
-
-@pytest.fixture(scope="module")
-def door() -> Iterator[Door]:
-    door = open_door(DoorOptions(port=0))
-    yield door
-    door.close()
 
 
 @pytest.fixture
@@ -87,7 +80,7 @@ def test_a_file_comes_whole_and_under_its_name(door: Door, file: tuple[str, Path
     assert headers["Content-Disposition"] == "attachment; filename*=UTF-8''Gr%C3%B6%C3%9Fe%201.rrd"
     assert headers["X-Content-Type-Options"] == "nosniff"
     assert "Content-Encoding" not in headers
-    until(lambda: open_files(path) == 0)
+    until(lambda: open_files(path) == 0, "the end of the reading")
 
 
 def test_of_a_file_that_grows_no_more_comes_than_was_announced(door: Door, file: tuple[str, Path]) -> None:
@@ -97,7 +90,7 @@ def test_of_a_file_that_grows_no_more_comes_than_was_announced(door: Door, file:
     raw, got = begun(door, address)
     os.truncate(path, LARGE + 10 * BLOCK)
     assert rest(raw, got) == (LARGE + 100, LARGE + 100)
-    until(lambda: open_files(path) == 0)
+    until(lambda: open_files(path) == 0, "the end of the reading")
 
 
 def test_a_file_that_shrinks_is_cut_off_and_not_filled_up(door: Door, file: tuple[str, Path]) -> None:
@@ -108,7 +101,7 @@ def test_a_file_that_shrinks_is_cut_off_and_not_filled_up(door: Door, file: tupl
     os.truncate(path, LARGE // 2)
     announced, count = rest(raw, got)
     assert announced == LARGE and count <= LARGE // 2
-    until(lambda: open_files(path) == 0)
+    until(lambda: open_files(path) == 0, "the end of the reading")
 
 
 def test_who_goes_away_in_the_middle_holds_nothing(door: Door, file: tuple[str, Path]) -> None:
@@ -118,7 +111,7 @@ def test_who_goes_away_in_the_middle_holds_nothing(door: Door, file: tuple[str, 
     raw, _ = begun(door, address)
     assert open_files(path) == 1
     raw.close()
-    until(lambda: open_files(path) == 0)
+    until(lambda: open_files(path) == 0, "the end of the reading")
     assert ask(door, "/")[0] == 200
 
 
@@ -169,4 +162,4 @@ def test_a_file_that_is_kept_packed_is_unpacked_for_who_cannot(door: Door, tmp_p
     status, headers, body = ask(door, "/packed/x", Accept_Encoding="identity")
     assert (status, headers["Vary"], body) == (200, "Accept-Encoding", plain)
     assert headers["Content-Length"] == str(len(plain)) and "Content-Encoding" not in headers
-    until(lambda: open_files(path) == 0)
+    until(lambda: open_files(path) == 0, "the end of the reading")

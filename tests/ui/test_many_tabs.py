@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import logging
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -138,7 +137,4 @@ def test_a_tab_that_comes_and_goes_leaves_nothing_behind(house: House) -> None:
         return {name: (before[name], now) for name, now in held().items() if now > before[name]}
 
     # The kernel, and a thread of viser's, may take a socket's end later than the page does.
-    deadline = time.monotonic() + 20
-    while (left := grown()) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not left
+    until(lambda: not grown(), "as few as before", 20, seen=grown)

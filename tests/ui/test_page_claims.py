@@ -17,12 +17,13 @@ from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.connection import Connection
 
-from tests.ui.knocking import CAMERA, claim, client, close_code, say, until
+from tests.drive.waiting import until
+from tests.ui.knocking import CAMERA, claim, client, close_code, say
 from tests.ui.tabs import messages_in
 from workbench.ui import page_guard
 from workbench.ui.client_messages import KINDS, MAX_BYTES
 from workbench.ui.control_values import LONGEST_LINE
-from workbench.ui.door import Door, DoorOptions, open_door
+from workbench.ui.door import Door
 from workbench.ui.viser_seam import element_id
 
 unhurried = settings(
@@ -34,13 +35,6 @@ ANYTHING = st.recursive(
     lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=4), inner, max_size=3),
     max_leaves=8,
 )
-
-
-@pytest.fixture(scope="module")
-def door() -> Iterator[Door]:
-    door = open_door(DoorOptions(port=0))
-    yield door
-    door.close()
 
 
 @pytest.fixture
@@ -64,7 +58,7 @@ def bystander(door: Door) -> Iterator[Callable[[], None]]:
             wanted = not box.value
             before = len(heard)
             say(other, claim(box, wanted))
-            until(lambda: heard[before:] == [wanted])
+            until(lambda: heard[before:] == [wanted], "what the other page changed")
 
         works()
         yield works
@@ -82,7 +76,7 @@ def caught_up(door: Door, connection: Connection) -> None:
     """Return when all that this page said before was taken or dropped."""
     box = door.server.gui.add_checkbox("after", False)
     say(connection, claim(box, True))
-    until(lambda: box.value)
+    until(lambda: box.value, "what was said last")
     box.remove()
 
 
@@ -128,12 +122,12 @@ CONTROLS: dict[str, Callable[[viser.GuiApi], viser.GuiInputHandle | viser.GuiBut
 }
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def controls(door: Door) -> dict[str, viser.GuiInputHandle]:
     return {name: make(door.server.gui) for name, make in CONTROLS.items()}  # type: ignore[misc]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def attacker(door: Door) -> Iterator[Connection]:
     with client(door) as connection:
         yield connection
@@ -193,7 +187,7 @@ def test_whatever_is_claimed_a_control_holds_what_it_can_hold(door, controls, at
 )
 def test_what_a_control_can_hold_is_taken(controls, attacker, name, claimed, held):
     say(attacker, claim(controls[name], claimed))
-    until(lambda: controls[name].value == held)
+    until(lambda: controls[name].value == held, f"{held!r}", seen=lambda: controls[name].value)
 
 
 @pytest.mark.parametrize(
@@ -226,7 +220,7 @@ def test_the_page_that_sent_it_is_told_and_shown_the_true_value(
             later = told[kinds.index("NotificationShowMessage") :]
             return any(m.get("uuid") == element_id(control) and "value" in m["updates"] for m in later)
 
-        until(shown)
+        until(shown, "the notice")
     value = control.value
     values = [m["updates"]["value"] for m in told if m.get("uuid") == element_id(control) and "updates" in m]
     assert values[-1] == (list(value) if isinstance(value, tuple) else value)
@@ -241,7 +235,7 @@ def test_what_is_typed_on_the_way_to_a_number_is_not_held_against_it(door, monke
     with client(door) as connection:
         say(connection, claim(number, 1))
         say(connection, claim(number, 12))
-        until(lambda: number.value == 12)
+        until(lambda: number.value == 12, "the number")
         seen: list[str] = []
         with pytest.raises(TimeoutError):
             while True:
@@ -328,7 +322,7 @@ def test_a_gizmo_goes_nowhere_that_is_no_place(door, bystander):
         caught_up(door, connection)
         assert tuple(gizmo.position) == (0.0, 0.0, 0.0)
         say(connection, {**update, "wxyz": (1.0, 0.0, 0.0, 0.0), "position": (1.0, 2.0, 3.0)})
-        until(lambda: tuple(gizmo.position) == (1.0, 2.0, 3.0))
+        until(lambda: tuple(gizmo.position) == (1.0, 2.0, 3.0), "the gizmo's place")
     gizmo.remove()
     bystander()
 
@@ -377,7 +371,7 @@ def test_a_page_that_floods_is_slowed_then_let_go_and_the_others_go_on(door, bys
 
     thread = threading.Thread(target=flood)
     thread.start()
-    until(lambda: slider.value > 0)
+    until(lambda: slider.value > 0, "the flood")
     while not gone.is_set():
         bystander()
     thread.join()

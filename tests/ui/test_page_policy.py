@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -14,21 +13,15 @@ from PIL import Image
 from playwright.sync_api import Page
 
 from tests.drive.page import page_at
-from tests.ui.knocking import ask, until
+from tests.drive.waiting import until
+from tests.ui.knocking import ask
 from workbench.ui import page_policy
 from workbench.ui.door import Door, DoorOptions, open_door
 from workbench.ui.page_policy import DIRECTIVES, HANDLERS
 from workbench.web_assets import web_assets_folder
 
 
-@pytest.fixture(scope="module")
-def door() -> Iterator[Door]:
-    door = open_door(DoorOptions(port=0))
-    yield door
-    door.close()
-
-
-@pytest.fixture(scope="module")
+@pytest.fixture
 def filled(door: Door) -> Door:
     """With one of each thing that a policy could break: blobs, data, workers, wasm, frames, handlers."""
     server = door.server
@@ -101,14 +94,20 @@ def test_code_that_came_into_the_page_as_html_does_not_run(door, browser):
         "<style onload=\"document.title='ran'\"></style><base href='//evil.example/'>",
     )
     handle = door.server.gui.add_html("".join(attacks) + "<p id='there'>x</p>")
-    with page_at(browser, door.url) as (page, _):
+    refused = {"inline event handler": 4, "inline script": 2, "JavaScript URL": 1, "plugin": 1, "base URI": 1}
+    with page_at(browser, door.url) as (page, complaints):
         page.wait_for_selector("#there", timeout=60_000)
         page.evaluate("document.getElementById('link').click(); document.getElementById('click').click()")
         page.evaluate(
             """() => { const s = document.createElement('script'); s.textContent = "document.title='ran'";
             document.head.append(s) }"""
         )
-        page.wait_for_timeout(1000)
+
+        def were() -> dict[str, int]:
+            page.wait_for_timeout(50)  # in which Playwright hears of them
+            return {what: sum(what in complaint for complaint in complaints) for what in refused}
+
+        until(lambda: were() == refused, "the browser's word that each was refused", seen=were)
         assert page.title() != "ran"
     handle.remove()
 
@@ -118,7 +117,7 @@ def test_a_page_whose_token_was_renewed_says_what_to_do(browser):
     door = open_door(DoorOptions(port=0))
     try:
         with page_at(browser, door.url) as (page, _):
-            until(lambda: page.wait_for_timeout(50) or door.server.get_clients())
+            until(door.server.get_clients, "the page")
             door.renew_token()
             page.wait_for_selector("text=Open the address that the terminal shows", timeout=60_000)
             page.goto(door.url, wait_until="domcontentloaded")

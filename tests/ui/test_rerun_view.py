@@ -6,7 +6,6 @@ import gzip
 import http.client
 import threading
 import urllib.parse
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -20,7 +19,7 @@ from tests.drive.waiting import until
 from workbench.recording.blueprint_in_file import add_blueprint, blueprint_stream, encode_blueprint
 from workbench.recording.rerun_chunks import static_chunk
 from workbench.recording.web_viewer import VIEWER_FILES, web_viewer_folder
-from workbench.ui.door import Door, DoorOptions, open_door
+from workbench.ui.door import Door
 from workbench.ui.gate import cookie_name
 from workbench.ui.offers import Offers
 from workbench.ui.rerun_view import RerunPages, RerunView
@@ -36,13 +35,6 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
         stream.log("reward", rr.Scalars(1.0))
     stream.disconnect()
     return path
-
-
-@pytest.fixture
-def door() -> Iterator[Door]:
-    door = open_door(DoorOptions(port=0))
-    yield door
-    door.close()
 
 
 @pytest.fixture

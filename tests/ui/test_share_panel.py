@@ -11,7 +11,7 @@ import viser
 
 from tests.drive.panels import Panels
 from workbench.recording.sources import Source
-from workbench.ui.door import Door, DoorOptions, open_door
+from workbench.ui.door import Door
 from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted
 from workbench.ui.making import Making, MakingView
 from workbench.ui.offers import Offers
@@ -41,13 +41,6 @@ class Noted(Making):
     def start(self, wanted: Wanted) -> bool:
         self.wanted.append(wanted)
         return True
-
-
-@pytest.fixture
-def door() -> Iterator[Door]:
-    door = open_door(DoorOptions(port=0))
-    yield door
-    door.close()
 
 
 @pytest.fixture

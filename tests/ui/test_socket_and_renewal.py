@@ -20,7 +20,8 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import unix_connect
 
-from tests.ui.knocking import PROTOCOL, ask, both, client, close_code, cookie_of, token_of, until
+from tests.drive.waiting import until
+from tests.ui.knocking import PROTOCOL, ask, both, client, close_code, cookie_of, token_of
 from tests.ui.tabs import open_deaf_tab, tabs_of
 from workbench.machine.child_python import child_environment, python_command
 from workbench.ui import listening
@@ -94,7 +95,7 @@ def test_a_websocket_works_over_it(door):
     ) as connection:
         update = {"type": "GuiUpdateMessage", "uuid": element_id(box), "updates": {"value": True}}
         connection.send(msgspec.msgpack.encode(update))
-        until(lambda: box.value)
+        until(lambda: box.value, "the value")
 
 
 def test_the_file_is_gone_at_the_end_and_one_that_was_left_is_taken_over(folder):
@@ -232,9 +233,9 @@ def test_an_answer_on_its_way_ends_with_the_token(on_port):
 
 def test_a_page_that_does_not_listen_is_closed_as_well(on_port):
     tab = open_deaf_tab(on_port.url)
-    until(on_port.server.get_clients)
+    until(on_port.server.get_clients, "the page")
     on_port.renew_token()
-    until(lambda: not on_port.server.get_clients())
+    until(lambda: not on_port.server.get_clients(), "the end of the page")
     with pytest.raises(ConnectionClosed):
         while True:
             tab.recv(timeout=30)
@@ -292,14 +293,14 @@ def test_the_palette_of_the_page_renews_and_the_page_is_closed(child_process: No
         first = until_line(process, lambda line: line.startswith("  page")).split()[1]
         with tabs_of(first) as tabs:
             tab = tabs.open()
-            until(lambda: tab.open)
+            until(lambda: tab.open, "the page")
             tabs.trigger(tab, "Renew the token and close every page")
             second = until_line(process, lambda line: line.startswith("  page")).split()[1]
             assert second.partition("?")[0] == first.partition("?")[0] and second != first
-            until(lambda: not tab.open)
+            until(lambda: not tab.open, "the end of the page")
         with tabs_of(second) as tabs:
             tab = tabs.open()
-            until(lambda: tab.open)
+            until(lambda: tab.open, "the page")
         process.send_signal(signal.SIGTERM)
         assert process.wait(60) == 0
     finally:

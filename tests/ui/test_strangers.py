@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.ui.knocking import ask, both, client, cookie_of, knock, token_of
@@ -21,13 +21,6 @@ from workbench.ui.gate import cookie_name
 from workbench.ui.told_rarely import ToldRarely
 
 LONG = 300
-
-
-@pytest.fixture
-def door() -> Iterator[Door]:
-    door = open_door(DoorOptions(port=0))
-    yield door
-    door.close()
 
 
 def connected(door: Door) -> socket.socket:
@@ -58,7 +51,7 @@ def test_a_head_that_comes_a_byte_at_a_time_gains_no_time(door, monkeypatch):
     with connected(door) as slow, pytest.raises(OSError):
         for byte in b"GET / HTTP/1.1\r\nX: " + b"y" * 10_000:
             slow.sendall(bytes([byte]))
-            time.sleep(0.02)
+            time.sleep(0.02)  # what is tested: all the time a little comes
 
 
 def test_one_that_is_refused_and_does_not_hang_up_is_closed_as_well(door, monkeypatch):
@@ -74,6 +67,7 @@ def test_one_that_is_refused_and_does_not_hang_up_is_closed_as_well(door, monkey
 def test_a_page_that_has_shown_the_token_is_not_hurried(door, monkeypatch):
     monkeypatch.setattr(strangers, "PATIENCE", 0.3)
     slow = (200, "application/octet-stream", b"x" * 1000)
+    # Both take longer than a stranger is given.
     door.add_route("/slow/", lambda path: time.sleep(0.8) or slow)
     assert ask(door, "/slow/x")[2] == b"x" * 1000
     with client(door) as page:
@@ -164,29 +158,28 @@ def fuzz(door: Door, raw: bytes) -> None:
         assert answer == b"" or answer.startswith((b"HTTP/1.1 403", b"HTTP/1.1 431"))
 
 
-@pytest.fixture(scope="module")
-def fuzzed() -> Iterator[Door]:
-    door = open_door(DoorOptions(port=0))
+@pytest.fixture
+def fuzzed(door: Door, capfd: pytest.CaptureFixture[str]) -> Iterator[Door]:
+    """After all that was sent to it, it still opens, and nothing was printed of it."""
     yield door
-    door.close()
+    assert both(door) == (200, 101)
+    assert "Traceback" not in capfd.readouterr().err
 
 
-@settings(deadline=None, max_examples=60)
+unhurried = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@settings(unhurried, max_examples=60)
 @given(REQUESTS)
 def test_whatever_a_stranger_sends_is_refused(fuzzed, raw):
     fuzz(fuzzed, raw)
 
 
 @pytest.mark.slow
-@settings(deadline=None, max_examples=3000)
+@settings(unhurried, max_examples=3000)
 @given(REQUESTS | st.binary(max_size=3000))
 def test_whatever_a_stranger_sends_for_long_is_refused(fuzzed, raw):
     fuzz(fuzzed, raw)
-
-
-def test_the_fuzzed_door_still_opens_and_says_nothing_ill(fuzzed, capfd):
-    assert both(fuzzed) == (200, 101)
-    assert "Traceback" not in capfd.readouterr().err
 
 
 # What is said ------------------------------------------------------------------------------------
