@@ -14,8 +14,11 @@ from tests.ui.scenes import camera, table_scene
 from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.recording.episode import Episode, EpisodeInfo
-from workbench.recording.episode_writer import EpisodeFiles, EpisodeWriter
+from workbench.recording.episode_writer import SCENE_SUFFIX, EpisodeFiles, EpisodeWriter
+from workbench.recording.journal import Journal
 from workbench.recording.row import EpisodeRow
+from workbench.recording.scene_file import read_scene
+from workbench.recording.survey import Header, JournalReader
 
 BODY = {"ground": 0, "table": 1, "arm/hand": 2, "cube": 3}
 
@@ -72,8 +75,20 @@ def geometry_of(episode: Episode) -> SceneGeometry:
 def begin(folder: Path, episode: Episode) -> None:
     """All of it in a journal, as a writer leaves it that was killed before it made the files."""
     writer = appended(folder, episode, pictures=False)
-    writer._journal.write()
+    journal_of(writer).write()
     writer.close()
+
+
+def journal_of(writer: EpisodeWriter) -> Journal:
+    """For a test that says itself when it is written: else a thread does, now and then."""
+    return writer._journal
+
+
+def header_of(journal: Path) -> Header:
+    """As `recover` reads it, of a journal that has one."""
+    header = JournalReader(journal).header(read_scene(journal.with_suffix(SCENE_SUFFIX)))
+    assert header is not None
+    return header
 
 
 def write(folder: Path, episode: Episode, pictures: bool = True, every: int = 1) -> Path:

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.drive.entries import ENTRIES
-from tests.drive.episodes import Made
+from tests.drive.episodes import Made, journal_of
 from tests.recording.read_rrd import read_rrd
 from tests.recording.verify_rrd import verify_rrd
 from workbench.core.entries import split_entries
@@ -47,7 +47,7 @@ def write(made: Made, folder: Path, others: list[Others], finish: bool = True) -
         writer.append(dataclasses.replace(row, others=entries))
     if finish:
         return writer.finish()
-    writer._journal.sync()
+    journal_of(writer).sync()
     writer.close()
     return None
 

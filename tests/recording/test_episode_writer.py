@@ -23,7 +23,7 @@ import rerun as rr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.drive.episodes import Made, Track
+from tests.drive.episodes import Made, Track, journal_of
 from tests.recording.verify_rrd import verify_rrd
 from workbench.core.geometry import Mesh
 from workbench.core.pictures import CameraInfo, Picture
@@ -230,7 +230,7 @@ def test_a_disk_without_room_leaves_the_journal_or_nothing(
             writer = episode.writer(tmp_path)
             for row in episode.rows():
                 writer.append(row)
-                writer._journal.write()
+                journal_of(writer).write()
         if room:
             writer.close()
     assert {Path(name).parent.name for name in left(tmp_path)} <= {FOLDER}

@@ -190,15 +190,16 @@ def test_readers_end_with_the_program_however_it_ends(tmp_path: Path) -> None:
         "from workbench.recording.library_scan import scan_folder\n"
         "folder = pathlib.Path(sys.argv[1])\n"
         "list(reading.read_rows(folder, scan_folder(folder).found.values()))\n"
-        "print(reading._readers[folder, False]._pid, flush=True)\n"
+        "print('read', flush=True)\n"
         "time.sleep(60)\n"
     )
     process = subprocess.Popen(
         python_command("-c", program, str(tmp_path)), env=child_environment(), stdout=subprocess.PIPE
     )
     assert process.stdout is not None
-    reader = psutil.Process(int(process.stdout.readline()))
-    family = [reader, *reader.parents()[:1]]
+    assert process.stdout.readline() == b"read\n"
+    family = psutil.Process(process.pid).children(recursive=True)
+    assert family
     process.kill()
     process.wait()
     process.stdout.close()

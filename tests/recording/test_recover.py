@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.drive.episodes import Made
+from tests.drive.episodes import Made, header_of, journal_of
 from tests.drive.waiting import until
 from tests.recording.refused_calls import descriptors, refused
 from workbench.core.geometry import Mesh
@@ -55,9 +55,9 @@ def test_a_journal_may_end_anywhere(make_episode: Maker, tmp_path: Path) -> None
     ends = []
     for row in episode.rows():
         writer.append(row)
-        writer._journal.write()
-        ends.append(writer._journal.size)
-    writer._journal.write()
+        journal_of(writer).write()
+        ends.append(journal_of(writer).size)
+    journal_of(writer).write()
     journal = next((tmp_path / FOLDER).glob("*.arrow"))
     whole = journal.read_bytes()
     writer.discard()
@@ -75,7 +75,7 @@ def test_garbage_at_the_end_is_left_out(make_episode: Maker, tmp_path: Path) -> 
     writer = episode.writer(tmp_path)
     for row in episode.rows():
         writer.append(row)
-    writer._journal.write()
+    journal_of(writer).write()
     writer.close()
     journal = next((tmp_path / FOLDER).glob("*.arrow"))
     with journal.open("ab") as file:
@@ -113,8 +113,8 @@ def test_a_writer_that_died_between_two_names(
             "workbench.recording.landing.sync_folder", lambda folder: (_ for _ in ()).throw(Death())
         )
     with pytest.raises(Death):
-        writer._journal.finish()
-        making.make_files(writer._journal.path, writer._header, tmp_path)
+        journal_of(writer).finish()
+        making.make_files(journal_of(writer).path, header_of(journal_of(writer).path), tmp_path)
     monkeypatch.undo()
     writer.close()
     assert len([path for path in tmp_path.iterdir() if path.is_file()]) == linked
@@ -128,7 +128,7 @@ def test_a_writer_that_died_between_two_names(
 def test_a_journal_without_a_step_is_cleared_away(make_episode: Maker, tmp_path: Path) -> None:
     writer = make_episode().writer(tmp_path)
     writer.append(next(iter(make_episode().rows())))
-    writer._journal.write()
+    journal_of(writer).write()
     writer.close()
     Journal(tmp_path / FOLDER / "empty.arrow").close()
     (tmp_path / FOLDER / "stray.rrd").write_text("half")
@@ -143,7 +143,7 @@ def test_without_its_meshes_an_episode_is_recovered_bare(make_episode: Maker, tm
     writer = episode.writer(tmp_path)
     for row in episode.rows():
         writer.append(row)
-    writer._journal.write()
+    journal_of(writer).write()
     writer.close()
     scene = next((tmp_path / FOLDER).glob("*.scene"))
     scene.write_bytes(scene.read_bytes()[:-100])
@@ -171,7 +171,7 @@ def left(episode: Made, folder: Path, **info: object) -> Path:
     writer = episode.writer(folder)
     for row in episode.rows():
         writer.append(row)
-    writer._journal.write()
+    journal_of(writer).write()
     writer.close()
     return folder / FOLDER / f"{episode.info.id}.arrow"
 

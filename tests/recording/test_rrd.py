@@ -17,7 +17,7 @@ import pytest
 import rerun as rr
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
-from tests.drive.episodes import Made
+from tests.drive.episodes import Made, header_of, journal_of
 from tests.recording.verify_rrd import verify_rrd
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.machine.child_python import child_environment, python_command
@@ -37,9 +37,10 @@ def test_a_disk_that_is_full_at_any_byte_is_an_error_of_the_disk(
     writer = episode.writer(tmp_path)
     for row in episode.rows():
         writer.append(row)
-    writer._journal.finish()
-    reader = JournalReader(writer._journal.path)
-    survey = reader.survey(writer._header)
+    journal = journal_of(writer)
+    journal.finish()
+    reader = JournalReader(journal.path)
+    survey = reader.survey(header_of(journal.path))
     path = tmp_path / "some.rrd"
 
     def size_with_room(room: int) -> int:

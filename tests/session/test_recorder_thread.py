@@ -67,6 +67,10 @@ def step_of(size: int, env_steps: int = 1) -> Stepped:
     return Stepped(step, np.zeros(1, bool), snapshot=bytes(size))
 
 
+def until_taken(recorder: LiveRecorder) -> None:
+    until(recorder._queue.empty, "the steps to be taken")
+
+
 def test_what_the_disk_has_taken_does_not_wait_any_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -79,10 +83,10 @@ def test_what_the_disk_has_taken_does_not_wait_any_more(
         for _ in range(2):
             recorder.start(cast(Any, SimpleNamespace()), (0,))
             for _ in range(30):
-                until(recorder._queue.empty, "the steps to be taken")
+                until_taken(recorder)
                 recorder.take(step_of(1000))
                 assert recorder.status().problem is None
-            until(recorder._queue.empty, "the steps to be taken")
+            until_taken(recorder)
             go.clear()
             recorder.start(cast(Any, SimpleNamespace()), (0,))  # whose thread now waits in `on_change`
             taken = 0
@@ -92,7 +96,7 @@ def test_what_the_disk_has_taken_does_not_wait_any_more(
             assert 9 <= taken <= 11
             assert "the disk is slower than the simulation" in str(recorder.status().problem)
             go.set()
-            until(recorder._queue.empty, "the steps to be taken")
+            until_taken(recorder)
     finally:
         go.set()
         recorder.close()

@@ -274,19 +274,19 @@ def test_another_opening_ends_one_that_has_shown_something(monkeypatch: pytest.M
         return shelf.read(row, shapes)
 
     review = Review(shelf, read, clock=shelf.clock)  # type: ignore[arg-type]
+    before = set(threading.enumerate())
     review.open("ab")
     assert reached.wait(60)
-    first = review._thread
+    (first,) = set(threading.enumerate()) - before
     opened(review, "c")
     go_on.set()
-    assert first is not None
     first.join(60)
     assert [o.id for o in review.view().opened] == ["c"] and not review.view().loading
 
 
 def test_waits_for_the_next_position_while_it_plays() -> None:
-    review, _ = review_of(a=made(100))
-    real = Review(review._library, review._read)
+    _, shelf = review_of(a=made(100))
+    real = Review(shelf, shelf.read)  # type: ignore[arg-type]
     opened(real, "a")
     real.toggle_play()
     seen = real.view()
