@@ -364,10 +364,7 @@ def test_what_is_held_back_is_written_to_all_journals_before_the_disk_is_waited_
     monkeypatch.setattr(os, "fsync", noted)
     three += [Journal(tmp_path / f"{number}.arrow") for number in range(3)]
     journals.before_writing(holder.flush)
-    deadline = time.monotonic() + 10
-    while len(seen) < 3:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
+    until(lambda: len(seen) >= 3, "three writes")
     assert seen[0] == [[b"\0"], [b"\1"], [b"\2"]]
     for journal in three:
         journal.close()
