@@ -104,7 +104,9 @@ def test_a_file_that_shrinks_is_cut_off_and_not_filled_up(door: Door, file: tupl
     until(lambda: open_files(path) == 0, "the end of the reading")
 
 
-def test_who_goes_away_in_the_middle_holds_nothing(door: Door, file: tuple[str, Path]) -> None:
+def test_who_goes_away_in_the_middle_holds_nothing_and_is_no_news(
+    door: Door, file: tuple[str, Path], caplog: pytest.LogCaptureFixture
+) -> None:
     address, path = file
     path.touch()
     os.truncate(path, LARGE)
@@ -113,6 +115,7 @@ def test_who_goes_away_in_the_middle_holds_nothing(door: Door, file: tuple[str, 
     raw.close()
     until(lambda: open_files(path) == 0, "the end of the reading")
     assert ask(door, "/")[0] == 200
+    assert caplog.records == []
 
 
 def test_for_who_does_not_read_no_more_is_read(door: Door, file: tuple[str, Path]) -> None:

@@ -24,6 +24,7 @@ import socket
 import sys
 import threading
 import time
+import traceback
 import warnings
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
@@ -407,10 +408,20 @@ def make_viser(
 
 
 def _quiet_logger() -> logging.Logger:
-    """Logger for `websockets`: a port scanner's garbage is no error of ours, and it must not put a
-    traceback into the author's terminal."""
+    """Logger for `websockets`: a port scanner's garbage is no error of ours, nor is a browser that goes away before
+    its answer is all there, and neither must put a traceback into the author's terminal."""
     logger = logging.getLogger("workbench.door.websockets")
     logger.setLevel(logging.WARNING)
     if not logger.filters:
-        logger.addFilter(lambda record: record.getMessage() != "opening handshake failed")
+        logger.addFilter(_is_news)
     return logger
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    if record.getMessage() == "opening handshake failed":
+        return False
+    error = record.exc_info[1] if record.exc_info else None
+    if not isinstance(error, AssertionError):
+        return True
+    # `websockets` ends a connection after its answer, and asserts that it has not ended yet: who was answered has gone.
+    return traceback.extract_tb(error.__traceback__)[-1].name != "send_eof"
