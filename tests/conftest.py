@@ -42,6 +42,28 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.skip(reason="torch sees no CUDA device"))
 
 
+ONE_AFTER_THE_OTHER = {
+    "tests/browser/test_page.py": "tests/browser/test_camera_judging.py",
+    "tests/browser/test_timeline.py": "tests/browser/test_judgement.py",
+}
+"""Files that share a page's server with another (tests/browser/conftest.py), so that one process has to run both."""
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
+    """As ``--dist loadfile``, but for those."""
+    if config.getoption("dist") != "loadfile":
+        return None
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            file = nodeid.split("::", 1)[0]
+            return ONE_AFTER_THE_OTHER.get(file, file)
+
+    return Scheduling(config, log)
+
+
 SIGHTS = Path(__file__).parents[1] / "test-results"
 """Where a failed test leaves what its pages showed."""
 

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
 
-from tests.drive.page import page_on
+from tests.browser.conftest import At
+from tests.drive.studio import press as press_tool
 from tests.drive.waiting import until
 
 pytestmark = pytest.mark.browser
-ENVS = 3
+ENVS = 2
 CAMERA = "base_camera"
 PICTURE = "img[src^='blob:']:visible"
 FOLDERS = {
@@ -28,11 +29,11 @@ FOLDERS = {
 
 
 @pytest.fixture(scope="module")
-def page(task_file: Path, browser: Browser) -> Iterator[Page]:
+def page(example: At, browser: Browser) -> Iterator[Page]:
     """The Studio tab on base_camera, with every folder that judges open."""
-    arguments = ("--num-envs", str(ENVS))
-    with page_on(task_file, *arguments, browser=browser, height=900) as (page, errors, _):
-        page.get_by_role("tab", name="Studio").click()
+    with example(browser, height=900) as desk:
+        page = desk.page
+        desk.tab("Studio")
         page.locator("input[aria-haspopup=listbox]:visible").first.click()
         page.get_by_role("option", name=f"{CAMERA} · sensor", exact=True).click()
         # The first picture pushes the folders down: a click that is under way then falls beside its folder.
@@ -41,7 +42,9 @@ def page(task_file: Path, browser: Browser) -> Iterator[Page]:
             page.get_by_text(folder, exact=True).click()
             expect(page.get_by_role("button", name=inside, exact=True)).to_be_visible()
         yield page
-        assert not errors
+        press_tool(page, "Back to the file")
+        expect(page.get_by_text(re.compile("^As push_cube.py has it"))).to_be_visible()
+        assert not desk.errors
 
 
 def press(page: Page, name: str) -> None:
@@ -101,6 +104,9 @@ def test_the_sheet_has_all_envs_and_a_press_selects_one(page: Page) -> None:
     last.click()
     expect(last).to_have_class("wb-selected")
     expect(page.get_by_text(f"env {ENVS - 1}: step 0").first).to_be_visible()
+    first = page.locator(".wb-sheet [data-env='0']")
+    first.click()
+    expect(first).to_have_class("wb-selected")
 
 
 def test_a_download_is_the_camera_and_places_it_again(page: Page) -> None:

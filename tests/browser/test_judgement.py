@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, Locator, expect
 
+from tests.browser.conftest import At
 from tests.drive.desk import Desk
-from tests.drive.page import page_on
 from tests.drive.waiting import until
 
 pytestmark = pytest.mark.browser
@@ -19,11 +18,10 @@ STEPS = 60
 
 
 @pytest.fixture(scope="module")
-def desk(task_file: Path, browser: Browser) -> Iterator[Desk]:
+def desk(example_without_pictures: At, browser: Browser) -> Iterator[Desk]:
     """Three envs that have made some sixty steps, paused, on the Reward tab."""
-    # Without pictures there are no shaders to wait for.
-    arguments = ("--num-envs", "3", "--env", "render_backend=none")
-    with page_on(task_file, *arguments, browser=browser, height=1000) as (page, errors, opened):
+    with example_without_pictures(browser, height=1000) as desk:
+        page = desk.page
         page.get_by_role("button", name="Play", exact=True).click()
         strip = page.locator(".wb-timeline")
 
@@ -36,7 +34,7 @@ def desk(task_file: Path, browser: Browser) -> Iterator[Desk]:
         expect(page.get_by_text("paused", exact=True)).to_be_visible()
         page.get_by_role("button", name="Reset all", exact=True).click()
         page.get_by_role("tab", name="Reward").click()
-        yield Desk(page, errors, task_file, opened)
+        yield desk
 
 
 def says(desk: Desk, pattern: str) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, expect
 
+from tests.browser.conftest import RECORDINGS, At
 from tests.drive.desk import Desk
-from tests.drive.page import TASK, page_on
+from tests.drive.page import TASK
 from tests.drive.studio import picture
 from tests.drive.waiting import until
 from tests.recording.verify_rrd import verify_rrd
@@ -19,14 +19,13 @@ from tests.recording.verify_rrd import verify_rrd
 pytestmark = pytest.mark.browser
 
 
-RECORDINGS = "kept"
+DRAWN = "        self.drawn = torch.rand((self.num_envs, 2))\n"
 
 
 @pytest.fixture(scope="module")
-def desk(task_file: Path, browser: Browser) -> Iterator[Desk]:
-    arguments = ("--num-envs", "2", "--recordings", RECORDINGS)
-    with page_on(task_file, *arguments, browser=browser) as (page, errors, opened):
-        yield Desk(page, errors, task_file, opened)
+def desk(example: At, browser: Browser) -> Iterator[Desk]:
+    with example(browser) as desk:
+        yield desk
 
 
 @pytest.fixture
@@ -195,6 +194,31 @@ def test_a_message_with_markup_is_text_in_the_banner(calm: Desk) -> None:
     calm.file.write_text("raise ValueError('<img src=x onerror=window.hacked=1><b>bold</b>')\n")
     expect(calm.page.get_by_text("<b>bold</b>").first).to_be_visible()
     assert calm.page.evaluate("window.hacked") is None
+
+
+def test_the_mark_of_a_rule_that_only_warns_stands_until_the_file_is_mended(calm: Desk) -> None:
+    text = TASK.read_text()
+    hook = text.index("def _initialize_episode")
+    body = text.index("        with torch.device(self.device):\n", hook)
+    broken = text[:body] + DRAWN + text[body:]
+    line = broken[: broken.index(DRAWN)].count("\n") + 1
+    calm.tab("Reward")
+    calm.file.write_text(broken)
+    mark, row = calm.page.locator(".wb-rules-mark"), calm.page.locator(".wb-rules-row")
+    expect(mark).to_contain_text("1 warning")
+    told = rf"warning .*push_cube\.py:{line}: self\.drawn is changed in env 1"
+    calm.opened.wait_for_line(told)
+    expect(calm.page.get_by_role("tab", name="Reward")).to_be_visible()
+    mark.click()
+    expect(row).to_contain_text(f"push_cube.py:{line}")
+    expect(row).to_contain_text("self.drawn = torch.rand((self.num_envs, 2))")
+    expect(calm.page.get_by_role("tab", name="Reward")).to_be_visible()
+    mark.click()
+    expect(row).to_be_hidden()
+    calm.file.write_text(text)
+    expect(mark).to_be_hidden()
+    expect(calm.page.get_by_text("paused", exact=True)).to_be_visible()
+    assert sum(bool(re.search(told, printed)) for printed in calm.opened.lines) == 1
 
 
 def test_record_keeps_an_episode(calm: Desk) -> None:

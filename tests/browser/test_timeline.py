@@ -5,29 +5,26 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, expect
 
+from tests.browser.conftest import At
 from tests.drive.desk import Desk
-from tests.drive.page import page_on
 from tests.drive.waiting import until
 from workbench.ui.timeline_panel import RANGE_EVERY
 
 pytestmark = pytest.mark.browser
 STEPS = 8
-ARGUMENTS = "--num-envs 2 --env render_backend=none".split()
-"""Without pictures there are no shaders to wait for."""
 SLIDER = ".mantine-Slider-root"
 
 
 @pytest.fixture(scope="module")
-def opened(task_file: Path, browser: Browser) -> Iterator[Desk]:
-    with page_on(task_file, *ARGUMENTS, browser=browser) as (page, errors, terminal):
-        page.get_by_role("tab", name="Reward").click()
-        expect(page.get_by_text("elapsed steps")).to_be_visible()
-        yield Desk(page, errors, task_file, terminal)
+def opened(example_without_pictures: At, browser: Browser) -> Iterator[Desk]:
+    with example_without_pictures(browser) as desk:
+        desk.tab("Reward")
+        expect(desk.page.get_by_text("elapsed steps")).to_be_visible()
+        yield desk
 
 
 @pytest.fixture
