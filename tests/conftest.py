@@ -10,7 +10,7 @@ import sys
 import tempfile
 from collections.abc import Generator, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 # Before anything imports rerun, which reads it once: a wrong argument raises instead of printing a warning.
 os.environ["RERUN_STRICT"] = "1"
@@ -50,7 +50,7 @@ ONE_AFTER_THE_OTHER = {
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> object:
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object:
     """As ``--dist loadfile``, but for those."""
     if config.getoption("dist") != "loadfile":
         return None
