@@ -329,6 +329,26 @@ def test_a_greeting_that_fails_loses_the_worker_and_is_tried_again(caplog: pytes
     assert "nothing to say" in caplog.text
 
 
+def test_a_greeting_that_fails_three_times_in_a_row_is_tried_again_when_somebody_asks() -> None:
+    with minded() as one:
+        greet = one.worker._greet
+        failures = iter(range(3))
+
+        def fails() -> list[Request]:
+            if next(failures, None) is not None:
+                raise RuntimeError("nothing to say")
+            return greet()
+
+        one.worker._greet = fails
+        one.worker.replace()
+        one.until_dead(4)
+        assert [death.gives_up for death in one.deaths] == [False, False, False, True]
+        assert one.worker.pid is None
+        one.worker.replace()
+        one.until_greeted(2)
+        assert len(one.deaths) == 4
+
+
 def test_a_worker_without_its_main_thread_is_ended() -> None:
     with minded() as one:
         one.worker.send(do("without_a_main_thread 60"))
