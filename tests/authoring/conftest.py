@@ -9,7 +9,8 @@ from textwrap import dedent
 
 import pytest
 
-from workbench.authoring import load, registry
+from tests.authoring.registered import TABLES, registered
+from workbench.authoring import load
 
 HEADER = """\
 from mani_skill.envs.sapien_env import BaseEnv
@@ -42,7 +43,7 @@ def clean_process() -> Iterator[None]:
     """Undo what a test loaded: its modules, finders and registrations are the process's."""
     modules, finders, path = dict(sys.modules), list(sys.meta_path), list(sys.path)
     loads = dict(load._loads)
-    tables = [dict(table) for table in registry._TABLES]
+    tables = registered()
     yield
     for name in set(sys.modules) - set(modules):
         if getattr(sys.modules[name], "__file__", None) is not None and "pytest" not in name:
@@ -56,6 +57,6 @@ def clean_process() -> Iterator[None]:
     sys.meta_path[:], sys.path[:] = finders, path
     load._loads.clear()
     load._loads.update(loads)
-    for table, before in zip(registry._TABLES, tables, strict=True):
+    for table, before in zip(TABLES, tables, strict=True):
         table.clear()
         table.update(before)

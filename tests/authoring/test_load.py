@@ -19,6 +19,7 @@ from mani_skill.agents.registration import REGISTERED_AGENTS
 from mani_skill.utils.registration import REGISTERED_ENVS
 
 from tests.authoring.refusal import refused
+from tests.authoring.registered import registered
 from workbench.authoring import registry
 from workbench.authoring.load import LoadedTask, load_task, take_back, with_late_imports
 
@@ -32,10 +33,6 @@ class PushEnv(BaseEnv):
     def evaluate(self):
         return {}
 """
-
-
-def tables() -> list[dict]:
-    return [dict(table) for table in registry._TABLES]
 
 
 def test_a_file_gives_its_class_with_what_it_was_registered_with(write: Write) -> None:
@@ -474,11 +471,11 @@ def test_the_same_id_twice_is_an_error_that_names_both_lines(write: Write) -> No
 
 
 def test_keyboard_interrupt_passes_through_and_leaves_no_trace(write: Write) -> None:
-    before = tables()
+    before = registered()
     path = write("push.py", PUSH + "\nraise KeyboardInterrupt\n", task=True)
     with pytest.raises(KeyboardInterrupt):
         load_task(str(path))
-    assert tables() == before
+    assert registered() == before
 
 
 def test_after_a_failed_load_all_is_as_it_was(write: Write) -> None:
@@ -491,7 +488,7 @@ def test_after_a_failed_load_all_is_as_it_was(write: Write) -> None:
     """
     path = write("push.py", "import helper\n" + PUSH + body, task=True)
     good = load_task(str(path))
-    before, modules = tables(), dict(sys.modules)
+    before, modules = registered(), dict(sys.modules)
     path_before, finders = list(sys.path), list(sys.meta_path)
 
     write("helper.py", "SIZE = 2\n")
@@ -502,7 +499,7 @@ def test_after_a_failed_load_all_is_as_it_was(write: Write) -> None:
         + "\n@register_agent()\nclass Robot(Panda):\n    uid = 'author_robot'\n\n1 / 0\n"
     )
     refused(path)
-    assert tables() == before
+    assert registered() == before
     assert {name: sys.modules.get(name) for name in modules} == modules
     assert (sys.path, sys.meta_path) == (path_before, finders)
     assert REGISTERED_ENVS["AuthorPush-v1"].cls is good.cls
@@ -518,14 +515,14 @@ def test_a_load_whose_class_cannot_be_built_is_taken_back(write: Write) -> None:
     helper = write("helper.py", "SIZE = 1\n")
     path = write("push.py", "import helper\n" + PUSH, task=True)
     good = load_task(str(path))
-    before, modules = tables(), dict(sys.modules)
+    before, modules = registered(), dict(sys.modules)
     for number in range(3):
         helper.write_text("SIZE = 2\n")
         path.write_text(path.read_text() + f"\nNUMBER = {number}\n")
         bad = load_task(str(path))
         assert sys.modules["helper"].SIZE == 2
         assert take_back(bad) and not take_back(bad)
-        assert tables() == before
+        assert registered() == before
         assert {name: sys.modules.get(name) for name in modules} == modules
         assert "NUMBER" not in inspect.getsource(sys.modules[good.cls.__module__])
     assert with_late_imports(good).source_hash == good.source_hash
@@ -574,13 +571,13 @@ def test_a_failed_save_leaves_an_id_with_the_file_that_took_it_since(write: Writ
     assert REGISTERED_ENVS["AuthorPush-v1"].cls is newer.cls
     text = one.read_text()
     one.write_text(text + "\n1 / 0\n")
-    before = tables()
+    before = registered()
     refused(one)
-    assert tables() == before
+    assert registered() == before
     assert REGISTERED_ENVS["AuthorPush-v1"].cls is newer.cls
     one.write_text(text)
     again = load_task(str(one))
-    assert take_back(again) and tables() == before
+    assert take_back(again) and registered() == before
 
 
 def test_what_a_failed_load_put_on_the_search_path_is_gone(write: Write, folder: Path) -> None:

@@ -16,6 +16,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils import assets
 from mani_skill.utils import registration as env_registration
 
+from tests.authoring.registered import TABLES, registered
 from workbench.authoring import registry
 from workbench.authoring.problem import HOOK_STAGES
 
@@ -23,10 +24,15 @@ THIS_FILE = __file__
 
 
 def test_the_tables_are_the_ones_that_upstream_reads() -> None:
-    assert registry._TABLES[0] is env_registration.REGISTERED_ENVS
-    assert registry._TABLES[1] is gym.registry
-    assert registry._TABLES[2] is agent_registration.REGISTERED_AGENTS is agents.REGISTERED_AGENTS
-    assert registry._TABLES[3] is assets.DATA_GROUPS
+    ours = [id(table) for table in registry._TABLES]
+    assert ours == [
+        id(env_registration.REGISTERED_ENVS),
+        id(gym.registry),
+        id(agent_registration.REGISTERED_AGENTS),
+        id(assets.DATA_GROUPS),
+    ]
+    assert agents.REGISTERED_AGENTS is agent_registration.REGISTERED_AGENTS
+    assert ours == [id(table) for table in TABLES], "what the tests here look at"
 
 
 def test_the_decorators_have_the_arguments_that_are_looked_at() -> None:
@@ -43,7 +49,7 @@ def test_an_entry_has_what_a_load_reads() -> None:
 
 
 def test_registering_writes_only_the_tables_that_are_kept() -> None:
-    before = [dict(table) for table in registry._TABLES]
+    before = registered()
     registrations = registry.Registrations()
     with registry.registering(lambda file: file == THIS_FILE, registrations):
 
@@ -56,7 +62,7 @@ def test_registering_writes_only_the_tables_that_are_kept() -> None:
             uid = "author_registry_robot"
 
     assert [made.name for made in registrations.made] == ["AuthorRegistry-v1", "author_registry_robot"]
-    after = [set(table) - set(old) for table, old in zip(registry._TABLES, before, strict=True)]
+    after = [set(table) - set(old) for table, old in zip(TABLES, before, strict=True)]
     assert after == [
         {"AuthorRegistry-v1"},
         {"AuthorRegistry-v1"},
@@ -64,7 +70,7 @@ def test_registering_writes_only_the_tables_that_are_kept() -> None:
         {"AuthorRegistry-v1", "author_registry_robot"},
     ]
     registrations.undo()
-    assert [dict(table) for table in registry._TABLES] == before
+    assert registered() == before
     registrations.redo()
     assert env_registration.REGISTERED_ENVS["AuthorRegistry-v1"].cls is Task
     registrations.undo()
@@ -84,7 +90,7 @@ def test_other_files_register_as_they_always_do() -> None:
 
 
 def test_upstreams_own_refusals_still_refuse() -> None:
-    before = [dict(table) for table in registry._TABLES]
+    before = registered()
     registrations = registry.Registrations()
     with registry.registering(lambda file: file == THIS_FILE, registrations):
         with pytest.raises(TypeError, match="BaseEnv"):
@@ -94,7 +100,7 @@ def test_upstreams_own_refusals_still_refuse() -> None:
         with pytest.raises(gym.error.Error):
             env_registration.register_env("not an id")(type("Task", (BaseEnv,), {}))
     registrations.undo()
-    assert [dict(table) for table in registry._TABLES] == before
+    assert registered() == before
 
 
 def test_every_hook_that_names_a_stage_is_one_of_upstreams() -> None:
@@ -110,7 +116,7 @@ def _registered(env_id: str, *, override: bool = False) -> tuple[registry.Regist
 
 
 def test_taking_a_load_back_leaves_what_a_newer_one_put_under_the_name() -> None:
-    before = [dict(table) for table in registry._TABLES]
+    before = registered()
     first, old = _registered("AuthorRegistry-v1")
     second, new = _registered("AuthorRegistry-v1")
     assert second.replaced_names() == ("AuthorRegistry-v1",) and first.replaced_names() == ()
@@ -122,11 +128,11 @@ def test_taking_a_load_back_leaves_what_a_newer_one_put_under_the_name() -> None
     second.undo()
     assert env_registration.REGISTERED_ENVS["AuthorRegistry-v1"].cls is old
     first.undo()
-    assert [dict(table) for table in registry._TABLES] == before
+    assert registered() == before
 
 
 def test_a_load_that_came_back_once_does_not_take_a_name_that_a_newer_one_has_since() -> None:
-    before = [dict(table) for table in registry._TABLES]
+    before = registered()
     first, old = _registered("AuthorRegistry-v1")
     first.undo()
     first.redo()
@@ -137,7 +143,7 @@ def test_a_load_that_came_back_once_does_not_take_a_name_that_a_newer_one_has_si
     assert env_registration.REGISTERED_ENVS["AuthorRegistry-v1"].cls is new
     second.undo()
     first.undo()
-    assert [dict(table) for table in registry._TABLES] == before
+    assert registered() == before
 
 
 def test_tasks_and_robots_are_classes_of_their_kind_and_not_the_base_itself() -> None:
@@ -160,7 +166,7 @@ def test_an_id_is_found_by_its_class_and_one_of_gymnasium_alone_is_told_apart() 
 
 
 def test_a_name_that_one_load_takes_twice_is_refused_with_both_places() -> None:
-    before = [dict(table) for table in registry._TABLES]
+    before = registered()
     registrations = registry.Registrations()
     elsewhere = compile(
         "def register(decorate, cls):\n    return decorate('AuthorRegistry-v1')(cls)",
@@ -185,7 +191,7 @@ def test_a_name_that_one_load_takes_twice_is_refused_with_both_places() -> None:
     assert [made.cls.__name__ for made in registrations.made] == ["Other", "First", "Second"]
     assert env_registration.REGISTERED_ENVS["AuthorRegistry-v1"].cls is second
     registrations.undo()
-    assert [dict(table) for table in registry._TABLES] == before
+    assert registered() == before
 
 
 def test_a_body_that_raises_leaves_the_decorators_as_they_were() -> None:
@@ -197,7 +203,7 @@ def test_a_body_that_raises_leaves_the_decorators_as_they_were() -> None:
 
 
 def test_a_robot_that_replaces_another_is_put_in_its_place() -> None:
-    before = [dict(table) for table in registry._TABLES]
+    before = registered()
     registrations = registry.Registrations()
     with registry.registering(lambda file: file == THIS_FILE, registrations):
         robot = agents.register_agent()(type("Robot", (Panda,), {}))
@@ -207,7 +213,7 @@ def test_a_robot_that_replaces_another_is_put_in_its_place() -> None:
     assert robot is not again and agent_registration.REGISTERED_AGENTS["panda"].agent_cls is again
     assert registrations.replaced_names() == ("panda",)
     registrations.undo()
-    assert [dict(table) for table in registry._TABLES] == before
+    assert registered() == before
 
 
 def test_a_librarys_agents_are_registered_as_they_always_are() -> None:
