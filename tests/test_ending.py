@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import signal
 import time
 from pathlib import Path
@@ -23,6 +24,11 @@ PATIENCE = 15.0
 def gone(processes: list[psutil.Process]) -> bool:
     _, alive = psutil.wait_procs(processes, timeout=PATIENCE)
     return not alive
+
+
+def signal_thread(pid: int, thread: int, number: signal.Signals) -> None:
+    if ctypes.CDLL(None, use_errno=True).tgkill(pid, thread, int(number)) != 0:
+        raise OSError(ctypes.get_errno(), "tgkill")
 
 
 def workers_of(server: psutil.Process) -> int:
@@ -49,6 +55,17 @@ def test_a_worker_that_hangs_ends_with_its_server(tmp_path: Path, number: signal
         server.send_signal(number)
         assert gone(processes)
         print(f"{number.name}: all gone after {time.monotonic() - began:.2f} s")
+
+
+def test_a_signal_that_the_kernel_hands_to_another_thread_ends_the_page(tmp_path: Path) -> None:
+    """Python's handler runs in the main thread, which is not woken by it: on a busy machine Ctrl-C did nothing."""
+    (tmp_path / "recordings").mkdir()
+    with open_workbench("recordings", cwd=tmp_path, what="review") as opened:
+        server = psutil.Process(opened.process.pid)
+        others = [thread.id for thread in server.threads() if thread.id != server.pid]
+        signal_thread(server.pid, max(others), signal.SIGINT)
+        assert gone([server])
+    assert opened.process.returncode == 0
 
 
 def test_ctrl_c_ends_all_that_there_can_be(tmp_path: Path) -> None:

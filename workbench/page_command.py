@@ -180,11 +180,20 @@ class _End:
 
     def wait(self, door: Door) -> None:
         """Return at the end; until then renew the token as often as that is asked for."""
-        while self._asked.get() != "end":
-            if door.options.token:
+        while (asked := self._next()) != "end":
+            if asked == "renew" and door.options.token:
                 door.renew_token()
                 say("  the token was renewed, and every page was closed; open the new address:")
                 say_addresses(door.addresses())
+
+    def _next(self) -> Literal["end", "renew"] | None:
+        """What is asked for, or None after a while."""
+        try:
+            # Not for ever: the kernel may hand the signal to another thread, and the main one, which alone runs its
+            # handler, would sleep on. So it does on a busy machine.
+            return self._asked.get(timeout=0.2)
+        except queue.Empty:
+            return None
 
 
 def _announce(door: Door, what: str) -> None:

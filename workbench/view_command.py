@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import threading
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -45,7 +45,9 @@ def _in_page(files: Sequence[Path], host: str, port: int) -> int:
         say_addresses(door.addresses(address))
         say(f"  remote  {door.ssh_hint}")
         say("  Ctrl-C ends it.")
-        threading.Event().wait()
+        while True:
+            # Not for ever in one go: a signal that the kernel hands to another thread does not wake this one.
+            time.sleep(0.2)
     except KeyboardInterrupt:
         say("closing")
     finally:

@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,7 +34,10 @@ class Viewer:
         Raises:
             RuntimeError: the viewer ended by itself with an error.
         """
-        if status := self._process.wait():
+        # Not for ever in one go: a signal that the kernel hands to another thread does not wake this one.
+        while (status := self._process.poll()) is None:
+            time.sleep(0.1)
+        if status:
             self._says.join(timeout=5.0)
             raise RuntimeError(f"rerun's viewer ended with {status}; what it said is above.")
 
