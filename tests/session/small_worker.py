@@ -114,7 +114,7 @@ class SmallWorker:
     def _pass_time(self, seconds: float) -> None:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            pass
+            time.sleep(0.005)
 
 
 if __name__ == "__main__":

@@ -221,7 +221,7 @@ def test_what_makes_no_sense_is_refused(asked: dict[str, Any], says: str, tmp_pa
         record(RecordOptions("PushCube-v1", tmp_path, **asked))
 
 
-def test_pictures_of_every_camera_are_recorded(tmp_path: Path) -> None:
+def test_pictures_of_every_camera_are_recorded(renderer: None, tmp_path: Path) -> None:
     what = RecordOptions(
         str(TASKS / "push_cube.py"), tmp_path, 1, max_steps=2, options=TaskOptions(num_envs=1)
     )
@@ -391,22 +391,35 @@ def test_arguments_are_refused_with_a_sentence(
     ("arguments", "says"),
     [
         (["record", "PickCub-v1"], "PickCube-v1"),
-        (["open", "PickCub-v1", "--port", "0"], "PickCube-v1"),
         (["record", "PickCube-v1", "--num-envs", "0"], "num-envs"),
         (["record", "PickCube-v1", "--actions", "demo.h5"], "demo.h5"),
         (["record", "PickCube-v1", "--out", sys.executable], "is not a folder"),
     ],
 )
-def test_a_command_that_cannot_be_done_ends_with_a_sentence(
-    arguments: list[str], says: str, tmp_path: Path
+def test_a_recording_that_cannot_be_made_ends_with_a_sentence(
+    arguments: list[str],
+    says: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main(arguments)
+    said = capsys.readouterr().err
+    assert ended.value.code not in (0, None) and says in said and "Traceback" not in said
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_page_that_cannot_be_opened_ends_with_a_sentence(tmp_path: Path) -> None:
+    """As a process: the door is open by then, and a worker is there."""
     done = subprocess.run(
-        [sys.executable, "-m", "workbench.cli", *arguments],
+        [sys.executable, "-m", "workbench.cli", "open", "PickCub-v1", "--port", "0"],
         capture_output=True,
         text=True,
         timeout=120,
         cwd=tmp_path,
         stdin=subprocess.DEVNULL,
     )
-    assert done.returncode != 0 and says in done.stderr
+    assert done.returncode != 0 and "PickCube-v1" in done.stderr
     assert not any(tmp_path.iterdir())
