@@ -94,7 +94,7 @@ def _open(reply: FileReply, accepts_gzip: bool) -> tuple[BinaryIO, int, bool]:
         return file, length, reply.gzipped
     # The last four bytes of a gzip are the length of what is in it (RFC 1952).
     file.seek(-4, os.SEEK_END)
-    plain = int.from_bytes(file.read(4), "little")
+    plain = int.from_bytes(file.read(), "little")
     file.seek(0)
     return gzip.GzipFile(fileobj=file), plain, False  # type: ignore[return-value]
 
