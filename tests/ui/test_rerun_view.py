@@ -38,7 +38,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def pages(door: Door) -> RerunPages:
+def pages(child_process: None, door: Door) -> RerunPages:
     return RerunPages(door, Offers(door))
 
 
