@@ -353,6 +353,31 @@ def test_a_greeting_that_fails_three_times_in_a_row_is_tried_again_when_somebody
         assert len(one.deaths) == 4
 
 
+def test_where_no_worker_can_be_started_it_gives_up_until_somebody_asks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    command, failures = process.python_command, iter(range(4))
+
+    def fails(*arguments: str) -> list[str]:
+        if next(failures, None) is not None:
+            raise OSError("no more processes")
+        return command(*arguments)
+
+    monkeypatch.setattr(process, "python_command", fails)
+    one = Minded(WorkerOptions())
+    one.worker.start()
+    try:
+        one.until_dead(3)
+        one.worker.replace()
+        one.until_greeted(1)
+        assert [death.gives_up for death in one.deaths] == [False, False, True, False]
+        assert {death.why for death in one.deaths} == {
+            "was lost by the thread that minds it (OSError: no more processes)"
+        }
+    finally:
+        one.worker.stop()
+
+
 def test_a_worker_without_its_main_thread_is_ended() -> None:
     with minded() as one:
         one.worker.send(do("without_a_main_thread 60"))
