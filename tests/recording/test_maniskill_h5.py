@@ -45,7 +45,7 @@ def stacked(rows: list[dict[str, NDArray]]) -> dict[str, NDArray]:
 
 def record_both(task: str, folder: Path, **kwargs: Any) -> tuple[Path, Path]:
     """The .h5 of one episode from ManiSkill's wrapper, and from ours."""
-    stock: Any = gym.make(task, num_envs=1, **kwargs)
+    stock: Any = gym.make(task, num_envs=1, render_backend="none", **kwargs)
     env: Any = RecordEpisode(
         stock,
         str(folder / "theirs"),
