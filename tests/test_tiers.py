@@ -13,6 +13,7 @@ TESTS = """
 import os, subprocess, sys, threading
 import sapien
 import pytest
+from tests.drive.waiting import until
 
 def test_plain(): pass
 
@@ -24,6 +25,9 @@ def test_in_a_thread():
     thread = threading.Thread(target=os.system, args=("true",))
     thread.start()
     thread.join()
+def test_waits_for_it():
+    threading.Thread(target=os.system, args=("true",)).start()
+    until(lambda: False, "what cannot come")
 def test_swallowed():
     try: subprocess.run(["true"])
     except BaseException: pass
@@ -57,7 +61,9 @@ def test_only_what_needs_nothing_is_fast_and_the_rest_is_named_its_fixture(
     outcomes = {
         name: outcome for outcome, name in re.findall(r"^(PASSED|FAILED) \S+::(\w+)", said, re.MULTILINE)
     }
-    unsaid = ("test_says_nothing", "test_forks", "test_in_a_thread", "test_swallowed", "test_renders_unsaid")
+    in_threads = ("test_in_a_thread", "test_waits_for_it")
+    unsaid = ("test_says_nothing", "test_forks", *in_threads, "test_swallowed", "test_renders_unsaid")
     assert outcomes == {"test_plain": "PASSED", **dict.fromkeys(unsaid, "FAILED")}, said
     assert " 5 deselected" in said and "fixture `renderer`" in said, said
-    assert said.count("ask for the fixture `child_process`") >= 4, said
+    assert said.count("ask for the fixture `child_process`") >= 5, said
+    assert "did not come within" not in said, said

@@ -26,7 +26,7 @@ def live_session(
     worker: WorkerOptions | None = None,
     **env_kwargs: object,
 ) -> Iterator[Session]:
-    """A session at the first moment of the task, closed afterwards.
+    """A session at the first moment of the task, closed afterwards; who opens one asks for the fixture `child_process`.
 
     Args:
         draw: with a renderer, for whose shaders every worker takes some seconds.
@@ -67,12 +67,21 @@ def step(session: Session, count: int = 1) -> SessionView:
     return view
 
 
-def start_over(session: Session, seed: int = 0) -> SessionView:
-    """Paused at the first moment of new episodes of all envs, live."""
+def start_over(session: Session, seed: int) -> SessionView:
+    """Paused at the first moment of new episodes of all envs, live; the session's seed is this from now on."""
     session.pause()
     before = session.view().timeline.last
     session.set_seed(seed)
-    return wait_until(session, lambda view: view.timeline.last > before and not view.playing, "the reset")
+
+    def came(view: SessionView) -> bool:
+        timeline = session._state.timeline
+        if timeline is None or view.playing or view.timeline.last <= before:
+            return False
+        (moment,) = timeline.history.between(view.timeline.last, view.timeline.last)
+        # By its seed: a reset that was under way comes first.
+        return moment.seeds is not None and moment.seeds[0] == seed
+
+    return wait_until(session, came, "the reset")
 
 
 def rescored(rescorer: Rescorer, *states: str) -> RescoreView:

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from tests.drive import waiting
 from workbench.machine.chromium import find_chromium, how_to_get_chromium
 
 MARKER_OF = {"chromium_path": "browser", "child_process": "process", "renderer": "render"}
@@ -46,7 +47,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("fast"):
-        config.pluginmanager.register(Guard())
+        guard = Guard()
+        config.pluginmanager.register(guard)
+        waiting.interrupts.append(guard.check)
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:
@@ -73,6 +76,11 @@ class Guard:
                 f"`{MARKER_OF[fixture]}`"
             )
             pytest.fail(self.refused[-1])
+
+    def check(self) -> None:
+        """For who waits for what a thread was refused."""
+        if self.refused:
+            pytest.fail(self.refused[0])
 
     def pytest_collection_modifyitems(self, config: pytest.Config, items: list[pytest.Item]) -> None:
         left_out = (*MARKER_OF.values(), "thorough", "slow")
@@ -104,8 +112,10 @@ class Guard:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self) -> Iterator[None]:
-        """What a thread, or code that catches everything, was refused fails the test as well."""
+        """What a thread, or code that catches everything, was refused fails the test as well, and by its reason."""
         self.refused.clear()
-        yield
-        if self.refused:
-            pytest.fail(self.refused[0])
+        try:
+            return (yield)
+        finally:
+            if self.refused:
+                pytest.fail(self.refused[0])

@@ -10,6 +10,9 @@ T = TypeVar("T")
 PATIENCE = 90.0
 """Seconds after which what has not come is a failed test."""
 
+interrupts: list[Callable[[], None]] = []
+"""Asked at every look: one that raises ends the wait, where what is waited for can no longer come."""
+
 
 def until(
     reached: Callable[[], T | None],
@@ -20,6 +23,8 @@ def until(
     """The first true answer of `reached`; without one in time the test fails and says what `seen` saw."""
     deadline, pause = time.monotonic() + seconds, 0.01
     while not (answer := reached()):
+        for interrupt in interrupts:
+            interrupt()
         if time.monotonic() > deadline:
             raise AssertionError(
                 f"{what} did not come within {seconds:g} s" + (f": {seen()}" if seen else "")

@@ -23,7 +23,7 @@ DRAWS = True
 def settle(session: Session) -> None:
     session.set_action_source("random")
     session.set_episode_end("reset")
-    start_over(session)
+    start_over(session, 0)
 
 
 def test_a_single_step_moves_every_env_once(session: Session) -> None:

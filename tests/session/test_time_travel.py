@@ -31,7 +31,7 @@ def fresh(session: Session) -> int:
     session.set_episode_end("reset")
     session.set_action_source("sliders")
     session.set_sliders((0.3, -0.4, 0.2, 0.6, -0.1, 0.5, 0.2, -1.0))
-    return start_over(session).timeline.last
+    return start_over(session, 0).timeline.last
 
 
 def after(session: Session, ask) -> SessionView:
