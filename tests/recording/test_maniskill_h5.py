@@ -44,7 +44,7 @@ def stacked(rows: list[dict[str, NDArray]]) -> dict[str, NDArray]:
 
 
 def record_both(task: str, folder: Path, **kwargs: Any) -> tuple[Path, Path]:
-    """The .h5 of one episode from ManiSkill's wrapper, and from ours."""
+    """The .h5 of one episode from ManiSkill's wrapper, which asks git for its commit, and from ours."""
     stock: Any = gym.make(task, num_envs=1, render_backend="none", **kwargs)
     env: Any = RecordEpisode(
         stock,
@@ -110,7 +110,9 @@ def tree(path: Path) -> dict[str, NDArray]:
     ("task", "obs_mode"),
     [("PickCube-v1", "state_dict"), ("PickCube-v1", "state"), ("MS-CartpoleBalance-v1", "state")],
 )
-def test_names_types_shapes_and_numbers_are_theirs(tmp_path: Path, task: str, obs_mode: str) -> None:
+def test_names_types_shapes_and_numbers_are_theirs(
+    child_process: None, tmp_path: Path, task: str, obs_mode: str
+) -> None:
     theirs, ours = record_both(task, tmp_path, obs_mode=obs_mode)
     expected, found = tree(theirs), tree(ours)
     assert list(found) == list(expected)
@@ -151,7 +153,7 @@ def test_long_columns_are_packed_and_read_the_same(make_episode: Callable[..., M
     np.testing.assert_array_equal(found.poses[:, 1, 0], np.arange(3001))
 
 
-def test_theirs_is_read_as_ours_is(tmp_path: Path) -> None:
+def test_theirs_is_read_as_ours_is(child_process: None, tmp_path: Path) -> None:
     theirs, ours = record_both("PickCube-v1", tmp_path, obs_mode="state_dict")
     assert trajectories(theirs) == trajectories(ours) == ("traj_0",)
     found, expected = read_maniskill(theirs, "traj_0"), read_episode(ours)
@@ -217,7 +219,7 @@ def test_a_file_that_was_cut_takes_only_its_own_with_it(
     assert (read.poses is None, not read.env_states) == (lost == "poses", lost == "env_states")
 
 
-def test_what_is_no_recording_is_said(tmp_path: Path) -> None:
+def test_what_is_no_recording_is_said(child_process: None, tmp_path: Path) -> None:
     theirs, ours = record_both("MS-CartpoleBalance-v1", tmp_path, obs_mode="state")
     for reading, why in (
         (lambda: read_episode(tmp_path / "none.rrd"), "none.rrd is not there"),
