@@ -5,13 +5,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.drive.session import step, wait_until
+from tests.drive.session import start_over, step, wait_until
 from tests.session.studio import BASE, PEOPLE, camera, moved, said
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.session.messages import CameraRequest, TaskOptions
@@ -22,18 +22,57 @@ from workbench.session.view import SessionView
 pytestmark = pytest.mark.usefixtures("child_process")
 
 
+@dataclass
+class Copied:
+    """What a session said of an installed task, from its refusal to write it to the camera in the copy of it."""
+
+    folder: Path
+    refused: SessionView
+    planned: SessionView
+    ended: SessionView
+
+
 @pytest.fixture(scope="module")
-def studio_session(task_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Session, Copied]]:
+    """A session that began with an installed task, and went on to the copy of it.
+
+    Its tests go on in that process: the shaders of another take 6 s.
+    """
+    folder = tmp_path_factory.mktemp("copied")
+    (folder / "push_cube.py").write_text("somebody's own")
+    options = TaskOptions(num_envs=2, env_kwargs={"obs_mode": "rgb"})
+    with pytest.MonkeyPatch.context() as patch:
+        # The copy goes to where the session was begun.
+        patch.chdir(folder)
+        session = Session("PushCube-v1", options, recordings=tmp_path_factory.mktemp("recordings"))
+    try:
+        wait_until(session, lambda view: view.task is not None, "the first load")
+        there = replace(camera(session, BASE).now, position=(0.31, 0.02, 0.55))
+        session.studio.place(BASE, there)
+        session.studio.file.plan_write(BASE)
+        refused = wait_until(session, said(lambda s: s.writing.stage == "refused"), "the refusal")
+        session.studio.file.copy_task()
+        planned = wait_until(session, said(lambda s: s.writing.stage == "planned"), "the plan in the copy")
+        session.studio.file.write()
+        ended = wait_until(session, said(lambda s: s.writing.stage in ("checked", "mismatch")), "the check")
+        session.studio.file.drop_plan()
+        yield session, Copied(folder, refused, planned, ended)
+    finally:
+        session.close()
+
+
+@pytest.fixture(scope="module")
+def studio_session(opened: tuple[Session, Copied], task_file: Path) -> Session:
+    session, _ = opened
     text = task_file.read_text()
     # Small pictures: what is tested is where they are taken from.
     task_file.write_text(text.replace("512", "64"))
-    options = TaskOptions(num_envs=2, env_kwargs={"obs_mode": "rgb"})
-    session = Session(str(task_file), options, recordings=tmp_path_factory.mktemp("recordings"))
+    session.studio.back_to_file(BASE)
     session.set_clients(1)
-    wait_until(session, lambda view: view.task is not None, "the first load")
+    session.open_file(task_file, "PushCubeEnv")
+    wait_until(session, lambda view: view.task.file == str(task_file), "the example")
     session.watch_cameras((CameraRequest("base_camera", "sensor"), CameraRequest("render_camera", "human")))
-    yield session
-    session.close()
+    return session
 
 
 @pytest.fixture
@@ -263,8 +302,7 @@ def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved
 
 
 def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session: Session) -> None:
-    session.reset()
-    wait_until(session, lambda v: not v.step.elapsed_steps.any(), "a fresh episode")
+    start_over(session)
     step(session, 4)
     session.studio.judge_steps(BASE)
     studio = settled(session, lambda s: len(s.report_moments) == 5, "five moments")
@@ -365,31 +403,17 @@ def test_placements_outlive_reloads_and_workers_until_the_file_says_otherwise(
 
 
 def test_an_installed_task_is_copied_opened_and_the_placement_planned_in_the_copy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    opened: tuple[Session, Copied],
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "push_cube.py").write_text("somebody's own")
-    options = TaskOptions(num_envs=1, env_kwargs={"obs_mode": "rgb"})
-    session = Session("PushCube-v1", options, recordings=tmp_path / "recordings")
-    try:
-        wait_until(session, lambda view: view.task is not None, "the first load")
-        start = camera(session, BASE).now
-        there = replace(start, position=(0.31, 0.02, 0.55))
-        session.studio.place(BASE, there)
-        session.studio.file.plan_write(BASE)
-        view = wait_until(session, said(lambda s: s.writing.stage == "refused"), "the refusal")
-        assert view.studio.writing.can_copy and "is installed" in view.studio.writing.message
-        session.studio.file.copy_task()
-        view = wait_until(session, said(lambda s: s.writing.stage == "planned"), "the plan in the copy")
-        file = tmp_path / "push_cube_2.py"
-        assert view.task.file == str(file) == view.studio.writing.edit.file
-        assert view.task.env_id == "MyPushCube2-v1" and view.reload.level == "rebuilt"
-        assert view.reload.reason == "push_cube_2.py was opened in place of PushCubeEnv"
-        assert view.studio.writing.message.startswith(f"This is your copy of the task, {file}. This changes")
-        assert moved(view) == {BASE}, "the placement is lost"
-        session.studio.file.write()
-        view = wait_until(session, said(lambda s: s.writing.stage in ("checked", "mismatch")), "the check")
-        assert view.studio.writing.stage == "checked", view.studio.writing.message
-        assert (tmp_path / "push_cube.py").read_text() == "somebody's own"
-    finally:
-        session.close()
+    _, copied = opened
+    view = copied.refused
+    assert view.studio.writing.can_copy and "is installed" in view.studio.writing.message
+    view, file = copied.planned, copied.folder / "push_cube_2.py"
+    assert view.task.file == str(file) == view.studio.writing.edit.file
+    assert view.task.env_id == "MyPushCube2-v1" and view.reload.level == "rebuilt"
+    assert view.reload.reason == "push_cube_2.py was opened in place of PushCubeEnv"
+    assert view.studio.writing.message.startswith(f"This is your copy of the task, {file}. This changes")
+    assert moved(view) == {BASE}, "the placement is lost"
+    view = copied.ended
+    assert view.studio.writing.stage == "checked", view.studio.writing.message
+    assert (copied.folder / "push_cube.py").read_text() == "somebody's own"

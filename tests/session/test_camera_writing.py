@@ -159,7 +159,9 @@ def test_a_camera_that_the_robot_brings_is_in_no_copy_of_the_task(session: Sessi
         assert 'mount=self.robot.links_map["camera_link"],' in found.refusal.snippet
 
 
-def test_an_inherited_camera_gets_a_hook_that_keeps_the_parents_others(tmp_path: Path) -> None:
+def test_an_inherited_camera_gets_a_hook_that_keeps_the_parents_others(
+    session: Session, task_file: Path, tmp_path: Path
+) -> None:
     file = tmp_path / "task.py"
     text = """from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
 from mani_skill.utils.registration import register_env
@@ -179,10 +181,10 @@ class Inherits(PushCubeEnv):
     NEAR = 1
 """
     file.write_text(text)
-    options = TaskOptions(num_envs=1, backend="cpu")
-    session = Session(f"{file}:Inherits", options, recordings=tmp_path / "recordings")
+    example = session.view().task
+    session.open_file(file, "Inherits")
     try:
-        before = wait_until(session, lambda v: v.task is not None, "the first load").task
+        before = wait_until(session, lambda v: v.task.class_name == "Inherits", "the other task").task
         info = camera(session, BASE).info
         wanted = replace(info.settings, position=(0.4, 0.1, 0.9), fov=1.2)
 
@@ -212,7 +214,10 @@ class Inherits(PushCubeEnv):
         again = plan(task, camera(session, BASE).info, Wish("edit", BASE, replace(wanted, fov=0.8)))
         assert again.stage == "planned" and again.edit.diff.count("\n+ ") == 1, again.message
     finally:
-        session.close()
+        session.studio.back_to_file(BASE)
+        session.studio.file.drop_plan()
+        session.open_file(task_file, example.class_name)
+        wait_until(session, lambda v: v.task.file == str(task_file), "the example again")
 
 
 def test_a_change_is_not_taken_back_out_of_a_file_that_moved_on(session: Session, task_file: Path) -> None:
