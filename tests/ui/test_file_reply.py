@@ -166,3 +166,25 @@ def test_a_file_that_is_kept_packed_is_unpacked_for_who_cannot(door: Door, tmp_p
     assert (status, headers["Vary"], body) == (200, "Accept-Encoding", plain)
     assert headers["Content-Length"] == str(len(plain)) and "Content-Encoding" not in headers
     until(lambda: open_files(path) == 0, "the end of the reading")
+
+
+@pytest.mark.parametrize("damage", ["not packed at all", "torn off", "turned"])
+def test_a_packed_file_that_is_damaged_is_cut_off_and_the_terminal_stays_quiet(
+    door: Door, tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str
+) -> None:
+    packed = bytearray(gzip.compress(os.urandom(6 * BLOCK)))
+    if damage == "not packed at all":
+        packed[:2] = b"no"
+    elif damage == "torn off":
+        packed[3 * BLOCK : -4] = b""
+    else:
+        packed[3 * BLOCK : 3 * BLOCK + 4096] = b"\xff" * 4096
+    path = tmp_path / "viewer.wasm.gz"
+    path.write_bytes(packed)
+    prefix = f"/damaged-{damage.replace(' ', '-')}/"
+    door.add_route(prefix, lambda _: FileReply(path, "application/wasm", gzipped=True))
+    raw, got = begun(door, f"{prefix}x")
+    announced, count = rest(raw, got)
+    assert announced == 6 * BLOCK and count < announced
+    until(lambda: open_files(path) == 0, "the end of the reading")
+    assert caplog.records == []

@@ -15,6 +15,7 @@ import asyncio
 import gzip
 import os
 import urllib.parse
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
@@ -107,7 +108,7 @@ async def _pour(connection: ServerConnection, file: BinaryIO, head: bytes, lengt
         try:
             # Never more than was announced: a recording may grow while it is read.
             block = await asyncio.to_thread(file.read, min(BLOCK, left))
-        except OSError:
+        except (OSError, EOFError, zlib.error):  # the disk's, and what gzip says of a file that is torn
             block = b""
         if not block:
             # Shorter than announced. Cut off, so that the browser does not take a piece for the whole.
