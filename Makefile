@@ -78,8 +78,9 @@ test-gpu:
 	@if [ -z "$(GPU_PYTHON)" ]; then echo "test-gpu needs Python 3.11 or 3.12; name one: make test-gpu GPU_PYTHON=/path/to/python3.12" >&2; exit 1; fi
 	@$(GPU_PYTHON) tests/gpu/run.py $(if $(WHEELS),--wheels "$(WHEELS)") $(if $(PHYSX_GPU),--physx-gpu "$(PHYSX_GPU)") $(ARGS)
 
-gpu-wheels: set-up
+gpu-wheels:
 	@if [ -z "$(WHEELS)" ]; then echo "Which folder? Type: make gpu-wheels WHEELS=DIR" >&2; exit 1; fi
+	@$(MAKE) --no-print-directory set-up
 	@$(BIN)/python tests/gpu/run.py --fetch --wheels "$(WHEELS)" $(if $(FOR_PYTHON),--for-python $(FOR_PYTHON)) $(ARGS)
 
 mutants: set-up-test $(VENV)/.installed-mutants

@@ -1,12 +1,13 @@
 """Pictures of every tab of both pages, to hold one version against another by number and by eye.
 
-    python tests/browser/tab_pictures.py take /tmp/before      # with the old commit checked out
-    python tests/browser/tab_pictures.py take /tmp/after       # with the new one
-    python tests/browser/tab_pictures.py compare /tmp/before /tmp/after --out /tmp/differences
+    git worktree add /tmp/old COMMIT
+    PYTHONPATH=/tmp/old .venv/bin/python /tmp/old/tests/browser/tab_pictures.py take /tmp/before
+    .venv/bin/python tests/browser/tab_pictures.py take /tmp/after
+    .venv/bin/python tests/browser/tab_pictures.py compare /tmp/before /tmp/after --out /tmp/differences
 
-Both show the golden task and the golden recordings (tests/golden), in the same place, with the same seed and steps; beside
+One after the other: both show the golden task and the golden recordings (tests/golden), in the same place, with the same seed and steps; beside
 each picture is the text of the page. Numbers that no two runs share (times, rates, memory) are written over with dots before a picture is
-taken. The comparison prints the share of pixels that are another colour and the lines of text that came and went, leaves a picture of
+taken. The comparison prints the share of pixels that are another colour and the lines of text that came and went, leaves in --out a picture of
 both and of where they differ, and exits with 1 where a picture differs by more than --share, or is in one folder alone.
 """
 
@@ -200,10 +201,13 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     commands = parser.add_subparsers(dest="command", required=True)
-    commands.add_parser("take").add_argument("folder", type=Path)
-    comparing = commands.add_parser("compare")
-    comparing.add_argument("old", type=Path)
-    comparing.add_argument("new", type=Path)
+    taking = commands.add_parser("take", help="pictures and texts of every tab, into a folder")
+    taking.add_argument(
+        "folder", type=Path, help="is made where it is not there; what is in it is written over"
+    )
+    comparing = commands.add_parser("compare", help="two such folders")
+    comparing.add_argument("old", type=Path, help="folder of the one version")
+    comparing.add_argument("new", type=Path, help="folder of the other")
     comparing.add_argument("--out", type=Path, help="folder for pictures of both and of where they differ")
     comparing.add_argument(
         "--share", type=float, default=MOST, help=f"of the pixels that may differ ({MOST})"
