@@ -302,7 +302,7 @@ def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved
 
 
 def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session: Session) -> None:
-    start_over(session)
+    start_over(session, 0)
     step(session, 4)
     session.studio.judge_steps(BASE)
     studio = settled(session, lambda s: len(s.report_moments) == 5, "five moments")
