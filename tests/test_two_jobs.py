@@ -115,11 +115,11 @@ class Filming:
 
 
 def running(module: str) -> list[psutil.Process]:
+    """Of what this process has started, itself or by a keeper; a page's server of other tests has workers further down."""
     found = []
-    for process in psutil.Process().children(recursive=True):
+    for child in psutil.Process().children():
         try:
-            if module in process.cmdline():
-                found.append(process)
+            found += [process for process in (child, *child.children()) if module in process.cmdline()]
         except psutil.NoSuchProcess:
             continue
     return found

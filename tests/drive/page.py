@@ -106,7 +106,7 @@ def _sight_of(page: Page, errors: list[str]) -> Sight:
     log = "\n".join([page.url, *errors])
     try:
         # Not `evaluate`, which waits for ever for a page that hangs.
-        page.wait_for_function("viewIsSeen = true", timeout=10_000)
+        page.wait_for_function("() => (viewIsSeen = true)", timeout=10_000)
         page.wait_for_timeout(1500)  # viser draws once a second
         return Sight(log, page.screenshot(timeout=10_000))
     except Error as error:

@@ -409,7 +409,7 @@ def test_a_real_browser_opens_the_page_with_nothing_to_complain_of(door, browser
         )
         page.goto(door.url, wait_until="domcontentloaded")
         page.wait_for_selector("#from-html", timeout=60_000)
-        page.wait_for_function("document.getElementById('logo').naturalWidth > 0", timeout=60_000)
+        page.wait_for_function("() => document.getElementById('logo').naturalWidth > 0", timeout=60_000)
         assert connected.wait(60)
         assert page.url == f"http://127.0.0.1:{door.port}/"  # the token has left the address bar
         assert page.evaluate("document.cookie") == ""  # and no script can read it

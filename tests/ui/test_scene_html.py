@@ -60,12 +60,12 @@ def test_it_plays_without_a_server(episode: Episode, tmp_path: Path, browser: Br
         tab.goto(path.as_uri())
         time_shown = tab.locator("input").first
         tab.wait_for_function(
-            "document.querySelector('input') && parseFloat(document.querySelector('input').value) > 0.3"
+            "() => document.querySelector('input') && parseFloat(document.querySelector('input').value) > 0.3"
         )
         assert float(time_shown.input_value()) <= 3.2
         # What is said is the episode's own time, to its end and no further while the last state is held.
         tab.wait_for_function(
-            "document.querySelector('#wb-time').textContent === 'step 20 of 20, 2.00 of 2.00 s'"
+            "() => document.querySelector('#wb-time').textContent === 'step 20 of 20, 2.00 of 2.00 s'"
         )
         caption = tab.locator(".wb-caption")
         assert "Made & <b>, seed 7" in caption.inner_text()
