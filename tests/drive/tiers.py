@@ -105,6 +105,7 @@ class Guard:
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self) -> Iterator[None]:
         self.running = True
+        self.refused.clear()
         try:
             return (yield)
         finally:
@@ -113,7 +114,6 @@ class Guard:
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_call(self) -> Iterator[None]:
         """What a thread, or code that catches everything, was refused fails the test as well, and by its reason."""
-        self.refused.clear()
         try:
             return (yield)
         finally:

@@ -29,6 +29,7 @@ from workbench.session.messages import (
     WarmUp,
 )
 
+pytestmark = pytest.mark.usefixtures("child_process")
 SMALL_WORKER = Path(__file__).with_name("small_worker.py")
 OPTIONS = TaskOptions(num_envs=1)
 
