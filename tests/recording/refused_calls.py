@@ -6,6 +6,7 @@ import errno
 import io
 import os
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any
@@ -80,3 +81,8 @@ def descriptors() -> list[str]:
     """What this process has open of files on a disk."""
     held = (_path(int(number)) for number in os.listdir("/proc/self/fd"))
     return sorted(path for path in held if path.startswith("/") and not path.startswith(("/dev", "/proc")))
+
+
+def left_open(before: list[str]) -> list[str]:
+    """What is open now and was not then. What is not open any more is another test's, whose thread came to its end."""
+    return sorted((Counter(descriptors()) - Counter(before)).elements())

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.recording.refused_calls import descriptors, refused
+from tests.recording.refused_calls import descriptors, left_open, refused
 from workbench.recording.new_file import new_file
 
 
@@ -43,7 +43,7 @@ def test_whatever_call_fails_it_is_whole_or_not_there(
                 write(path)
             except OSError as error:
                 told = str(error.strerror)
-        assert descriptors() == before, call
+        assert left_open(before) == [], call
         if path.exists():
             assert path.read_bytes() == b"whole" and not told, call
         else:
