@@ -71,8 +71,9 @@ class Judging:
 
     def pids(self) -> list[int]:
         found = running("workbench.session.worker_start")
-        # Each has a keeper above it of the same name.
-        return [process.pid for process in found if not process.children()]
+        # Each has a keeper above it of the same name, which is there before it.
+        keepers = {process.pid for process in found}
+        return [process.pid for process in found if process.ppid() in keepers]
 
     def ended(self) -> bool:
         return self._rescorer.view.state in ("done", "failed")
@@ -139,8 +140,7 @@ def test_of_two_processes_of_a_page_one_is_killed(jobs: list[Judging | Filming],
     held: dict[int, int] = {}
     for number, job in enumerate(jobs):
         job.start()
-        until(lambda job=job: bool(job.pids()) or job.ended(), "the process")
-        (held[number],) = job.pids()
+        (held[number],) = until(lambda job=job: job.pids(), "the process", seen=job.told)
         # It stands still, so that both are under way when one is killed.
         os.kill(held[number], signal.SIGSTOP)
     assert not killed.ended() and not other.ended()
