@@ -103,6 +103,11 @@ def held_by(server: viser.ViserServer) -> dict[str, int]:
     }
 
 
+def told_so_far(server: viser.ViserServer) -> int:
+    """How many messages the server has put on their way to all pages."""
+    return server._websock_server._broadcast_buffer.message_counter
+
+
 def inputs_of(gui: viser.GuiApi) -> list[Any]:
     """All inputs of a server's pages, or of one page."""
     return list(gui._gui_input_handle_from_uuid.values())

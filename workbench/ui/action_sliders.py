@@ -8,7 +8,6 @@ import viser
 
 from workbench.session.messages import ActionDimension
 from workbench.session.session import Session
-from workbench.ui.changed import show
 from workbench.ui.checked import checked_number
 from workbench.ui.controls import Control
 
@@ -57,7 +56,7 @@ class ActionSliders:
                 )
 
     def draw(self, shown: bool, values: tuple[float, ...]) -> None:
-        show(self._folder, shown)
+        self._folder.visible = shown
         if shown and len(values) == len(self._controls):
             for dimension, control, value in zip(self._dimensions, self._controls, values, strict=True):
                 low, high = slider_bounds(dimension)

@@ -14,7 +14,6 @@ import viser
 from workbench.authoring.problem import Problem
 from workbench.session.view import SessionView
 from workbench.ui.busy_banner import is_shown as busy_is_shown
-from workbench.ui.changed import show
 from workbench.ui.fragments import render
 from workbench.ui.over_the_view import GAP, FitsTheView
 
@@ -76,7 +75,7 @@ class Banner:
             return
         self._fits.fit()
         stopped = view.state == "stopped"
-        show(self._restart, stopped)
+        self._restart.visible = stopped
         # Written once a problem: a new text would close the traceback that someone has open.
         drawn = view.problem_serial, _kept(view) if problem.stage == "worker" else ""
         if drawn != self._drawn:

@@ -14,7 +14,6 @@ import viser
 
 from workbench.session.last_words import Busy
 from workbench.session.view import SessionView
-from workbench.ui.changed import show
 from workbench.ui.fragments import render
 
 SHOWN_AFTER = 4.0
@@ -52,27 +51,19 @@ class BusyBanner:
         self._panel.float(x=-GAP, y=GAP, width=WIDTH)
         self._interrupt.on_click(lambda _: interrupt())
         self._restart.on_click(lambda _: restart())
-        self._drawn = ""
-        self._trace_drawn = ""
 
     def draw(self, view: SessionView) -> None:
         busy = view.busy
         if busy is None or not is_shown(view):
-            if self._panel.visible:
-                self._panel.visible = False
+            self._panel.visible = False
             return
-        html = busy_html(busy, view)
-        if html != self._drawn:
-            self._drawn = html
-            self._html.content = html
+        self._html.content = busy_html(busy, view)
         # Apart from the seconds, which would close it each time that they change.
         trace = render("traceback", traceback=busy.traceback) if busy.deaf and busy.traceback else ""
-        if trace != self._trace_drawn:
-            self._trace_drawn = trace
-            self._traceback.content = trace
-            self._traceback.visible = bool(trace)
+        self._traceback.content = trace
+        self._traceback.visible = bool(trace)
         can_interrupt = not busy.deaf and not busy.drawing
-        show(self._interrupt, can_interrupt)
+        self._interrupt.visible = can_interrupt
         if not self._panel.visible:
             self._panel.visible = True
             self._panel.expand()

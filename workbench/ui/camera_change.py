@@ -14,7 +14,6 @@ import viser
 from workbench.session.session import Session
 from workbench.session.studio_view import Writing
 from workbench.ui.arrival import Arrival
-from workbench.ui.changed import fill, show
 from workbench.ui.fragments import render
 from workbench.ui.viser_seam import element_id
 
@@ -55,30 +54,22 @@ class CameraChange:
             picture: address of what the camera would see that is to be added.
         """
         stage = writing.stage
-        show(self._text, stage != "none" or bool(writing.message))
-        show(self._copy, writing.can_copy)
-        show(self._write, stage == "planned" and not stale)
-        show(self._drop, stage not in ("none", "written"))
-        show(self._undo, stage in DONE)
+        self._text.visible = stage != "none" or bool(writing.message)
+        self._copy.visible = writing.can_copy
+        self._write.visible = stage == "planned" and not stale
+        self._drop.visible = stage not in ("none", "written")
+        self._undo.visible = stage in DONE
         name = "" if writing.edit is None else writing.edit.names
-        _label(self._drop, LEAVE if stage == "planned" else CLOSE)
-        _label(self._write, f"Write it to {name}" if name else "Write it")
+        self._drop.label = LEAVE if stage == "planned" else CLOSE
+        self._write.label = f"Write it to {name}" if name else "Write it"
         new = self.arrival.just_came(writing if stage != "none" else None)
-        fill(
-            self._text,
-            writing_html(
-                writing,
-                stale,
-                about if stage == "planned" else "",
-                element_id(self._drop) if new else "",
-                picture if stage == "planned" else "",
-            ),
+        self._text.content = writing_html(
+            writing,
+            stale,
+            about if stage == "planned" else "",
+            element_id(self._drop) if new else "",
+            picture if stage == "planned" else "",
         )
-
-
-def _label(button: viser.GuiButtonHandle, label: str) -> None:
-    if button.label != label:
-        button.label = label
 
 
 def writing_html(

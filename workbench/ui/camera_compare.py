@@ -17,7 +17,6 @@ from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera
 from workbench.session.view import SessionView
 from workbench.ui.camera_work import WorkBar
-from workbench.ui.changed import fill, show
 from workbench.ui.fragments import render
 from workbench.ui.inline_pictures import data_address
 
@@ -95,11 +94,10 @@ class CameraCompare:
         usable = camera is not None and camera.now is not None
         self._bar.draw(studio.progress)
         for button in (self._keep, self._compare):
-            if button.disabled == usable:
-                button.disabled = not usable
+            button.disabled = not usable
         kept = None if camera is None else self._kept.get(camera.key)
         back = camera is not None and kept is not None and kept != camera.now
-        show(self._take, back)
+        self._take.visible = back
         both = studio.compared
         mine = (
             both is not None
@@ -110,7 +108,7 @@ class CameraCompare:
         if wanted == self._drawn:
             return
         self._drawn = wanted
-        show(self._html, mine)
+        self._html.visible = mine
         if not mine or both is None or camera is None or both[0].rgb is None or both[1].rgb is None:
             return
         asked = self._asked if self._asked is not None and self._asked[0] == camera.key else None
@@ -124,7 +122,7 @@ class CameraCompare:
             env=both[0].env,
             differences=[] if asked is None else what_differs(asked[2], asked[1]),
         )
-        fill(self._html, content)
+        self._html.content = content
 
 
 def what_differs(old: CameraSettings, new: CameraSettings) -> list[str]:

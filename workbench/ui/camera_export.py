@@ -137,8 +137,7 @@ class CameraExport:
         camera = view.studio.chosen
         idle = camera is None or camera.now is None
         for button in (self._download, self._import):
-            if button.disabled != idle:
-                button.disabled = idle
+            button.disabled = idle
         try:
             convention, direction = self._choices()
         except ValueError:

@@ -83,7 +83,6 @@ class CameraGizmo:
             visible=False,
         )
         self._line: viser.LineSegmentsHandle | None = None
-        self._drawn_line: object = None
         self._held_at = -1e9
         self._start: _Taken | None = None
         # Async: callbacks in viser's pool of threads would come in any order.
@@ -108,8 +107,7 @@ class CameraGizmo:
             (self._eye, two),
             (self._target, two),
         ):
-            if handle.visible != shown:
-                handle.visible = shown
+            handle.visible = shown
         self._draw_line(camera)
         if camera is None or camera.now is None:
             return
@@ -128,12 +126,10 @@ class CameraGizmo:
             for page in self._server.get_clients().values()
         ]
         for handle, pixels in zip((self._eye, self._target), sizes(min(apart, default=np.inf)), strict=True):
-            if handle.scale != pixels:
-                handle.scale = pixels
+            handle.scale = pixels
             few = pixels < PIXELS / 2
             # Its planes are what hides most, and can be done without.
-            if handle.disable_sliders != few:
-                handle.disable_sliders = few
+            handle.disable_sliders = few
 
     def _draw_line(self, camera: StudioCamera | None) -> None:
         """From the eye to the target, which otherwise would be any three arrows in the air."""
@@ -143,10 +139,6 @@ class CameraGizmo:
             wanted = np.stack([eye, self._placing.target_in_view(camera, camera.now)])[None].astype(
                 np.float32
             )
-        shown = None if wanted is None else wanted.tobytes()
-        if shown == self._drawn_line:
-            return
-        self._drawn_line = shown
         if wanted is None:
             if self._line is not None:
                 self._line.visible = False

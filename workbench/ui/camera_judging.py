@@ -15,7 +15,6 @@ from workbench.ui.camera_compare import CameraCompare
 from workbench.ui.camera_export import CameraExport
 from workbench.ui.camera_suggest import CameraSuggest
 from workbench.ui.camera_verdict import CameraVerdict
-from workbench.ui.changed import show
 
 
 class CameraJudging:
@@ -36,7 +35,7 @@ class CameraJudging:
         # Folders without a subject would be dead controls.
         there = view.studio.chosen is not None
         for part in self._parts:
-            show(part.folder, there)
+            part.folder.visible = there
             part.draw(view)
 
     def draw_in_view(self, view: SessionView, offset: NDArray) -> None:

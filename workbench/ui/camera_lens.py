@@ -22,7 +22,6 @@ from workbench.core.camera_frames import (
 from workbench.core.camera_settings import CameraSettings
 from workbench.session.studio_view import StudioCamera
 from workbench.ui.camera_moves import kept_where_equal
-from workbench.ui.changed import show
 from workbench.ui.checked import checked_int
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
@@ -109,7 +108,7 @@ class CameraLens:
 
     def draw(self, camera: StudioCamera | None) -> None:
         """Show this camera's; None hides all."""
-        show(self._folder, camera is not None)
+        self._folder.visible = camera is not None
         if camera is not None and camera.now is not None:
             self._draw_lens(camera.now)
 
@@ -122,7 +121,7 @@ class CameraLens:
             (self._focal, by_matrix),
             (self._centre, by_matrix),
         ):
-            show(control.handle, shown)
+            control.handle.visible = shown
         k = intrinsic_of(now)
         if by_matrix:
             self._focal.show((k[0, 0], k[1, 1]))

@@ -32,7 +32,6 @@ from workbench.core.camera_frames import (
 from workbench.core.camera_settings import CameraSettings
 from workbench.session.studio_view import StudioCamera
 from workbench.ui.camera_moves import Floats, kept_where_equal, rounded
-from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_text
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
@@ -115,7 +114,7 @@ class CameraNumbers:
 
     def draw(self, camera: StudioCamera | None) -> None:
         """Show this camera's; None hides all."""
-        show(self._folder, camera is not None)
+        self._folder.visible = camera is not None
         if camera is None or camera.now is None:
             return
         now, alone = camera.now, self._look_at()
@@ -123,9 +122,8 @@ class CameraNumbers:
             (self._position, "Eye" if alone else "Position"),
             (self._target, "Target" if alone else "Looks at"),
         ):
-            if control.handle.label != label:
-                control.handle.label = label
-        fill(self._about, render("aside", text=STAYS if alone else GOES_ALONG))
+            control.handle.label = label
+        self._about.content = render("aside", text=STAYS if alone else GOES_ALONG)
         self._position.show(now.position)
         self._target.show(self._placing.target(camera, now))
         self._draw_orientation(now)
@@ -138,8 +136,8 @@ class CameraNumbers:
             (self._forward, AXES),
             (self._up, AXES),
         ):
-            show(control.handle, said == name)
-        show(self._left, said == AXES)
+            control.handle.visible = said == name
+        self._left.visible = said == AXES
         if said == RPY:
             # Half a turn is the same both ways round; it would flicker between the two.
             self._rpy.show([180.0 if round(a, DEGREES) == -180 else a for a in rpy_of(now.quaternion)])
@@ -150,7 +148,7 @@ class CameraNumbers:
             self._forward.show(forward)
             self._up.show(up)
             text = render("note", text=f"Left: {', '.join(f'{n:.{UNIT}f}' for n in rounded(left, UNIT))}")
-            fill(self._left, text)
+            self._left.content = text
 
     # --- what is typed -----------------------------------------------------------------------------------
 

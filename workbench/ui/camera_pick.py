@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from workbench.session.session import Session
 from workbench.session.studio_view import Picked, StudioCamera
 from workbench.session.view import SessionView
-from workbench.ui.changed import show
 from workbench.ui.fragments import render
 from workbench.ui.presses import Presses
 
@@ -61,7 +60,7 @@ class CameraPick:
             (self._pane, shown and camera is not None),
             (self._found, shown and picked is not None),
         ):
-            show(handle, wanted)
+            handle.visible = wanted
         size = None if camera is None else _size(camera)
         if camera is None or not shown or (size, picked) == self._drawn:
             return

@@ -22,7 +22,6 @@ from workbench.session.studio_view import StudioCamera
 from workbench.session.view import SessionView
 from workbench.ui.arrival import Arrival
 from workbench.ui.camera_work import WorkBar
-from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_number
 from workbench.ui.fragments import render
 from workbench.ui.inline_pictures import data_address
@@ -149,8 +148,7 @@ class CameraSuggest:
     def draw(self, view: SessionView) -> None:
         studio, camera = view.studio, view.studio.chosen
         able = camera is not None and camera.now is not None and not camera.refused
-        if self._search.disabled == able:
-            self._search.disabled = not able
+        self._search.disabled = not able
         self._bar.draw(studio.progress)
         self._draw_mounted(camera)
         self._draw_bounds(camera)
@@ -161,17 +159,17 @@ class CameraSuggest:
             return
         self._drawn = wanted
         mine = bool(studio.suggestions) and studio.suggestions_of == studio.selected
-        show(self._offers, mine)
+        self._offers.visible = mine
         if mine and camera is not None:
             content = self._offers_html(studio.suggestions, camera, new)
-            fill(self._offers, content)
+            self._offers.content = content
 
     def _draw_mounted(self, camera: StudioCamera | None) -> None:
         mount = None if camera is None else camera.info.mount
-        show(self._mounted, mount is not None)
+        self._mounted.visible = mount is not None
         if mount is not None:
             text = f"It rides on {mount}: the box is in that body's frame, which is looked from as it is after a reset."
-            fill(self._mounted, render("note", text=text))
+            self._mounted.content = render("note", text=text)
 
     def _draw_bounds(self, camera: StudioCamera | None) -> None:
         if camera is None or camera.now is None:
@@ -183,8 +181,7 @@ class CameraSuggest:
         room = ROOM if camera.info.mount is None else ROOM_ON_MOUNT
         for handle, sign in ((self._low, -1), (self._high, 1)):
             x, y, z = (round(number + sign * room, 2) for number in camera.now.position)
-            if handle.value != (x, y, z):
-                handle.value = (x, y, z)
+            handle.value = (x, y, z)
 
     def _draw_names(self, view: SessionView) -> None:
         key = view.studio.selected

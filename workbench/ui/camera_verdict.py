@@ -22,7 +22,6 @@ from workbench.session.view import SessionView
 from workbench.ui import camera_report_words as words
 from workbench.ui.arrival import Arrival
 from workbench.ui.camera_work import WorkBar
-from workbench.ui.changed import fill, show
 from workbench.ui.fragments import render
 from workbench.ui.inline_pictures import data_address
 from workbench.ui.presses import Presses
@@ -136,8 +135,8 @@ class CameraVerdict:
     def draw(self, view: SessionView) -> None:
         studio = view.studio
         camera = studio.chosen
-        show(self._resets, self._over.value == FRESH)
-        show(self._steps, self._over.value == STEPS)
+        self._resets.visible = self._over.value == FRESH
+        self._steps.visible = self._over.value == STEPS
         self._bar.draw(studio.progress)
         self._sheet_bar.draw(studio.progress)
         self._draw_report(studio, camera)
@@ -151,7 +150,7 @@ class CameraVerdict:
         if wanted == self._drawn:
             return
         self._drawn = wanted
-        show(self._report, report is not None)
+        self._report.visible = report is not None
         if report is None or camera is None:
             return
         uses = {
@@ -165,7 +164,7 @@ class CameraVerdict:
             for i, moment in enumerate(studio.report_moments)
         ]
         how = Standing(studio.report_stale, studio.report_before, new)
-        fill(self._report, report_html(report, camera, how, studio.report_seeds, uses, seen_at))
+        self._report.content = report_html(report, camera, how, studio.report_seeds, uses, seen_at)
 
     def _draw_sheet(self, view: SessionView, camera: StudioCamera | None) -> None:
         studio = view.studio
@@ -176,12 +175,12 @@ class CameraVerdict:
         if wanted == self._drawn_sheet:
             return
         self._drawn_sheet = wanted
-        show(self._pictures, mine)
+        self._pictures.visible = mine
         if not mine or camera is None:
             return
         judged = studio.report_of == camera.key and not studio.report_seeds and not studio.report_moments
         report = studio.report if judged else None
-        fill(self._pictures, self._sheet_html(sheet, report, view.selected_env, new))
+        self._pictures.content = self._sheet_html(sheet, report, view.selected_env, new)
 
     def _sheet_html(
         self, sheet: tuple[Picture, ...], report: CameraReport | None, selected: int, new: bool

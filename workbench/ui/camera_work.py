@@ -13,7 +13,6 @@ import viser
 
 from workbench.session.session import Session
 from workbench.session.studio_view import Progress
-from workbench.ui.changed import show
 from workbench.ui.fragments import render
 
 SHORT = 0.5
@@ -44,7 +43,7 @@ class WorkBar:
             self._began = time.monotonic()
         shown = self._began is not None and time.monotonic() - self._began >= SHORT
         for handle in (self._bar, self._stop):
-            show(handle, shown)
+            handle.visible = shown
         if not shown or running is None or running == self._drawn:
             return
         self._drawn = running

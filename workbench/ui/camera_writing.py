@@ -20,7 +20,6 @@ from workbench.core.pictures import Picture
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioView, Writing
 from workbench.ui.camera_change import CameraChange
-from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_text
 from workbench.ui.first_place import FirstPlace, aimed_at, first_place, objects_in
 from workbench.ui.fragments import render
@@ -134,8 +133,8 @@ class CameraWriting:
     def _say(self, why_not: str) -> None:
         """Beside the buttons that were pressed, where one looks."""
         if self._why_not is not None:
-            show(self._why_not, bool(why_not))
-            fill(self._why_not, render("warning", text=why_not) if why_not else "")
+            self._why_not.visible = bool(why_not)
+            self._why_not.content = render("warning", text=why_not) if why_not else ""
 
     def _plan_member(self, what: object, client: viser.ClientHandle | None) -> None:
         file, view = self._session.studio.file, self._session.view()
@@ -189,9 +188,8 @@ class CameraWriting:
         # Not at the place of the button that writes: a second press must not write what was not read.
         can_plan = can_place and (writing.stage != "planned" or stale or of_members)
         wants_plan = can_plan and chosen is not None and chosen.moved and writing.stage != "written"
-        show(self._plan, can_plan)
-        if self._plan.disabled == wants_plan:
-            self._plan.disabled = not wants_plan
+        self._plan.visible = can_plan
+        self._plan.disabled = not wants_plan
         for change, here in ((self._change, not of_members), (self._member_change, of_members)):
             if change is not None:
                 shown = here and self._before is None
@@ -203,7 +201,7 @@ class CameraWriting:
             if self._name is not None and self._name.value:
                 self._name.value = ""  # it is taken now
         if self._with_chosen is not None:
-            show(self._with_chosen, chosen is not None)
+            self._with_chosen.visible = chosen is not None
 
     def _address(self, studio: StudioView) -> str:
         """Of the picture of the camera that is to be added; empty while there is none."""

@@ -19,7 +19,6 @@ from workbench.core.camera_settings import CameraKey
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.session.messages import CameraRequest, TaskDescription
 from workbench.session.view import SessionView
-from workbench.ui.changed import fill
 from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.false_colour import DepthRange
 from workbench.ui.fragments import render
@@ -151,9 +150,8 @@ class CamerasPanel:
                     camera = self._build_camera(info, first_of_kind[info.kind] == info.name)
                 else:
                     camera.info, camera.depth_span = info, None
-                    fill(camera.facts, facts(camera))
-                if camera.folder.order != order:
-                    camera.folder.order = order
+                    camera.facts.content = facts(camera)
+                camera.folder.order = order
                 self._cameras[key] = camera
 
     def _build_camera(self, info: CameraInfo, first: bool) -> _Camera:

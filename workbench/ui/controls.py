@@ -80,12 +80,10 @@ class Control(Generic[Handle, T]):
             self._apply(client)
         elif idle > HANDS_OFF + self._settle:
             shown = self._shown(value)
-            if self.handle.value != shown:
-                self.handle.value = shown
+            self.handle.value = shown
 
     def enable(self, enabled: bool) -> None:
-        if self.handle.disabled == enabled:
-            self.handle.disabled = not enabled
+        self.handle.disabled = not enabled
 
     async def _on_update(self, event: viser.GuiEvent) -> None:
         # Async, so that it runs with the message itself: in viser's pool of threads it may come so late that `show`

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from workbench.session.number_text import lost_text, number_text
 from workbench.session.view import SessionView
-from workbench.ui.changed import fill, show
 from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import CURSOR, LONGEST, SELECTED_COLOUR, STEP, YES_OR_NO, LineChart, Span, line
@@ -37,11 +36,11 @@ class CurvesPanel:
     def draw(self, view: SessionView) -> None:
         curves = view.curves
         drawable = curves is not None and len(curves.tick) > 1
-        show(self._empty, not drawable)
+        self._empty.visible = not drawable
         if curves is None or not drawable:
             self._reward.hide()
             self._success.hide()
-            show(self._lost, False)
+            self._lost.visible = False
             return
         shown = None if view.timeline.shown is None else view.timeline.tick
         wanted = (curves.serial, view.selected_env, curves.reward.shape[1], shown)
@@ -51,8 +50,8 @@ class CurvesPanel:
         _draw(self._reward, "reward", curves.tick, curves.reward, env, None, shown)
         lost = said_of(curves.reward[-1])
         if lost:
-            fill(self._lost, render("warning", text=lost))
-        show(self._lost, bool(lost))
+            self._lost.content = render("warning", text=lost)
+        self._lost.visible = bool(lost)
         _draw(self._success, "success", curves.tick, curves.success, env, YES_OR_NO, shown)
 
 

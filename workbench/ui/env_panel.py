@@ -16,7 +16,6 @@ import viser
 from workbench.session.env_table import EnvRows
 from workbench.session.session import Session
 from workbench.session.view import SessionView
-from workbench.ui.changed import fill
 from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.env_strip import (
     FILTERS,
@@ -72,7 +71,7 @@ class EnvPanel:
         self._at_once = at_once
         rows = self._session.env_rows()
         content = render("envs", head=()) if rows is None else self._html(rows, view.selected_env)
-        fill(self._handle, content)
+        self._handle.content = content
 
     def _html(self, rows: EnvRows, selected: int) -> str:
         if self._column not in columns(rows):

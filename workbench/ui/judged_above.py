@@ -10,7 +10,6 @@ import viser
 
 from workbench.session.view import SessionView
 from workbench.ui import judged_in_words as words
-from workbench.ui.changed import fill, show
 from workbench.ui.fragments import render
 
 
@@ -20,6 +19,6 @@ class JudgedAbove:
 
     def draw(self, view: SessionView) -> None:
         says = words.in_a_line(view.judgement)
-        show(self._line, bool(says))
+        self._line.visible = bool(says)
         if says:
-            fill(self._line, render("judged_above", says=says))
+            self._line.content = render("judged_above", says=says)

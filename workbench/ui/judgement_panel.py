@@ -20,7 +20,6 @@ from workbench.session.lengths import length
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui import judged_in_words as words
-from workbench.ui.changed import fill, show
 from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import LONGEST
@@ -58,12 +57,12 @@ class JudgementPanel:
         wanted = (judged.serial, view.selected_env, shown, self._name.value, self._first, view.timeline.first)
         if not self._due.is_due(wanted):
             return
-        show(self._status, judged.state != "none")
-        show(self._stop, judged.state in ("loading", "judging"))
+        self._status.visible = judged.state != "none"
+        self._stop.visible = judged.state in ("loading", "judging")
         if judged.state == "none":
             self._first = 0
         else:
-            fill(self._status, status_html(judged))
+            self._status.content = status_html(judged)
         self._draw_list(judged, view)
         self._draw_chart(judged, view)
 
@@ -74,13 +73,11 @@ class JudgementPanel:
         names = () if summary is None else summary.names
         differs = summary is not None and bool(summary.differing or summary.differing_names)
         if names and self._name.options != names:
-            chosen = self._name.value
             self._name.options = names
-            self._name.value = chosen if chosen in names else names[0]
         # What a page sends as its choice may be anything.
         name = self._name.value if self._name.value in names else "reward"
         curve = self._session.judged_curve(name, view.selected_env) if differs else None
-        show(self._name, curve is not None)
+        self._name.visible = curve is not None
         if curve is None or len(curve.tick) < 2:
             self._chart.hide()
             return
@@ -92,7 +89,7 @@ class JudgementPanel:
 
     def _draw_list(self, judged: JudgementView, view: SessionView) -> None:
         self._listed = () if judged.summary is None else judged.summary.differences
-        show(self._list, bool(self._listed))
+        self._list.visible = bool(self._listed)
         if not self._listed:
             return
         count = len(self._listed)
@@ -111,7 +108,7 @@ class JudgementPanel:
                 "on": self._presses.id_of("on", lambda _: self._turn(MOST_ROWS)),
             },
         )
-        fill(self._list, content)
+        self._list.content = content
 
     def _row(self, place: int, view: SessionView) -> dict[str, object]:
         episode = self._listed[place]

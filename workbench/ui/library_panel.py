@@ -23,7 +23,6 @@ import viser
 
 from workbench.recording.library import Library, LibraryView
 from workbench.recording.library_row import LibraryRow
-from workbench.ui.changed import fill, show
 from workbench.ui.commands import Command
 from workbench.ui.draw_due import Clock
 from workbench.ui.file_size import size_in_words
@@ -194,8 +193,7 @@ class LibraryPanel:
         listed = self._list
         of_use = self._asking or bool(listed.words or listed.task) or listed.outcome != "all"
         for handle in self._escapes:
-            if handle.disabled == of_use:
-                handle.disabled = not of_use
+            handle.disabled = not of_use
 
     # --- drawing ---------------------------------------------------------------------------------------
 
@@ -219,7 +217,7 @@ class LibraryPanel:
             self._draw_tools(view, page)
             self._draw_marks(page)
             if self._is_new("trash", view.trash):
-                fill(self._trash, self._trash_html(view))
+                self._trash.content = self._trash_html(view)
         self._tell()
 
     def _is_new(self, part: str, wanted: object) -> bool:
@@ -237,38 +235,35 @@ class LibraryPanel:
             listed.look_for(listed.words, listed.task)  # its task may have gone
             self._tasks.options = (ALL_TASKS, *tasks)
             self._tasks.value = ALL_TASKS if listed.task is None else listed.task
-        show(self._tasks, len(tasks) > 1)
-        show(self._find, bool(view.rows))
+        self._tasks.visible = len(tasks) > 1
+        self._find.visible = bool(view.rows)
         others = chosen(view.rows, listed.words, "all", listed.task)
         counts = {outcome: sum(has_outcome(row, outcome) for row in others) for outcome in OUTCOMES}
         done, total = view.reading or (0, 0)
-        fill(
-            self._filters,
-            render(
-                "library_filters",
-                problem=view.problem or "",
-                reading=""
-                if view.reading is None
-                else f"Reading {done} of {total} recordings"
-                if total
-                else "Looking through the folder",
-                percent=f"{100 * done / max(1, total):.0f}",
-                pills=[
-                    {
-                        "name": outcome,
-                        "hint": MEANS[outcome],
-                        "count": f"{len(others)} of {len(view.rows)}"
-                        if outcome == "all" and len(others) < len(view.rows)
-                        else counts[outcome],
-                        "on": outcome == listed.outcome,
-                        "press": self._press(outcome, lambda outcome=outcome: listed.choose(outcome)),
-                    }
-                    for outcome in OUTCOMES
-                    if outcome != "broken" or counts["broken"] or listed.outcome == "broken"
-                ]
-                if view.rows
-                else [],
-            ),
+        self._filters.content = render(
+            "library_filters",
+            problem=view.problem or "",
+            reading=""
+            if view.reading is None
+            else f"Reading {done} of {total} recordings"
+            if total
+            else "Looking through the folder",
+            percent=f"{100 * done / max(1, total):.0f}",
+            pills=[
+                {
+                    "name": outcome,
+                    "hint": MEANS[outcome],
+                    "count": f"{len(others)} of {len(view.rows)}"
+                    if outcome == "all" and len(others) < len(view.rows)
+                    else counts[outcome],
+                    "on": outcome == listed.outcome,
+                    "press": self._press(outcome, lambda outcome=outcome: listed.choose(outcome)),
+                }
+                for outcome in OUTCOMES
+                if outcome != "broken" or counts["broken"] or listed.outcome == "broken"
+            ]
+            if view.rows
+            else [],
         )
 
     def _draw_table(self, view: LibraryView, page: Sequence[LibraryRow]) -> None:
@@ -287,25 +282,22 @@ class LibraryPanel:
         if not self._is_new("table", wanted):
             return
         pictures = self._library.thumbnails([row.id for row in page])
-        fill(
-            self._table,
-            render(
-                "library",
-                numbers=self._numbers,
-                some=bool(view.rows),
-                none_so=self._none_so(view),
-                clear=self._press("clear", self._clear_filter),
-                head=[self._head(column) for column in COLUMNS],
-                second=[self._head(column) for column in SECOND_LINE],
-                rows=[
-                    {
-                        "number": self._number(row.id),
-                        "cells": cells(row, newest, now),
-                        "picture": data_address_of_jpeg(pictures.get(row.id)),
-                    }
-                    for row in page
-                ],
-            ),
+        self._table.content = render(
+            "library",
+            numbers=self._numbers,
+            some=bool(view.rows),
+            none_so=self._none_so(view),
+            clear=self._press("clear", self._clear_filter),
+            head=[self._head(column) for column in COLUMNS],
+            second=[self._head(column) for column in SECOND_LINE],
+            rows=[
+                {
+                    "number": self._number(row.id),
+                    "cells": cells(row, newest, now),
+                    "picture": data_address_of_jpeg(pictures.get(row.id)),
+                }
+                for row in page
+            ],
         )
 
     def _none_so(self, view: LibraryView) -> str:
@@ -344,40 +336,37 @@ class LibraryPanel:
         if not self._is_new("tools", wanted):
             return
         if not view.rows and not view.trash.files:
-            fill(self._tools, "")
+            self._tools.content = ""
             return
         last = first + len(page)
-        fill(
-            self._tools,
-            render(
-                "library_tools",
-                tools=[
-                    {
-                        "name": action.label,
-                        "hint": f"At most {action.most} at once"
-                        if action.most is not None and count > action.most
-                        else action.hint,
-                        "press": self._press(("action", k), lambda k=k: self._run(self._actions[k]))
-                        if 0 < count <= (action.most or count)
-                        else "",
-                    }
-                    for k, action in enumerate(self._actions)
-                ],
-                summary=f"{count} selected" if count else "Press a row to select it" if rows else "",
-                count=len(rows),
-                all=self._press("all", self._then_tell(listed.select_all)) if count < len(rows) else "",
-                none=self._press("none", lambda: self.select(())) if count else "",
-                undo=self._press("undo", self._edits.undo_delete) if view.trash.files else "",
-                pages=None
-                if len(rows) <= MOST_ROWS
-                else {
-                    "first": first + 1,
-                    "last": last,
-                    "of": len(rows),
-                    "back": self._press("back", lambda: listed.turn(-1)) if first else "",
-                    "on": self._press("on", lambda: listed.turn(1)) if last < len(rows) else "",
-                },
-            ),
+        self._tools.content = render(
+            "library_tools",
+            tools=[
+                {
+                    "name": action.label,
+                    "hint": f"At most {action.most} at once"
+                    if action.most is not None and count > action.most
+                    else action.hint,
+                    "press": self._press(("action", k), lambda k=k: self._run(self._actions[k]))
+                    if 0 < count <= (action.most or count)
+                    else "",
+                }
+                for k, action in enumerate(self._actions)
+            ],
+            summary=f"{count} selected" if count else "Press a row to select it" if rows else "",
+            count=len(rows),
+            all=self._press("all", self._then_tell(listed.select_all)) if count < len(rows) else "",
+            none=self._press("none", lambda: self.select(())) if count else "",
+            undo=self._press("undo", self._edits.undo_delete) if view.trash.files else "",
+            pages=None
+            if len(rows) <= MOST_ROWS
+            else {
+                "first": first + 1,
+                "last": last,
+                "of": len(rows),
+                "back": self._press("back", lambda: listed.turn(-1)) if first else "",
+                "on": self._press("on", lambda: listed.turn(1)) if last < len(rows) else "",
+            },
         )
 
     def _draw_marks(self, page: Sequence[LibraryRow]) -> None:
@@ -385,9 +374,8 @@ class LibraryPanel:
         selected = [self._number(row.id) for row in page if row.id in listed.selected]
         cursor = None if listed.cursor is None else self._number(listed.cursor)
         if self._is_new("marks", (selected, cursor)):
-            fill(
-                self._marks,
-                render("library_marks", selected=selected, cursor=cursor, follow=listed.follow),
+            self._marks.content = render(
+                "library_marks", selected=selected, cursor=cursor, follow=listed.follow
             )
 
     def _trash_html(self, view: LibraryView) -> str:

@@ -16,7 +16,6 @@ import viser
 import viser.uplot as uplot
 from numpy.typing import NDArray
 
-from workbench.ui.changed import show
 from workbench.ui.viser_seam import send_lines
 
 TAKING_TURNS = 3
@@ -57,7 +56,7 @@ class LineChart:
 
     def hide(self) -> None:
         if self.handle is not None:
-            show(self.handle, False)
+            self.handle.visible = False
 
     def draw(
         self,
@@ -81,7 +80,7 @@ class LineChart:
                 self._change_to(title, data, series, span)
             chart = self._charts[-1]
             send_lines(chart, data, tuple(with_gaps(values) for values in data))
-            show(chart, True)
+            chart.visible = True
         self._made_for = wanted
 
     def _change_to(

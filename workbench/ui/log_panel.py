@@ -44,7 +44,6 @@ class LogPanel:
         self._filter.on_update(self._on_filter)
         self._wanted = ""
         self._drawn: tuple[int, str] | None = None
-        self._vitals_drawn = ""
         self._clock, self._drawn_at = clock, -math.inf
 
     def draw(self, view: SessionView) -> None:
@@ -58,10 +57,7 @@ class LogPanel:
             # With nothing there, there is nothing to filter, to hold or to clear.
             for control in (self._filter, self._hold, self._clear):
                 control.visible = bool(view.printed.lines or view.printed.dropped)
-        vitals = vitals_html(view.vitals)
-        if vitals != self._vitals_drawn:
-            self._vitals_drawn, self._drawn_at = vitals, now
-            self._vitals.content = vitals
+        self._vitals.content = vitals_html(view.vitals)
 
     def _on_filter(self, event: viser.GuiEvent) -> None:
         try:

@@ -46,7 +46,6 @@ class LookThrough:
         self._lock = threading.Lock()
         self._looking: dict[int, _Looking] = {}
         self._border: viser.LineSegmentsHandle | None = None
-        self._drawn: bytes | None = None
 
     @property
     def any(self) -> bool:
@@ -85,7 +84,7 @@ class LookThrough:
     def _draw_border(self, camera: StudioCamera | None) -> None:
         """A view is wider than the picture; what is inside of this line is in it."""
         if camera is None or camera.now is None:
-            if self._border is not None and self._border.visible:
+            if self._border is not None:
                 self._border.visible = False
             return
         corners = picture_corners(camera.now, self._placing.frame(camera).to_view(camera.now), BORDER_AT)
@@ -94,11 +93,7 @@ class LookThrough:
             self._border = self._server.scene.add_line_segments(
                 "/studio/border", points, colors=BORDER_COLOUR, thickness=2.0, thickness_units="screen"
             )
-        elif points.tobytes() != self._drawn:
-            self._border.points = points
-        self._drawn = points.tobytes()
-        if not self._border.visible:
-            self._border.visible = True
+        self._border.points, self._border.visible = points, True
 
     def settings_from(
         self, client: viser.ClientHandle, settings: CameraSettings, frame: Frame

@@ -8,7 +8,6 @@ past. Each can be stopped where it was begun, and what each is doing stands unde
 from __future__ import annotations
 
 import shlex
-from typing import Protocol
 
 import viser
 
@@ -16,7 +15,6 @@ from workbench.session.keep_status import KeepStatus
 from workbench.session.record_live import recovered_in_words
 from workbench.session.session import Session
 from workbench.session.view import RecordingStatus, SessionView
-from workbench.ui.changed import fill, show
 from workbench.ui.file_size import size_in_words
 from workbench.ui.fragments import render
 
@@ -24,10 +22,6 @@ THIS_ENV, ALL_ENVS = "the selected env", "all envs"
 RECORD, NEXT, KEEP = "Record", "Record the next episode", "Keep what I just saw"
 KEEP_BEFORE = "Keep the episode before"
 STOP, STOP_WAITING, STOP_KEEPING = "Stop recording", "Stop waiting", "Stop keeping"
-
-
-class _Disabled(Protocol):
-    disabled: bool
 
 
 class RecordPanel:
@@ -92,22 +86,21 @@ class RecordPanel:
             keeping.active,
         )
         waits = recording.active and recording.waiting == len(recording.env_idx)
-        _label(self._button, STOP_WAITING if waits else STOP if recording.active else RECORD)
-        _icon(self._button, viser.Icon.PLAYER_STOP if recording.active else viser.Icon.PLAYER_RECORD)
-        _label(self._keep, STOP_KEEPING if keeping.active else KEEP)
-        _icon(self._keep, viser.Icon.PLAYER_STOP if keeping.active else viser.Icon.HISTORY)
+        self._button.label = STOP_WAITING if waits else STOP if recording.active else RECORD
+        self._button.icon = viser.Icon.PLAYER_STOP if recording.active else viser.Icon.PLAYER_RECORD
+        self._keep.label = STOP_KEEPING if keeping.active else KEEP
+        self._keep.icon = viser.Icon.PLAYER_STOP if keeping.active else viser.Icon.HISTORY
         can_record = view.task is not None and view.state != "stopped"
-        _disable(self._button, not can_record and not recording.active)
-        _disable(
-            self._next, not can_record or recording.active
-        )  # hidden, the next button would move under the pointer
-        _disable(self._keep, view.timeline.moments == 0 and not keeping.active)
-        _disable(self._which, not can_record)
-        show(self._which, view.task is None or view.task.num_envs > 1)
+        self._button.disabled = not can_record and not recording.active
+        # Hidden, the next button would move under the pointer.
+        self._next.disabled = not can_record or recording.active
+        self._keep.disabled = view.timeline.moments == 0 and not keeping.active
+        self._which.disabled = not can_record
+        self._which.visible = view.task is None or view.task.num_envs > 1
         about = what_keeping_means(view, self._which.value == ALL_ENVS)
-        fill(self._about, render("note", text=about) if about and not keeping.active else "")
-        show(self._before, has_one_before(view) and not keeping.active)
-        fill(self._status, recording_html(recording))
+        self._about.content = render("note", text=about) if about and not keeping.active else ""
+        self._before.visible = has_one_before(view) and not keeping.active
+        self._status.content = recording_html(recording)
 
 
 def runs_since(view: SessionView) -> int | None:
@@ -171,18 +164,3 @@ def _envs_in_words(env_idx: tuple[int, ...]) -> str:
 
 def _percent(keeping: KeepStatus) -> int:
     return round(100 * keeping.done / keeping.total) if keeping.total else 0
-
-
-def _label(button: viser.GuiButtonHandle, label: str) -> None:
-    if button.label != label:
-        button.label = label
-
-
-def _icon(button: viser.GuiButtonHandle, icon: viser.IconName) -> None:
-    if button.icon != icon:
-        button.icon = icon
-
-
-def _disable(handle: _Disabled, disabled: bool) -> None:
-    if handle.disabled != disabled:
-        handle.disabled = disabled

@@ -33,7 +33,6 @@ import viser
 
 from workbench.recording.reading import told_rerun
 from workbench.recording.web_viewer import VIEWER_FILES, VIEWER_POLICY, is_kept, viewer_file
-from workbench.ui.changed import fill
 from workbench.ui.door import Door
 from workbench.ui.file_reply import FileReply
 from workbench.ui.fragments import render
@@ -239,8 +238,7 @@ class RerunView:
         self._chosen = len(paths) if chosen is None else chosen
         self._paths = tuple(paths)
         disabled = not self._paths or self._waiting
-        if self._button.disabled != disabled:
-            self._button.disabled = disabled
+        self._button.disabled = disabled
         wanted = (self._paths, self._chosen, self._waiting, self._problem)
         if wanted != self._drawn:
             self._drawn = wanted
@@ -251,7 +249,7 @@ class RerunView:
                 waiting=self._waiting,
                 problem=self._problem,
             )
-            fill(self._words, words)
+            self._words.content = words
         self._widen()
 
     def _widen(self) -> None:

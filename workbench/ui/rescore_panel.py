@@ -19,7 +19,6 @@ from workbench.session.rescore_messages import EpisodeFile, Verdict
 from workbench.session.rescorer import Rescorer, RescoreView
 from workbench.session.review import Review
 from workbench.session.review_view import ReviewView
-from workbench.ui.changed import fill, show
 from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.judged_with import RECORDED, TODAYS, codes_for
@@ -125,9 +124,9 @@ class RescorePanel:
         if not self._due.is_due(wanted):
             return
         running = told.state in RUNNING
-        show(self._begin, bool(view.opened) and not running)
-        show(self._stop, running)
-        fill(self._status, status_html(told))
+        self._begin.visible = bool(view.opened) and not running
+        self._stop.visible = running
+        self._status.content = status_html(told)
         self._listed = in_order(told.verdicts)
         self._draw_list()
         self._draw_chart()
@@ -154,9 +153,8 @@ class RescorePanel:
         labels = tuple(code.label for code in self._codes)
         if self._code.options != labels:
             self._code.options = labels
-        if self._code.value != chosen.label:
-            self._code.value = chosen.label
-        fill(self._told, render("note", text=chosen.told))
+        self._code.value = chosen.label
+        self._told.content = render("note", text=chosen.told)
 
     def _draw_list(self) -> None:
         count = len(self._listed)
@@ -175,7 +173,7 @@ class RescorePanel:
                 "on": self._presses.id_of("on", lambda _: self._turn(MOST_ROWS)),
             },
         )
-        fill(self._list, content)
+        self._list.content = content
 
     def _row(self, place: int) -> dict[str, object]:
         verdict = self._listed[place]

@@ -18,7 +18,6 @@ from workbench.session.review_compare import (
 )
 from workbench.session.review_view import Opened, ReviewView
 from workbench.session.reward_terms import PREFIX
-from workbench.ui.changed import fill, show
 from workbench.ui.fragments import render
 from workbench.ui.presses import Presses
 from workbench.ui.review_scene import COLOURS, letter
@@ -59,18 +58,15 @@ class ReviewComparePanel:
         several = len(view.opened) > 1
         letters = tuple(letter(index) for index in range(1, len(view.opened)))
         if several and self._other.options != letters:
-            before = self._other.value
             self._other.options = letters
-            self._other.value = before if before in letters else letters[0]
-        show(self._other, len(letters) > 1)
-        show(self._tolerance, several)
-        show(self._swap, several)
+        self._other.visible = len(letters) > 1
+        self._tolerance.visible = several
+        self._swap.visible = several
         label = f"Swap A and {self._other.value}" if len(letters) > 1 else "Swap A and B"
-        if self._swap.label != label:
-            self._swap.label = label
+        self._swap.label = label
         if not several:
             self._drawn = None
-            fill(self._html, render("note", text="Open two recordings, and this says where they part."))
+            self._html.content = render("note", text="Open two recordings, and this says where they part.")
             return
         other = 1 + letters.index(self._other.value)
         tolerance = TOLERANCE_NAMES[self._tolerance.value]
@@ -80,7 +76,7 @@ class ReviewComparePanel:
         self._drawn = wanted
         a, b = view.opened[0], view.opened[other]
         found = difference(a.episode, b.episode, (view.anchors[0], view.anchors[other]), tolerance)
-        fill(self._html, self._content(view, a, b, other, found))
+        self._html.content = self._content(view, a, b, other, found)
 
     def _content(self, view: ReviewView, a: Opened, b: Opened, other: int, found: Difference) -> str:
         partings = [*([found.bodies] if found.bodies else []), *found.numbers]

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from workbench.session.review import MOST_COMPARED
 from workbench.session.review_events import ACTION, REWARD, TERMS, curves
 from workbench.session.review_view import ReviewView, column_at
-from workbench.ui.changed import fill, show
 from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import CURSOR, LONGEST, STEP, LineChart, line, span_of
@@ -88,7 +87,7 @@ class ReviewCurves:
             return
         chosen = view.chosen
         if chosen is None:
-            fill(self._numbers, render("note", text="Numbers and curves appear when a recording is open."))
+            self._numbers.content = render("note", text="Numbers and curves appear when a recording is open.")
             return
         together = shown_together(view)
         steps = [step_of(view.opened[i].episode, view.states[i]) for i in together]
@@ -100,9 +99,8 @@ class ReviewCurves:
         heads = [letter(i) for i in together] if len(steps) > 1 else ["value"]
         table = compared(rows, beside if len(steps) > 1 else [(rows, view.states[view.selected])])
         colours = [COLOURS[i % 4] for i in shown_together(view)] if len(steps) > 1 else [""]
-        fill(
-            self._numbers,
-            render("review_numbers", rows=table, heads=list(zip(heads, colours, strict=True))),
+        self._numbers.content = render(
+            "review_numbers", rows=table, heads=list(zip(heads, colours, strict=True))
         )
 
     # --- charts --------------------------------------------------------------------------------------
@@ -125,7 +123,7 @@ class ReviewCurves:
             for group in (TERMS, ACTION):
                 self._offered |= {f"{group}: {line}": (group, line) for line in entries.get(group, {})}
         options = tuple(self._offered)
-        show(self._entry, bool(options))
+        self._entry.visible = bool(options)
         if options and options != self._entry.options:
             wish = self._wish if self._wish in options else "success" if "success" in options else options[0]
             self._entry.options = options

@@ -25,7 +25,6 @@ from workbench.session.review_events import success_words
 from workbench.session.review_pictures import PictureReader
 from workbench.session.review_view import ReviewView
 from workbench.ui.cameras_panel import CamerasPanel
-from workbench.ui.changed import fill
 from workbench.ui.commands import Command, register
 from workbench.ui.draw_due import Clock
 from workbench.ui.fragments import render
@@ -275,7 +274,7 @@ class ReviewPage:
         self._make_way_for_the_first(view)
         self._fold_what_crowds()
         going = self._offers.going()
-        fill(self._status, status_html(view, going, self._folded_keys))
+        self._status.content = status_html(view, going, self._folded_keys)
         self._panel.draw(view, bool(going))
         self._timeline.draw(view)
         self._draw_cameras(view)
@@ -375,7 +374,7 @@ class ReviewPage:
 
     def _draw_cameras(self, view: ReviewView) -> None:
         chosen = view.chosen
-        fill(self._cameras_note, render("note", text=self._reader.problem) if self._reader.problem else "")
+        self._cameras_note.content = render("note", text=self._reader.problem) if self._reader.problem else ""
         if chosen is None:
             return
         cameras = self._reader.cameras(chosen.episode)

@@ -18,7 +18,6 @@ from workbench.session.recorded_text import version_of
 from workbench.session.review import MOST_COMPARED, SPEEDS, Review
 from workbench.session.review_events import success_words
 from workbench.session.review_view import Opened, ReviewView
-from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_choice
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
@@ -114,36 +113,33 @@ class ReviewPanel:
         """
         there = bool(view.opened)
         for handle in (self._play, self._speed.handle, self._loop.handle):
-            show(handle, there)
-        show(self._live, there and self._on_step_back is not None)
+            handle.visible = there
+        self._live.visible = there and self._on_step_back is not None
         live = GO_LIVE if len(view.opened) < 2 else f"{GO_LIVE} ({letter(view.selected)})"
         live = STAY if going else live
-        if self._live.label != live:
-            self._live.label = live
+        self._live.label = live
         label = "Pause" if view.playing else "Play"
-        if self._play.label != label:
-            self._play.label = label
-            self._play.icon = viser.Icon.PLAYER_PAUSE if view.playing else viser.Icon.PLAYER_PLAY
+        self._play.label = label
+        self._play.icon = viser.Icon.PLAYER_PAUSE if view.playing else viser.Icon.PLAYER_PLAY
         self._speed.show(view.speed)
         self._loop.show(view.loop)
-        fill(self._problems, render("review_problems", problems=view.problems, loading=view.loading))
+        self._problems.content = render("review_problems", problems=view.problems, loading=view.loading)
         listed = (view.opened, view.selected, bool(view.loading))
         if self._listed != listed:
             # Not at every position: with many recordings it would be most of what a frame costs.
             self._listed = listed
-            fill(self._list, self._list_html(view))
-        show(self._arrange, 1 < len(view.opened) <= MOST_COMPARED)
-        show(self._align.handle, len(view.opened) > 1 and len(view.alignments) > 1)
+            self._list.content = self._list_html(view)
+        self._arrange.visible = 1 < len(view.opened) <= MOST_COMPARED
+        self._align.handle.visible = len(view.opened) > 1 and len(view.alignments) > 1
         if self._align.handle.options != view.alignments:
             self._align.handle.options = view.alignments
         self._align.show(view.align)
-        fill(self._never, render("note", text=never_words(view)) if never_words(view) else "")
+        self._never.content = render("note", text=never_words(view)) if never_words(view) else ""
         chosen = view.chosen
-        fill(
-            self._facts,
+        self._facts.content = (
             ""
             if chosen is None
-            else render("review_facts", rows=facts(chosen, self._changes.of(chosen.episode.info))),
+            else render("review_facts", rows=facts(chosen, self._changes.of(chosen.episode.info)))
         )
 
     def _list_html(self, view: ReviewView) -> str:

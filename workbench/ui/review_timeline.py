@@ -11,7 +11,6 @@ import viser
 
 from workbench.session.review import MOST_COMPARED, Review
 from workbench.session.review_view import Opened, ReviewView, column_at
-from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_int
 from workbench.ui.control_values import name_control
 from workbench.ui.controls import Control
@@ -41,7 +40,7 @@ NAMES = {
 
 class ReviewTimeline:
     def __init__(self, server: viser.ViserServer, review: Review) -> None:
-        self._server, self._review = server, review
+        self._review = review
         gui = server.gui
         self._panel = gui.add_panel(visible=False, order=10.0)
         with self._panel.add_tab("Timeline", viser.Icon.HISTORY):
@@ -94,20 +93,16 @@ class ReviewTimeline:
     # --- drawing -------------------------------------------------------------------------------------
 
     def draw(self, view: ReviewView) -> None:
-        show(self._panel, bool(view.opened))
+        self._panel.visible = bool(view.opened)
         if not view.opened:
             return
         self._fits.fit()
         self._shown = view.position
         handle = self._slider.handle
         low, high = view.first, max(view.last, view.first + 1)
-        if handle.min != low or handle.max != high:
-            self._ends = (low, high)
-            with self._server.atomic():
-                handle.min, handle.max = low, high
+        handle.min, handle.max = self._ends = low, high
         self._slider.show(view.position)
-        if self._walk.options != walk(view.playing):
-            self._walk.options = walk(view.playing)
+        self._walk.options = walk(view.playing)
         wanted = (view.position, view.selected, view.opened_serial, view.anchors, view.align)
         if wanted == self._drawn:
             return
@@ -115,7 +110,7 @@ class ReviewTimeline:
         # Only the cursor and the words follow the position.
         if self._fixed[0] != wanted[1:]:
             self._fixed = (wanted[1:], strip_values(view))
-        fill(self._strip, render("review_timeline", **self._fixed[1], **cursor_values(view)))
+        self._strip.content = render("review_timeline", **self._fixed[1], **cursor_values(view))
 
 
 def walk(playing: bool) -> tuple[str, ...]:

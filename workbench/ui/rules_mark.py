@@ -12,7 +12,6 @@ import viser
 from workbench.core.rules import RULES, Finding
 from workbench.session.messages import RulesBroken
 from workbench.session.view import SessionView
-from workbench.ui.changed import fill, show
 from workbench.ui.fragments import render
 from workbench.ui.presses import Presses
 
@@ -32,18 +31,18 @@ class RulesMark:
         self._rules = view.rules
         if view.rules is None:
             self._open = False
-            show(self._html, False)
+            self._html.visible = False
             return
         # What is the same is not sent: a list that somebody reads keeps its place.
-        fill(self._html, rules_html(view.rules, self._open, self._press))
-        show(self._html, True)
+        self._html.content = rules_html(view.rules, self._open, self._press)
+        self._html.visible = True
 
     def toggle(self) -> None:
         """Open or close the list."""
         rules = self._rules
         if rules is not None:
             self._open = not self._open
-            fill(self._html, rules_html(rules, self._open, self._press))
+            self._html.content = rules_html(rules, self._open, self._press)
 
 
 def rules_html(rules: RulesBroken, open: bool, press_id: str) -> str:

@@ -14,7 +14,6 @@ from workbench.session.messages import ActionSource, EpisodeEnd
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.action_sliders import ActionSliders
-from workbench.ui.changed import show
 from workbench.ui.checked import checked_int, checked_text
 from workbench.ui.controls import Control
 
@@ -151,7 +150,7 @@ class RunPanel:
             self._sliders.build(view.task.actions, view.sliders)
         self._draw_play(view.playing, can_act)
         # viser cannot grey out a group of buttons; one that does nothing must not be there.
-        show(self._transport, can_act)
+        self._transport.visible = can_act
         for control in (self._env, self._speed, self._seed, self._end, self._source, self._policy):
             control.enable(can_act)
         self._env.show(view.selected_env)
@@ -166,12 +165,9 @@ class RunPanel:
         self._sliders.draw(view.action_source == "sliders", view.sliders)
 
     def _draw_play(self, playing: bool, can_act: bool) -> None:
-        label = "Pause" if playing else "Play"
-        if self._play.label != label:
-            self._play.label = label
-            self._play.icon = viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY
-        if self._play.disabled == can_act:
-            self._play.disabled = not can_act
+        self._play.label = "Pause" if playing else "Play"
+        self._play.icon = viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY
+        self._play.disabled = not can_act
 
     # --- values ----------------------------------------------------------------------------------
 

@@ -15,7 +15,6 @@ from workbench.core.camera_frames import triple
 from workbench.recording.lerobot_export import ExportOptions
 from workbench.recording.scene_eye import Eye
 from workbench.recording.sources import Source
-from workbench.ui.changed import fill, show
 from workbench.ui.file_size import size_in_words
 from workbench.ui.fragments import render
 from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted, What, file_name
@@ -90,7 +89,7 @@ class SharePanel:
 
     def takes_opened(self, choice: bool) -> bool:
         """Whether it is to be about what is open although other recordings are selected; `choice`: there are both."""
-        show(self._of, choice)
+        self._of.visible = choice
         return choice and self._of.value == OPENED
 
     def draw(self, chosen: Chosen) -> None:
@@ -103,34 +102,30 @@ class SharePanel:
             return
         self._drawn = now
         names = [source.name for source in chosen.sources]
-        fill(
-            self._about,
-            render(
-                "share_about",
-                count=len(names),
-                names=list(zip(short_names(names)[:MOST_NAMED], names)),
-                more=len(names[MOST_NAMED:]),
-                selected=chosen.selected,
-            ),
+        self._about.content = render(
+            "share_about",
+            count=len(names),
+            names=list(zip(short_names(names)[:MOST_NAMED], names)),
+            more=len(names[MOST_NAMED:]),
+            selected=chosen.selected,
         )
         options = _names(chosen.cameras)
         if self._camera.options != options:
             self._camera.options = options
-        show(self._camera, what == "film" and len(options) > 2)
-        show(self._successes, what == "lerobot")
-        show(self._fitting, what == "lerobot" and len(names) > 1)
-        show(self._task, what == "lerobot")
-        show(self._make, not view.running)
-        show(self._stop, view.running)
-        if self._make.disabled != (not chosen.sources):
-            self._make.disabled = not chosen.sources
+        self._camera.visible = what == "film" and len(options) > 2
+        self._successes.visible = what == "lerobot"
+        self._fitting.visible = what == "lerobot" and len(names) > 1
+        self._task.visible = what == "lerobot"
+        self._make.visible = not view.running
+        self._stop.visible = view.running
+        self._make.disabled = not chosen.sources
         will = (
             None
             if view.running or not names or what is None
             else will_make(what, chosen, camera, self._folder)
         )
-        fill(self._will, "" if will is None else render("share_will", will=will))
-        fill(self._made, self._html(view))
+        self._will.content = "" if will is None else render("share_will", will=will)
+        self._made.content = self._html(view)
 
     def _start(self, client: viser.ClientHandle | None) -> None:
         chosen, what = self._chosen, WHAT.get(self._what.value)

@@ -14,7 +14,6 @@ import viser
 from workbench.session.env_table import EnvRows
 from workbench.session.last_words import Busy
 from workbench.session.view import SessionView
-from workbench.ui.changed import fill, show
 from workbench.ui.draw_due import Clock
 from workbench.ui.env_strip import first_flagged, mask
 from workbench.ui.fragments import render
@@ -89,10 +88,10 @@ class StatusLine:
             return
         self._drawn_at, self._state = now, state
         marks = self._marks()
-        fill(self._handle, render("status_line", **status_values(view, fresh, marked=bool(marks))))
+        self._handle.content = render("status_line", **status_values(view, fresh, marked=bool(marks)))
         if marks:
-            fill(self._standing, render("standing_marks", marks=marks))
-        show(self._standing, bool(marks))
+            self._standing.content = render("standing_marks", marks=marks)
+        self._standing.visible = bool(marks)
 
     def _marks(self) -> list[Mark]:
         rows = self._env_rows()

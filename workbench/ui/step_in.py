@@ -34,7 +34,6 @@ from workbench.session.step_back import (
     why_not_into,
     write_source,
 )
-from workbench.ui.changed import fill, show
 from workbench.ui.fragments import render
 from workbench.ui.going_live import GoingLive, begin_to_go
 from workbench.ui.put_together import Workplace
@@ -269,15 +268,15 @@ class StepInPart:
     def draw(self, view: ReviewView) -> None:
         self._step_in.change_pages_when_there()
         home = self._step_in.can_go_home()
-        show(self._folder, bool(view.opened) or home)
-        show(self._home, home)
+        self._folder.visible = bool(view.opened) or home
+        self._home.visible = home
         info = None if view.chosen is None else view.chosen.episode.info
         if self._about != (info and info.id, self._step_in.recorded_source):
             self._about = info and info.id, self._step_in.recorded_source
             words = ""
             if info is not None and self._step_in.recorded_source:
                 words = side_files_in_words(info.source_file, info.side_files)
-            fill(self._besides, render("note", text=words) if words else "")
+            self._besides.content = render("note", text=words) if words else ""
 
     def _chosen(self) -> None:
         # What a page sends as its choice may be anything.

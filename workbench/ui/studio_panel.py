@@ -34,7 +34,6 @@ from workbench.ui.camera_numbers import CameraNumbers
 from workbench.ui.camera_pick import CameraPick
 from workbench.ui.camera_writing import CameraWriting
 from workbench.ui.cameras_panel import KIND_NAMES
-from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_choice
 from workbench.ui.commands import Command
 from workbench.ui.controls import Control
@@ -156,9 +155,9 @@ class StudioPanel:
         studio = view.studio
         self._draw_choice(view)
         chosen, camera = studio.chosen, self._shown(studio)
-        show(self._facts, chosen is not None)
-        show(self._tools, camera is not None)
-        show(self._handles, camera is not None)
+        self._facts.visible = chosen is not None
+        self._tools.visible = camera is not None
+        self._handles.visible = camera is not None
         self._numbers.draw(camera)
         self._lens.draw(camera)
         self._writing.draw(studio)
@@ -166,10 +165,10 @@ class StudioPanel:
         self._pick.draw(view, shown=self._picture.visible)
         self._judging.draw(view)
         if chosen is not None:
-            fill(self._facts, self._facts_of(chosen, view))
+            self._facts.content = self._facts_of(chosen, view)
         if camera is not None:
-            fill(self._tools, self._tools_of(camera, studio))
-            fill(self._handles, self._handles_of(studio.quick_scale))
+            self._tools.content = self._tools_of(camera, studio)
+            self._handles.content = self._handles_of(studio.quick_scale)
 
     def _draw_choice(self, view: SessionView) -> None:
         studio = view.studio
@@ -182,7 +181,7 @@ class StudioPanel:
             }
             self._choice.handle.options = tuple(self._names)
         self._choice.show(studio.selected)
-        show(self._choice.handle, bool(keys))
+        self._choice.handle.visible = bool(keys)
         if not keys:
             text = (
                 "This task has no camera."
@@ -193,9 +192,9 @@ class StudioPanel:
             text = "Choose a camera here, or press its frustum in the view, to place it."
         else:
             text = ""
-        show(self._note, bool(text))
+        self._note.visible = bool(text)
         if text:
-            fill(self._note, render("note", text=text))
+            self._note.content = render("note", text=text)
 
     def _facts_of(self, camera: StudioCamera, view: SessionView) -> str:
         info = camera.info

@@ -20,7 +20,6 @@ from workbench.session.quick_look import MODALITIES as IN_A_QUICK_LOOK
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.cameras_panel import FASTEST, modalities_of
-from workbench.ui.changed import fill, show
 from workbench.ui.draw_due import Clock
 from workbench.ui.false_colour import DepthRange
 from workbench.ui.fragments import render
@@ -69,8 +68,8 @@ class StudioPicture:
                 self._session.studio.look()
         if self._picture is not None:
             # The last one stays while the next is drawn; that of another camera does not.
-            show(self._picture, self._drawn is not None and self._drawn[0] == key)
-        show(self._caption, self.visible and bool(self._caption.content))
+            self._picture.visible = self._drawn is not None and self._drawn[0] == key
+        self._caption.visible = self.visible and bool(self._caption.content)
         kind = self.shows
         if key is None or picture is None or picture.env != view.selected_env or view.task is None:
             return
@@ -90,8 +89,7 @@ class StudioPicture:
             with self.folder:
                 self._picture = self._server.gui.add_image(pixels, format=form, jpeg_quality=80)
         else:
-            if self._picture.format != form:
-                self._picture.format = form
+            self._picture.format = form
             self._picture.image = pixels
-            show(self._picture, True)
-        fill(self._caption, caption)
+            self._picture.visible = True
+        self._caption.content = caption

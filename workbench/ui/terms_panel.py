@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from workbench.session.reward_terms import MOST, TermCurves
 from workbench.session.session import Session
 from workbench.session.view import SessionView
-from workbench.ui.changed import fill, show
 from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import LONGEST, STEP, LineChart, line
@@ -47,10 +46,10 @@ class TermsPanel:
             curves = None
         dense = view.task is not None and "dense" in view.task.reward_mode
         no_curve = () if curves is None else curves.no_curve
-        show(self._how_to, curves is not None and not curves.terms and not no_curve and dense)
-        show(self._no_curve, bool(no_curve))
+        self._how_to.visible = curves is not None and not curves.terms and not no_curve and dense
+        self._no_curve.visible = bool(no_curve)
         if no_curve:
-            fill(self._no_curve, render("note", text=no_curve_text(no_curve)))
+            self._no_curve.content = render("note", text=no_curve_text(no_curve))
         if curves is None or not curves.terms:
             self._chart.hide()
             return

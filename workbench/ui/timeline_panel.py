@@ -19,7 +19,6 @@ import viser
 from workbench.session.session import Session
 from workbench.session.timeline import Scope
 from workbench.session.view import SessionView
-from workbench.ui.changed import fill, show
 from workbench.ui.checked import checked_int
 from workbench.ui.control_values import name_control
 from workbench.ui.controls import Control
@@ -47,7 +46,7 @@ WALK = (LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, NOW, EPISODE)
 
 class TimelinePanel:
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
-        self._server, self._session, self._clock = server, session, clock
+        self._session, self._clock = session, clock
         gui = server.gui
         self._panel = gui.add_panel(visible=False, order=10.0)
         with self._panel.add_tab("Timeline", viser.Icon.HISTORY):
@@ -133,7 +132,7 @@ class TimelinePanel:
     def draw(self, view: SessionView) -> None:
         past = view.timeline
         there = view.task is not None and past.moments > 0
-        show(self._panel, there)
+        self._panel.visible = there
         if not there or view.task is None:
             return
         self._shown = past.shown
@@ -154,28 +153,21 @@ class TimelinePanel:
             low, high = (serial - self._newest for serial in self._range)
             handle = self._slider.handle
             # Never an empty range, which the browser divides by.
-            low = min(low, high - 1)
-            if handle.min != low or handle.max != high:
-                with self._server.atomic():
-                    handle.min, handle.max = low, high
+            handle.min, handle.max = min(low, high - 1), high
         self._slider.show(0 if past.shown is None else past.shown - self._newest)
 
     def _draw_buttons(self, view: SessionView) -> None:
         past = view.timeline
         # A group of buttons cannot be greyed, so what would do nothing is left out.
         undo = () if past.undo is None else (f"{UNDO} {past.undo}",)
-        walk = (*WALK[:-1], EVERYTHING if self._episode_only else EPISODE, *undo)
-        if self._walk.options != walk:
-            self._walk.options = walk
+        self._walk.options = (*WALK[:-1], EVERYTHING if self._episode_only else EPISODE, *undo)
         travel = go_on_labels(view) if past.can_go_on else ()
-        if travel and self._travel.options != travel:
+        if travel:
             self._travel.options = travel
         not_carried = "; ".join(past.not_carried)
         hint = render("timeline_hint", live=past.shown is None, not_carried=not_carried, arrived=past.arrived)
-        fill(self._hint, hint)
-        if self._travel.visible != bool(travel):
-            with self._server.atomic():
-                self._travel.visible, self._hint.visible = bool(travel), not travel
+        self._hint.content = hint
+        self._travel.visible, self._hint.visible = bool(travel), not travel
 
     def _draw_strip(self, view: SessionView) -> None:
         past = view.timeline

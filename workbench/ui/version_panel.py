@@ -17,7 +17,6 @@ from workbench.authoring.problem import Problem
 from workbench.session.messages import LoadLevel, ReloadReport
 from workbench.session.session import Session
 from workbench.session.view import SessionView
-from workbench.ui.changed import show
 from workbench.ui.checked import checked_choice
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
@@ -59,14 +58,14 @@ class VersionPanel:
     def draw(self, view: SessionView) -> None:
         task = view.task
         can_load = view.state != "stopped"
-        show(self._again, can_load)
+        self._again.visible = can_load
         if len(view.choices) > 1:
             # In one order, whichever of them is shown.
             if tuple(sorted(view.choices)) != self._names:
                 self._names = tuple(sorted(view.choices))
                 self._task.handle.options = self._names
             self._task.show(view.choices[0])
-        show(self._task.handle, len(view.choices) > 1)
+        self._task.handle.visible = len(view.choices) > 1
         notices = () if task is None else task.notices
         refused = view.refused if view.state not in ("starting", "loading") else None
         wanted = (view.reload, refused, task is None, notices)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import viser
 
 from workbench.session.view import SessionView
-from workbench.ui.changed import show
 
 DETAILS = {"fine": 1_000_000, "normal": 200_000, "coarse": 50_000}
 """Triangles in the view. A browser without a graphics card wants the fewest."""
@@ -51,7 +50,7 @@ class ViewPanel:
 
     def draw(self, view: SessionView) -> None:
         several = view.task is not None and view.task.num_envs > 1
-        show(self._show, several)
+        self._show.visible = several
 
     def _apply_theme(self) -> None:
         self._server.gui.configure_theme(
