@@ -65,6 +65,7 @@ SKIPPED: tuple[tuple[str, str, object], ...] = (
     ("chart", "visible", False),
     ("chart", "title", "another"),
     ("image", "format", "png"),
+    ("image", "image", np.ones((2, 2, 3), np.uint8)),  # but it is encoded each time
     ("lines", "points", LINES + 1),
     ("lines", "visible", False),
     ("label", "text", "another"),
@@ -82,7 +83,6 @@ SENT_AGAIN: tuple[tuple[str, str, object], ...] = (
     ("dropdown", "options", ("one", "three")),
     ("chart", "data", (np.arange(2.0), np.ones(2))),
     ("chart", "series", (uplot.Series(), uplot.Series(label="b"))),
-    ("image", "image", np.ones((2, 2, 3), np.uint8)),
 )
 
 
@@ -95,7 +95,7 @@ def sent_by(server: viser.ViserServer, handle: Any, name: str, value: object) ->
 @pytest.mark.parametrize(("kind", "name", "value"), SKIPPED)
 def test_what_is_equal_is_not_sent(server: viser.ViserServer, kind: str, name: str, value: object) -> None:
     handle = MAKERS[kind](server)
-    assert sent_by(server, handle, name, value) == 1
+    assert sent_by(server, handle, name, value) >= 1
     again = value.copy() if isinstance(value, np.ndarray) else value
     assert sent_by(server, handle, name, again) == 0
 
