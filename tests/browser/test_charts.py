@@ -16,7 +16,7 @@ from tests.drive.panels import Clock
 from tests.drive.waiting import until
 from tests.ui.scenes import running
 from workbench.session.view import Curves
-from workbench.ui.curves_panel import REDRAW_EVERY, CurvesPanel
+from workbench.ui.curves_panel import CurvesPanel
 
 pytestmark = pytest.mark.browser
 ENVS = 3
@@ -53,14 +53,14 @@ def test_the_curve_is_drawn_through_nan_another_env_and_a_rebuild(
 ) -> None:
     """It went blank, and stayed so: each new range or line moved the x axis, until none of the steps was on it."""
     clock = Clock()
-    panel = CurvesPanel(server, clock)
+    panel = CurvesPanel(server)
     with page_at(browser, f"http://127.0.0.1:{server.get_port()}") as (page, errors):
         expect(page.get_by_text("Curves appear with the second step.")).to_be_visible()
 
         def draw(curves: Curves, env: int = 0) -> None:
             clock.passes()
             panel.draw(running(ENVS, curves=curves, selected_env=env))
-            page.wait_for_timeout(1000 * REDRAW_EVERY / 4)  # as fast as steps come while it plays
+            page.wait_for_timeout(1000 * CurvesPanel.every / 4)  # as fast as steps come while it plays
 
         for last in range(40, 200, 20):
             draw(past(0, last))

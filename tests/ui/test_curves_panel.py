@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.drive.panels import Clock, Panels
+from tests.drive.panels import Panels
 from tests.ui.scenes import running
 from workbench.session.view import Curves
 from workbench.ui.curves_panel import CurvesPanel, curve_data
@@ -36,11 +36,10 @@ def test_single_env_has_one_line() -> None:
     assert curve_data(past.tick, past.reward, 0)[1] == ("env 0",)
 
 
-def test_other_env_shows_its_own_past(panels: Panels, clock: Clock) -> None:
-    panel = CurvesPanel(panels.server, clock)
+def test_other_env_shows_its_own_past(panels: Panels) -> None:
+    panel = CurvesPanel(panels.server)
     past = curves(50, 4)
     panel.draw(running(4, curves=past, selected_env=0))
-    clock.passes()
     panel.draw(running(4, curves=past, selected_env=3))
     chart = panels.charts()[0]
     assert len(chart.data[0]) == 50
@@ -64,15 +63,14 @@ def test_without_a_past_nothing_is_drawn(panels: Panels) -> None:
     assert len(panels.charts()) == 2 and "Curves appear" not in panels.html()
 
 
-def test_envs_whose_reward_is_nan_are_counted_and_left_out_of_the_mean(panels: Panels, clock: Clock) -> None:
+def test_envs_whose_reward_is_nan_are_counted_and_left_out_of_the_mean(panels: Panels) -> None:
     past = curves(50, 4)
     past.reward[40:, :3] = np.nan
-    panel = CurvesPanel(panels.server, clock)
+    panel = CurvesPanel(panels.server)
     panel.draw(running(4, curves=past, selected_env=0))
     chart = panels.charts()[0]
     np.testing.assert_array_equal(chart.data[1][40:], past.reward[40:, 3])
     assert np.isnan(chart.data[2][40:]).all()
     assert "NaN in 3 of 4 envs; the mean is of the others" in panels.html()
-    clock.passes()
     panel.draw(running(4, curves=curves(50, 4, serial=2)))
     assert "NaN" not in panels.html()

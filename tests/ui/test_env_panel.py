@@ -12,7 +12,9 @@ import pytest
 from tests.drive.panels import Clock, Panels
 from tests.drive.session import wait_until
 from workbench.session.session import Session
+from workbench.session.view import SessionView
 from workbench.ui.env_panel import MOST_ROWS, EnvPanel
+from workbench.ui.parts import Parts
 
 
 def odd(elapsed: np.ndarray) -> dict[str, np.ndarray]:
@@ -28,18 +30,18 @@ def session(scripted_session: Callable[..., Session]) -> Session:
 class Envs:
     """The table on a page."""
 
-    panel: EnvPanel
+    parts: Parts[SessionView]
     panels: Panels
     session: Session
 
     def shown(self) -> list[int]:
-        self.panel.draw(self.session.view())
+        self.parts.draw(self.session.view())
         return [int(env) for env in re.findall(r'data-env="(\d+)"', self.panels.html())]
 
 
 @pytest.fixture
 def envs(panels: Panels, session: Session, clock: Clock) -> Envs:
-    return Envs(EnvPanel(panels.server, session, clock), panels, session)
+    return Envs(Parts((EnvPanel(panels.server, session),), clock), panels, session)
 
 
 def test_pages_filters_and_rows_are_pressed(envs: Envs) -> None:

@@ -82,7 +82,7 @@ class Judging:
 @pytest.fixture
 def judging(panels: Panels, clock: Clock) -> Judging:
     session = RecordedSession()
-    return Judging(JudgementPanel(panels.server, cast(Any, session), clock), session, panels, clock)
+    return Judging(JudgementPanel(panels.server, cast(Any, session)), session, panels, clock)
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from tests.ui.scenes import running
 from workbench.session.kept_worker import Vitals
 from workbench.session.printed import NOTHING_PRINTED, Printed, PrintedLine
 from workbench.ui.log_panel import LINES_SHOWN, LogPanel, log_html, vitals_html
+from workbench.ui.parts import Parts
 
 LINES = (
     PrintedLine("stdout", "reward 0.5"),
@@ -45,11 +46,13 @@ def test_what_was_printed_is_text() -> None:
 
 def test_held_still_it_waits_and_cleared_it_does_not(panels: Panels, clock: Clock) -> None:
     cleared: list[bool] = []
-    panel = LogPanel(panels.server, lambda: cleared.append(True), clock)
+    panel = LogPanel(panels.server, lambda: cleared.append(True))
+
+    parts = Parts((panel,), clock)
 
     def drawn(printed: Printed) -> str:
         clock.passes()
-        panel.draw(running(2, printed=printed))
+        parts.draw(running(2, printed=printed))
         return panels.html()
 
     drawn(NOTHING_PRINTED)

@@ -149,7 +149,6 @@ def rescoring(panels: Panels, library: Library, review: Review, clock: Clock) ->
         review,
         lambda ids: episode_files(library, ids),
         choices,
-        clock=clock,
     )
     return Rescoring(panel, panels, clock, review, choices, told)
 

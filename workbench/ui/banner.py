@@ -16,6 +16,7 @@ from workbench.session.view import SessionView
 from workbench.ui.busy_banner import is_shown as busy_is_shown
 from workbench.ui.fragments import render
 from workbench.ui.over_the_view import GAP, FitsTheView
+from workbench.ui.parts import Part
 
 WIDEST, NARROWEST = 520, 240
 """Pixels. Between them it is as wide as the narrowest open view leaves room for: over the controls it
@@ -41,7 +42,7 @@ INTERRUPTED = {
 }
 
 
-class Banner:
+class Banner(Part[SessionView]):
     """A floating panel that is there only while a problem stands.
 
     Args:

@@ -15,6 +15,7 @@ import viser
 from workbench.session.last_words import Busy
 from workbench.session.view import SessionView
 from workbench.ui.fragments import render
+from workbench.ui.parts import Part
 
 SHOWN_AFTER = 4.0
 """Seconds. The status line says it earlier; a banner is for what one may want to end."""
@@ -32,7 +33,7 @@ def is_shown(view: SessionView) -> bool:
     return busy is not None and busy.seconds >= SHOWN_AFTER and not (busy.getting_ready or busy.held)
 
 
-class BusyBanner:
+class BusyBanner(Part[SessionView]):
     """A floating panel that is there only while the worker is busy for long.
 
     Args:

@@ -9,6 +9,7 @@ at 1,000 a second the page shows one in five seconds), hence the limit on how of
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -19,10 +20,10 @@ from workbench.core.camera_settings import CameraKey
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.session.messages import CameraRequest, TaskDescription
 from workbench.session.view import SessionView
-from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.false_colour import DepthRange
 from workbench.ui.fragments import render
 from workbench.ui.in_colours import COLOUR, MODALITIES, depth_span, image_format, in_colours
+from workbench.ui.parts import Clock, DrawDue, Part
 
 FASTEST = 1 / 15
 """Seconds between two pictures of one camera."""
@@ -53,15 +54,23 @@ class MakesPictures(Protocol):
     def watch_cameras(self, cameras: tuple[CameraRequest, ...]) -> None: ...
 
 
-class CamerasPanel:
+class CamerasPanel(Part[SessionView]):
+    """
+    Args:
+        session: Who is asked for pictures.
+        no_camera: What is said where there is none.
+        studio_shows: Which kind of picture of the camera that is being placed is on the page beside its colours.
+    """
+
     def __init__(
         self,
         server: viser.ViserServer,
         session: MakesPictures,
         no_camera: str = "This task has no camera.",
+        studio_shows: Callable[[], str] = lambda: COLOUR,
         clock: Clock = time.monotonic,
     ) -> None:
-        self._no_camera = no_camera
+        self._no_camera, self._studio_shows = no_camera, studio_shows
         self._server = server
         self._session = session
         self._cameras: dict[tuple[CameraKind, str], _Camera] = {}
@@ -72,8 +81,6 @@ class CamerasPanel:
         self._quick = False
         self._studio: CameraKey | None = None
         """The camera that is being placed, whose picture is wanted whether or not it has a tick here."""
-        self.studio_shows = "rgb"
-        """Which kind of picture of that one is on the page beside its colours."""
         self._note = server.gui.add_html(render("note", text="Pictures appear when the task is loaded."))
         self._frustums = server.gui.add_checkbox(
             "In the view",
@@ -191,7 +198,7 @@ class CamerasPanel:
             return wanted  # it is looked through in another size, and need not be drawn in its own
         if key != self._studio:
             return wanted
-        return tuple(m for m in modalities_of(camera.info) if m in ("rgb", self.studio_shows, *wanted))
+        return tuple(m for m in modalities_of(camera.info) if m in (COLOUR, self._studio_shows(), *wanted))
 
     def _mark_stale(self, view: SessionView) -> None:
         """Say of pictures that are on the page, and are not of the moment that is, that they are not."""

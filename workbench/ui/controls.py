@@ -17,7 +17,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 import viser
 
-from workbench.ui.draw_due import Clock
+from workbench.ui.parts import Clock
 
 T = TypeVar("T")
 Handle = TypeVar("Handle", bound=viser.GuiInputHandle)

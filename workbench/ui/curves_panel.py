@@ -6,8 +6,6 @@ nothing is wiped. What is sent is bounded, and no more often than the eye follow
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import viser
 import viser.uplot as uplot
@@ -15,23 +13,29 @@ from numpy.typing import NDArray
 
 from workbench.session.number_text import lost_text, number_text
 from workbench.session.view import SessionView
-from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import CURSOR, LONGEST, SELECTED_COLOUR, STEP, YES_OR_NO, LineChart, Span, line
+from workbench.ui.parts import Part
 
-REDRAW_EVERY = 0.2
 HEIGHT = 150
 BATCH_COLOUR = "#868e96"
 
 
-class CurvesPanel:
-    def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
+class CurvesPanel(Part[SessionView]):
+    every = 0.2
+
+    def __init__(self, server: viser.ViserServer) -> None:
         folder = server.gui.add_folder(None)
         self._reward = LineChart(server, folder, HEIGHT)
         self._success = LineChart(server, folder, HEIGHT)
         self._lost = server.gui.add_html("", visible=False)
         self._empty = server.gui.add_html('<div class="wb-note">Curves appear with the second step.</div>')
-        self._due = DrawDue(REDRAW_EVERY, clock)
+
+    def key(self, view: SessionView) -> object:
+        curves, past = view.curves, view.timeline
+        if curves is None or len(curves.tick) < 2:
+            return None
+        return curves.serial, view.selected_env, curves.reward.shape[1], past.shown and past.tick
 
     def draw(self, view: SessionView) -> None:
         curves = view.curves
@@ -43,9 +47,6 @@ class CurvesPanel:
             self._lost.visible = False
             return
         shown = None if view.timeline.shown is None else view.timeline.tick
-        wanted = (curves.serial, view.selected_env, curves.reward.shape[1], shown)
-        if not self._due.is_due(wanted):
-            return
         env = view.selected_env
         _draw(self._reward, "reward", curves.tick, curves.reward, env, None, shown)
         lost = said_of(curves.reward[-1])

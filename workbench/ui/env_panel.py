@@ -7,7 +7,6 @@ filter belong to the page's server, like the selected env, so two open pages sho
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Hashable
 
 import numpy as np
@@ -16,7 +15,6 @@ import viser
 from workbench.session.env_table import EnvRows
 from workbench.session.session import Session
 from workbench.session.view import SessionView
-from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.env_strip import (
     FILTERS,
     MEANS,
@@ -32,10 +30,9 @@ from workbench.ui.env_strip import (
     order,
 )
 from workbench.ui.fragments import render
+from workbench.ui.parts import Part
 from workbench.ui.presses import Presses
 
-REDRAW_EVERY = 0.3
-"""Seconds. Faster, numbers of many rows cannot be read."""
 MOST_ROWS = 64
 """On one page of the table."""
 HINTS = {
@@ -48,10 +45,13 @@ HINTS = {
 }
 
 
-class EnvPanel:
+class EnvPanel(Part[SessionView]):
     """The table of envs in the present container."""
 
-    def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
+    every = 0.3
+    """Faster, numbers of many rows cannot be read."""
+
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
         self._handle = server.gui.add_html("")
         self._presses = Presses(server)
@@ -60,15 +60,14 @@ class EnvPanel:
         self._first = 0
         self._pressed = 0
         """How often something was that changes the table."""
-        self._at_once: object = None
-        """What a person waits for, as it was drawn."""
-        self._due = DrawDue(REDRAW_EVERY, clock)
+
+    def key(self, view: SessionView) -> object:
+        return view.task_serial, view.step_serial
+
+    def urgent(self, view: SessionView) -> object:
+        return view.selected_env, self._pressed
 
     def draw(self, view: SessionView) -> None:
-        at_once = (view.selected_env, self._pressed)
-        if not self._due.is_due((view.task_serial, view.step_serial, *at_once), at_once != self._at_once):
-            return
-        self._at_once = at_once
         rows = self._session.env_rows()
         content = render("envs", head=()) if rows is None else self._html(rows, view.selected_env)
         self._handle.content = content

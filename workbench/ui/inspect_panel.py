@@ -15,9 +15,9 @@ import viser
 from workbench.core.inspection import SECTIONS, Inspection, Section
 from workbench.session.session import Session
 from workbench.session.view import SessionView
-from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.inspect_rows import contact_rows, joint_rows, leaf_rows, pose_rows
+from workbench.ui.parts import Clock, DrawDue, Part
 
 READ_EVERY = 0.2
 """Seconds."""
@@ -34,7 +34,7 @@ CHOICES: dict[str, Section | None] = {
 }
 
 
-class InspectPanel:
+class InspectPanel(Part[SessionView]):
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
         self._session, self._clock = session, clock
         self._show = server.gui.add_dropdown(
@@ -54,8 +54,6 @@ class InspectPanel:
         self._had: Inspection | None = None
         self._now: Inspection | None = None
         self._before: Inspection | None = None
-        self._drawn: str | None = None
-        """Which choice."""
         self._due = DrawDue(READ_EVERY, clock)
 
     def draw(self, view: SessionView) -> None:
@@ -66,9 +64,8 @@ class InspectPanel:
         wanted = (choice, view.task_serial, view.selected_env, id(self._now), no_step)
         if choice == POSES:
             wanted = (*wanted, view.step_serial)
-        if not self._due.is_due(wanted, at_once=choice != self._drawn):
+        if not self._due.is_due(wanted, urgent=choice):
             return
-        self._drawn = choice
         self._handle.content = inspect_html(choice, view, self._now, self._before, no_step)
 
     def forces(self, view: SessionView) -> Inspection | None:

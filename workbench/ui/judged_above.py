@@ -11,9 +11,10 @@ import viser
 from workbench.session.view import SessionView
 from workbench.ui import judged_in_words as words
 from workbench.ui.fragments import render
+from workbench.ui.parts import Part
 
 
-class JudgedAbove:
+class JudgedAbove(Part[SessionView]):
     def __init__(self, server: viser.ViserServer) -> None:
         self._line = server.gui.add_html("", visible=False)
 

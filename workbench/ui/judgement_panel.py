@@ -7,7 +7,6 @@ list selects its env and goes to the moment where it differs, in the timeline an
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import numpy as np
@@ -20,19 +19,20 @@ from workbench.session.lengths import length
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui import judged_in_words as words
-from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import LONGEST
+from workbench.ui.parts import Part
 from workbench.ui.presses import Presses
 from workbench.ui.then_and_now import ThenAndNow
 
-REDRAW_EVERY = 0.25
 MOST_ROWS = 8
 """Of the list, at a time."""
 
 
-class JudgementPanel:
-    def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
+class JudgementPanel(Part[SessionView]):
+    every = 0.25
+
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._server, self._session = server, session
         self._status = server.gui.add_html("", visible=False)
         self._stop = server.gui.add_button("Stop judging", icon=viser.Icon.PLAYER_STOP, visible=False)
@@ -49,14 +49,14 @@ class JudgementPanel:
         self._presses = Presses(server)
         self._first = 0
         self._listed: tuple[EpisodeDifference, ...] = ()
-        self._due = DrawDue(REDRAW_EVERY, clock)
+
+    def key(self, view: SessionView) -> object:
+        past = view.timeline
+        chosen = self._name.value, self._first
+        return view.judgement.serial, view.selected_env, past.shown, past.first, *chosen
 
     def draw(self, view: SessionView) -> None:
         judged = view.judgement
-        shown = view.timeline.shown
-        wanted = (judged.serial, view.selected_env, shown, self._name.value, self._first, view.timeline.first)
-        if not self._due.is_due(wanted):
-            return
         self._status.visible = judged.state != "none"
         self._stop.visible = judged.state in ("loading", "judging")
         if judged.state == "none":

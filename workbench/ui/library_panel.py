@@ -24,7 +24,6 @@ import viser
 from workbench.recording.library import Library, LibraryView
 from workbench.recording.library_row import LibraryRow
 from workbench.ui.commands import Command
-from workbench.ui.draw_due import Clock
 from workbench.ui.file_size import size_in_words
 from workbench.ui.fragments import render
 from workbench.ui.library_commands import Action, acting, walking
@@ -43,6 +42,7 @@ from workbench.ui.library_rows import (
     newest_sources,
     none_like_that,
 )
+from workbench.ui.parts import Clock, Part
 from workbench.ui.presses import Presses
 
 MOST_OPEN = 4
@@ -54,7 +54,7 @@ OPEN = 4
 """In what ``choosable.html`` says of a press, beside `TOGGLE` and `RANGE`: it was the second of two."""
 
 
-class LibraryPanel:
+class LibraryPanel(Part[object]):
     """The table in the present container.
 
     Args:
@@ -197,12 +197,8 @@ class LibraryPanel:
 
     # --- drawing ---------------------------------------------------------------------------------------
 
-    def draw(self, _view: object = None) -> None:
-        """Draw what has changed. To be called often; costs nothing while nothing has.
-
-        Args:
-            _view: of the page that hosts it; not looked at.
-        """
+    def draw(self, view: object = None) -> None:
+        """Draw what has changed; `view` is of the page that hosts it, and not looked at."""
         view = self._library.view()
         with self._lock, self._list.lock:
             if self._typed_at is not None and self._clock() - self._typed_at > TYPING:

@@ -6,8 +6,7 @@ hook of every step costs the page no more than one that prints once.
 
 from __future__ import annotations
 
-import math
-import time
+from collections.abc import Callable
 
 import viser
 
@@ -16,23 +15,24 @@ from workbench.session.memory_limit import in_words
 from workbench.session.printed import Printed
 from workbench.session.view import SessionView
 from workbench.ui.checked import checked_text
-from workbench.ui.draw_due import Clock
 from workbench.ui.fragments import render
 from workbench.ui.log_colours import spans_of_lines
+from workbench.ui.parts import Part
 
-REDRAW_EVERY = 0.3
 LINES_SHOWN = 200
 LONGEST_FILTER = 200
 
 
-class LogPanel:
+class LogPanel(Part[SessionView]):
     """
     Args:
         server: The page.
         clear: Asks the session to forget what was printed.
     """
 
-    def __init__(self, server: viser.ViserServer, clear, clock: Clock = time.monotonic) -> None:
+    every = 0.3
+
+    def __init__(self, server: viser.ViserServer, clear: Callable[[], None]) -> None:
         self._filter = server.gui.add_text(
             "Filter", "", hint="Only lines with this in them; stderr: or stdout: before it takes one stream."
         )
@@ -43,21 +43,21 @@ class LogPanel:
         self._clear.on_click(lambda _: self._on_clear(clear))
         self._filter.on_update(self._on_filter)
         self._wanted = ""
-        self._drawn: tuple[int, str] | None = None
-        self._clock, self._drawn_at = clock, -math.inf
+        self._asked, self._drawn = 0, -1
+        """How often somebody asked for other lines, and when drawn: also while it is held."""
+
+    def key(self, view: SessionView) -> object:
+        return view.printed.serial, self._hold.value, self._asked, view.vitals
 
     def draw(self, view: SessionView) -> None:
-        now = self._clock()
-        if now - self._drawn_at < REDRAW_EVERY:
-            return
-        key = view.printed.serial, self._wanted
-        if key != self._drawn and not (self._hold.value and self._drawn is not None):
-            self._drawn, self._drawn_at = key, now
-            self._html.content = log_html(view.printed, self._wanted)
-            # With nothing there, there is nothing to filter, to hold or to clear.
-            for control in (self._filter, self._hold, self._clear):
-                control.visible = bool(view.printed.lines or view.printed.dropped)
         self._vitals.content = vitals_html(view.vitals)
+        if self._hold.value and self._drawn == self._asked:
+            return
+        self._drawn = self._asked
+        self._html.content = log_html(view.printed, self._wanted)
+        # With nothing there, there is nothing to filter, to hold or to clear.
+        for control in (self._filter, self._hold, self._clear):
+            control.visible = bool(view.printed.lines or view.printed.dropped)
 
     def _on_filter(self, event: viser.GuiEvent) -> None:
         try:
@@ -68,10 +68,10 @@ class LogPanel:
                     "Not possible", str(error), color="orange", auto_close_seconds=6.0
                 )
             return
-        self._drawn = None  # also while it is held: the filter is of what stands there
+        self._asked += 1
 
-    def _on_clear(self, clear) -> None:
-        self._drawn = None
+    def _on_clear(self, clear: Callable[[], None]) -> None:
+        self._asked += 1
         clear()
 
 

@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-import time
-
 import viser
 
 from workbench.session.view import SessionView
-from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.numbers_table import number_rows
+from workbench.ui.parts import Part
 
-REDRAW_EVERY = 0.12
 
+class NumbersPanel(Part[SessionView]):
+    every = 0.12
 
-class NumbersPanel:
-    def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
+    def __init__(self, server: viser.ViserServer) -> None:
         self._handle = server.gui.add_html("")
-        self._due = DrawDue(REDRAW_EVERY, clock)
+
+    def key(self, view: SessionView) -> object:
+        return view.task_serial, view.step_serial, view.selected_env
 
     def draw(self, view: SessionView) -> None:
-        wanted = (view.task_serial, view.step_serial, view.selected_env)
-        if not self._due.is_due(wanted):
-            return
         task, step = view.task, view.step
         rows = []
         if task is not None and step is not None:

@@ -23,7 +23,6 @@ from workbench.ui.camera_frustums import LARGE, SMALL, CameraFrustums, without_t
 from workbench.ui.cameras_panel import CamerasPanel
 from workbench.ui.commands import Command, register
 from workbench.ui.curves_panel import CurvesPanel
-from workbench.ui.draw_due import Clock
 from workbench.ui.env_layout import EnvLayout, acting_box, env_under_ray, lay_out
 from workbench.ui.env_panel import EnvPanel
 from workbench.ui.force_arrows import ForceArrows
@@ -33,6 +32,7 @@ from workbench.ui.judged_above import JudgedAbove
 from workbench.ui.judgement_panel import JudgementPanel
 from workbench.ui.log_panel import LogPanel
 from workbench.ui.numbers_panel import NumbersPanel
+from workbench.ui.parts import Clock, Part, Parts
 from workbench.ui.record_panel import RecordPanel
 from workbench.ui.redraw_loop import RedrawLoop, draw_apart
 from workbench.ui.rules_mark import RulesMark
@@ -59,7 +59,7 @@ class Page:
         server: Of viser, already behind its door.
         session: What is shown and asked.
         dark: How it begins.
-        on_review: Called when a person wants to see the recordings; None leaves the button out.
+        on_review: Called when a person wants to see the recordings.
         stage: The 3-D view; None makes one.
         commands: Of the program; in the palette as well.
         clock: That the parts of the page go by.
@@ -70,7 +70,7 @@ class Page:
         server: viser.ViserServer,
         session: Session,
         dark: bool = True,
-        on_review: Callable[[], None] | None = None,
+        on_review: Callable[[], None] = lambda: None,
         stage: Stage | None = None,
         commands: tuple[Command, ...] = (),
         clock: Clock = time.monotonic,
@@ -92,15 +92,17 @@ class Page:
         server.gui.main_panel.set_width(PANEL_WIDTH)
         server.gui.set_panel_label("Workbench")
 
-        self._status = StatusLine(
+        status = StatusLine(
             server, session.env_rows, on_flagged=lambda: self._envs.select_first_flagged(), clock=clock
         )
         self._rules = RulesMark(server)
-        run_tab = self._add_tabs(dark)
+        run_tab, in_tabs = self._add_tabs(dark)
         self._timeline = TimelinePanel(server, session, clock)
         self._add_table_of_envs()
-        self._banner = Banner(server, session.reload, session.restart_worker)
-        self._busy_banner = BusyBanner(server, session.interrupt, session.restart_worker)
+        banner = Banner(server, session.reload, session.restart_worker)
+        busy_banner = BusyBanner(server, session.interrupt, session.restart_worker)
+        floating = self._envs, self._timeline, banner, busy_banner
+        self._parts = Parts((status, self._rules, *in_tabs, *floating), clock)
 
         self._mark = SelectionMark(server)
         self._frustums = CameraFrustums(server)
@@ -111,40 +113,45 @@ class Page:
             server.gui.add_html(render("keys", commands=commands))
         server.scene.on_click()(self._on_scene_click)
 
-    def _add_tabs(self, dark: bool) -> viser.GuiTabHandle:
-        """Returns the Run tab, which other parts put something into."""
-        server, session, on_review = self._server, self._session, self._on_review
+    def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[Part[SessionView]]]:
+        """Returns the Run tab, which other parts put something into, and what is in all of them."""
+        server, session, clock, on_review = self._server, self._session, self._clock, self._on_review
         tabs = server.gui.add_tab_group()
         run_tab = tabs.add_tab("Run", viser.Icon.PLAYER_PLAY)
         with run_tab:
             self._run = RunPanel(server, session)
             self._view_panel = ViewPanel(server, dark)
-            self._version = VersionPanel(server, session)
+            version = VersionPanel(server, session)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
-            self._cameras = CamerasPanel(server, session, clock=self._clock)
+            self._cameras = CamerasPanel(
+                server, session, studio_shows=lambda: self._studio.shows, clock=clock
+            )
         with tabs.add_tab("Studio", viser.Icon.CAMERA_PLUS):
-            self._studio = StudioPanel(server, session, self._clock)
+            self._studio = StudioPanel(server, session, clock)
         with tabs.add_tab("Reward", viser.Icon.CHART_LINE):
-            self._numbers = NumbersPanel(server, self._clock)
-            self._judged_above = JudgedAbove(server)
-            self._curves = CurvesPanel(server, self._clock)
-            self._terms = TermsPanel(server, session, self._clock)
-            self._judgement = JudgementPanel(server, session, self._clock)
+            reward = [
+                NumbersPanel(server),
+                JudgedAbove(server),
+                CurvesPanel(server),
+                TermsPanel(server, session),
+            ]
+            self._judgement = JudgementPanel(server, session)
         with tabs.add_tab("Inspect", viser.Icon.ZOOM_IN):
-            self._inspect = InspectPanel(server, session, self._clock)
+            self._inspect = InspectPanel(server, session, clock)
         with tabs.add_tab("Episodes", viser.Icon.MOVIE):
             self._record = RecordPanel(server, session)
-            if on_review is not None:
-                review = server.gui.add_button("Review recordings", icon=viser.Icon.LIST_DETAILS)
-                review.on_click(lambda _: on_review())
+            review = server.gui.add_button("Review recordings", icon=viser.Icon.LIST_DETAILS)
+            review.on_click(lambda _: on_review())
         with tabs.add_tab("Log", viser.Icon.TERMINAL_2):
-            self._log = LogPanel(server, session.clear_printed, self._clock)
-        return run_tab
+            log = LogPanel(server, session.clear_printed)
+        on_run = self._run, self._view_panel, version
+        cameras = self._studio, self._cameras
+        return run_tab, [*on_run, *cameras, *reward, self._judgement, self._inspect, self._record, log]
 
     def _add_table_of_envs(self) -> None:
         self._env_window = self._server.gui.add_panel(order=5.0)
         with self._env_window.add_tab("Envs", viser.Icon.LIST_DETAILS):
-            self._envs = EnvPanel(self._server, self._session, self._clock)
+            self._envs = EnvPanel(self._server, self._session)
         self._env_window.dock_left()
         self._env_window.set_width(ENVS_WIDTH)
         # A strip at the edge until somebody wants it: it takes half of a small screen's view.
@@ -170,29 +177,7 @@ class Page:
     def redraw(self) -> None:
         """Draw the session as it is now."""
         view = self._session.view()
-        draw_apart(self._server, lambda: self._draw_panels(view), lambda: self._draw_scene(view))
-
-    def _draw_panels(self, view: SessionView) -> None:
-        self._status.draw(view)
-        self._rules.draw(view)
-        self._banner.draw(view)
-        self._busy_banner.draw(view)
-        self._run.draw(view)
-        self._view_panel.draw(view)
-        self._version.draw(view)
-        self._cameras.studio_shows = self._studio.shows
-        self._cameras.draw(view)
-        self._studio.draw(view)
-        self._numbers.draw(view)
-        self._curves.draw(view)
-        self._terms.draw(view)
-        self._inspect.draw(view)
-        self._envs.draw(view)
-        self._judged_above.draw(view)
-        self._judgement.draw(view)
-        self._record.draw(view)
-        self._timeline.draw(view)
-        self._log.draw(view)
+        draw_apart(self._server, lambda: self._parts.draw(view), lambda: self._draw_scene(view))
 
     def _toggle_envs(self) -> None:
         self._envs_open = not self._envs_open
@@ -292,9 +277,8 @@ class Page:
     def _commands(self) -> list[Command]:
         session, run, timeline = self._session, self._run, self._timeline
         judgement = self._judgement
-        review = [] if self._on_review is None else [Command("Review recordings", self._on_review, "V")]
         return [
-            *review,
+            Command("Review recordings", self._on_review, "V"),
             Command("Play or pause", run.toggle_play, "space"),
             Command("Single step", session.step, "S"),
             Command("Reset all envs", session.reset, "R"),

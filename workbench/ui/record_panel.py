@@ -17,6 +17,7 @@ from workbench.session.session import Session
 from workbench.session.view import RecordingStatus, SessionView
 from workbench.ui.file_size import size_in_words
 from workbench.ui.fragments import render
+from workbench.ui.parts import Part
 
 THIS_ENV, ALL_ENVS = "the selected env", "all envs"
 RECORD, NEXT, KEEP = "Record", "Record the next episode", "Keep what I just saw"
@@ -24,7 +25,7 @@ KEEP_BEFORE = "Keep the episode before"
 STOP, STOP_WAITING, STOP_KEEPING = "Stop recording", "Stop waiting", "Stop keeping"
 
 
-class RecordPanel:
+class RecordPanel(Part[SessionView]):
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
         self._selected_env = 0

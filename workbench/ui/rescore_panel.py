@@ -6,7 +6,6 @@ episode at the first state that differs; its reward, as it was recorded and as i
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,15 +18,14 @@ from workbench.session.rescore_messages import EpisodeFile, Verdict
 from workbench.session.rescorer import Rescorer, RescoreView
 from workbench.session.review import Review
 from workbench.session.review_view import ReviewView
-from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.judged_with import RECORDED, TODAYS, codes_for
 from workbench.ui.line_chart import LONGEST
+from workbench.ui.parts import Part
 from workbench.ui.presses import Presses
 from workbench.ui.review_scene import COLOURS, letter
 from workbench.ui.then_and_now import ThenAndNow
 
-REDRAW_EVERY = 0.2
 MOST_ROWS = 10
 """Of the list, at a time."""
 RUNNING = ("asking", "loading", "judging")
@@ -43,7 +41,7 @@ class RescoreChoices:
     """Asked before the files that the recordings name."""
 
 
-class RescorePanel:
+class RescorePanel(Part[ReviewView]):
     """The panel in the present container.
 
     Args:
@@ -55,6 +53,8 @@ class RescorePanel:
         known: Task files that the server knows of besides those that recordings name.
     """
 
+    every = 0.2
+
     def __init__(
         self,
         server: viser.ViserServer,
@@ -63,7 +63,6 @@ class RescorePanel:
         find: Callable[[Sequence[str]], list[EpisodeFile]],
         choices: RescoreChoices,
         known: Callable[[], Sequence[Path]] = tuple,
-        clock: Clock = time.monotonic,
     ) -> None:
         self._server, self._rescorer, self._review = server, rescorer, review
         self._find, self._choices, self._known = find, choices, known
@@ -96,7 +95,6 @@ class RescorePanel:
         self._first = 0
         self._listed: list[Verdict] = []
         self._selected: str | None = None
-        self._due = DrawDue(REDRAW_EVERY, clock)
 
     def judge(self, ids: Sequence[str]) -> None:
         """Begin with these recordings of the library."""
@@ -117,12 +115,19 @@ class RescorePanel:
 
     # --- drawing -----------------------------------------------------------------------------------
 
+    def key(self, view: ReviewView) -> object:
+        at = self._rescorer.view.serial, view.opened_serial, view.selected
+        return *at, self._first, self._selected, self._codes_are_of(view)
+
+    def _codes_are_of(self, view: ReviewView) -> object:
+        """What decides which code there is to choose from."""
+        choices = self._choices
+        opened = tuple(one.id for one in view.opened)
+        return opened, tuple(self._known()), choices.recorded_source, choices.file
+
     def draw(self, view: ReviewView) -> None:
         self._draw_codes(view)
         told = self._rescorer.view
-        wanted = (told.serial, view.opened_serial, view.selected, self._first, self._selected)
-        if not self._due.is_due(wanted):
-            return
         running = told.state in RUNNING
         self._begin.visible = bool(view.opened) and not running
         self._stop.visible = running
@@ -132,17 +137,10 @@ class RescorePanel:
         self._draw_chart()
 
     def _draw_codes(self, view: ReviewView) -> None:
-        known = tuple(self._known())
-        wanted = (
-            tuple(one.id for one in view.opened),
-            known,
-            self._choices.recorded_source,
-            self._choices.file,
-        )
-        if wanted == self._codes_of:
+        if self._codes_of == (wanted := self._codes_are_of(view)):
             return
         self._codes_of = wanted
-        self._codes = codes_for([one.episode.info for one in view.opened], known)
+        self._codes = codes_for([one.episode.info for one in view.opened], self._known())
         choices = self._choices
         of_choice = [
             c for c in self._codes if (c.recorded, c.file) == (choices.recorded_source, choices.file)

@@ -19,6 +19,7 @@ from workbench.session.review_compare import (
 from workbench.session.review_view import Opened, ReviewView
 from workbench.session.reward_terms import PREFIX
 from workbench.ui.fragments import render
+from workbench.ui.parts import Part
 from workbench.ui.presses import Presses
 from workbench.ui.review_scene import COLOURS, letter
 
@@ -26,7 +27,7 @@ TOLERANCE_NAMES = {length(way): way for way in TOLERANCES}
 MOST_ROWS = 30
 
 
-class ReviewComparePanel:
+class ReviewComparePanel(Part[ReviewView]):
     def __init__(self, server: viser.ViserServer, review: Review) -> None:
         self._review = review
         gui = server.gui
@@ -50,9 +51,11 @@ class ReviewComparePanel:
         )
         self._html = gui.add_html("")
         self._presses = Presses(server)
-        self._drawn: object = None
         self._places: dict[int, int] = {}
         """What a row of the table goes to: its position."""
+
+    def key(self, view: ReviewView) -> object:
+        return view.opened_serial, len(view.opened), view.anchors, self._other.value, self._tolerance.value
 
     def draw(self, view: ReviewView) -> None:
         several = len(view.opened) > 1
@@ -65,15 +68,10 @@ class ReviewComparePanel:
         label = f"Swap A and {self._other.value}" if len(letters) > 1 else "Swap A and B"
         self._swap.label = label
         if not several:
-            self._drawn = None
             self._html.content = render("note", text="Open two recordings, and this says where they part.")
             return
         other = 1 + letters.index(self._other.value)
         tolerance = TOLERANCE_NAMES[self._tolerance.value]
-        wanted = (view.opened_serial, view.anchors, other, tolerance)
-        if wanted == self._drawn:
-            return
-        self._drawn = wanted
         a, b = view.opened[0], view.opened[other]
         found = difference(a.episode, b.episode, (view.anchors[0], view.anchors[other]), tolerance)
         self._html.content = self._content(view, a, b, other, found)

@@ -7,7 +7,6 @@ selected recording alone. A line at the position would have to be sent with ever
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,25 +17,52 @@ from numpy.typing import NDArray
 from workbench.session.review import MOST_COMPARED
 from workbench.session.review_events import ACTION, REWARD, TERMS, curves
 from workbench.session.review_view import ReviewView, column_at
-from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import CURSOR, LONGEST, STEP, LineChart, line, span_of
 from workbench.ui.numbers_table import NumberRow, number_rows
+from workbench.ui.parts import Part
 from workbench.ui.review_as_session import step_of
 from workbench.ui.review_scene import COLOURS, letter
 from workbench.ui.terms_panel import COLOURS as LINE_COLOURS
 
-REDRAW_EVERY = 0.15
-_NUMBERS_EVERY = 0.09
 CHARTS = {"reward": 150, "also": 150, "terms": 150, "action": 190}
 """Their heights, from the top."""
 Lines = dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
 
 
-class ReviewCurves:
-    def __init__(self, server: viser.ViserServer, clock: Clock = time.monotonic) -> None:
-        self._numbers = server.gui.add_html("")
-        self._numbers_due = DrawDue(_NUMBERS_EVERY, clock)
+class ReviewNumbers(Part[ReviewView]):
+    every = 0.09
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._html = server.gui.add_html("")
+
+    def key(self, view: ReviewView) -> object:
+        return view.opened_serial, view.selected, view.position, view.anchors
+
+    def draw(self, view: ReviewView) -> None:
+        chosen = view.chosen
+        if chosen is None:
+            self._html.content = render("note", text="Numbers and curves appear when a recording is open.")
+            return
+        together = shown_together(view)
+        steps = [step_of(view.opened[i].episode, view.states[i]) for i in together]
+        own = step_of(chosen.episode, view.states[view.selected])
+        rows = number_rows(own, 0, chosen.length)
+        beside = [
+            (number_rows(step, 0, None), view.states[i]) for step, i in zip(steps, together, strict=True)
+        ]
+        heads = [letter(i) for i in together] if len(steps) > 1 else ["value"]
+        table = compared(rows, beside if len(steps) > 1 else [(rows, view.states[view.selected])])
+        colours = [COLOURS[i % 4] for i in shown_together(view)] if len(steps) > 1 else [""]
+        self._html.content = render(
+            "review_numbers", rows=table, heads=list(zip(heads, colours, strict=True))
+        )
+
+
+class ReviewCurves(Part[ReviewView]):
+    every = 0.15
+
+    def __init__(self, server: viser.ViserServer) -> None:
         folder = server.gui.add_folder(None)
         self._entry: viser.GuiDropdownHandle = server.gui.add_dropdown(
             "Also", ("-",), initial_value="-", visible=False
@@ -46,7 +72,6 @@ class ReviewCurves:
             name: LineChart(server, folder, height, order)
             for order, (name, height) in enumerate(CHARTS.items(), start=1)
         }
-        self._due = DrawDue(REDRAW_EVERY, clock)
         self._lines_drawn: object = None
         self._found: dict[str, dict[str, Lines]] = {}
         self._offered: dict[str, tuple[str, str]] = {}
@@ -54,18 +79,11 @@ class ReviewCurves:
         self._wish = ""
         """The entry that was last chosen, kept while recordings without it are open."""
 
+    def key(self, view: ReviewView) -> object:
+        which = view.opened_serial, len(view.opened), view.selected
+        return *which, view.position, view.anchors, self._wish
+
     def draw(self, view: ReviewView) -> None:
-        self._draw_numbers(view)
-        wanted = (
-            view.opened_serial,
-            view.selected,
-            view.position,
-            view.anchors,
-            self._wish,
-            len(view.opened),
-        )
-        if not self._due.is_due(wanted):
-            return
         # By the recording's id: what gets its scene later is the same recording.
         self._found = {one.id: self._found.get(one.id) or curves(one.episode) for one in view.opened}
         shown = shown_together(view)
@@ -78,30 +96,6 @@ class ReviewCurves:
             self._lines_drawn = lines
             self._draw_lines("terms", TERMS, view)
             self._draw_lines("action", ACTION, view)
-
-    # --- numbers -------------------------------------------------------------------------------------
-
-    def _draw_numbers(self, view: ReviewView) -> None:
-        wanted = (view.opened_serial, view.selected, view.position, view.anchors)
-        if not self._numbers_due.is_due(wanted):
-            return
-        chosen = view.chosen
-        if chosen is None:
-            self._numbers.content = render("note", text="Numbers and curves appear when a recording is open.")
-            return
-        together = shown_together(view)
-        steps = [step_of(view.opened[i].episode, view.states[i]) for i in together]
-        own = step_of(chosen.episode, view.states[view.selected])
-        rows = number_rows(own, 0, chosen.length)
-        beside = [
-            (number_rows(step, 0, None), view.states[i]) for step, i in zip(steps, together, strict=True)
-        ]
-        heads = [letter(i) for i in together] if len(steps) > 1 else ["value"]
-        table = compared(rows, beside if len(steps) > 1 else [(rows, view.states[view.selected])])
-        colours = [COLOURS[i % 4] for i in shown_together(view)] if len(steps) > 1 else [""]
-        self._numbers.content = render(
-            "review_numbers", rows=table, heads=list(zip(heads, colours, strict=True))
-        )
 
     # --- charts --------------------------------------------------------------------------------------
 

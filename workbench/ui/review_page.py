@@ -8,11 +8,9 @@ belong in and are drawn with the rest.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import viser
 
@@ -26,15 +24,15 @@ from workbench.session.review_pictures import PictureReader
 from workbench.session.review_view import ReviewView
 from workbench.ui.cameras_panel import CamerasPanel
 from workbench.ui.commands import Command, register
-from workbench.ui.draw_due import Clock
 from workbench.ui.fragments import render
 from workbench.ui.library_commands import Action
 from workbench.ui.library_panel import LibraryPanel
+from workbench.ui.parts import Clock, DrawDue, Part, Parts
 from workbench.ui.presses import Presses
 from workbench.ui.redraw_loop import RedrawLoop, draw_apart
 from workbench.ui.review_as_session import as_session_view
 from workbench.ui.review_compare_panel import ReviewComparePanel
-from workbench.ui.review_curves import ReviewCurves
+from workbench.ui.review_curves import ReviewCurves, ReviewNumbers
 from workbench.ui.review_in_3d import ReviewIn3D
 from workbench.ui.review_panel import ReviewPanel
 from workbench.ui.review_scene import COLOURS, letter
@@ -55,47 +53,41 @@ TOLD_WIDTH = 20.0
 BACK = "Back to the live env"
 
 
-class Drawn(Protocol):
-    def draw(self, view: ReviewView) -> None: ...
-
-
 @dataclass(frozen=True)
 class Places:
-    """Where a `Part` may put itself: tabs, to be entered with ``with``, and the table of recordings."""
+    """Where a part may put itself: tabs, to be entered with ``with``, and the table of recordings."""
 
     review: viser.GuiTabHandle
-    compare: viser.GuiTabHandle
     share: viser.GuiTabHandle
     tabs: viser.GuiTabGroupHandle
     """For a tab of its own."""
-    library: LibraryPanel | None
+    library: LibraryPanel
     """Says which recordings are selected, and takes further buttons for them (`LibraryPanel.add_action`)."""
-    make_way: Callable[[Callable[[bool], None]], int] = lambda fold: 0
+    make_way: Callable[[Callable[[bool], None]], int]
     """Folds the table of recordings, for a part that opens a panel of its own; says how many pixels of the smallest
     page are between the panels then. It gets what folds and unfolds that panel in turn, where there is no room for it
     beside the table."""
-    unfolded: Callable[[], None] = lambda: None
+    unfolded: Callable[[], None]
     """To be called when a page shows that panel: the table is folded if the two leave no view."""
-    clock: Clock = time.monotonic
 
 
-Part = Callable[[viser.ViserServer, Places], "Drawn | None"]
-"""Builds itself into the page; what it gives back is drawn with every new view."""
+AddPart = Callable[[viser.ViserServer, Places], "Part[ReviewView] | None"]
+"""Builds a part into the page."""
 
 
 @dataclass(frozen=True)
 class ReviewOffers:
-    """What the review offers besides looking; what is None is not on the page."""
+    """What the review offers besides looking."""
 
-    on_step_back: Callable[[str, int], None] | None = None
+    on_step_back: Callable[[str, int], None] = lambda id, state: None
     """Go on live from a state of a recording: its id and the state. Asked for again on the way there, it is given up."""
     going: Callable[[], str] = lambda: ""
     """What is waited for on the way to the live env; empty while nobody is on it."""
     on_back: Callable[[], None] | None = None
-    """Back to the live page."""
-    on_rescore: Callable[[tuple[str, ...]], None] | None = None
+    """Back to the live page; None where there is none."""
+    on_rescore: Callable[[tuple[str, ...]], None] = lambda ids: None
     """Judge recordings again: their ids."""
-    parts: tuple[Part, ...] = ()
+    parts: tuple[AddPart, ...] = ()
     commands: tuple[Command, ...] = ()
 
 
@@ -105,7 +97,7 @@ class ReviewPage:
     Args:
         server: Of viser, already behind its door.
         review: What is shown and asked.
-        library: The recordings that can be opened; None leaves their table out.
+        library: The recordings that can be opened.
         offers: What else there is on the page.
         dark: How it begins.
         stage: The 3-D view; None makes one.
@@ -116,29 +108,26 @@ class ReviewPage:
         self,
         server: viser.ViserServer,
         review: Review,
-        library: Library | None = None,
-        offers: ReviewOffers | None = None,
+        library: Library,
+        offers: ReviewOffers = ReviewOffers(),
         dark: bool = True,
         stage: Stage | None = None,
         clock: Clock = time.monotonic,
     ) -> None:
         self._server, self._review, self._clock = server, review, clock
-        self._offers = offers or ReviewOffers()
+        self._offers = offers
         self._loop = RedrawLoop(server, "review-page", review.wait, self._has_viewers, self._look_and_redraw)
         self._reader = PictureReader()
         self._requests: tuple[CameraRequest, ...] = ()
         self._pictures: dict[CameraKey, Picture] = {}
         self._pictures_serial = 0
         self._had_opened = tuple(one.id for one in review.view().opened)
-        self._folded_keys = ""
-        """Keys that are of use only where the library is seen."""
         self._fold_other: Callable[[bool], None] = lambda folded: None
         """Of a part's own panel."""
         self._other_folded = False
         self._unfolded = "", 0.0
         """Which of the two panels came into a page last, and when, until something is done about it."""
-        self._told: ReviewView | None = None
-        self._told_at = -math.inf
+        self._told = DrawDue(TOLD_EVERY, clock)
         stage = stage or Stage(server)
         self._framing = stage.framing
 
@@ -149,28 +138,17 @@ class ReviewPage:
         self._add_way_back()
         tabs = server.gui.add_tab_group()
         review_tab = self._add_tabs(tabs)
-        share_tab = tabs.add_tab("Share", viser.Icon.SHARE) if self._offers.parts else review_tab
+        share_tab = tabs.add_tab("Share", viser.Icon.SHARE)
         self._add_library(library)
-        places = Places(
-            review_tab,
-            self._compare_tab,
-            share_tab,
-            tabs,
-            self._library,
-            self._make_way,
-            self._other_unfolded,
-            self._clock,
-        )
-        made = [part(server, places) for part in self._offers.parts]
-        self._parts = tuple(part for part in made if part is not None)
+        places = Places(review_tab, share_tab, tabs, self._library, self._make_way, self._other_unfolded)
+        more = [add(server, places) for add in offers.parts]
         with review_tab:
             self._view_panel = ViewPanel(server, dark)
         self._timeline = ReviewTimeline(server, review)
         self._in_3d = ReviewIn3D(server, review, stage)
-        commands = [*self._commands(), *self._offers.commands]
-        if self._library is not None:
-            commands += self._library.commands()
-            self._folded_keys = " ".join(self._library.keys)
+        own = self._panel, self._timeline, *self._in_tabs, self._library
+        self._parts = Parts((*own, *(part for part in more if part is not None)), clock)
+        commands = [*self._commands(), *offers.commands, *self._library.commands()]
         register(server, commands)
         with review_tab, server.gui.add_folder("Keys", expand_by_default=False):
             server.gui.add_html(render("keys", commands=commands))
@@ -186,47 +164,38 @@ class ReviewPage:
         server, review = self._server, self._review
         review_tab = tabs.add_tab("Review", viser.Icon.PLAYER_PLAY)
         with review_tab:
-            self._panel = ReviewPanel(server, review, self._offers.on_step_back)
+            self._panel = ReviewPanel(server, review, self._offers.on_step_back, self._offers.going)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
             self._cameras_note = server.gui.add_html("")
-            self._cameras = CamerasPanel(server, self, "This recording has no pictures.", self._clock)
+            self._cameras = CamerasPanel(server, self, "This recording has no pictures.", clock=self._clock)
         with tabs.add_tab("Curves", viser.Icon.CHART_LINE):
-            self._curves = ReviewCurves(server, self._clock)
-        self._compare_tab = tabs.add_tab("Compare", viser.Icon.ARROWS_DIFF)
-        with self._compare_tab:
-            self._compare = ReviewComparePanel(server, review)
+            numbers, curves = ReviewNumbers(server), ReviewCurves(server)
+        with tabs.add_tab("Compare", viser.Icon.ARROWS_DIFF):
+            self._in_tabs = numbers, curves, ReviewComparePanel(server, review)
         return review_tab
 
-    def _add_library(self, library: Library | None) -> None:
-        """The table of recordings, in a panel of its own; `library` None leaves it out."""
-        self._library_window: viser.PanelHandle | None = None
-        self._library: LibraryPanel | None = None
-        if library is not None:
-            self._library_window = self._server.gui.add_panel(order=5.0)
-            with self._library_window.add_tab("Library", viser.Icon.LIST_DETAILS):
-                self._library = LibraryPanel(self._server, library, self._review.open, clock=self._clock)
-                Presses(self._server).when_unfolded(self._library_unfolded)
-            self._library.add_action(
-                Action(
-                    "Side by side",
-                    "Watch them all at once, each at its own place (Shift Enter)",
-                    self._open_side_by_side,
-                    MOST_OPEN,
-                    "Open the selected recordings side by side",
-                    "enter",
-                    "shift",
-                )
+    def _add_library(self, library: Library) -> None:
+        """The table of recordings, in a panel of its own."""
+        self._library_window = self._server.gui.add_panel(order=5.0)
+        with self._library_window.add_tab("Library", viser.Icon.LIST_DETAILS):
+            self._library = LibraryPanel(self._server, library, self._review.open, clock=self._clock)
+            Presses(self._server).when_unfolded(self._library_unfolded)
+        self._library.add_action(
+            Action(
+                "Side by side",
+                "Watch them all at once, each at its own place (Shift Enter)",
+                self._open_side_by_side,
+                MOST_OPEN,
+                "Open the selected recordings side by side",
+                "enter",
+                "shift",
             )
-            if self._offers.on_rescore is not None:
-                self._library.add_action(
-                    Action(
-                        "Judge again",
-                        "Run today's reward and evaluate over them (J)",
-                        self._offers.on_rescore,
-                    )
-                )
-            self._library_window.dock_left()
-            self._library_window.set_width(LIBRARY_WIDTH)
+        )
+        self._library.add_action(
+            Action("Judge again", "Run today's reward and evaluate over them (J)", self._offers.on_rescore)
+        )
+        self._library_window.dock_left()
+        self._library_window.set_width(LIBRARY_WIDTH)
         self._library_open = True
         if self._had_opened:
             self._show_library(False)
@@ -240,8 +209,7 @@ class ReviewPage:
     def stop(self) -> None:
         """Stop to redraw; returns when the loop has ended."""
         self._loop.stop()
-        if self._library is not None:
-            self._library.close()
+        self._library.close()
 
     @property
     def dark(self) -> bool:
@@ -262,28 +230,14 @@ class ReviewPage:
 
     def _draw_panels(self, view: ReviewView) -> None:
         """While it plays, less often than the 3-D view, and all of them at once: what they say is of one moment."""
-        now = self._clock()
-        if (
-            view.playing
-            and self._told is not None
-            and self._told.playing
-            and now - self._told_at < TOLD_EVERY
-        ):
+        if not self._told.is_due(object(), urgent=None if view.playing else object()):
             return
-        self._told, self._told_at = view, now
         self._make_way_for_the_first(view)
         self._fold_what_crowds()
-        going = self._offers.going()
-        self._status.content = status_html(view, going, self._folded_keys)
-        self._panel.draw(view, bool(going))
-        self._timeline.draw(view)
+        keys = " ".join(self._library.keys)
+        self._status.content = status_html(view, self._offers.going(), keys)
         self._draw_cameras(view)
-        self._curves.draw(view)
-        self._compare.draw(view)
-        if self._library is not None:
-            self._library.draw()
-        for part in self._parts:
-            part.draw(view)
+        self._parts.draw(view)
 
     def _draw_scene(self, view: ReviewView) -> None:
         chosen = view.chosen
@@ -313,8 +267,6 @@ class ReviewPage:
     def _show_library(self, shown: bool) -> None:
         self._library_open = shown
         self._unfolded = "", 0.0
-        if self._library_window is None:
-            return
         if shown:
             # While it is folded, the other panel and the view share the width.
             self._other_folded = 0 < self._smallest_view() < LIBRARY_WIDTH + LEAST_VIEW
@@ -398,19 +350,16 @@ class ReviewPage:
             Command("Frame what is shown", self._in_3d.frame, "F"),
             Command("Open or close the library", lambda: self._show_library(not self._library_open), "B"),
             Command("Dark or light", self._view_panel.toggle_dark, "D"),
+            Command("Judge again what is selected, or else what is open", self._judge, "J"),
+            Command("Go on live from here", self._panel.step_back, "G"),
         ]
-        if offers.on_rescore is not None:
-            commands.append(Command("Judge again what is selected, or else what is open", self._judge, "J"))
-        if offers.on_step_back is not None:
-            commands.append(Command("Go on live from here", self._panel.step_back, "G"))
         if offers.on_back is not None:
             commands.append(Command(BACK, offers.on_back, "V"))
         return commands
 
     def _judge(self) -> None:
-        chosen = () if self._library is None else self._library.selected()
-        if self._offers.on_rescore is not None:
-            self._offers.on_rescore(chosen or tuple(one.id for one in self._review.view().opened))
+        opened = tuple(one.id for one in self._review.view().opened)
+        self._offers.on_rescore(self._library.selected() or opened)
 
     def _open_side_by_side(self, ids: tuple[str, ...]) -> None:
         self._panel.lay_side_by_side()

@@ -21,6 +21,7 @@ from workbench.session.review_view import Opened, ReviewView
 from workbench.ui.checked import checked_choice
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
+from workbench.ui.parts import Part
 from workbench.ui.presses import Presses
 from workbench.ui.review_scene import COLOURS, letter
 
@@ -29,19 +30,24 @@ GHOSTS, GRID = "over each other", "side by side"
 GO_LIVE, STAY = "Go on live from here", "Stay here"
 
 
-class ReviewPanel:
+class ReviewPanel(Part[ReviewView]):
     """
     Args:
         server: The page.
         review: What is shown and asked.
         on_step_back: Called with the id of the selected recording and the state that is shown, when a person wants to
-            go on from there live, and again when they would rather stay; None leaves the button out.
+            go on from there live, and again when they would rather stay.
+        going: What is waited for on the way to the live env.
     """
 
     def __init__(
-        self, server: viser.ViserServer, review: Review, on_step_back: Callable[[str, int], None] | None
+        self,
+        server: viser.ViserServer,
+        review: Review,
+        on_step_back: Callable[[str, int], None],
+        going: Callable[[], str],
     ) -> None:
-        self._review, self._on_step_back = review, on_step_back
+        self._review, self._on_step_back, self._going = review, on_step_back, going
         gui = server.gui
         self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY, visible=False)
         self._play.on_click(lambda _: review.toggle_play())
@@ -97,7 +103,7 @@ class ReviewPanel:
 
     def step_back(self) -> None:
         view = self._review.view()
-        if self._on_step_back is not None and view.chosen is not None:
+        if view.chosen is not None:
             self._on_step_back(view.chosen.id, view.states[view.selected])
 
     def select_neighbour(self, step: int) -> None:
@@ -106,17 +112,12 @@ class ReviewPanel:
         if view.opened:
             self._review.select((view.selected + step) % len(view.opened))
 
-    def draw(self, view: ReviewView, going: bool = False) -> None:
-        """
-        Args:
-            going: Whether the live env is being waited for.
-        """
+    def draw(self, view: ReviewView) -> None:
         there = bool(view.opened)
-        for handle in (self._play, self._speed.handle, self._loop.handle):
+        for handle in (self._play, self._live, self._speed.handle, self._loop.handle):
             handle.visible = there
-        self._live.visible = there and self._on_step_back is not None
         live = GO_LIVE if len(view.opened) < 2 else f"{GO_LIVE} ({letter(view.selected)})"
-        live = STAY if going else live
+        live = STAY if self._going() else live
         self._live.label = live
         label = "Pause" if view.playing else "Play"
         self._play.label = label

@@ -16,6 +16,7 @@ from workbench.ui.control_values import name_control
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
 from workbench.ui.over_the_view import GAP, FitsTheView
+from workbench.ui.parts import Part
 from workbench.ui.review_scene import COLOURS, letter
 from workbench.ui.timeline_panel import (
     LAST_EVENT,
@@ -38,7 +39,7 @@ NAMES = {
 }
 
 
-class ReviewTimeline:
+class ReviewTimeline(Part[ReviewView]):
     def __init__(self, server: viser.ViserServer, review: Review) -> None:
         self._review = review
         gui = server.gui

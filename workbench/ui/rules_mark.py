@@ -13,10 +13,11 @@ from workbench.core.rules import RULES, Finding
 from workbench.session.messages import RulesBroken
 from workbench.session.view import SessionView
 from workbench.ui.fragments import render
+from workbench.ui.parts import Part
 from workbench.ui.presses import Presses
 
 
-class RulesMark:
+class RulesMark(Part[SessionView]):
     """The mark, in the present container; nothing while no rule is broken."""
 
     def __init__(self, server: viser.ViserServer) -> None:

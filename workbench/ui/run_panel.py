@@ -16,6 +16,7 @@ from workbench.session.view import SessionView
 from workbench.ui.action_sliders import ActionSliders
 from workbench.ui.checked import checked_int, checked_text
 from workbench.ui.controls import Control
+from workbench.ui.parts import Part
 
 SPEEDS: dict[str, float] = {
     "0.1 ×": 0.1,
@@ -44,7 +45,7 @@ PREVIOUS, NEXT = "‹ previous", "next ›"
 LARGEST_SEED = 2**31 - 1
 
 
-class RunPanel:
+class RunPanel(Part[SessionView]):
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
         self._scene_serial = -1

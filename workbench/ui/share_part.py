@@ -22,8 +22,9 @@ from workbench.ui.door import Door
 from workbench.ui.library_panel import LibraryPanel
 from workbench.ui.making import Making
 from workbench.ui.offers import Offers
+from workbench.ui.parts import Part
 from workbench.ui.rerun_view import RerunPages, RerunView
-from workbench.ui.review_page import Part, Places, ReviewOffers
+from workbench.ui.review_page import AddPart, Places, ReviewOffers
 from workbench.ui.share_panel import Chosen, SharePanel
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ class Sharing:
         """`offers` with the Share tab, for `Workplace.offer`."""
         return replace(offers, parts=(*offers.parts, self._part(place.shelf.library)))
 
-    def _part(self, library: Library) -> Part:
+    def _part(self, library: Library) -> AddPart:
         def build(server: viser.ViserServer, places: Places) -> SharePart:
             with places.share:
                 share = SharePanel(server, self._offers, self._making, library.folder)
@@ -57,17 +58,15 @@ class Sharing:
         self._making.close()
 
 
-class SharePart:
+class SharePart(Part[ReviewView]):
     """The Share tab of a review page."""
 
-    def __init__(
-        self, library: Library, table: LibraryPanel | None, share: SharePanel, rerun: RerunView
-    ) -> None:
+    def __init__(self, library: Library, table: LibraryPanel, share: SharePanel, rerun: RerunView) -> None:
         self._library, self._table, self._share, self._rerun = library, table, share, rerun
 
     def draw(self, view: ReviewView) -> None:
         opened = {one.id: one.episode for one in view.opened}
-        ids = self._table.selected() if self._table is not None else ()
+        ids = self._table.selected()
         if self._share.takes_opened(bool(ids) and bool(opened) and set(ids) != set(opened)):
             ids = ()
         rows = [row for row in map(self._library.row, ids or tuple(opened)) if row is not None]

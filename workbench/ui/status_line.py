@@ -14,14 +14,11 @@ import viser
 from workbench.session.env_table import EnvRows
 from workbench.session.last_words import Busy
 from workbench.session.view import SessionView
-from workbench.ui.draw_due import Clock
 from workbench.ui.env_strip import first_flagged, mask
 from workbench.ui.fragments import render
+from workbench.ui.parts import Clock, Part
 from workbench.ui.presses import Presses
 from workbench.ui.version_panel import took
-
-REDRAW_EVERY = 0.25
-"""Seconds. Rates that change faster cannot be read."""
 
 NEWS = 6.0
 """Seconds for which a new version is announced."""
@@ -49,12 +46,15 @@ class Mark:
     """As `Presses.id_of` gives it."""
 
 
-class StatusLine:
+class StatusLine(Part[SessionView]):
     """
     Args:
         env_rows: The envs as they stand; None before there is a task.
         on_flagged: Called when the mark of flagged envs is pressed.
     """
+
+    every = 0.25
+    """Rates that change faster cannot be read."""
 
     def __init__(
         self,
@@ -69,26 +69,28 @@ class StatusLine:
         self._standing = server.gui.add_html("", visible=False)
         # At the end of the panel, behind the tabs: all that comes after it is hidden.
         self._presses = Presses(server)
-        self._clock, self._drawn_at = clock, -math.inf
-        self._state = ""
+        self._clock = clock
         self._task_serial = 0
         self._loaded_at = -math.inf
 
-    def draw(self, view: SessionView) -> None:
-        now = self._clock()
+    def urgent(self, view: SessionView) -> object:
+        busy = view.busy and (view.busy.doing, f"{view.busy.seconds:.0f}")
+        at = view.task_serial, view.problem_serial, view.timeline.shown is None
+        return busy, view.state, view.stale, view.activity, self._is_fresh(view), *at
+
+    def _is_fresh(self, view: SessionView) -> bool:
+        """Whether a new version came in a moment ago."""
         if view.task_serial != self._task_serial:
             # The first version is no news.
-            self._loaded_at = now if self._task_serial else -math.inf
+            self._loaded_at = self._clock() if self._task_serial else -math.inf
             self._task_serial = view.task_serial
-        fresh = now - self._loaded_at < NEWS
-        busy = "" if view.busy is None else f"{view.busy.doing} {view.busy.seconds:.0f}"
-        state = f"{busy} {view.state} {view.stale} {view.activity} {view.task_serial} {fresh} {view.problem_serial}"
-        state += f" {view.timeline.shown is None}"
-        if state == self._state and now - self._drawn_at < REDRAW_EVERY:
-            return
-        self._drawn_at, self._state = now, state
+        return self._clock() - self._loaded_at < NEWS
+
+    def draw(self, view: SessionView) -> None:
         marks = self._marks()
-        self._handle.content = render("status_line", **status_values(view, fresh, marked=bool(marks)))
+        self._handle.content = render(
+            "status_line", **status_values(view, self._is_fresh(view), marked=bool(marks))
+        )
         if marks:
             self._standing.content = render("standing_marks", marks=marks)
         self._standing.visible = bool(marks)

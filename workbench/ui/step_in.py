@@ -36,6 +36,7 @@ from workbench.session.step_back import (
 )
 from workbench.ui.fragments import render
 from workbench.ui.going_live import GoingLive, begin_to_go
+from workbench.ui.parts import Part
 from workbench.ui.put_together import Workplace
 from workbench.ui.rescore_panel import RescoreChoices, RescorePanel
 from workbench.ui.review_page import Places, ReviewOffers
@@ -235,7 +236,7 @@ class StepIn:
                 client.add_notification("This recording cannot be gone into", text, color="red")
 
 
-class StepInPart:
+class StepInPart(Part[ReviewView]):
     """How to go live: the code, and into which envs."""
 
     def __init__(self, server: viser.ViserServer, step_in: StepIn) -> None:
@@ -312,7 +313,6 @@ class Judging:
                 lambda ids: episode_files(shelf.library, ids),
                 self._choices,
                 self._place.task_files,
-                places.clock,
             )
         return self._panel
 

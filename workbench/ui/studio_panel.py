@@ -37,9 +37,9 @@ from workbench.ui.cameras_panel import KIND_NAMES
 from workbench.ui.checked import checked_choice
 from workbench.ui.commands import Command
 from workbench.ui.controls import Control
-from workbench.ui.draw_due import Clock
 from workbench.ui.fragments import render
 from workbench.ui.look_through import LookThrough
+from workbench.ui.parts import Clock, Part
 from workbench.ui.placing import Placing
 from workbench.ui.presses import Presses
 from workbench.ui.studio_picture import StudioPicture
@@ -63,7 +63,7 @@ VARIES = "Its pose differs between envs, or the task moves it: what is placed he
 IN_ITS_EYE = "You look from where it stands. Move the view, and its handles appear."
 
 
-class StudioPanel:
+class StudioPanel(Part[SessionView]):
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
         self._server, self._session = server, session
         self._placing = Placing(session)

@@ -20,10 +20,10 @@ from workbench.session.quick_look import MODALITIES as IN_A_QUICK_LOOK
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.cameras_panel import FASTEST, modalities_of
-from workbench.ui.draw_due import Clock
 from workbench.ui.false_colour import DepthRange
 from workbench.ui.fragments import render
 from workbench.ui.in_colours import COLOUR, depth_span, image_format, in_colours
+from workbench.ui.parts import Clock
 
 
 class StudioPicture:

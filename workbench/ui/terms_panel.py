@@ -5,8 +5,6 @@ All in one chart: the question is which of them is stuck while the others grow.
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import viser
 from numpy.typing import NDArray
@@ -14,11 +12,10 @@ from numpy.typing import NDArray
 from workbench.session.reward_terms import MOST, TermCurves
 from workbench.session.session import Session
 from workbench.session.view import SessionView
-from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import LONGEST, STEP, LineChart, line
+from workbench.ui.parts import Part
 
-REDRAW_EVERY = 0.25
 COLOURS = (
     "#228be6", "#f08c00", "#2f9e44", "#be4bdb", "#e03131", "#12b886",
     "#fab005", "#7950f2", "#fd7e14", "#15aabf", "#e64980", "#868e96",
@@ -29,18 +26,19 @@ HOW_TO = (
 )
 
 
-class TermsPanel:
-    def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
+class TermsPanel(Part[SessionView]):
+    every = 0.25
+
+    def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
         self._chart = LineChart(server, server.gui.add_folder(None), height=170)
         self._how_to = server.gui.add_html(render("note", text=HOW_TO), visible=False)
         self._no_curve = server.gui.add_html("", visible=False)
-        self._due = DrawDue(REDRAW_EVERY, clock)
+
+    def key(self, view: SessionView) -> object:
+        return view.task_serial, view.step_serial, view.selected_env
 
     def draw(self, view: SessionView) -> None:
-        wanted = (view.task_serial, view.step_serial, view.selected_env)
-        if not self._due.is_due(wanted):
-            return
         curves = self._session.term_curves()
         if curves is not None and len(curves.tick) < 2:
             curves = None

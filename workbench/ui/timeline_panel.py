@@ -22,9 +22,9 @@ from workbench.session.view import SessionView
 from workbench.ui.checked import checked_int
 from workbench.ui.control_values import name_control
 from workbench.ui.controls import Control
-from workbench.ui.draw_due import Clock, DrawDue
 from workbench.ui.fragments import render
 from workbench.ui.over_the_view import GAP, FitsTheView
+from workbench.ui.parts import Clock, DrawDue, Part
 from workbench.ui.timeline_strip import strip_values
 
 WIDEST, NARROWEST = 760, 280
@@ -44,7 +44,7 @@ UNDO = "undo"
 WALK = (LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, NOW, EPISODE)
 
 
-class TimelinePanel:
+class TimelinePanel(Part[SessionView]):
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
         self._session, self._clock = session, clock
         gui = server.gui

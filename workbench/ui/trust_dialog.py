@@ -58,8 +58,7 @@ class TrustDialog:
 
     def part(self, server: viser.ViserServer, places: Places) -> None:
         """For the review page, whose table of recordings takes no keys while something is asked."""
-        if places.library is not None:
-            self._asking = places.library.leave_keys
+        self._asking = places.library.leave_keys
         with self._lock:
             self._asking(bool(self._waiting))
 

@@ -20,6 +20,7 @@ from workbench.session.view import SessionView
 from workbench.ui.checked import checked_choice
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
+from workbench.ui.parts import Part
 
 AS_NEEDED, PATCHED, CAMERAS, REBUILT = "Load again", "Patch", "Cameras", "Rebuild"
 LEVELS: dict[str, LoadLevel] = {
@@ -32,10 +33,9 @@ MOST_SHOWN = 8
 """Things not carried that are named; the rest is counted."""
 
 
-class VersionPanel:
+class VersionPanel(Part[SessionView]):
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
-        self._drawn: object = None
         self._names: tuple[str, ...] = ("",)
         # viser's annotations take the first options for all that there will ever be.
         add_dropdown: Any = server.gui.add_dropdown
@@ -68,10 +68,7 @@ class VersionPanel:
         self._task.handle.visible = len(view.choices) > 1
         notices = () if task is None else task.notices
         refused = view.refused if view.state not in ("starting", "loading") else None
-        wanted = (view.reload, refused, task is None, notices)
-        if wanted != self._drawn:
-            self._drawn = wanted
-            self._html.content = version_html(view.reload, task is not None, refused, notices)
+        self._html.content = version_html(view.reload, task is not None, refused, notices)
 
     def _load(self, value: str) -> None:
         self._session.reload(LEVELS[value])
