@@ -70,17 +70,17 @@ def test_the_least_seen_object_comes_first_scenery_is_left_out_and_what_is_hidde
         seen("goal", [0, 0, 0, 0], never_drawn=True),
     )
     rows = object_rows(report)
-    assert [row.name for row in rows] == ["cube", "bowl", "goal"]
-    assert (rows[0].seen, rows[0].pixels, rows[0].cut) == ("75 %", "35", "25 %")
-    assert rows[0].bad == ("seen", "cut", "hidden") and rows[1].bad == ()
-    assert rows[2].seen == "" and "hides" in rows[2].note
+    assert [row["name"] for row in rows] == ["cube", "bowl", "goal"]
+    assert (rows[0]["seen"], rows[0]["pixels"], rows[0]["cut"]) == ("75 %", "35", "25 %")
+    assert rows[0]["bad"] == ["seen", "cut", "hidden"] and rows[1]["bad"] == []
+    assert rows[2]["seen"] == "" and "hides" in rows[2]["note"]
 
 
 def test_an_object_that_some_envs_lack_is_judged_where_it_is() -> None:
     rows = object_rows(report_of(seen("can", [50, 0], present=[True, False])))
-    assert (rows[0].seen, rows[0].note) == ("100 %", "in 1 of 2 envs")
+    assert (rows[0]["seen"], rows[0]["note"]) == ("100 %", "in 1 of 2 envs")
     rows = object_rows(report_of(seen("can", [0, 0], present=[False, False])))
-    assert (rows[0].seen, rows[0].note) == ("", "in none of these envs")
+    assert (rows[0]["seen"], rows[0]["note"]) == ("", "in none of these envs")
 
 
 @pytest.mark.parametrize(
@@ -140,5 +140,5 @@ def test_a_picture_that_is_all_background_has_no_histogram() -> None:
 def test_over_steps_it_is_said_when_each_object_is_seen() -> None:
     report = report_of(seen("cube", [50, 0, 10, 40], [50, 20, 40, 40], cut=(3,), present=[True] * 4))
     (row,) = object_rows(report, "steps")
-    assert row.moods == ("good", "bad", "warn", "warn")
+    assert row["moods"] == ["good", "bad", "warn", "warn"]
     assert headline(report, "steps") == "cube is not seen in 1 of 4 steps."

@@ -1,14 +1,16 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from tests.ui.env_rows import FELL, rows_of
-from workbench.session.env_table import KEPT_REWARDS, LastEpisode, Outcome
+from workbench.session.env_table import KEPT_REWARDS, EnvRows, LastEpisode, Outcome
 from workbench.ui.env_strip import (
     FILTERS,
     MOST_ENTRIES,
@@ -19,6 +21,10 @@ from workbench.ui.env_strip import (
     moment_of,
     order,
 )
+
+
+def cells_of(rows: EnvRows, envs: NDArray[np.int64]) -> list[SimpleNamespace]:
+    return [SimpleNamespace(**row) for row in make_rows(rows, envs)]
 
 
 @pytest.mark.parametrize(
@@ -66,7 +72,7 @@ def test_any_returns_are_sorted_and_none_is_lost(totals: list[float], descending
 def test_cells_say_how_an_env_stands() -> None:
     rows = rows_of()
     assert entry_names(rows) == ("success", "near")
-    running, solved, _, cut, after, odd = make_rows(rows, np.arange(6))
+    running, solved, _, cut, after, odd = cells_of(rows, np.arange(6))
     assert (running.state, running.steps, running.total, running.last) == ("running", "3", "1", "success 41")
     assert running.tally == "3 of 5 episodes ended in success"
     assert (solved.state, solved.first_true, solved.last) == ("success", ("33", "20"), "")
@@ -78,7 +84,7 @@ def test_cells_say_how_an_env_stands() -> None:
 def test_an_outlier_of_the_episode_before_is_said_to_be_that() -> None:
     last = LastEpisode(np.zeros(6, np.int8), np.full(6, 13, np.int32), np.zeros(6), {2: (FELL,)})
     rows = rows_of(outliers={}, last=last)
-    row = make_rows(rows, np.array([2]))[0]
+    row = cells_of(rows, np.array([2]))[0]
     assert row.flags == ("cube dropped 0.90 m (episode before, step 12)",) and row.last == "cut short 13"
     assert np.flatnonzero(mask(rows, "flagged")).tolist() == [2]
 
@@ -89,7 +95,7 @@ def test_the_moment_of_an_env_is_its_first_outlier_else_its_end() -> None:
 
 
 def test_small_curves_share_one_scale_and_stay_in_their_box() -> None:
-    lowest, *_, highest = (row.curve for row in make_rows(rows_of(), np.arange(6)))
+    lowest, *_, highest = (row.curve for row in cells_of(rows_of(), np.arange(6)))
     points = [[float(n) for n in point.split(",")] for line in (*lowest, *highest) for point in line.split()]
     assert len(points) == 6
     assert points[0] == [0, 13] and points[-1] == [60, 1]
@@ -98,7 +104,7 @@ def test_small_curves_share_one_scale_and_stay_in_their_box() -> None:
 
 def test_a_long_episode_has_no_more_points_than_can_be_seen() -> None:
     rewards = np.random.default_rng(0).normal(size=(6, KEPT_REWARDS)).astype(np.float32)
-    rows = make_rows(rows_of(rewards=rewards), np.arange(6))
+    rows = cells_of(rows_of(rewards=rewards), np.arange(6))
     assert all(len(line.split()) <= 40 for row in rows for line in row.curve)
 
 
@@ -106,12 +112,12 @@ def test_a_reward_that_is_not_a_number_leaves_a_gap_and_no_reward_no_curve() -> 
     rewards = rows_of().rewards.copy()
     rewards[0, -2] = np.nan
     rewards[1, -1] = np.inf
-    first, second, *_ = make_rows(rows_of(rewards=rewards), np.arange(6))
+    first, second, *_ = cells_of(rows_of(rewards=rewards), np.arange(6))
     # Ends of one point each, drawn as a dot; and a line of the two that are left.
     assert len(first.curve) == 2 and all(len(set(line.split())) == 1 for line in first.curve)
     assert len(second.curve) == 1 and len(set(second.curve[0].split())) == 2
     nothing = rows_of(rewards=np.full((6, KEPT_REWARDS), np.nan, np.float32))
-    assert all(row.curve == [] for row in make_rows(nothing, np.arange(6)))
+    assert all(row.curve == [] for row in cells_of(nothing, np.arange(6)))
 
 
 def test_a_task_with_many_entries_keeps_success_and_fail() -> None:
@@ -126,6 +132,6 @@ def test_a_return_that_is_nan_is_said_and_its_curve_has_a_gap() -> None:
     rewards[:] = np.arange(KEPT_REWARDS)
     rewards[0, 50] = np.nan
     rows = rows_of(rewards=rewards, total=np.full(6, math.nan))
-    odd, other = make_rows(rows, np.array([0, 1]))
+    odd, other = cells_of(rows, np.array([0, 1]))
     assert odd.total == "NaN" and len(odd.curve) == 2 and len(other.curve) == 1
-    assert make_rows(rows, np.array([3]))[0].total == ""
+    assert cells_of(rows, np.array([3]))[0].total == ""

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -16,7 +18,7 @@ def leaf(name: str, *values: float, shape: tuple[int, ...] | None = None) -> Lea
 
 
 def changed(leaves: list[Leaf], before: list[Leaf] | None) -> list[list[bool]]:
-    return [[n.changed for n in row.numbers] for row in leaf_rows(leaves, before)]
+    return [[n["changed"] for n in row["numbers"]] for row in leaf_rows(leaves, before)]
 
 
 def test_numbers_that_differ_from_the_reading_before_are_marked() -> None:
@@ -30,7 +32,7 @@ def test_numbers_that_differ_from_the_reading_before_are_marked() -> None:
 
 def test_what_is_too_large_to_read_is_told_by_its_range() -> None:
     [row] = leaf_rows([leaf("rgb", *range(64), shape=(128, 128, 3))], None)
-    assert (row.kind, row.numbers, row.note) == (
+    assert (row["kind"], row["numbers"], row["note"]) == (
         "float32 (128, 128, 3)",
         (),
         "49152 numbers from 0.000 to 255.000",
@@ -51,7 +53,7 @@ JOINTS = JointReadings(
 
 
 def test_joints_stand_between_their_limits() -> None:
-    turn, free, slide = joint_rows(JOINTS)
+    turn, free, slide = (SimpleNamespace(**row) for row in joint_rows(JOINTS))
     assert (turn.place, turn.target_place, turn.at_limit) == (75.0, 50.0, False)
     assert turn.limits == "-1.000 to 1.000 rad"
     assert (free.place, free.target_place, free.at_limit, free.target) == (None, None, False, "")
@@ -72,8 +74,8 @@ PRESSED = Touching(
 
 def test_a_contact_is_told_in_newtons_with_its_place() -> None:
     [row] = contact_rows([PRESSED])
-    assert (row.force, row.impulse, row.point) == ("5 N", "0.05 N s", "0.100, 0.000, 0.000")
-    assert row.note == "2 points, 1.00 mm deep"
+    assert (row["force"], row["impulse"], row["point"]) == ("5 N", "0.05 N s", "0.100, 0.000, 0.000")
+    assert row["note"] == "2 points, 1.00 mm deep"
 
 
 def test_arrows_start_at_the_points_and_are_bounded() -> None:
@@ -92,7 +94,7 @@ def test_arrows_start_at_the_points_and_are_bounded() -> None:
 def test_a_pose_is_copied_as_python_that_makes_it_again() -> None:
     poses = np.array([[0.1, -2, 0, 1, 0, 0, 0], [np.nan] * 7], np.float32)
     [row] = pose_rows(("cube", "absent"), poses)
-    assert row.copy == "sapien.Pose(p=[0.1, -2, 0], q=[1, 0, 0, 0])"
+    assert row["copy"] == "sapien.Pose(p=[0.1, -2, 0], q=[1, 0, 0, 0])"
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,6 @@ code and the message; the whole traceback only on demand.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import viser
 
 from workbench.authoring.problem import Problem
@@ -92,23 +90,10 @@ def banner_html(problem: Problem, view: SessionView) -> str:
         subject = "The file"
     else:
         subject = "The task" if view.task is None else view.task.class_name or view.task.env_id
-    where = None
-    if problem.file is not None:
-        where = Path(problem.file).name + (f":{problem.line}" if problem.line is not None else "")
     doing = DOING.get(problem.stage, f"failed in {problem.stage}")
     if problem.interrupted:
         doing = INTERRUPTED.get(problem.stage, f"was interrupted in {problem.stage}")
-    return render(
-        "banner",
-        subject=subject,
-        doing=doing,
-        where=where,
-        path=problem.file,
-        code=problem.code,
-        message=problem.message,
-        kept=_kept(view),
-        traceback=problem.traceback.rstrip(),
-    )
+    return render("banner", subject=subject, doing=doing, problem=problem, kept=_kept(view))
 
 
 def _kept(view: SessionView) -> str:

@@ -8,8 +8,6 @@ good version comes back in another, where it was.
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import viser
 
 from workbench.session.last_words import Busy
@@ -85,13 +83,4 @@ def busy_html(busy: Busy, view: SessionView) -> str:
             "the last good version comes back where it was. Saving a mended file does as much."
         )
     subject = "The task" if view.task is None else view.task.class_name or view.task.env_id
-    return render(
-        "busy",
-        subject=subject,
-        doing="drawing pictures" if busy.drawing else busy.doing,
-        seconds=f"{busy.seconds:.0f}",
-        where=None if busy.file is None else f"{Path(busy.file).name}:{busy.line}",
-        path=busy.file,
-        code=busy.code,
-        advice=advice,
-    )
+    return render("busy", subject=subject, busy=busy, advice=advice)

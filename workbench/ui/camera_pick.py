@@ -88,14 +88,7 @@ def picked_here(view: SessionView) -> Picked | None:
 
 def pane_html(camera: StudioCamera, picked: Picked | None, press: str) -> str:
     width, height = _size(camera)
-    return render(
-        "camera_pane",
-        press=press,
-        aspect=f"{width / height:.6f}",
-        picked=picked is not None,
-        left="" if picked is None else f"{100 * picked.u:.2f}",
-        top="" if picked is None else f"{100 * picked.v:.2f}",
-    )
+    return render("camera_pane", press=press, aspect=f"{width / height:.6f}", picked=picked)
 
 
 def _size(camera: StudioCamera) -> tuple[int, int]:
@@ -105,14 +98,7 @@ def _size(camera: StudioCamera) -> tuple[int, int]:
 
 def found_html(picked: Picked) -> str:
     numbers = "" if picked.point is None else ", ".join(f"{x:.4f}" for x in picked.point)
-    return render(
-        "camera_found",
-        body=picked.body or "background",
-        pixel=f"{picked.pixel[0]}, {picked.pixel[1]}",
-        depth="" if picked.depth is None else f"{picked.depth:.4f}",
-        point=numbers,
-        copy=f"[{numbers}]",
-    )
+    return render("camera_found", picked=picked, point=numbers)
 
 
 class PointMark:

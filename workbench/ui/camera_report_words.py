@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -17,22 +18,6 @@ MOSTLY_HIDDEN = 0.1
 """Share of an object behind the robot from which on it is said of an env."""
 SMALL = 30.0
 """Pixels below which an object is called small."""
-
-
-@dataclass(frozen=True)
-class ObjectRow:
-    """One object's line of the table; the last four are empty where there is nothing to say."""
-
-    name: str
-    note: str
-    seen: str = ""
-    pixels: str = ""
-    cut: str = ""
-    hidden: str = ""
-    bad: tuple[str, ...] = ()
-    """Which of ``seen cut hidden`` an author should look at."""
-    moods: tuple[str, ...] = ()
-    """How it is seen in each picture: ``good``, ``warn`` (cut, or much hidden), ``bad`` (not seen), ``none`` (absent)."""
 
 
 @dataclass(frozen=True)
@@ -65,18 +50,21 @@ def metres(value: float) -> str:
     return f"{value:.3g} m"
 
 
-def object_rows(report: CameraReport, unit: str = "envs") -> list[ObjectRow]:
+def object_rows(report: CameraReport, unit: str = "envs") -> list[dict[str, Any]]:
     """Objects to be seen, the least seen first; then what the task hides. Scenery is left out.
+
+    ``bad``: which of ``seen cut hidden`` an author should look at. ``moods``: how it is seen in each picture, ``good``,
+    ``warn`` (cut, or much hidden), ``bad`` (not seen), ``none`` (absent).
 
     Args:
         unit: what the report is over: envs, steps.
     """
-    rows = []
+    rows: list[dict[str, Any]] = []
     wanted = report.wanted_objects()
     for thing in sorted(wanted, key=lambda thing: (thing.summary().seen, thing.name)):
         found = thing.summary()
         if not found.present:
-            rows.append(ObjectRow(thing.name, f"in none of these {unit}"))
+            rows.append({"name": thing.name, "note": f"in none of these {unit}", "seen": ""})
             continue
         bad = []
         if found.seen < 1:
@@ -91,19 +79,19 @@ def object_rows(report: CameraReport, unit: str = "envs") -> list[ObjectRow]:
         if found.covered > MOSTLY_HIDDEN:
             notes.append(f"{percent(found.covered)} behind other things")
         rows.append(
-            ObjectRow(
-                thing.name,
-                ", ".join(notes),
-                percent(found.seen),
-                f"{found.median_pixels:.0f}",
-                percent(found.cut),
-                percent(found.hidden),
-                tuple(bad),
-                tuple(_mood(thing, i) for i in range(len(report.envs))),
-            )
+            {
+                "name": thing.name,
+                "note": ", ".join(notes),
+                "seen": percent(found.seen),
+                "pixels": f"{found.median_pixels:.0f}",
+                "cut": percent(found.cut),
+                "hidden": percent(found.hidden),
+                "bad": bad,
+                "moods": [_mood(thing, i) for i in range(len(report.envs))],
+            }
         )
-    rows += [ObjectRow(t.name, "the task hides it from this camera") for t in report.objects if t.never_drawn]
-    return rows
+    hides = "the task hides it from this camera"
+    return rows + [{"name": t.name, "note": hides, "seen": ""} for t in report.objects if t.never_drawn]
 
 
 def headline(report: CameraReport, unit: str = "envs") -> str:

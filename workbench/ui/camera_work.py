@@ -28,7 +28,6 @@ class WorkBar:
         self._bar = server.gui.add_html("", visible=False)
         self._stop = server.gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
         self._stop.on_click(lambda _: session.studio.stop())
-        self._drawn: Progress | None = None
         self._began: float | None = None
 
     def asked(self) -> None:
@@ -44,13 +43,5 @@ class WorkBar:
         shown = self._began is not None and time.monotonic() - self._began >= SHORT
         for handle in (self._bar, self._stop):
             handle.visible = shown
-        if not shown or running is None or running == self._drawn:
-            return
-        self._drawn = running
-        self._bar.content = render(
-            "camera_progress",
-            what=running.what,
-            done=running.done,
-            total=running.total,
-            percent=f"{100 * running.done / max(1, running.total):.0f}",
-        )
+        if shown:
+            self._bar.content = render("camera_progress", running=running)

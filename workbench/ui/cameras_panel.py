@@ -249,11 +249,5 @@ def modalities_of(info: CameraInfo) -> tuple[str, ...]:
 
 def facts(camera: _Camera) -> str:
     """The line under a camera's name."""
-    info = camera.info
-    return render(
-        "camera_facts",
-        size=f"{info.width} × {info.height}",
-        fovy=f"{np.degrees(info.fovy):.0f}°",
-        mount=info.mount,
-        stale=camera.stale,
-    )
+    fovy = f"{np.degrees(camera.info.fovy):.0f}°"
+    return render("camera_facts", info=camera.info, fovy=fovy, stale=camera.stale)

@@ -94,7 +94,7 @@ class EnvPanel(Part[SessionView]):
             pages=self._pages(len(envs), len(shown)),
             head=self._head(rows),
             rows=[
-                {"cells": row, "selected": row.env == selected, "press": self._press_of_env(row.env)}
+                {"cells": row, "selected": row["env"] == selected, "press": self._press_of_env(row["env"])}
                 for row in make_rows(rows, shown)
             ],
         )

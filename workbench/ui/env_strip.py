@@ -8,8 +8,7 @@ sorted.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,26 +51,6 @@ WORDS = {
 }
 _GRAVITY = np.array([2, 3, 0, 1])
 """Of an `Outcome` when sorted by: failed first, then cut off, then running, then solved."""
-
-
-@dataclass(frozen=True)
-class Row:
-    env: int
-    state: str
-    """One of `WORDS`' values."""
-    total: str
-    steps: str
-    first_true: tuple[str, ...]
-    """Of each of the columns; empty where it never was."""
-    curve: list[str]
-    """``points`` of SVG polylines, with a gap where the reward is not finite; empty without one."""
-    last: str
-    """How the episode before ended: ``success 34``; empty if there was none."""
-    last_state: str
-    tally: str
-    """``3 of 5 episodes ended in success``."""
-    flags: tuple[str, ...]
-    """Reasons, oldest first; those of the episode before are marked as such."""
 
 
 def entry_names(rows: EnvRows) -> tuple[str, ...]:
@@ -131,8 +110,8 @@ def moment_of(rows: EnvRows, env: int) -> int | None:
     return int(rows.end[env]) if rows.end[env] >= 0 else None
 
 
-def make_rows(rows: EnvRows, envs: NDArray[np.int64]) -> list[Row]:
-    """The cells of these envs."""
+def make_rows(rows: EnvRows, envs: NDArray[np.int64]) -> list[dict[str, Any]]:
+    """The cells of these envs. A curve is ``points`` of SVG polylines; reasons of flags are the oldest first."""
     names = entry_names(rows)
     curves = _curves(rows.rewards, envs)
     made = []
@@ -145,20 +124,20 @@ def make_rows(rows: EnvRows, envs: NDArray[np.int64]) -> list[Row]:
         ]
         now = [f"{outlier.reason} (step {outlier.step})" for outlier in rows.outliers.get(env, ())]
         made.append(
-            Row(
-                env=env,
-                state=WORDS[outcome],
-                total=number_text(float(rows.total[env]), ".3g") if rows.followed[env] else "",
-                steps=str(int(rows.steps[env])),
-                first_true=tuple(_step(int(rows.first_true[name][env])) for name in names),
-                curve=curve,
-                last=f"{'cut short' if last == Outcome.RUNNING else WORDS[last]} {rows.last.steps[env]}"
+            {
+                "env": env,
+                "state": WORDS[outcome],
+                "total": number_text(float(rows.total[env]), ".3g") if rows.followed[env] else "",
+                "steps": str(int(rows.steps[env])),
+                "first_true": tuple(_step(int(rows.first_true[name][env])) for name in names),
+                "curve": curve,
+                "last": f"{'cut short' if last == Outcome.RUNNING else WORDS[last]} {rows.last.steps[env]}"
                 if had_one
                 else "",
-                last_state=WORDS[last],
-                tally=f"{rows.succeeded[env]} of {rows.ended[env]} episodes ended in success",
-                flags=tuple(now + before),
-            )
+                "last_state": WORDS[last],
+                "tally": f"{rows.succeeded[env]} of {rows.ended[env]} episodes ended in success",
+                "flags": tuple(now + before),
+            }
         )
     return made
 

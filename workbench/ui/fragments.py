@@ -10,7 +10,8 @@ file that is not UTF-8, cannot be sent to a page at all.
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 import jinja2
 
@@ -21,6 +22,39 @@ from workbench.web_assets import web_assets_folder
 def render(template: str, **values: Any) -> str:
     """``web_assets/panels/<template>.html`` with these values, all of them escaped."""
     return _environment().get_template(f"{template}.html").render(**values)
+
+
+class _Placed(Protocol):
+    @property
+    def file(self) -> str | None: ...
+    @property
+    def line(self) -> int | None: ...
+
+
+def place(thing: _Placed | None) -> str:
+    """``push.py:88`` of a problem, a finding, a busy worker; empty where no file is known."""
+    if thing is None or not thing.file:
+        return ""
+    return Path(thing.file).name + (f":{thing.line}" if thing.line else "")
+
+
+def size(count: float) -> str:
+    """Bytes as a person says them: ``640 B``, ``2.5 MB``, ``1.2 GB``, to three digits, by 1000."""
+    for unit in ("B", "kB", "MB"):
+        if count < 999.5:
+            return f"{count:.3g} {unit}"
+        count /= 1000
+    return f"{count:.3g} GB"
+
+
+def percent(done: float, total: float) -> int:
+    """How much of a whole is done; 0 while the whole is not known."""
+    return round(100 * done / total) if total else 0
+
+
+def counted(count: int, what: str) -> str:
+    """``1 step``, ``7 steps``."""
+    return f"{count} {what}" if count == 1 else f"{count} {what}s"
 
 
 def _shown(value: Any) -> Any:
@@ -40,4 +74,5 @@ def _environment() -> jinja2.Environment:
     )
     macros = environment.get_template("can_be_pressed.html").module
     environment.globals.update({name: getattr(macros, name) for name in ("press", "to_copy")})
+    environment.filters.update({"place": place, "size": size, "percent": percent, "counted": counted})
     return environment

@@ -8,69 +8,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.inspection import JointReadings, Leaf, Touching
 from workbench.session.number_text import number_text
+from workbench.ui.fragments import counted
 
 NEAR_A_LIMIT = 0.02
 """Part of a joint's range."""
 
-
-@dataclass(frozen=True)
-class Number:
-    text: str
-    changed: bool
+Row = dict[str, Any]
+"""As the template ``inspect`` reads it."""
 
 
-@dataclass(frozen=True)
-class LeafRow:
-    name: str
-    kind: str
-    """``float32 (7,)``."""
-    numbers: tuple[Number, ...]
-    note: str
-    """``49152 numbers from 0 to 255`` where not all are shown; else empty."""
-
-
-@dataclass(frozen=True)
-class JointRow:
-    name: str
-    position: str
-    target: str
-    velocity: str
-    limits: str
-    place: float | None
-    """Per cent of the way from the lower limit to the upper one; None without limits."""
-    target_place: float | None
-    at_limit: bool
-
-
-@dataclass(frozen=True)
-class ContactRow:
-    first: str
-    second: str
-    force: str
-    vector: str
-    impulse: str
-    point: str
-    """The middle of its points."""
-    note: str
-
-
-@dataclass(frozen=True)
-class PoseRow:
-    name: str
-    p: str
-    q: str
-    copy: str
-    """As Python that one would type."""
-
-
-def leaf_rows(leaves: Sequence[Leaf], before: Sequence[Leaf] | None) -> list[LeafRow]:
+def leaf_rows(leaves: Sequence[Leaf], before: Sequence[Leaf] | None) -> list[Row]:
     """One row an array.
 
     Args:
@@ -88,22 +42,22 @@ def leaf_rows(leaves: Sequence[Leaf], before: Sequence[Leaf] | None) -> list[Lea
         count = math.prod(leaf.shape)
         whole = len(leaf.values) == count
         rows.append(
-            LeafRow(
-                name=leaf.name,
-                kind=f"{leaf.dtype} {leaf.shape}" if leaf.shape else leaf.dtype,
-                numbers=tuple(
-                    Number(number(value), bool(new))
+            {
+                "name": leaf.name,
+                "kind": f"{leaf.dtype} {leaf.shape}" if leaf.shape else leaf.dtype,
+                "numbers": tuple(
+                    {"text": number(value), "changed": bool(new)}
                     for value, new in zip(leaf.values.tolist(), changed.tolist(), strict=True)
                 )
                 if whole
                 else (),
-                note="" if whole else f"{count} numbers from {number(leaf.low)} to {number(leaf.high)}",
-            )
+                "note": "" if whole else f"{count} numbers from {number(leaf.low)} to {number(leaf.high)}",
+            }
         )
     return rows
 
 
-def joint_rows(joints: JointReadings) -> list[JointRow]:
+def joint_rows(joints: JointReadings) -> list[Row]:
     rows = []
     for i, name in enumerate(joints.names):
         low, high = float(joints.low[i]), float(joints.high[i])
@@ -112,42 +66,43 @@ def joint_rows(joints: JointReadings) -> list[JointRow]:
         place = _place(float(joints.position[i]), low, high) if bounded else None
         target = float(joints.target[i])
         rows.append(
-            JointRow(
-                name=name,
-                position=number(float(joints.position[i])),
-                target="" if math.isnan(target) else number(target),
-                velocity=number(float(joints.velocity[i])),
-                limits=f"{number(low)} to {number(high)} {unit}" if bounded else f"no limits, {unit}",
-                place=place,
-                target_place=None if place is None or math.isnan(target) else _place(target, low, high),
-                at_limit=place is not None and not 100 * NEAR_A_LIMIT < place < 100 * (1 - NEAR_A_LIMIT),
-            )
+            {
+                "name": name,
+                "position": number(float(joints.position[i])),
+                "target": "" if math.isnan(target) else number(target),
+                "velocity": number(float(joints.velocity[i])),
+                "limits": f"{number(low)} to {number(high)} {unit}" if bounded else f"no limits, {unit}",
+                "place": place,
+                "target_place": None if place is None or math.isnan(target) else _place(target, low, high),
+                "at_limit": place is not None and not 100 * NEAR_A_LIMIT < place < 100 * (1 - NEAR_A_LIMIT),
+            }
         )
     return rows
 
 
-def contact_rows(contacts: Sequence[Touching]) -> list[ContactRow]:
+def contact_rows(contacts: Sequence[Touching]) -> list[Row]:
     return [
-        ContactRow(
-            first=pair.bodies[0],
-            second=pair.bodies[1],
-            force=f"{number_text(float(np.linalg.norm(pair.force)), '.3g')} N",
-            vector=vector(pair.force),
-            impulse=f"{number_text(float(np.linalg.norm(pair.impulse)), '.3g')} N s",
-            point=vector(pair.points.mean(axis=0)) if len(pair.points) else "",
-            note=_depth(pair),
-        )
+        {
+            "first": pair.bodies[0],
+            "second": pair.bodies[1],
+            "force": f"{number_text(float(np.linalg.norm(pair.force)), '.3g')} N",
+            "vector": vector(pair.force),
+            "impulse": f"{number_text(float(np.linalg.norm(pair.impulse)), '.3g')} N s",
+            "point": vector(pair.points.mean(axis=0)) if len(pair.points) else "",
+            "note": _depth(pair),
+        }
         for pair in contacts
     ]
 
 
-def pose_rows(names: Sequence[str], poses: NDArray[np.float32]) -> list[PoseRow]:
+def pose_rows(names: Sequence[str], poses: NDArray[np.float32]) -> list[Row]:
     """Of the bodies that an env has; `poses` is (B, 7), p and q (wxyz), NaN where it has none."""
     rows = []
     for name, pose in zip(names, poses, strict=True):
         if np.isfinite(pose).all():
             p, q = pose[:3], pose[3:]
-            rows.append(PoseRow(name, vector(p), vector(q), f"sapien.Pose(p={_code(p)}, q={_code(q)})"))
+            code = f"sapien.Pose(p={_code(p)}, q={_code(q)})"
+            rows.append({"name": name, "p": vector(p), "q": vector(q), "copy": code})
     return rows
 
 
@@ -175,7 +130,7 @@ def _place(value: float, low: float, high: float) -> float:
 
 
 def _depth(pair: Touching) -> str:
-    points = f"{len(pair.points)} point{'' if len(pair.points) == 1 else 's'}"
+    points = counted(len(pair.points), "point")
     return f"{points}, {1000 * -pair.separation:.2f} mm deep" if pair.separation < 0 else points
 
 

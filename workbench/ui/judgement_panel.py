@@ -7,8 +7,6 @@ list selects its env and goes to the moment where it differs, in the timeline an
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import viser
 from numpy.typing import NDArray
@@ -173,23 +171,4 @@ def chart_data(curve: JudgedCurve, shown: int | None) -> tuple[NDArray[np.float6
 
 
 def status_html(judged: JudgementView) -> str:
-    summary, problem = judged.summary, judged.problem
-    file = None if problem is None else problem.file
-    return render(
-        "judgement",
-        state=judged.state,
-        done=judged.done,
-        total=judged.total,
-        percent=f"{100 * judged.done / max(1, judged.total):.0f}",
-        rate=f"{judged.steps_per_second:.0f} a second" if judged.steps_per_second >= 1 else "",
-        why=judged.why,
-        message="" if problem is None else problem.message,
-        where="" if file is None or problem is None else f"{Path(file).name}:{problem.line}",
-        path=file or "",
-        code="" if problem is None else problem.code or "",
-        headline=words.headline(judged),
-        numbers=words.numbers(judged),
-        drift="" if summary is None else words.drift(summary),
-        drifted=summary is not None and words.is_far(summary),
-        not_carried=judged.not_carried,
-    )
+    return render("judgement", judged=judged, words=words)

@@ -9,7 +9,7 @@ import viser
 
 from workbench.recording.library import Library, LibraryError
 from workbench.recording.library_row import LONGEST_NOTE, LibraryRow, clean_tags
-from workbench.ui.file_size import size_in_words
+from workbench.ui.fragments import size
 from workbench.ui.library_forms import Question, ask_text, ask_whether
 from workbench.ui.library_rows import in_words
 
@@ -89,7 +89,7 @@ class LibraryEdits:
             lambda: ask_whether(
                 self._server,
                 "Empty the trash",
-                f"Delete {trash.files} files ({size_in_words(trash.size)}) for good?",
+                f"Delete {trash.files} files ({size(trash.size)}) for good?",
                 [],
                 "This cannot be undone.",
                 "Delete for good",

@@ -24,8 +24,7 @@ import viser
 from workbench.recording.library import Library, LibraryView
 from workbench.recording.library_row import LibraryRow
 from workbench.ui.commands import Command
-from workbench.ui.file_size import size_in_words
-from workbench.ui.fragments import render
+from workbench.ui.fragments import render, size
 from workbench.ui.library_commands import Action, acting, walking
 from workbench.ui.library_edits import LibraryEdits
 from workbench.ui.library_list import MOST_ROWS, RANGE, TOGGLE, LibraryList
@@ -289,6 +288,7 @@ class LibraryPanel(Part[object]):
             rows=[
                 {
                     "number": self._number(row.id),
+                    "of": row,
                     "cells": cells(row, newest, now),
                     "picture": data_address_of_jpeg(pictures.get(row.id)),
                 }
@@ -378,7 +378,7 @@ class LibraryPanel(Part[object]):
         return render(
             "library_trash",
             files=view.trash.files,
-            size=size_in_words(view.trash.size),
+            size=size(view.trash.size),
             empty=self._press("empty", self._edits.ask_empty),
         )
 

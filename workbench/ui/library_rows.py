@@ -9,12 +9,11 @@ from __future__ import annotations
 import datetime
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from workbench.recording.library_row import LibraryRow
 from workbench.session.number_text import number_text
-from workbench.ui.file_size import size_in_words
+from workbench.ui.fragments import counted, size
 
 Column = Literal["task", "date", "seed", "steps", "return", "success", "version", "tags", "note", "name"]
 COLUMNS: tuple[Column, ...] = ("task", "date", "seed", "steps", "return", "success")
@@ -43,32 +42,6 @@ MEANS: dict[Outcome, str] = {
 HASH = 7
 """Characters of a source hash that are shown."""
 _DESCENDING_FIRST: tuple[Column, ...] = ("date", "steps", "return", "success")
-
-
-@dataclass(frozen=True)
-class Cells:
-    """The text of a row."""
-
-    task: str
-    date: str
-    when: str
-    """The date in full."""
-    seed: str
-    steps: str
-    total: str
-    outcome: str
-    """``success``, ``once``, ``fail``, ``no``, or empty where it is not known."""
-    version: str
-    other_version: bool
-    """Not that of the newest recording of its task."""
-    tags: tuple[str, ...]
-    note: str
-    name: str
-    about: str
-    """What is said when the pointer rests on the row."""
-    problem: str
-    remark: str
-    """``cut short``, or which kind of file it is where it is not one of ours."""
 
 
 def newest_sources(rows: Iterable[LibraryRow]) -> dict[str, str]:
@@ -160,37 +133,28 @@ def _key(row: LibraryRow, column: Column) -> float | str | None:
     return text.lower() or None
 
 
-def cells(row: LibraryRow, newest: dict[str, str], now: datetime.datetime) -> Cells:
-    """
+def cells(row: LibraryRow, newest: dict[str, str], now: datetime.datetime) -> dict[str, Any]:
+    """What is said of a row besides what stands in it.
+
     Args:
         newest: of `newest_sources`.
         now: with the zone that dates are shown in.
     """
     when = None if row.date is None else row.date.astimezone(now.tzinfo)
-    total = row.total_reward
-    task = row.task or ("?" if row.problem else "")
-    about = [row.name, size_in_words(row.size), row.facts.control_mode]
-    if row.facts.acted_by:
-        about.append(f"actions: {row.facts.acted_by}")
-    if row.facts.env_index is not None:
-        about.insert(1, f"env {row.facts.env_index}")
-    return Cells(
-        task=task,
-        date="" if when is None else _short_date(when, now),
-        when="" if when is None else f"{when:%Y-%m-%d %H:%M:%S}",
-        seed="" if row.seed is None else str(row.seed),
-        steps="" if row.length is None else str(row.length),
-        total="" if total is None else number_text(total),
-        outcome=_outcome(row),
-        version=row.source_hash[:HASH],
-        other_version=bool(row.source_hash) and newest.get(row.task, row.source_hash) != row.source_hash,
-        tags=row.tags,
-        note=row.note,
-        name=row.name,
-        about=", ".join(part for part in about if part),
-        problem=row.problem or "",
-        remark=_remark(row),
-    )
+    env = "" if row.facts.env_index is None else f"env {row.facts.env_index}"
+    actions = f"actions: {row.facts.acted_by}" if row.facts.acted_by else ""
+    about = (row.name, env, size(row.size), row.facts.control_mode, actions)
+    return {
+        "task": row.task or ("?" if row.problem else ""),
+        "date": "" if when is None else _short_date(when, now),
+        "when": "" if when is None else f"{when:%Y-%m-%d %H:%M:%S}",
+        "total": "" if row.total_reward is None else number_text(row.total_reward),
+        "outcome": _outcome(row),
+        "version": row.source_hash[:HASH],
+        "other_version": bool(row.source_hash) and newest.get(row.task, row.source_hash) != row.source_hash,
+        "about": ", ".join(part for part in about if part),
+        "remark": _remark(row),
+    }
 
 
 def _remark(row: LibraryRow) -> str:
@@ -223,7 +187,5 @@ def in_words(rows: Sequence[LibraryRow]) -> str:
     """``3 recordings (9 files, 1.2 MB)``."""
     files = {path for row in rows for path in row.paths}
     by_files = {row.paths: row.size for row in rows}
-    what = "1 recording" if len(rows) == 1 else f"{len(rows)} recordings"
-    return (
-        f"{what} ({len(files)} file{'' if len(files) == 1 else 's'}, {size_in_words(sum(by_files.values()))})"
-    )
+    what, of = counted(len(rows), "recording"), counted(len(files), "file")
+    return f"{what} ({of}, {size(sum(by_files.values()))})"

@@ -99,7 +99,7 @@ def log_html(printed: Printed, wanted: str) -> str:
         shown=len(lines),
         kept=len(printed.lines),
         wanted=wanted,
-        dropped=f"{printed.dropped:,}".replace(",", " ") if printed.dropped else "",
+        dropped=printed.dropped,
     )
 
 
@@ -107,10 +107,4 @@ def vitals_html(vitals: Vitals) -> str:
     """What the processes hold, in words that change only when it matters."""
     if not vitals.memory:
         return ""
-    return render(
-        "vitals",
-        worker=in_words(vitals.memory),
-        limit=None if vitals.memory_limit is None else in_words(vitals.memory_limit),
-        spare=None if vitals.spare_memory is None else in_words(vitals.spare_memory),
-        ready=vitals.spare_ready,
-    )
+    return render("vitals", vitals=vitals, in_words=in_words)

@@ -11,12 +11,10 @@ import shlex
 
 import viser
 
-from workbench.session.keep_status import KeepStatus
 from workbench.session.record_live import recovered_in_words
 from workbench.session.session import Session
 from workbench.session.view import RecordingStatus, SessionView
-from workbench.ui.file_size import size_in_words
-from workbench.ui.fragments import render
+from workbench.ui.fragments import counted, render
 from workbench.ui.parts import Part
 
 THIS_ENV, ALL_ENVS = "the selected env", "all envs"
@@ -128,7 +126,7 @@ def what_keeping_means(view: SessionView, all_envs: bool) -> str:
         return ""
     if view.timeline.shown is not None:
         return f"{KEEP} takes the whole episode round the moment that is shown."
-    count = f"{steps} step{'' if steps == 1 else 's'} so far"
+    count = f"{counted(steps, 'step')} so far"
     if all_envs and view.task.num_envs > 1:
         return f"{KEEP} takes the episodes that run, ended or not (env {view.selected_env}: {count})."
     which = "episode" if view.task.num_envs == 1 else f"episode of env {view.selected_env}"
@@ -136,24 +134,12 @@ def what_keeping_means(view: SessionView, all_envs: bool) -> str:
 
 
 def recording_html(recording: RecordingStatus) -> str:
-    last = recording.last_file
     return render(
         "recording",
-        active=recording.active,
+        recording=recording,
         envs=_envs_in_words(recording.env_idx),
-        one=len(recording.env_idx) == 1,
-        waiting=recording.waiting,
-        all_wait=recording.waiting == len(recording.env_idx),
-        steps=recording.steps,
-        written=recording.episodes_written,
-        being_written=recording.being_written,
         recovered=recovered_in_words(recording.recovered),
-        size=size_in_words(recording.bytes_written),
-        folder=recording.folder,
-        command=None if last is None else f"workbench view {shlex.quote(last)}",
-        problem=recording.problem,
-        keeping=recording.keeping,
-        percent=_percent(recording.keeping),
+        command=recording.last_file and f"workbench view {shlex.quote(recording.last_file)}",
     )
 
 
@@ -161,7 +147,3 @@ def _envs_in_words(env_idx: tuple[int, ...]) -> str:
     numbers = ", ".join(str(env) for env in env_idx[:6])
     more = f" and {len(env_idx) - 6} more" if len(env_idx) > 6 else ""
     return f"env{'s' if len(env_idx) != 1 else ''} {numbers}{more}"
-
-
-def _percent(keeping: KeepStatus) -> int:
-    return round(100 * keeping.done / keeping.total) if keeping.total else 0

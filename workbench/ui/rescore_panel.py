@@ -249,26 +249,7 @@ def in_order(verdicts: Sequence[Verdict]) -> list[Verdict]:
 
 
 def status_html(told: RescoreView) -> str:
-    problem = told.problem
-    file = None if problem is None else problem.file
     known = told.verdicts if told.state != "none" else ()
     rate = told.steps / told.seconds if told.seconds > 0.5 else 0.0
-    return render(
-        "rescore",
-        state=told.state,
-        task=told.task,
-        done=len(told.verdicts),
-        total=told.total,
-        percent=f"{100 * len(told.verdicts) / max(1, told.total):.0f}",
-        rate=f"{rate:.0f} steps a second" if rate >= 1 else "",
-        why=told.why,
-        message="" if problem is None else problem.message,
-        where="" if file is None or problem is None else f"{Path(file).name}:{problem.line}",
-        path=file or "",
-        code="" if problem is None else problem.code or "",
-        headline=words.summary(known) if known and told.state in ("done", "stopped") else "",
-        doubt=words.doubts(known),
-        notes=told.notes,
-        hidden=told.hidden,
-        not_carried=words.not_carried(known),
-    )
+    headline = words.summary(known) if known and told.state in ("done", "stopped") else ""
+    return render("rescore", told=told, known=known, rate=rate, headline=headline, words=words)

@@ -5,14 +5,12 @@ A rule that only warns stops nothing, so whatever tells of it must not pass: the
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import viser
 
-from workbench.core.rules import RULES, Finding
+from workbench.core.rules import RULES
 from workbench.session.messages import RulesBroken
 from workbench.session.view import SessionView
-from workbench.ui.fragments import render
+from workbench.ui.fragments import place, render
 from workbench.ui.parts import Part
 from workbench.ui.presses import Presses
 
@@ -48,34 +46,11 @@ class RulesMark(Part[SessionView]):
 
 def rules_html(rules: RulesBroken, open: bool, press_id: str) -> str:
     """The mark, and the list where it is open; every value escaped."""
-    rows = [_row(finding) for finding in rules.rows]
-    places = [row["where"] for row in rows if row["where"]]
-    return render(
-        "rules",
-        open=open,
-        press_id=press_id,
-        count=len(rows),
-        newest="" if not places else places[0] + (f" and {len(rows) - 1} more" if len(rows) > 1 else ""),
-        rows=rows,
-        more=rules.more,
-    )
-
-
-def _row(finding: Finding) -> dict[str, str]:
-    where = ""
-    if finding.file is not None:
-        where = Path(finding.file).name + (f":{finding.line}" if finding.line else "")
-    return {
-        "rule": finding.rule,
-        "asks": f"{RULES[finding.rule].asks} Else, on the GPU: {RULES[finding.rule].otherwise}",
-        "where": where,
-        "path": finding.file or "",
-        "function": f"in {finding.function}" if finding.function else "",
-        "code": finding.code,
-        "message": finding.message,
-        "times": times(finding.count),
-        "since": f"first at step {finding.first_step}" if finding.first_step else "from the start",
-    }
+    newest = next((place(row) for row in rules.rows if row.file), "")
+    if newest and len(rules.rows) > 1:
+        newest += f" and {len(rules.rows) - 1} more"
+    known = {"RULES": RULES, "times": times}
+    return render("rules", open=open, press_id=press_id, newest=newest, rules=rules, **known)
 
 
 def times(count: int) -> str:

@@ -8,6 +8,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import viser
 
@@ -15,8 +16,7 @@ from workbench.core.camera_frames import triple
 from workbench.recording.lerobot_export import ExportOptions
 from workbench.recording.scene_eye import Eye
 from workbench.recording.sources import Source
-from workbench.ui.file_size import size_in_words
-from workbench.ui.fragments import render
+from workbench.ui.fragments import counted, render, size
 from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted, What, file_name
 from workbench.ui.making import Making, MakingView
 from workbench.ui.offers import Offers
@@ -165,7 +165,7 @@ class SharePanel:
             {
                 "address": self._offers.address(path, download=True),
                 "name": path.name,
-                "size": size_in_words(path.stat().st_size),
+                "size": size(path.stat().st_size),
             }
             for path in made.paths
             if path.is_file()
@@ -177,25 +177,14 @@ class SharePanel:
         return {"links": links, "lost": lost, "words": made.words, "folder": ", ".join(map(str, made.paths))}
 
 
-@dataclass(frozen=True)
-class WillMake:
-    """What a press on *Make* makes, as far as it is known before the recordings are read."""
-
-    what: str
-    files: tuple[str, ...] = ()
-    more: int = 0
-    """Further files."""
-    short: tuple[str, ...] = ()
-    """`files` as they are shown."""
-    where: str = ""
-    """The folder that they go into; empty for files that the page offers to save."""
-
-
-def will_make(what: What, chosen: Chosen, camera: str, folder: Path) -> WillMake:
+def will_make(what: What, chosen: Chosen, camera: str, folder: Path) -> dict[str, Any]:
+    """What a press on *Make* makes, as far as it is known before the recordings are read: in words, its files, how many
+    `more` there are, and the folder ``where`` they go; empty for files that the page offers to save."""
     names = [source.name for source in chosen.sources]
     of = "of it" if len(names) == 1 else f"of these {len(names)} recordings"
     if what == "lerobot":
-        return WillMake(f"one dataset {of}", where=f"{folder / 'datasets'}/lerobot_\u2039date and time\u203a")
+        where = f"{folder / 'datasets'}/lerobot_\u2039date and time\u203a"
+        return {"what": f"one dataset {of}", "files": (), "more": 0, "where": where}
     if what != "film":
         files = [file_name(what, name) for name in names]
     elif camera in chosen.cameras:
@@ -204,10 +193,9 @@ def will_make(what: What, chosen: Chosen, camera: str, folder: Path) -> WillMake
         files = [file_name(what, name, known) for name in names for known in chosen.cameras]
     else:
         known = f" ({', '.join(chosen.cameras)})" if chosen.cameras else ""
-        return WillMake(f"one film for each camera{known} {of}")
-    count = f"{len(files)} file{'' if len(files) == 1 else 's'}"
-    short = tuple(short_names(files)[:MOST_NAMED])
-    return WillMake(count, tuple(files[:MOST_NAMED]), len(files[MOST_NAMED:]), short)
+        return {"what": f"one film for each camera{known} {of}", "files": (), "more": 0, "where": ""}
+    shown = list(zip(files, short_names(files)))[:MOST_NAMED]
+    return {"what": counted(len(files), "file"), "files": shown, "more": len(files[MOST_NAMED:]), "where": ""}
 
 
 _TIME = re.compile(r"_\d{4}-\d\d-\d\dT\d\d-\d\d-\d\d")

@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import viser
@@ -15,7 +14,7 @@ from workbench.session.env_table import EnvRows
 from workbench.session.last_words import Busy
 from workbench.session.view import SessionView
 from workbench.ui.env_strip import first_flagged, mask
-from workbench.ui.fragments import render
+from workbench.ui.fragments import place, render
 from workbench.ui.parts import Clock, Part
 from workbench.ui.presses import Presses
 from workbench.ui.version_panel import took
@@ -165,8 +164,8 @@ def _doing(busy: Busy) -> str:
     if busy.awaited:
         return f"for a debugger to attach, {busy.seconds:.0f} s; the log says where"
     if busy.held:
-        place = "" if busy.file is None else f" at {Path(busy.file).name}:{busy.line}"
-        return f"by a debugger{place} for {busy.seconds:.0f} s; it goes on from there, not from this page"
+        at = f" at {place(busy)}" if busy.file else ""
+        return f"by a debugger{at} for {busy.seconds:.0f} s; it goes on from there, not from this page"
     if busy.getting_ready:
         return f"a new worker is getting ready (shaders are compiled once a process), {busy.seconds:.0f} s"
     return f"{busy.doing} for {busy.seconds:.0f} s"
