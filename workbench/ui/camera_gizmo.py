@@ -22,6 +22,7 @@ from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.session.studio_view import StudioCamera
 from workbench.ui.camera_moves import Floats, Frame, Snap, looking_at, snapped, turned_in_world
 from workbench.ui.placing import Placing
+from workbench.ui.selection_mark import LineSet
 
 LEFT_ALONE = 60.0
 """Seconds without a movement after which a gizmo that was never let go (a page that went away) is free again."""
@@ -82,7 +83,7 @@ class CameraGizmo:
             disable_rotations=True,
             visible=False,
         )
-        self._line: viser.LineSegmentsHandle | None = None
+        self._line = LineSet(server, "/studio/line of sight", SIGHT_COLOUR, 2.0)
         self._held_at = -1e9
         self._start: _Taken | None = None
         # Async: callbacks in viser's pool of threads would come in any order.
@@ -133,21 +134,11 @@ class CameraGizmo:
 
     def _draw_line(self, camera: StudioCamera | None) -> None:
         """From the eye to the target, which otherwise would be any three arrows in the air."""
-        wanted = None
-        if camera is not None and camera.now is not None and self._look_at():
-            eye = self._placing.frame(camera).to_view(camera.now)[:3]
-            wanted = np.stack([eye, self._placing.target_in_view(camera, camera.now)])[None].astype(
-                np.float32
-            )
-        if wanted is None:
-            if self._line is not None:
-                self._line.visible = False
-        elif self._line is None:
-            self._line = self._server.scene.add_line_segments(
-                "/studio/line of sight", wanted, colors=SIGHT_COLOUR, thickness=2.0, thickness_units="screen"
-            )
-        else:
-            self._line.points, self._line.visible = wanted, True
+        if camera is None or camera.now is None or not self._look_at():
+            self._line.draw(None)
+            return
+        eye = self._placing.frame(camera).to_view(camera.now)[:3]
+        self._line.draw(np.stack([eye, self._placing.target_in_view(camera, camera.now)])[None])
 
     # --- what the hand does ----------------------------------------------------------------------------
 

@@ -19,6 +19,7 @@ from workbench.session.studio_view import Picked, StudioCamera
 from workbench.session.view import SessionView
 from workbench.ui.fragments import render
 from workbench.ui.presses import Presses
+from workbench.ui.selection_mark import LineSet
 
 MARK_COLOUR = (230, 73, 128)
 MARK_SIZE = 0.05
@@ -106,7 +107,7 @@ class PointMark:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
-        self._cross: viser.LineSegmentsHandle | None = None
+        self._cross = LineSet(server, "/picked/cross", MARK_COLOUR, 3.0)
         self._label: viser.LabelHandle | None = None
         self._drawn: object = None
 
@@ -117,26 +118,18 @@ class PointMark:
             return
         self._drawn = wanted
         if point is None or picked is None:
-            for handle in (self._cross, self._label):
-                if handle is not None:
-                    handle.remove()
-            self._cross = self._label = None
+            self._cross.draw(None)
+            if self._label is not None:
+                self._label.remove()
+                self._label = None
             return
         place = np.asarray(point, np.float64) + offset
         text = picked.body or ""
-        if self._cross is None or self._label is None:
-            ends = np.eye(3, dtype=np.float32) * MARK_SIZE
-            self._cross = self._server.scene.add_line_segments(
-                "/picked/cross",
-                np.stack([-ends, ends], axis=1),
-                MARK_COLOUR,
-                thickness=3.0,
-                thickness_units="screen",
-                position=place,
-            )
+        ends = np.eye(3) * MARK_SIZE
+        self._cross.draw(np.stack([place - ends, place + ends], axis=1))
+        if self._label is None:
             self._label = self._server.scene.add_label(
                 "/picked/label", text, position=place, anchor="bottom-left"
             )
         else:
-            self._cross.position = place
             self._label.position, self._label.text = place, text

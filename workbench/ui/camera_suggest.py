@@ -23,9 +23,11 @@ from workbench.session.view import SessionView
 from workbench.ui.arrival import Arrival
 from workbench.ui.camera_work import WorkBar
 from workbench.ui.checked import checked_number
+from workbench.ui.env_layout import box_corners
 from workbench.ui.fragments import render
 from workbench.ui.inline_pictures import data_address
 from workbench.ui.presses import Presses
+from workbench.ui.selection_mark import LineSet
 
 ROOM, ROOM_ON_MOUNT = 0.3, 0.1
 """Metres from the eye to each side of the box that is first offered; less on a body, which has to carry it."""
@@ -97,7 +99,7 @@ class CameraSuggest:
         self._search.on_click(self._ask)
         for corner in (self._low, self._high):
             corner.on_update(self._on_touch)
-        self._box = BoundsBox(server)
+        self._box = LineSet(server, "/bounds of the eye", BOX_COLOUR, 2.0)
 
     # --- asked ---------------------------------------------------------------------------------------
 
@@ -237,18 +239,18 @@ class CameraSuggest:
         camera = view.studio.chosen
         nowhere = camera is None or (camera.info.mount is not None and camera.mount_pose is None)
         if self._show_box.value is not True or nowhere or camera is None:
-            self._box.draw(None, offset)
+            self._box.draw(None)
             return
         try:
             low, high = self._bounds()
         except ValueError:
-            self._box.draw(None, offset)
+            self._box.draw(None)
             return
         edges = box_edges(low, high)
         if camera.mount_pose is not None:
             mount = camera.mount_pose.astype(np.float64)
             edges = (edges @ rotation_matrix(mount[3:]).T + mount[:3]).astype(np.float32)
-        self._box.draw(edges, offset)
+        self._box.draw(edges + offset)
 
 
 def choices_of(task: TaskDescription, kind: CameraKind) -> tuple[Choice, ...]:
@@ -275,29 +277,6 @@ def choices_of(task: TaskDescription, kind: CameraKind) -> tuple[Choice, ...]:
 
 def box_edges(low: Corner, high: Corner) -> NDArray[np.float32]:
     """(12, 2, 3) the edges of a box."""
-    picks = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
-    corners = np.where(picks == 0, low, high)
-    pairs = [(i, j) for i in range(8) for j in range(i) if np.abs(picks[i] - picks[j]).sum() == 1]
-    return corners[np.array(pairs)].astype(np.float32)
-
-
-class BoundsBox:
-    """The edges of one box in the view."""
-
-    def __init__(self, server: viser.ViserServer) -> None:
-        self._server = server
-        self._handle: viser.LineSegmentsHandle | None = None
-
-    def draw(self, edges: NDArray[np.float32] | None, offset: NDArray[np.float32]) -> None:
-        if edges is None:
-            if self._handle is not None:
-                self._handle.remove()
-                self._handle = None
-            return
-        points = edges + offset
-        if self._handle is None:
-            self._handle = self._server.scene.add_line_segments(
-                "/bounds of the eye", points, BOX_COLOUR, thickness=2.0, thickness_units="screen"
-            )
-        elif not np.array_equal(self._handle.points, points):
-            self._handle.points = points
+    # A corner's number has a bit for each axis; along an edge one of them changes.
+    pairs = [(i, i ^ bit) for bit in (1, 2, 4) for i in range(8) if i & bit]
+    return box_corners(low, high)[np.array(pairs)].astype(np.float32)

@@ -32,7 +32,6 @@ class Command:
     run: Callable[[], None]
     key: HotkeyKey | None = None
     modifier: KeyModifier | None = None
-    description: str | None = None
     registered: Callable[[viser.CommandHandle], None] | None = None
     """Gets its handle, for who wants to disable it at times."""
 
@@ -56,7 +55,6 @@ def register(server: viser.ViserServer, commands: Sequence[Command]) -> None:
     for command in commands:
         handle = server.gui.add_command(
             command.label,
-            description=command.description,
             hotkey=command.key,
             modifier=command.modifier,
         )

@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from workbench.core.geometry import Mesh, SceneGeometry, Visual
 
@@ -56,6 +56,12 @@ def rotate(wxyz: NDArray, points: NDArray) -> NDArray:
     w, axis = wxyz[..., :1], wxyz[..., 1:]
     across = 2.0 * np.cross(axis, points)
     return points + w * across + np.cross(axis, across)
+
+
+def box_corners(low: ArrayLike, high: ArrayLike) -> NDArray:
+    """(8, 3) corners of a box; the bits of a corner's number say at which end of x, y and z it is."""
+    picks = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
+    return np.where(picks == 0, low, high)
 
 
 def plane_normal(visual: Visual, geometry: SceneGeometry, poses: NDArray) -> NDArray[np.float64] | None:
@@ -189,8 +195,7 @@ def _extent(mesh: Mesh) -> NDArray:
 def _corners_in_env(visual: Visual, poses: NDArray) -> NDArray:
     """(K', 8, 3) corners of each instance's box in its env's frame; absent instances left out."""
     low, high = visual.mesh.vertices.min(axis=0), visual.mesh.vertices.max(axis=0)
-    picks = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
-    corners = np.where(picks == 0, low, high)
+    corners = box_corners(low, high)
     worn = poses[visual.envs, visual.bodies].astype(np.float64)
     worn = worn[np.isfinite(worn).all(axis=1)]
     return rotate(worn[:, None, 3:], corners[None]) + worn[:, None, :3]

@@ -31,7 +31,7 @@ from workbench.ui.env_strip import (
 )
 from workbench.ui.fragments import render
 from workbench.ui.parts import Part
-from workbench.ui.presses import Presses
+from workbench.ui.presses import Paged, Presses
 
 MOST_ROWS = 64
 """On one page of the table."""
@@ -57,7 +57,7 @@ class EnvPanel(Part[SessionView]):
         self._presses = Presses(server)
         self._column, self._descending = "env", False
         self._filter: Filter = "all"
-        self._first = 0
+        self._pages = Paged(self._presses, MOST_ROWS)
         self._pressed = 0
         """How often something was that changes the table."""
 
@@ -65,7 +65,7 @@ class EnvPanel(Part[SessionView]):
         return view.task_serial, view.step_serial
 
     def urgent(self, view: SessionView) -> object:
-        return view.selected_env, self._pressed
+        return view.selected_env, self._pressed, self._pages.first
 
     def draw(self, view: SessionView) -> None:
         rows = self._session.env_rows()
@@ -76,8 +76,8 @@ class EnvPanel(Part[SessionView]):
         if self._column not in columns(rows):
             self._column, self._descending = "env", False
         envs = order(rows, self._column, self._descending, self._filter)
-        self._first = min(self._first, max(0, (len(envs) - 1) // MOST_ROWS * MOST_ROWS))
-        shown = envs[self._first : self._first + MOST_ROWS]
+        places = self._pages.places(len(envs))
+        shown = envs[places.start : places.stop]
         return render(
             "envs",
             none_so=NONE_SO[self._filter],
@@ -91,7 +91,7 @@ class EnvPanel(Part[SessionView]):
                 }
                 for name in FILTERS
             ],
-            pages=self._pages(len(envs), len(shown)),
+            pages=self._pages.shown,
             head=self._head(rows),
             rows=[
                 {"cells": row, "selected": row["env"] == selected, "press": self._press_of_env(row["env"])}
@@ -118,17 +118,6 @@ class EnvPanel(Part[SessionView]):
         start = [sortable(name, name, HINTS[name]) for name in ("env", "state", "steps", "return")]
         return [*start, plain, *entries, *(sortable(name, name, HINTS[name]) for name in ("last", "flags"))]
 
-    def _pages(self, count: int, shown: int) -> dict[str, object] | None:
-        if count <= MOST_ROWS:
-            return None
-        return {
-            "first": self._first + 1,
-            "last": self._first + shown,
-            "of": count,
-            "back": self._press("back", lambda: self._turn(-MOST_ROWS)),
-            "on": self._press("on", lambda: self._turn(MOST_ROWS)),
-        }
-
     # --- what is pressed ---------------------------------------------------------------------------
 
     def _press(self, key: Hashable, do: Callable[[], None]) -> str:
@@ -152,13 +141,12 @@ class EnvPanel(Part[SessionView]):
 
     def _choose_column(self, column: str) -> None:
         self._descending = not self._descending if column == self._column else False
-        self._column, self._first = column, 0
+        self._column = column
+        self._pages.go_to(0)
 
     def _choose_filter(self, wanted: Filter) -> None:
-        self._filter, self._first = wanted, 0
-
-    def _turn(self, by: int) -> None:
-        self._first = max(0, self._first + by)
+        self._filter = wanted
+        self._pages.go_to(0)
 
     def select_first_flagged(self) -> None:
         """The first env with something odd, at the step at which that began."""

@@ -20,7 +20,7 @@ from workbench.ui import judged_in_words as words
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import LONGEST
 from workbench.ui.parts import Part
-from workbench.ui.presses import Presses
+from workbench.ui.presses import Paged, Presses
 from workbench.ui.then_and_now import ThenAndNow
 
 MOST_ROWS = 8
@@ -45,12 +45,12 @@ class JudgementPanel(Part[SessionView]):
         self._chart = ThenAndNow(server)
         self._list = server.gui.add_html("", visible=False)
         self._presses = Presses(server)
-        self._first = 0
+        self._pages = Paged(self._presses, MOST_ROWS)
         self._listed: tuple[EpisodeDifference, ...] = ()
 
     def key(self, view: SessionView) -> object:
         past = view.timeline
-        chosen = self._name.value, self._first
+        chosen = self._name.value, self._pages.first
         return view.judgement.serial, view.selected_env, past.shown, past.first, *chosen
 
     def draw(self, view: SessionView) -> None:
@@ -58,7 +58,7 @@ class JudgementPanel(Part[SessionView]):
         self._status.visible = judged.state != "none"
         self._stop.visible = judged.state in ("loading", "judging")
         if judged.state == "none":
-            self._first = 0
+            self._pages.go_to(0)
         else:
             self._status.content = status_html(judged)
         self._draw_list(judged, view)
@@ -90,23 +90,9 @@ class JudgementPanel(Part[SessionView]):
         self._list.visible = bool(self._listed)
         if not self._listed:
             return
-        count = len(self._listed)
-        self._first = min(self._first, (count - 1) // MOST_ROWS * MOST_ROWS)
-        shown = range(self._first, min(self._first + MOST_ROWS, count))
-        content = render(
-            "differences",
-            rows=[self._row(place, view) for place in shown],
-            more=None
-            if count <= MOST_ROWS
-            else {
-                "first": shown.start + 1,
-                "last": shown.stop,
-                "of": count,
-                "back": self._presses.id_of("back", lambda _: self._turn(-MOST_ROWS)),
-                "on": self._presses.id_of("on", lambda _: self._turn(MOST_ROWS)),
-            },
-        )
-        self._list.content = content
+        shown = self._pages.places(len(self._listed))
+        rows = [self._row(place, view) for place in shown]
+        self._list.content = render("differences", rows=rows, more=self._pages.shown)
 
     def _row(self, place: int, view: SessionView) -> dict[str, object]:
         episode = self._listed[place]
@@ -125,7 +111,7 @@ class JudgementPanel(Part[SessionView]):
         }
 
     def _go(self, row: int) -> None:
-        place = self._first + row
+        place = self._pages.first + row
         if place < len(self._listed):
             self._show_episode(self._listed[place])
 
@@ -134,9 +120,6 @@ class JudgementPanel(Part[SessionView]):
             self._session.show(episode.env, episode.at)
         else:
             self._session.select_env(episode.env)
-
-    def _turn(self, by: int) -> None:
-        self._first = max(0, min(self._first + by, (len(self._listed) - 1) // MOST_ROWS * MOST_ROWS))
 
     def go_to_difference(self, by: int) -> None:
         """Show the next (1) or last (-1) moment of the list, from the one that is shown; round the end."""
@@ -149,7 +132,7 @@ class JudgementPanel(Part[SessionView]):
             -1 if by > 0 else 0,
         )
         place = (here + by) % len(listed)
-        self._first = place // MOST_ROWS * MOST_ROWS
+        self._pages.go_to(place)
         self._show_episode(listed[place])
 
 

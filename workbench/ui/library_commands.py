@@ -30,17 +30,11 @@ class Action:
     modifier: KeyModifier | None = None
 
 
-def walking(
-    listed: LibraryList, then_tell: Callable[[Callable[[], None]], Callable[[], None]]
-) -> list[Command]:
-    """To go through the table and select in it.
-
-    Args:
-        then_tell: makes of something that may select others what says so too.
-    """
+def walking(listed: LibraryList) -> list[Command]:
+    """To go through the table and select in it."""
 
     def move(by: int, held: int = 0) -> Callable[[], None]:
-        return then_tell(lambda: listed.move(by, held))
+        return lambda: listed.move(by, held)
 
     return [
         Command("The next recording of the table", move(1), "arrowdown"),
@@ -49,8 +43,8 @@ def walking(
         Command("Select the one before it too", move(-1, RANGE), "arrowup", "shift"),
         Command("The next page of recordings", lambda: listed.turn(1), "pagedown"),
         Command("The page of recordings before it", lambda: listed.turn(-1), "pageup"),
-        Command("Select this recording, or no longer", then_tell(listed.toggle_cursor), "X"),
-        Command("Select all recordings that are listed", then_tell(listed.select_all), "A", "cmd/ctrl"),
+        Command("Select this recording, or no longer", listed.toggle_cursor, "X"),
+        Command("Select all recordings that are listed", listed.select_all, "A", "cmd/ctrl"),
     ]
 
 

@@ -24,7 +24,7 @@ import viser
 from workbench.recording.library import Library, LibraryView
 from workbench.recording.library_row import LibraryRow
 from workbench.ui.commands import Command
-from workbench.ui.fragments import render, size
+from workbench.ui.fragments import render
 from workbench.ui.library_commands import Action, acting, walking
 from workbench.ui.library_edits import LibraryEdits
 from workbench.ui.library_list import MOST_ROWS, RANGE, TOGGLE, LibraryList
@@ -58,8 +58,7 @@ class LibraryPanel(Part[object]):
 
     Args:
         on_open: gets the ids of one to `MOST_OPEN` recordings, in the order of the table.
-        on_selection: gets the ids that are selected, whenever they change.
-    Both are called on any thread, one call at a time or several at once, and must not block.
+            Called on any thread, and must not block.
     """
 
     def __init__(
@@ -67,11 +66,9 @@ class LibraryPanel(Part[object]):
         server: viser.ViserServer,
         library: Library,
         on_open: Callable[[tuple[str, ...]], None],
-        on_selection: Callable[[tuple[str, ...]], None] | None = None,
         clock: Clock = time.monotonic,
     ) -> None:
         self._server, self._library, self._clock = server, library, clock
-        self._on_selection = on_selection
         self._folder = os.fsencode(library.folder).decode(errors="replace")
         self._list = LibraryList(library)
         self._edits = LibraryEdits(server, library, self._on_asking)
@@ -126,8 +123,11 @@ class LibraryPanel(Part[object]):
         self._ids: list[str] = []
         """By the number of its row."""
         self._number_of: dict[str, int] = {}
-        self._drawn: dict[str, object] = {}
-        self._told: tuple[str, ...] = ()
+        self._drawn: object = None
+        self._filters_drawn: object = None
+        """What they were counted for: of thousands of rows that takes long."""
+        self._table_drawn: object = None
+        self._marked: object = None
 
         self._keys: list[viser.CommandHandle] = []
         self._escapes: list[viser.CommandHandle] = []
@@ -145,7 +145,6 @@ class LibraryPanel(Part[object]):
     def select(self, ids: Iterable[str]) -> None:
         """Select these recordings, of those that are listed."""
         self._list.select(ids)
-        self._tell()
 
     def add_action(self, action: Action) -> None:
         """One more button for the selected recordings; it is run on any thread and must not block."""
@@ -164,7 +163,7 @@ class LibraryPanel(Part[object]):
     def commands(self) -> list[Command]:
         """Keys of the table, for the page to register after the last action was added."""
         commands = [
-            *walking(self._list, self._then_tell),
+            *walking(self._list),
             *acting(self._actions, self._run),
             Command("Take back the last deletion", self._edits.undo_delete, "Z"),
         ]
@@ -203,28 +202,25 @@ class LibraryPanel(Part[object]):
             if self._typed_at is not None and self._clock() - self._typed_at > TYPING:
                 self._typed_at = None
                 self._list.look_for(self._find.value, self._list.task)
-            if not self._is_new("all", (view.serial, self._list.state(), len(self._actions))):
+            wanted = (view.serial, self._list.state(), len(self._actions))
+            if wanted == self._drawn:
                 return
+            self._drawn = wanted
             self._can_escape()
             page = self._list.page(view)
             self._draw_filters(view)
             self._draw_table(view, page)
             self._draw_tools(view, page)
             self._draw_marks(page)
-            if self._is_new("trash", view.trash):
-                self._trash.content = self._trash_html(view)
-        self._tell()
-
-    def _is_new(self, part: str, wanted: object) -> bool:
-        if part in self._drawn and self._drawn[part] == wanted:
-            return False
-        self._drawn[part] = wanted
-        return True
+            empty = self._press("empty", self._edits.ask_empty)
+            self._trash.content = render("library_trash", trash=view.trash, empty=empty)
 
     def _draw_filters(self, view: LibraryView) -> None:
         listed = self._list
-        if not self._is_new("filters", (view.serial, listed.words, listed.task, listed.outcome)):
+        wanted = (view.serial, listed.words, listed.task, listed.outcome)
+        if wanted == self._filters_drawn:
             return
+        self._filters_drawn = wanted
         tasks = tuple(sorted({row.task for row in view.rows if row.task}))
         if self._tasks.options != (ALL_TASKS, *tasks):
             listed.look_for(listed.words, listed.task)  # its task may have gone
@@ -274,8 +270,9 @@ class LibraryPanel(Part[object]):
             self._list.descending,
             now.date(),
         )
-        if not self._is_new("table", wanted):
+        if wanted == self._table_drawn:
             return
+        self._table_drawn = wanted
         pictures = self._library.thumbnails([row.id for row in page])
         self._table.content = render(
             "library",
@@ -320,17 +317,6 @@ class LibraryPanel(Part[object]):
     def _draw_tools(self, view: LibraryView, page: Sequence[LibraryRow]) -> None:
         listed, rows = self._list, self._list.rows(view)
         count, first = len(listed.selected), listed.first
-        wanted = (
-            count,
-            len(rows),
-            first,
-            len(page),
-            bool(view.rows),
-            len(self._actions),
-            bool(view.trash.files),
-        )
-        if not self._is_new("tools", wanted):
-            return
         if not view.rows and not view.trash.files:
             self._tools.content = ""
             return
@@ -351,7 +337,7 @@ class LibraryPanel(Part[object]):
             ],
             summary=f"{count} selected" if count else "Press a row to select it" if rows else "",
             count=len(rows),
-            all=self._press("all", self._then_tell(listed.select_all)) if count < len(rows) else "",
+            all=self._press("all", listed.select_all) if count < len(rows) else "",
             none=self._press("none", lambda: self.select(())) if count else "",
             undo=self._press("undo", self._edits.undo_delete) if view.trash.files else "",
             pages=None
@@ -369,18 +355,11 @@ class LibraryPanel(Part[object]):
         listed = self._list
         selected = [self._number(row.id) for row in page if row.id in listed.selected]
         cursor = None if listed.cursor is None else self._number(listed.cursor)
-        if self._is_new("marks", (selected, cursor)):
+        if (selected, cursor) != self._marked:
+            self._marked = selected, cursor
             self._marks.content = render(
                 "library_marks", selected=selected, cursor=cursor, follow=listed.follow
             )
-
-    def _trash_html(self, view: LibraryView) -> str:
-        return render(
-            "library_trash",
-            files=view.trash.files,
-            size=size(view.trash.size),
-            empty=self._press("empty", self._edits.ask_empty),
-        )
 
     def _number(self, id: str) -> int:
         """Of its row, from 1 on."""
@@ -394,20 +373,12 @@ class LibraryPanel(Part[object]):
     def _press(self, key: object, do: Callable[[], None]) -> str:
         return self._presses.id_of(("library", key), lambda _client: do())
 
-    def _then_tell(self, do: Callable[[], None]) -> Callable[[], None]:
-        def done() -> None:
-            do()
-            self._tell()
-
-        return done
-
     def _on_row(self, sent: int, _client: viser.ClientHandle | None) -> None:
         number, held = divmod(sent, 8)
         with self._lock:
             id = self._ids[number - 1] if 1 <= number <= len(self._ids) else None
         if id is None or not self._list.press(id, held & (TOGGLE | RANGE)):
             return
-        self._tell()
         if held & OPEN:
             self._run(self._actions[0])
 
@@ -424,16 +395,6 @@ class LibraryPanel(Part[object]):
         self._find.value, self._tasks.value = "", ALL_TASKS
         self._list.choose("all")
         self._list.look_for("", None)
-
-    def _tell(self) -> None:
-        """Say which are selected, if others are."""
-        with self._lock:
-            selected = self.selected()
-            if selected == self._told:
-                return
-            self._told = selected
-        if self._on_selection is not None:
-            self._on_selection(selected)
 
     # --- what is done with the selected ones ---------------------------------------------------------------
 

@@ -19,6 +19,7 @@ from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.session.studio_view import StudioCamera
 from workbench.ui.camera_moves import Floats, Frame, fov_that_shows_all, picture_corners, viewer_pose
 from workbench.ui.placing import Placing
+from workbench.ui.selection_mark import LineSet
 from workbench.ui.viewpoint import USUAL_ASPECT
 
 WIDEST = math.radians(150)
@@ -45,7 +46,7 @@ class LookThrough:
         self._server, self._placing = server, placing
         self._lock = threading.Lock()
         self._looking: dict[int, _Looking] = {}
-        self._border: viser.LineSegmentsHandle | None = None
+        self._border = LineSet(server, "/studio/border", BORDER_COLOUR, 2.0)
 
     @property
     def any(self) -> bool:
@@ -84,16 +85,10 @@ class LookThrough:
     def _draw_border(self, camera: StudioCamera | None) -> None:
         """A view is wider than the picture; what is inside of this line is in it."""
         if camera is None or camera.now is None:
-            if self._border is not None:
-                self._border.visible = False
+            self._border.draw(None)
             return
         corners = picture_corners(camera.now, self._placing.frame(camera).to_view(camera.now), BORDER_AT)
-        points = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1).astype(np.float32)
-        if self._border is None:
-            self._border = self._server.scene.add_line_segments(
-                "/studio/border", points, colors=BORDER_COLOUR, thickness=2.0, thickness_units="screen"
-            )
-        self._border.points, self._border.visible = points, True
+        self._border.draw(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))
 
     def settings_from(
         self, client: viser.ClientHandle, settings: CameraSettings, frame: Frame

@@ -117,6 +117,37 @@ class Presses:
         return self._ids[key]
 
 
+class Paged:
+    """Which page of a long list is shown, and the two buttons that turn it."""
+
+    def __init__(self, presses: Presses, most: int) -> None:
+        self._most, self.first, self._count = most, 0, 0
+        self._turns = [
+            presses.id_of("back", lambda _: self.go_to(self.first - most)),
+            presses.id_of("on", lambda _: self.go_to(self.first + most)),
+        ]
+
+    def go_to(self, place: int) -> None:
+        """To the page of a place, or the nearest that there is."""
+        last = max(0, self._count - 1)
+        self.first = min(max(place, 0), last) // self._most * self._most
+
+    def places(self, count: int) -> range:
+        """What is shown of a list that is so long now."""
+        self._count = count
+        self.go_to(self.first)
+        return range(self.first, min(self.first + self._most, count))
+
+    @property
+    def shown(self) -> dict[str, object] | None:
+        """For a template: from where to where, of how many, and the ids of the buttons; None where one page has all."""
+        if self._count <= self._most:
+            return None
+        back, on = self._turns
+        last = min(self.first + self._most, self._count)
+        return {"first": self.first + 1, "last": last, "of": self._count, "back": back, "on": on}
+
+
 def _in_words(key: Hashable) -> str:
     return " ".join(_in_words(part) for part in key) if isinstance(key, tuple) else str(key)
 

@@ -22,7 +22,7 @@ from workbench.ui.fragments import render
 from workbench.ui.judged_with import RECORDED, TODAYS, codes_for
 from workbench.ui.line_chart import LONGEST
 from workbench.ui.parts import Part
-from workbench.ui.presses import Presses
+from workbench.ui.presses import Paged, Presses
 from workbench.ui.review_scene import COLOURS, letter
 from workbench.ui.then_and_now import ThenAndNow
 
@@ -92,14 +92,15 @@ class RescorePanel(Part[ReviewView]):
         self._list = gui.add_html("")
         self._presses = Presses(server)
         self._chart = ThenAndNow(server)
-        self._first = 0
+        self._pages = Paged(self._presses, MOST_ROWS)
         self._listed: list[Verdict] = []
         self._selected: str | None = None
 
     def judge(self, ids: Sequence[str]) -> None:
         """Begin with these recordings of the library."""
         files = self._find(ids)
-        self._first, self._selected = 0, None
+        self._selected = None
+        self._pages.go_to(0)
         self._rescorer.start(
             files,
             file=self._choices.file,
@@ -117,7 +118,7 @@ class RescorePanel(Part[ReviewView]):
 
     def key(self, view: ReviewView) -> object:
         at = self._rescorer.view.serial, view.opened_serial, view.selected
-        return *at, self._first, self._selected, self._codes_are_of(view)
+        return *at, self._pages.first, self._selected, self._codes_are_of(view)
 
     def _codes_are_of(self, view: ReviewView) -> object:
         """What decides which code there is to choose from."""
@@ -155,23 +156,8 @@ class RescorePanel(Part[ReviewView]):
         self._told.content = render("note", text=chosen.told)
 
     def _draw_list(self) -> None:
-        count = len(self._listed)
-        self._first = max(0, min(self._first, (count - 1) // MOST_ROWS * MOST_ROWS))
-        shown = range(self._first, min(self._first + MOST_ROWS, count))
-        content = render(
-            "rescore_table",
-            rows=[self._row(place) for place in shown],
-            more=None
-            if count <= MOST_ROWS
-            else {
-                "first": shown.start + 1,
-                "last": shown.stop,
-                "of": count,
-                "back": self._presses.id_of("back", lambda _: self._turn(-MOST_ROWS)),
-                "on": self._presses.id_of("on", lambda _: self._turn(MOST_ROWS)),
-            },
-        )
-        self._list.content = content
+        rows = [self._row(place) for place in self._pages.places(len(self._listed))]
+        self._list.content = render("rescore_table", rows=rows, more=self._pages.shown)
 
     def _row(self, place: int) -> dict[str, object]:
         verdict = self._listed[place]
@@ -200,7 +186,7 @@ class RescorePanel(Part[ReviewView]):
         return {"letter": letter(index), "colour": COLOURS[index % len(COLOURS)]}
 
     def _go(self, row: int) -> None:
-        place = self._first + row
+        place = self._pages.first + row
         if place >= len(self._listed):
             return
         verdict = self._listed[place]
@@ -213,9 +199,6 @@ class RescorePanel(Part[ReviewView]):
         self._review.select(opened)
         if verdict.first_difference is not None:
             self._review.seek(verdict.first_difference - view.anchors[opened])
-
-    def _turn(self, by: int) -> None:
-        self._first += by
 
     def _draw_chart(self) -> None:
         chosen = next((v for v in self._listed if v.file.id == self._selected), None)

@@ -7,16 +7,44 @@ from __future__ import annotations
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from workbench.ui.env_layout import MARGIN, EnvLayout
 
 COLOUR = (34, 139, 230)
 
 
+class LineSet:
+    """Line segments in the 3-D view, `thickness` pixels wide, that come, change and go."""
+
+    def __init__(
+        self, server: viser.ViserServer, name: str, colour: tuple[int, int, int], thickness: float
+    ) -> None:
+        self._server, self._name, self._colour, self._thickness = server, name, colour, thickness
+        self._handle: viser.LineSegmentsHandle | None = None
+
+    def draw(self, points: NDArray | None) -> None:
+        """Draw these (K, 2, 3), metres in the view; None takes them away."""
+        if points is None:
+            if self._handle is not None:
+                self._handle.remove()
+                self._handle = None
+        elif self._handle is None:
+            self._handle = self._server.scene.add_line_segments(
+                self._name,
+                np.asarray(points, np.float32),
+                self._colour,
+                thickness=self._thickness,
+                thickness_units="screen",
+            )
+        else:
+            self._handle.points = np.asarray(points, np.float32)
+
+
 class SelectionMark:
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
-        self._frame: viser.LineSegmentsHandle | None = None
+        self._frame = LineSet(server, "/selected/frame", COLOUR, 3.0)
         self._label: viser.LabelHandle | None = None
         self._drawn: tuple[int, int, bool, str] | None = None
 
@@ -40,21 +68,18 @@ class SelectionMark:
         corners = np.array([(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)], np.float32)
         edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
         label_at = np.array([x1, (y0 + y1) / 2, z])
-        if self._frame is None or self._label is None:
-            self._frame = self._server.scene.add_line_segments(
-                "/selected/frame", edges, COLOUR, thickness=3.0, thickness_units="screen"
-            )
+        self._frame.draw(edges)
+        if self._label is None:
             self._label = self._server.scene.add_label(
                 "/selected/label", name, position=label_at, anchor="top-center"
             )
         else:
-            self._frame.points = edges
             self._label.text = name
             self._label.position = label_at
 
     def clear(self) -> None:
-        self._drawn = None if self._frame is not None else self._drawn
-        for handle in (self._frame, self._label):
-            if handle is not None:
-                handle.remove()
-        self._frame = self._label = None
+        self._drawn = None if self._label is not None else self._drawn
+        self._frame.draw(None)
+        if self._label is not None:
+            self._label.remove()
+            self._label = None

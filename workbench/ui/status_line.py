@@ -17,6 +17,7 @@ from workbench.ui.env_strip import first_flagged, mask
 from workbench.ui.fragments import place, render
 from workbench.ui.parts import Clock, Part
 from workbench.ui.presses import Presses
+from workbench.ui.timeline_strip import step_in_words
 from workbench.ui.version_panel import took
 
 NEWS = 6.0
@@ -138,7 +139,7 @@ def status_values(view: SessionView, fresh: bool = False, marked: bool = False) 
         "task": None if task is None else task.env_id,
         "backend": "" if task is None else task.backend,
         "device": "" if task is None else task.device,
-        "at": _where(view),
+        "at": step_in_words(view),
         "envs": "" if task is None else ("1 env" if task.num_envs == 1 else f"{task.num_envs} envs"),
         "moving": moving,
         "steps_per_second": f"{view.steps_per_second:.0f}",
@@ -176,13 +177,3 @@ def _news(view: SessionView) -> str:
     if report is None:
         return f"new version in {took(sum(view.load_milliseconds.values()))}"
     return f"{report.level} in {took(report.milliseconds)}" + (f": {report.reason}" if report.reason else "")
-
-
-def _where(view: SessionView) -> str:
-    """How far the selected env is into its episode: a single step is too small to be seen in the view."""
-    task, step = view.task, view.step
-    if task is None or step is None or view.selected_env >= len(step.elapsed_steps):
-        return ""
-    limit = f" / {task.max_episode_steps}" if task.max_episode_steps else ""
-    env = "" if task.num_envs == 1 else f"env {view.selected_env}: "
-    return f"{env}step {int(step.elapsed_steps[view.selected_env])}{limit}"

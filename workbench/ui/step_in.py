@@ -36,13 +36,13 @@ from workbench.session.step_back import (
 )
 from workbench.ui.fragments import render
 from workbench.ui.going_live import GoingLive, begin_to_go
+from workbench.ui.judged_with import RECORDED, TODAYS
 from workbench.ui.parts import Part
 from workbench.ui.put_together import Workplace
 from workbench.ui.rescore_panel import RescoreChoices, RescorePanel
 from workbench.ui.review_page import Places, ReviewOffers
 from workbench.ui.trust_dialog import TrustDialog
 
-TODAYS, RECORDED = "today's", "as recorded"
 ONE, ALL = "the selected env", "all envs"
 NEW_ENVS = 4
 """Envs of a session that is opened for all of them."""

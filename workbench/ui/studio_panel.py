@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any
 
@@ -61,6 +62,17 @@ STEPS = "In which it is dragged."
 SIZE = "Of the picture above, for a quick look. The camera keeps its own."
 VARIES = "Its pose differs between envs, or the task moves it: what is placed here holds for all of them until then."
 IN_ITS_EYE = "You look from where it stands. Move the view, and its handles appear."
+
+
+@dataclass(frozen=True)
+class Toggle:
+    """A row of buttons of which one is on."""
+
+    label: str
+    hint: str
+    choices: dict[str, Any]
+    now: object
+    choose: Callable[[Any], None]
 
 
 class StudioPanel(Part[SessionView]):
@@ -254,65 +266,44 @@ class StudioPanel(Part[SessionView]):
 
     def _handles_of(self, scale: float) -> str:
         """What is dragged in the view, along which axes, in which steps; and how large the picture above is."""
-        studio = self._session.studio
+
+        def place(look_at: bool) -> None:
+            self._look_at = look_at
+
+        def along(own_axes: bool) -> None:
+            self._own_axes = own_axes
+
+        def in_steps(snap: Snap) -> None:
+            self._snap = snap
+
+        kinds = {KINDS.get(kind, kind): kind for kind in self._picture.kinds}
+        toggles = (
+            Toggle("Place", PLACE, {"move, turn": False, "eye and target": True}, self._look_at, place),
+            Toggle("Along", ALONG, {"world": False, "camera": True}, self._own_axes, along),
+            Toggle("Steps", STEPS, SNAPS, self._snap, in_steps),
+            Toggle(
+                "Shows", "What the picture above is of.", kinds, self._picture.shows, self._picture.show_kind
+            ),
+            Toggle("Size", SIZE, SCALES, scale, self._session.studio.set_quick_scale),
+        )
         rows = [
             [
-                {"label": "Place", "hint": PLACE},
-                self._tool("move, turn", "", "move", self._sets(look_at=False), not self._look_at),
-                self._tool("eye and target", "", "look at", self._sets(look_at=True), self._look_at),
-            ],
-            [
-                {"label": "Along", "hint": ALONG},
-                self._tool(
-                    "world", "", "world", self._sets(own_axes=False), not self._own_axes, self._look_at
-                ),
-                self._tool("camera", "", "own", self._sets(own_axes=True), self._own_axes, self._look_at),
-            ],
-            [
-                {"label": "Steps", "hint": STEPS},
-                *(
-                    self._tool(name, "", f"snap {name}", self._sets(snap=snap), self._snap == snap)
-                    for name, snap in SNAPS.items()
-                ),
-            ],
-            [
-                {"label": "Shows", "hint": "What the picture above is of."},
-                *(
-                    self._tool(
-                        KINDS.get(kind, kind),
-                        "",
-                        f"kind {kind}",
-                        lambda _, kind=kind: self._picture.show_kind(kind),
-                        self._picture.shows == kind,
-                    )
-                    for kind in self._picture.kinds
-                ),
-            ],
-            [
-                {"label": "Size", "hint": SIZE},
+                {"label": one.label, "hint": one.hint},
                 *(
                     self._tool(
                         name,
                         "",
-                        f"quick {name}",
-                        lambda _, of=of: studio.set_quick_scale(of),
-                        scale == of,
+                        f"{one.label} {name}",
+                        lambda _, one=one, value=value: one.choose(value),
+                        one.now == value,
+                        one.label == "Along" and self._look_at,
                     )
-                    for name, of in SCALES.items()
+                    for name, value in one.choices.items()
                 ),
-            ],
+            ]
+            for one in toggles
         ]
         return render("studio_tools", rows=rows)
-
-    def _sets(
-        self, look_at: bool | None = None, own_axes: bool | None = None, snap: Snap | None = None
-    ) -> Callable[[viser.ClientHandle | None], None]:
-        def pressed(_: viser.ClientHandle | None) -> None:
-            self._look_at = self._look_at if look_at is None else look_at
-            self._own_axes = self._own_axes if own_axes is None else own_axes
-            self._snap = self._snap if snap is None else snap
-
-        return pressed
 
     def _tool(
         self,

@@ -73,15 +73,22 @@ def strip_values(strip: Strip, view: SessionView) -> dict[str, object]:
     }
 
 
-def where(view: SessionView) -> str:
-    """Env, step of its episode and simulated time of what is shown."""
+def step_in_words(view: SessionView) -> str:
+    """How far the selected env is into its episode: a single step is too small to be seen in the view."""
     task, step = view.task, view.step
     if task is None or step is None or view.selected_env >= len(step.elapsed_steps):
         return ""
-    elapsed = int(step.elapsed_steps[view.selected_env])
     limit = f" / {task.max_episode_steps}" if task.max_episode_steps else ""
     env = "" if task.num_envs == 1 else f"env {view.selected_env}: "
-    return f"{env}step {elapsed}{limit}, {elapsed * task.control_dt:.2f} s"
+    return f"{env}step {int(step.elapsed_steps[view.selected_env])}{limit}"
+
+
+def where(view: SessionView) -> str:
+    """Env, step of its episode and simulated time of what is shown."""
+    words = step_in_words(view)
+    if not words or view.task is None or view.step is None:
+        return words
+    return f"{words}, {view.step.elapsed_steps[view.selected_env] * view.task.control_dt:.2f} s"
 
 
 def reward_lines(reward: NDArray[np.float32]) -> list[str]:

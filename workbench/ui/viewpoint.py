@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.pictures import Picture
-from workbench.ui.env_layout import EnvLayout, rotate
+from workbench.ui.env_layout import EnvLayout, box_corners, rotate
 
 FOV = 0.75
 """Vertical, radians. viser's own 75 degrees bends what stands at the edge of a grid."""
@@ -50,8 +50,7 @@ def frame_box(low: NDArray, high: NDArray, aspect: float = USUAL_ASPECT, covered
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
     up = np.cross(right, forward)
-    picks = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
-    corners = np.where(picks == 0, low, high) - target
+    corners = box_corners(low, high) - target
     tall = np.tan(FOV / 2)
     wide = tall * float(np.clip(aspect, 0.3, 4.0))
     below = tall * (1 - 2 * float(np.clip(covered, 0.0, MOST_COVERED)))
