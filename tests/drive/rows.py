@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from weakref import WeakKeyDictionary
 
@@ -27,7 +27,7 @@ class EpisodeRow:
     reward: float = 0.0
     terminated: bool = False
     truncated: bool = False
-    pictures: Sequence[Picture] = ()
+    pictures: tuple[Picture, ...] = ()
     others: Mapping[str, OtherEntry] = field(default_factory=dict)
 
 

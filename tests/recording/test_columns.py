@@ -12,7 +12,7 @@ from hypothesis.extra import numpy as hnp
 
 from tests.drive.rows import EpisodeRow, packed
 from workbench.core.step import OtherEntry, StepResult
-from workbench.recording.columns import BatchPacker, assemble, layout_type, merge
+from workbench.recording.columns import BatchPacker, assemble, layout_type
 from workbench.session.episodes import batch_columns
 
 
@@ -23,17 +23,11 @@ def row(action: Any = (0.0, 0.0), **evaluate: Any) -> EpisodeRow:
 
 
 def through(rows: list[EpisodeRow]) -> dict[str, np.ndarray]:
-    """`rows` packed, and unpacked as columns; two halves, as a journal is read in pieces."""
+    """`rows` packed, and unpacked as columns."""
     packer = BatchPacker()
     contents = [packed(one, packer, 2) for one in rows]
     runs = [np.frombuffer(content, layout_type(layout.text)) for layout, content in contents]
-    counts: dict[np.dtype, int] = {}
-    for run in runs:
-        counts[run.dtype] = counts.get(run.dtype, 0) + 1
-    columns = merge(counts)
-    half = len(runs) // 2
-    parts = [assemble(part, columns) for part in (runs[:half], runs[half:]) if part]
-    return {name: np.concatenate([part[name] for part in parts]) for name in columns}
+    return assemble(runs)
 
 
 def test_types_are_kept_where_every_row_has_the_entry() -> None:

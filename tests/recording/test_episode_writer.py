@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import psutil
 import pytest
@@ -32,7 +33,7 @@ from workbench.recording import rrd
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.episode_writer import EpisodeFiles, EpisodeWriter
 from workbench.recording.journal import FOLDER
-from workbench.recording.landing import RecordingError, SafeFile
+from workbench.recording.landing import RecordingError
 from workbench.recording.make_files import episode_stem
 from workbench.recording.read_episode import read_episode
 from workbench.recording.recover import recover
@@ -296,17 +297,18 @@ def test_files_that_were_cut_short_are_not_given_their_names(
         if path.suffix == suffix:
             os.truncate(path, int(path.stat().st_size * kept))
 
-    finish, write_chunks = SafeFile.finish, rrd.write_chunks
+    open_h5, write_chunks = h5py.File, rrd.write_chunks
 
-    def finish_short(self: Any) -> None:
-        finish(self)
-        cut(Path(self._file.name))
+    def open_short(path: Path, mode: str, **how: Any) -> h5py.File:
+        if mode == "r":
+            cut(path)
+        return open_h5(path, mode, **how)
 
     def write_short(chunks: Any, path: Path, application_id: str) -> None:
         write_chunks(chunks, path, application_id)
         cut(path)
 
-    monkeypatch.setattr(SafeFile, "finish", finish_short)
+    monkeypatch.setattr(h5py, "File", open_short)
     monkeypatch.setattr(rrd, "write_chunks", write_short)
     writer = wide(make_episode).writer(tmp_path)
     for row in wide(make_episode).rows():

@@ -25,7 +25,7 @@ from workbench.machine.child_python import child_environment, python_command
 from workbench.recording import rrd
 from workbench.recording.blueprint_in_file import blueprint_stream
 from workbench.recording.read_episode import read_episode
-from workbench.recording.survey import JournalReader
+from workbench.recording.survey import read_pictures, read_survey
 
 Maker = Callable[..., Made]
 
@@ -40,15 +40,14 @@ def test_a_disk_that_is_full_at_any_byte_is_an_error_of_the_disk(
         append(writer, row)
     journal = journal_of(writer)
     journal.finish()
-    reader = JournalReader(journal.path)
-    survey = reader.survey(header_of(journal.path))
+    survey = read_survey(journal.path, header_of(journal.path))
     path = tmp_path / "some.rrd"
 
     def size_with_room(room: int) -> int:
         soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (room, hard))
         try:
-            rrd.write_rrd(survey, reader.pieces(survey), path)
+            rrd.write_rrd(survey, read_pictures(journal.path, survey), path)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         return path.stat().st_size

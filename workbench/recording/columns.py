@@ -15,8 +15,8 @@ floating point and holds NaN where a row lacks it; rows of differing shape are f
 from __future__ import annotations
 
 import json
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,15 +29,6 @@ STATE = "state/"
 OBS = "obs/"
 FIXED = ("poses", "action", "reward", "terminated", "truncated")
 """Names of the columns that every row has; `EVALUATE`, `BATCH`, `STATE` and `OBS` begin those of the others."""
-
-
-@dataclass(frozen=True)
-class Column:
-    """What one column of a whole episode is, without its rows."""
-
-    dtype: np.dtype
-    shape: tuple[int, ...]
-    """Of one row."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,53 +91,32 @@ def layout_type(text: str) -> np.dtype:
     return np.dtype([(name, dtype, tuple(shape)) for name, dtype, shape in json.loads(text)])
 
 
-def merge(layouts: Mapping[np.dtype, int]) -> dict[str, Column]:
-    """The columns of an episode that has so many rows of each of these layouts, in the order in which names first appear."""
-    total = sum(layouts.values())
-    seen: dict[str, list[tuple[np.dtype, tuple[int, ...]]]] = {}
-    rows: Counter[str] = Counter()
-    for layout, count in layouts.items():
-        for name in layout.names or ():
-            dtype = layout[name]
-            seen.setdefault(name, []).append((dtype.base, dtype.shape))
-            rows[name] += count
-    return {name: _merged(kinds, rows[name] == total) for name, kinds in seen.items()}
+def assemble(runs: Sequence[NDArray]) -> dict[str, NDArray]:
+    """The rows of `runs`, each structured (n,), as columns (sum of n, ...) in the order in which their names first appear."""
+    names = dict.fromkeys(name for run in runs for name in run.dtype.names or ())
+    return {
+        name: _column([run[name] if name in (run.dtype.names or ()) else len(run) for run in runs])
+        for name in names
+    }
 
 
-def _merged(kinds: list[tuple[np.dtype, tuple[int, ...]]], complete: bool) -> Column:
-    dtypes, shapes = zip(*kinds)
-    if complete and len(set(shapes)) == 1:
-        return Column(np.result_type(*dtypes), shapes[0])
-    shape = shapes[0] if len(set(shapes)) == 1 else (max(int(np.prod(s)) for s in shapes),)
-    return Column(np.result_type(np.float32, *dtypes), shape)
-
-
-def assemble(runs: Iterable[NDArray], columns: Mapping[str, Column]) -> dict[str, NDArray]:
-    """The rows of `runs`, each structured (n,), as arrays (sum of n, ...) of `columns`."""
-    runs = list(runs)
-    total = sum(len(run) for run in runs)
-    held: dict[str, NDArray] = {}
-    for name, column in columns.items():
-        have = [name in (run.dtype.names or ()) for run in runs]
-        if all(have) and len(runs) == 1 and runs[0].dtype[name] == _of(column):
-            held[name] = np.ascontiguousarray(runs[0][name])
+def _column(parts: Sequence[NDArray | int]) -> NDArray:
+    """Of the runs of rows that have it, and how many rows there are of those that lack it."""
+    there = [part for part in parts if isinstance(part, np.ndarray)]
+    shapes = {part.shape[1:] for part in there}
+    if len(there) == len(parts) and len(shapes) == 1:
+        return np.concatenate(there)
+    dtype = np.result_type(np.float32, *[part.dtype for part in there])
+    shape = shapes.pop() if len(shapes) == 1 else (max(math.prod(shape) for shape in shapes),)
+    out = np.full(
+        (sum(part if isinstance(part, int) else len(part) for part in parts), *shape), np.nan, dtype
+    )
+    begin = 0
+    for part in parts:
+        if isinstance(part, int):
+            begin += part
             continue
-        fill = np.nan if column.dtype.kind == "f" else 0
-        out = np.full((total, *column.shape), fill, dtype=column.dtype)
-        begin = 0
-        for run, has in zip(runs, have):
-            if has:
-                part = run[name]
-                rows = out[begin : begin + len(run)]
-                if part.shape[1:] == column.shape:
-                    rows[...] = part
-                else:
-                    flat = part.reshape(len(run), -1)
-                    rows[:, : flat.shape[1]] = flat
-            begin += len(run)
-        held[name] = out
-    return held
-
-
-def _of(column: Column) -> np.dtype:
-    return np.dtype((column.dtype, column.shape))
+        rows = out[begin : begin + len(part)].reshape(len(part), -1)
+        rows[:, : math.prod(part.shape[1:])] = part.reshape(len(part), -1)
+        begin += len(part)
+    return out
