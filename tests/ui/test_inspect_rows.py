@@ -8,8 +8,15 @@ import pytest
 from tests.ui.scenes import running
 from workbench.core.inspection import Inspection, JointReadings, Leaf, Touching
 from workbench.ui.force_arrows import LONGEST, METRES_AT_ONE_NEWTON, arrows_of
-from workbench.ui.inspect_panel import CHOICES, inspect_html
-from workbench.ui.inspect_rows import contact_rows, joint_rows, leaf_rows, number, pose_rows
+from workbench.ui.inspect_panel import (
+    CHOICES,
+    contact_rows,
+    inspect_html,
+    joint_rows,
+    leaf_rows,
+    number,
+    pose_rows,
+)
 
 
 def leaf(name: str, *values: float, shape: tuple[int, ...] | None = None) -> Leaf:
