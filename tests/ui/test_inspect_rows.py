@@ -101,7 +101,7 @@ def test_arrows_start_at_the_points_and_are_bounded() -> None:
 def test_a_pose_is_copied_as_python_that_makes_it_again() -> None:
     poses = np.array([[0.1, -2, 0, 1, 0, 0, 0], [np.nan] * 7], np.float32)
     [row] = pose_rows(("cube", "absent"), poses)
-    assert row["copy"] == "sapien.Pose(p=[0.1, -2, 0], q=[1, 0, 0, 0])"
+    assert row["code"] == "sapien.Pose(p=[0.1, -2, 0], q=[1, 0, 0, 0])"
 
 
 @pytest.mark.parametrize(
@@ -134,6 +134,8 @@ def test_the_tab_never_shows_another_envs_reading_and_escapes_names(choice: str)
         "observation": "&lt;script",
         "state": "s</b>",
     }
+    if choice == "poses":
+        assert 'data-copy="sapien.Pose(p=[' in own
     if choice in expected:
         assert expected[choice] in own
         assert choice == "poses" or expected[choice] not in other

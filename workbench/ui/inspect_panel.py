@@ -113,7 +113,7 @@ def pose_rows(names: Sequence[str], poses: NDArray[np.float32]) -> list[Row]:
         if np.isfinite(pose).all():
             p, q = pose[:3], pose[3:]
             code = f"sapien.Pose(p={_code(p)}, q={_code(q)})"
-            rows.append({"name": name, "p": vector(p), "q": vector(q), "copy": code})
+            rows.append({"name": name, "p": vector(p), "q": vector(q), "code": code})
     return rows
 
 
