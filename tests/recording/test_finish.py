@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from tests.drive.episodes import Made
-from tests.drive.rows import append
 from tests.recording.refused_calls import descriptors, refused
 from workbench.recording.episode_writer import EpisodeWriter
 from workbench.recording.journal import FOLDER
@@ -26,7 +25,7 @@ def recorded(make_episode: Maker, folder: Path) -> EpisodeWriter:
     episode = make_episode(2)
     writer = episode.writer(folder)
     for row in episode.rows():
-        append(writer, row)
+        writer.append(row)
     return writer
 
 

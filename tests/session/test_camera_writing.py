@@ -13,23 +13,29 @@ import pytest
 from tests.drive.session import wait_until
 from tests.session.studio import BASE, camera, moved, said
 from workbench.authoring.camera_source import Refusal, SourceEdit
+from workbench.authoring.camera_source.cameras import Run
 from workbench.core.camera_settings import CallSite, CameraKey, CameraSettings, differences
 from workbench.session.camera_writing import CameraWriting, Wish, copy, plan
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
 from workbench.session.studio_view import Writing
-from workbench.ui.camera_writing import writing_html
+from workbench.ui.camera_change import writing_html
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
 LIMITED = '''
 
 def limited(configs):
-    """Of its own mind."""
+    """Of its own mind, and of another once it is on the disk."""
+    text = open(limited.__code__.co_filename).read()
     for config in configs:
-        if config.fov < 0.5:
+        if config.fov < 0.1:
+            raise ValueError("no lens at all")
+        config.fov = max(config.fov, 0.3)
+        if "fov=" + "0.4," in text:
             raise ValueError("too narrow")
-        config.fov = max(config.fov, 0.8)
+        if "fov=" + "0.7," in text:
+            config.fov = 0.8
     return configs
 '''
 CALL = 'return [CameraConfig("base_camera", pose=pose, width=128, height=128, fov=1.0, near=0.01, far=10)]'
@@ -67,6 +73,11 @@ def there(session: Session, key: CameraKey) -> CameraSettings:
     found = camera(session, key).info.settings
     assert found is not None
     return found
+
+
+def asking(session: Session) -> Run:
+    """The worker runs the hooks; what has to wait for it here is on the test's own thread."""
+    return session.studio.file._run
 
 
 def names(session: Session) -> list[str]:
@@ -154,7 +165,7 @@ def test_a_camera_that_the_robot_brings_is_in_no_copy_of_the_task(session: Sessi
     elsewhere = CallSite("/site-packages/robots/wristcam.py", 20, "WristCam._sensor_configs")
     info = replace(camera(session, BASE).info, site=elsewhere, mount="panda/camera_link")
     for task in (view.task, replace(view.task, source_files=())):
-        found = plan(task, info, Wish("edit", BASE, replace(there(session, BASE), fov=0.9)))
+        found = plan(task, info, Wish("edit", BASE, replace(there(session, BASE), fov=0.9)), asking(session))
         assert found.stage == "refused" and not found.can_copy and "wristcam.py, line 20" in found.message
         assert 'mount=self.robot.links_map["camera_link"],' in found.refusal.snippet
 
@@ -189,13 +200,13 @@ class Inherits(PushCubeEnv):
         wanted = replace(info.settings, position=(0.4, 0.1, 0.9), fov=1.2)
 
         # A class with such a hook of its own is told whose the camera is, and gets the text for it.
-        refused = plan(replace(before, class_name="Far"), info, Wish("edit", BASE, wanted))
+        refused = plan(replace(before, class_name="Far"), info, Wish("edit", BASE, wanted), asking(session))
         assert refused.stage == "refused" and "base_camera is made by PushCubeEnv" in refused.message
         assert "the _default_sensor_configs of Far (task.py) hands it on" in refused.message
         assert refused.refusal.snippet.startswith("CameraConfig(")
         # An installed task is not written: the whole hook is there to be copied.
         installed = replace(before, source_files=(), file="/site-packages/their_task.py")
-        refused = plan(installed, info, Wish("edit", BASE, wanted))
+        refused = plan(installed, info, Wish("edit", BASE, wanted), asking(session))
         assert refused.stage == "refused" and "it is made by PushCubeEnv" in refused.message
         assert "def _default_sensor_configs(self):" in refused.refusal.snippet
         assert 'cameras["base_camera"] = CameraConfig(' in refused.refusal.snippet
@@ -211,7 +222,9 @@ class Inherits(PushCubeEnv):
             c.key: c.settings for c in task.cameras if c.key != BASE
         }
         # From now on it is the task's own, and changed where it stands.
-        again = plan(task, camera(session, BASE).info, Wish("edit", BASE, replace(wanted, fov=0.8)))
+        again = plan(
+            task, camera(session, BASE).info, Wish("edit", BASE, replace(wanted, fov=0.8)), asking(session)
+        )
         assert again.stage == "planned" and again.edit.diff.count("\n+ ") == 1, again.message
     finally:
         session.studio.back_to_file(BASE)
@@ -257,6 +270,47 @@ def test_a_camera_that_comes_out_otherwise_is_an_error_and_is_taken_back(
     studio.file.drop_plan()
 
 
+@pytest.mark.parametrize(
+    ("fov", "why"), [(0.2, "does not come out as what was asked for"), (0.05, "no lens at all")]
+)
+def test_a_change_that_the_hook_itself_makes_another_of_is_refused_before_it_is_written(
+    session: Session, task_file: Path, fov: float, why: str
+) -> None:
+    before = task_file.read_text()
+    session.studio.place(BASE, replace(there(session, BASE), fov=fov))
+    session.studio.file.plan_write(BASE)
+    view = wait_until(session, said(lambda s: s.writing.stage == "refused"), "the refusal")
+    assert why in view.studio.writing.message and f"fov={fov}" in view.studio.writing.refusal.snippet
+    assert task_file.read_text() == before and there(session, BASE).fov == 1.0
+    session.studio.file.drop_plan()
+    session.studio.back_to_file(BASE)
+
+
+def test_what_the_constructor_sets_is_edited_there_and_the_batch_stands_as_it_stood(
+    session: Session, task_file: Path
+) -> None:
+    before = task_file.read_text()
+    call = "        super().__init__(*args,"
+    text = before.replace(call, f"        self.eye = [0.45, 0, 0.6]\n{call}")
+    text = text.replace("look_at(eye=[0.45, 0, 0.6],", "look_at(eye=self.eye,")
+    assert text.count("self.eye") == 2
+    task_file.write_text(text)
+    wait_until(session, lambda v: v.task.source[str(task_file)] == text, "the version with a constructor")
+    step = session.view().step
+    wanted = replace(there(session, BASE), position=(0.45, 0.1, 0.7))
+    session.studio.place(BASE, wanted)
+    session.studio.file.plan_write(BASE)
+    planned(session)
+    assert session.view().step is step, "asking moved the batch"
+    assert written(session).message.startswith("base_camera is written")
+    assert "self.eye = [0.45, 0.1, 0.7]" in task_file.read_text()
+    assert there(session, BASE).position == pytest.approx((0.45, 0.1, 0.7), abs=1e-6)
+    session.studio.file.drop_plan()
+    task_file.write_text(before)
+    wait_until(session, lambda v: v.task.source[str(task_file)] == before, "the file of before")
+    session.studio.back_to_file(BASE)
+
+
 def test_a_change_with_which_the_file_does_not_load_says_so_and_is_taken_back(
     session: Session, task_file: Path
 ) -> None:
@@ -279,10 +333,10 @@ def test_a_read_only_file_may_be_copied_and_one_with_modules_beside_it_may_not(
 ) -> None:
     task = session.view().task
     wish = Wish("add", ("human", "side"), there(session, ("human", "render_camera")))
-    assert not plan(task, None, wish).can_copy, "it can be edited where it is"
+    assert not plan(task, None, wish, asking(session)).can_copy, "it can be edited where it is"
     task_file.chmod(0o444)
     try:
-        refused = plan(task, None, wish)
+        refused = plan(task, None, wish, asking(session))
         assert refused.can_copy and "is read-only" in refused.message
         file, told = copy(task, tmp_path)
         assert file == tmp_path / task_file.name and "MyWorkbenchPushCube-v1" in told.message
@@ -290,7 +344,7 @@ def test_a_read_only_file_may_be_copied_and_one_with_modules_beside_it_may_not(
         helper = tmp_path / "helper.py"
         helper.touch()
         with_helper = replace(task, source_files=(*task.source_files, str(helper)))
-        assert not plan(with_helper, None, wish).can_copy
+        assert not plan(with_helper, None, wish, asking(session)).can_copy
         file, told = copy(replace(task, file=str(tmp_path / "gone.py")), tmp_path)
         assert file is None and told.message.startswith("Not copied: gone.py cannot be read")
     finally:

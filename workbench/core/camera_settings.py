@@ -8,6 +8,7 @@ where it is written, and the files in which other programs want it. All of them 
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from typing import Literal
 
@@ -85,17 +86,25 @@ MOST_PIXELS = 4096
 """On a side; a typing mistake of a digit more would take the memory of all envs."""
 
 
+_FURTHEST = 1e6
+"""Metres."""
+
+
 def why_no_camera(settings: CameraSettings) -> str | None:
     """Why there can be no such camera, as a sentence without its end; None if there can."""
     numbers = (*settings.position, *settings.quaternion, settings.near, settings.far)
-    if not all(math.isfinite(number) for number in numbers):
+    if not all(abs(number) <= _FURTHEST for number in numbers):
         return "the camera's pose, near and far must be finite numbers"
     if abs(math.hypot(*settings.quaternion) - 1.0) > 1e-3:
         return "the camera's quaternion must be of unit length"
     if not 0 < settings.near < settings.far:
         return f"near must be above 0 and below far, not {settings.near:g} and {settings.far:g} metres"
-    if not (1 <= settings.width <= MOST_PIXELS and 1 <= settings.height <= MOST_PIXELS):
+    if not all(
+        isinstance(size, int) and 1 <= size <= MOST_PIXELS for size in (settings.width, settings.height)
+    ):
         return f"width and height must be 1 to {MOST_PIXELS}, not {settings.width} x {settings.height}"
+    if not re.fullmatch(r"[A-Za-z0-9_-]{1,60}", settings.shader_pack):
+        return f"{settings.shader_pack!r} is no shader pack"
     if (settings.fov is None) == (settings.intrinsic is None):
         return "a camera has either a fov or an intrinsic matrix"
     if settings.fov is not None and not 0.0 < settings.fov < math.pi:

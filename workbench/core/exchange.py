@@ -8,7 +8,7 @@ scene that can be taken out and made anew, since physics knows nothing of them.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Any
 
 import torch
@@ -80,16 +80,26 @@ def rehearse_hooks(env: BaseEnv, hooks: Collection[str]) -> dict[str, str]:
         Exception: whatever a hook raises; the env is as it was.
     """
     every = list(range(env.num_envs))
+
+    def call() -> None:
+        for hook in sorted(hooks):
+            if hook != "_initialize_episode":
+                getattr(env, hook)()
+                continue
+            for chosen in [every, every[:1]] if env.num_envs > 1 else [every]:
+                seams.set_reset_mask(env, chosen)
+                env._initialize_episode(torch.tensor(chosen, device=env.device), {})
+
+    return undone(env, call)
+
+
+def undone(env: BaseEnv, do: Callable[[], None]) -> dict[str, str]:
+    """Do something with the author's hooks, and undo what they did; returns and raises as `rehearse_hooks`."""
+    every = list(range(env.num_envs))
     kept = take_snapshot(env)
     try:
         with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
-            for hook in sorted(hooks):
-                if hook != "_initialize_episode":
-                    getattr(env, hook)()
-                    continue
-                for chosen in [every, every[:1]] if env.num_envs > 1 else [every]:
-                    seams.set_reset_mask(env, chosen)
-                    env._initialize_episode(torch.tensor(chosen, device=env.device), {})
+            do()
     finally:
         seams.set_reset_mask(env, every)
         own = isinstance(env, BatchedCpuMixin)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import sys
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property, wraps
 from itertools import islice
@@ -29,7 +29,7 @@ from mani_skill.agents.multi_agent import MultiAgent
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
 from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
-from mani_skill.sensors.camera import CameraConfig
+from mani_skill.sensors.camera import CameraConfig, parse_camera_configs
 from mani_skill.utils import common, sapien_utils
 from mani_skill.utils.structs.actor import Actor
 from mani_skill.utils.structs.articulation import Articulation
@@ -355,6 +355,32 @@ def camera_components(camera: Any) -> list[Any] | None:
 # --- what placing a camera writes ------------------------------------------------------------------
 
 
+_note_camera: Callable[[Any, FrameType], None] | None = None
+
+
+@contextmanager
+def noting_cameras(note: Callable[[Any, FrameType], None]) -> Iterator[None]:
+    """Within this `note` is called with every ``CameraConfig`` that is made, and the frame that makes it."""
+    global _note_camera
+    mark_camera_configs()
+    before, _note_camera = _note_camera, note
+    try:
+        yield
+    finally:
+        _note_camera = before
+
+
+def camera_configs(env: Any) -> dict[CameraKey, Any]:
+    """What the camera hooks give now, before keywords of ``gym.make`` change it."""
+    of_agent = {} if env.agent is None else parse_camera_configs(env.agent._sensor_configs)
+    sensors = {**parse_camera_configs(env._default_sensor_configs), **of_agent}
+    people = parse_camera_configs(env._default_human_render_camera_configs)
+    return {
+        **{("sensor", name): config for name, config in sensors.items()},
+        **{("human", name): config for name, config in people.items()},
+    }
+
+
 def mark_camera_configs() -> None:
     """Let every ``CameraConfig`` of this process keep where it was made, for `camera_site`, and at what its pose was
     said to look, for `camera_target`. Of tasks that are imported after this. Safe to call again."""
@@ -372,6 +398,8 @@ def mark_camera_configs() -> None:
         own = self.pose.raw_pose
         same = (to for pose, to in reversed(looked) if torch.equal(pose.raw_pose.to(own.device), own))
         self._workbench_target = next(same, None)
+        if _note_camera is not None:
+            _note_camera(self, sys._getframe(1))
 
     @wraps(stock_look_at)
     def look_at(eye: Any, target: Any, *args: Any, **kwargs: Any) -> Pose:

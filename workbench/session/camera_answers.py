@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
+from workbench.authoring.problem import TaskError
 from workbench.core.camera_search import SearchProgress, SearchSpace, suggest_cameras
 from workbench.core.camera_suggestion import OfferedPlacement, in_words
 from workbench.core.pictures import Picture
@@ -18,13 +19,16 @@ from workbench.session.camera_messages import (
     CameraPictures,
     CameraQuestion,
     CameraQuestionFailed,
+    CamerasRun,
     DrawCamera,
     JudgeCamera,
+    RunCameras,
     Searching,
     SuggestCameras,
     Suggested,
 )
 from workbench.session.open_task import OpenedTask
+from workbench.session.run_cameras import run_cameras
 
 JUDGED_SIDE = 128
 """Pixels of the shorter side of what is judged, where the camera's own are more: an object that is lost in those is
@@ -51,8 +55,10 @@ def answer(
             return CameraPictures(question.number, _drawn(opened, placed, question))
         if isinstance(question, JudgeCamera):
             return _judged(opened, question)
+        if isinstance(question, RunCameras):
+            return CamerasRun(question.number, run_cameras(opened, question))
         return _suggested(opened, question, tell, cancelled)
-    except (ValueError, IndexError, RuntimeError) as error:
+    except (ValueError, IndexError, RuntimeError, TaskError) as error:
         return CameraQuestionFailed(question.number, str(error))
 
 

@@ -8,11 +8,14 @@ the one before.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.authoring.camera_source.cameras import Ran
+from workbench.authoring.reference import TaskName
 from workbench.core.camera_report import CameraReport
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.camera_suggestion import OfferedPlacement
@@ -67,6 +70,17 @@ class SuggestCameras:
 
 
 @dataclass(frozen=True)
+class RunCameras:
+    """Run the camera hooks with other texts of the author's files; answered with `CamerasRun`."""
+
+    number: int
+    task: TaskName
+    """What was opened."""
+    texts: Mapping[str, str]
+    """By path."""
+
+
+@dataclass(frozen=True)
 class CameraPictures:
     """The answer to `DrawCamera`."""
 
@@ -80,6 +94,14 @@ class CameraJudged:
 
     number: int
     report: CameraReport
+
+
+@dataclass(frozen=True)
+class CamerasRun:
+    """The answer to `RunCameras`."""
+
+    number: int
+    ran: Ran
 
 
 @dataclass(frozen=True)
@@ -107,6 +129,6 @@ class CameraQuestionFailed:
     why: str
 
 
-CameraQuestion = DrawCamera | JudgeCamera | SuggestCameras
-CameraAnswer = CameraPictures | CameraJudged | Suggested | CameraQuestionFailed
+CameraQuestion = DrawCamera | JudgeCamera | SuggestCameras | RunCameras
+CameraAnswer = CameraPictures | CameraJudged | Suggested | CamerasRun | CameraQuestionFailed
 """What ends a request."""

@@ -66,7 +66,7 @@ class CameraStudio:
         self._episode = episode
         self._cameras = StudioCameras()
         self._lock = self._cameras.lock
-        self.file = StudioFile(self._cameras, self._note, open_copy)
+        self.file = StudioFile(self._cameras, self._note, open_copy, send, load)
         self._asking = threading.Lock()
         """Held while placements are sent; taken before `_lock`."""
         self._serial = 0
@@ -361,12 +361,14 @@ class CameraStudio:
         self._judging.take(answer)
         self._quick.take(answer)
         self._first.take(answer)
+        self.file.take(answer)
 
     def interrupted(self) -> None:
         """The file was saved, or the worker is gone: what is under way is about what there was before."""
         self._judging.stop()
         self._quick.stop()
         self._first.stop()
+        self.file.stop()
 
     def failed_to_load(self) -> None:
         """A version does not load; the one before goes on."""

@@ -3,9 +3,8 @@
 What was written is believed only when it was seen: the reload builds the camera anew, and the config that comes out
 is compared number by number with what the edit was to say. A difference is told as the error that it is.
 
-Plans are made of the files as they are on disk at that moment, since that is what is edited; if they say something
-else of the camera than the env has, the plan is refused. libcst takes a third of a second to import, so it is
-imported when the first plan is made. None of this runs on the page's thread, and nothing here is thread-safe.
+Plans are made of the files as they are on disk at that moment, since that is what is edited; the worker runs them, and
+what comes of the plan, and if they say something else of the camera than the env has, the plan is refused. None of this runs on the page's thread, and nothing here is thread-safe.
 """
 
 from __future__ import annotations
@@ -13,8 +12,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from workbench.authoring import camera_source
+from workbench.authoring.camera_source import Refusal, SourceEdit
+from workbench.authoring.camera_source.cameras import Run
 from workbench.authoring.copy_task import NoCopy, copy_task
 from workbench.authoring.modules import read_source
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
@@ -22,10 +23,7 @@ from workbench.core.pictures import CameraInfo
 from workbench.session.messages import TaskDescription
 from workbench.session.studio_view import Change, Writing, WritingStage
 
-if TYPE_CHECKING:
-    from workbench.authoring.camera_source import Refusal, SourceEdit
-
-    Plan = SourceEdit | Refusal
+Plan = SourceEdit | Refusal
 
 PARENTS_HOOKS = ("_default_sensor_configs", "_default_human_render_camera_configs")
 """What a task's class can take over from its parent."""
@@ -53,21 +51,20 @@ class Wish:
         return (self.key[0], self.name) if self.name else self.key
 
 
-def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish) -> Writing:
+def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish, run: Run) -> Writing:
     """The edit that fulfils a wish, or why there is none.
 
     Args:
         info: of the live camera; None where one is added.
+        run: asks the worker.
     """
-    from workbench.authoring import camera_source
-
     made: Plan
     texts, unread = _texts(task)
     elsewhere = "" if wish.what == "add" or info is None else _made_elsewhere(task, info)
     if unread:
         made = camera_source.Refusal(unread)
     elif elsewhere and info is not None:
-        made = _made_of_a_parents(task, texts, info, wish, elsewhere)
+        made = _made_of_a_parents(task, texts, info, wish, elsewhere, run)
     elif not task.source_files:
         text = "" if wish.settings is None else camera_source.snippet(wish.result[1], wish.settings)
         where = "" if task.file is None else f" ({task.file})"
@@ -77,7 +74,7 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish) -> Writing:
             text,
         )
     else:
-        made = _made(task, texts, info, wish)
+        made = _made(task, texts, info, wish, run)
     if isinstance(made, camera_source.SourceEdit):
         blocked = next(
             filter(None, (camera_source.not_writable(change.file) for change in made.changes)), None
@@ -133,11 +130,9 @@ def _is_a_robots(info: CameraInfo) -> bool:
 
 
 def _made_of_a_parents(
-    task: TaskDescription, texts: dict[str, str], info: CameraInfo, wish: Wish, elsewhere: str
+    task: TaskDescription, texts: dict[str, str], info: CameraInfo, wish: Wish, elsewhere: str, run: Run
 ) -> Plan:
     """A hook that puts another camera in place of a parent's, in the task's own class or to be copied."""
-    from workbench.authoring import camera_source
-
     if wish.settings is None:
         return camera_source.Refusal(elsewhere)
     (kind, _), (_, uid), site = wish.key, wish.result, info.site
@@ -156,14 +151,12 @@ def _made_of_a_parents(
         )
         return camera_source.Refusal(reason, whole)
     return camera_source.plan_override(
-        texts, task.file, task.class_name, kind, uid, wish.settings, site, more
+        texts, task.file, task.class_name, kind, uid, wish.settings, site, run, more
     )
 
 
 def _could_be_copied(task: TaskDescription) -> bool:
     """Whether the task's file is one that is not to be edited, and is all that the task is made of."""
-    from workbench.authoring import camera_source
-
     if task.file is None or len(task.source_files) > 1:
         return False
     return not task.source_files or camera_source.not_writable(task.file) is not None
@@ -182,22 +175,22 @@ def copy(task: TaskDescription, folder: Path) -> tuple[Path | None, Writing]:
     return made.file, Writing(message=f"The task is copied to {made.file}, which is being opened.{ids}")
 
 
-def _made(task: TaskDescription, texts: dict[str, str], info: CameraInfo | None, wish: Wish) -> Plan:
-    from workbench.authoring import camera_source
-
+def _made(
+    task: TaskDescription, texts: dict[str, str], info: CameraInfo | None, wish: Wish, run: Run
+) -> Plan:
     kind, uid = wish.key
     if wish.what == "add":
         assert wish.settings is not None
         file = task.file or task.source_files[0]
-        return camera_source.plan_add(texts, file, task.class_name, kind, uid, wish.settings, wish.target)
+        return camera_source.plan_add(texts, file, task.class_name, wish.key, wish.settings, run, wish.target)
     if info is None or info.settings is None:
         return camera_source.Refusal(f"there is no {kind} camera {uid!r} whose settings are known")
     if wish.what == "remove":
-        return camera_source.plan_remove(texts, uid, info.site, kind)
+        return camera_source.plan_remove(texts, wish.key, run)
     if wish.what == "rename":
-        return camera_source.plan_rename(texts, uid, wish.name, info.settings, info.site, kind)
+        return camera_source.plan_rename(texts, wish.key, wish.name, info.settings, run)
     if wish.what == "duplicate":
-        return camera_source.plan_duplicate(texts, uid, wish.name, info.settings, info.site, kind)
+        return camera_source.plan_duplicate(texts, wish.key, wish.name, info.settings, run)
     assert wish.settings is not None
     if info.varies:
         snippet = camera_source.snippet(uid, wish.settings)
@@ -206,7 +199,7 @@ def _made(task: TaskDescription, texts: dict[str, str], info: CameraInfo | None,
             "file would not place it",
             snippet,
         )
-    return camera_source.plan_edit(texts, uid, info.settings, wish.settings, info.site, kind)
+    return camera_source.plan_edit(texts, wish.key, info.settings, wish.settings, run)
 
 
 def _texts(task: TaskDescription) -> tuple[dict[str, str], str]:
@@ -268,16 +261,12 @@ class CameraWriting:
 
     def write(self) -> bool:
         """Make the planned edit. False if there is none, or it cannot be made."""
-        from workbench.authoring import camera_source
-
         return self._apply(
             ("planned",), camera_source.apply, "written", "Written to {file}, being loaded now."
         )
 
     def undo(self) -> bool:
         """Take the edit that was made out of the file again."""
-        from workbench.authoring import camera_source
-
         return self._apply(MADE, camera_source.revert, "undone", "{file} {was} before, being loaded now.")
 
     def _apply(

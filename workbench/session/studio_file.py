@@ -1,21 +1,43 @@
 """What the page asks of the author's file: show what a change would be, make it, take it back.
 
-What takes long (libcst, the disk) is done on a thread of its own, one thing after the other, and what came of it is in
+What takes long (the disk, the worker that runs the hooks) is done on a thread of its own, one thing after the other, and what came of it is in
 `view`. What a change means for the placements is settled when the version with it comes in: none is to be lost by it.
 """
 
 from __future__ import annotations
 
+import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 
+from workbench.authoring.camera_source.cameras import Ran
+from workbench.authoring.source.text import Refused
 from workbench.core.camera_settings import CameraKey, CameraKind, CameraSettings, differences
+from workbench.session.camera_askers import LiveAsker
+from workbench.session.camera_messages import CameraAnswer, CamerasRun, RunCameras
 from workbench.session.camera_writing import CameraWriting, Wish, copy, plan
-from workbench.session.messages import TaskDescription
+from workbench.session.lane import Job, JobFailed, Stopped
+from workbench.session.messages import Load, Request, TaskDescription
 from workbench.session.studio_cameras import StudioCameras
 from workbench.session.studio_view import Writing
+
+_FIRST_NUMBER = 3_000_000_000
+"""Of the questions asked here: other askers count from lower ones, and all hear all answers."""
+_PATIENCE = 60.0
+"""Seconds in which the worker must have run the hooks: a question may be lost with a worker that ends."""
+
+
+class _Asking(Job):
+    """One question."""
+
+    def __init__(self) -> None:
+        self.stopped, self._began = False, time.monotonic()
+
+    def check(self) -> None:
+        if self.stopped or time.monotonic() - self._began > _PATIENCE:
+            raise Stopped
 
 
 class StudioFile:
@@ -24,14 +46,23 @@ class StudioFile:
     Args:
         on_change: called, on any thread, when there is something new.
         open_copy: open this class of this file, in a folder of the user's, in place of the task.
+        send: to the worker that plays.
+        load: how the version that runs was loaded; None before there is one.
     """
 
     def __init__(
-        self, cameras: StudioCameras, on_change: Callable[[], None], open_copy: Callable[[Path, str], None]
+        self,
+        cameras: StudioCameras,
+        on_change: Callable[[], None],
+        open_copy: Callable[[Path, str], None],
+        send: Callable[[Request], None],
+        load: Callable[[], Load | None],
     ) -> None:
         self._cameras, self._note, self._open_copy = cameras, on_change, open_copy
         self.folder = Path.cwd()
         """Where a copy of a task goes: where the program was started."""
+        self._asker, self._load = LiveAsker(send, _FIRST_NUMBER), load
+        self._asking = _Asking()
         self._writing = CameraWriting()
         self._removed: dict[CameraKey, CameraSettings] = {}
         """Where cameras were placed, otherwise than the file said, that were taken out of it."""
@@ -82,10 +113,29 @@ class StudioFile:
             task, info = self._cameras.task, self._cameras.info(wish.key)
         if task is None:
             return
-        writing = plan(task, info, wish)
+        writing = plan(task, info, wish, self._run)
         with self._cameras.lock:
             self._writing.planned(wish, writing)
         self._note()
+
+    def _run(self, texts: Mapping[str, str]) -> Ran:
+        load, self._asking = self._load(), _Asking()
+        if load is None or self._closing:
+            raise Refused("no task is loaded")
+        try:
+            return self._asker.ask(RunCameras(0, load.task, texts), self._asking, CamerasRun).ran
+        except Stopped:
+            raise Refused("the task did not answer, or another version came meanwhile; ask again") from None
+        except JobFailed as failure:
+            raise Refused(str(failure)) from failure
+
+    def take(self, answer: CameraAnswer) -> None:
+        """The worker that plays answered somebody."""
+        self._asker.take(answer)
+
+    def stop(self) -> None:
+        """The worker is gone, or another version comes: what is under way is not answered any more."""
+        self._asking.stopped = True
 
     def write(self) -> None:
         """Make the planned edit; the file is reloaded, and the new camera compared with what was written."""
@@ -188,6 +238,7 @@ class StudioFile:
         """Wait for what is being written."""
         with self._cameras.lock:
             self._closing = True
+        self.stop()
         self._thread.shutdown(wait=True, cancel_futures=True)
 
     # --- the thread ------------------------------------------------------------------------------------

@@ -17,11 +17,10 @@ from workbench.core.camera_suggestion import OfferedPlacement
 from workbench.core.pictures import CameraInfo, Picture
 
 if TYPE_CHECKING:
-    # libcst takes 0.2 s to import, and a page that writes no camera need not wait for it.
     from workbench.authoring.camera_source import Refusal, SourceEdit
 
 WritingStage = Literal["none", "planned", "refused", "written", "checked", "mismatch", "undone"]
-"""``planned``: shown, not made. ``written``: in the file, the reload is awaited. ``control_values``: the new env has what
+"""``planned``: shown, not made. ``written``: in the file, the reload is awaited. ``checked``: the new env has what
 was written. ``mismatch``: it has something else. ``undone``: taken back out of the file."""
 
 

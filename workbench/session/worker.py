@@ -36,6 +36,7 @@ from workbench.session.acting import Acting
 from workbench.session.camera_messages import (
     DrawCamera,
     JudgeCamera,
+    RunCameras,
     SuggestCameras,
 )
 from workbench.session.debugger import CannotDebug, listen_for_debugger, wait_for_debugger
@@ -130,6 +131,7 @@ class Worker:
             DrawCamera: self._cameras.answer,
             JudgeCamera: self._cameras.answer,
             SuggestCameras: self._cameras.answer,
+            RunCameras: self._cameras.answer,
             SetCapture: self._set_capture,
             Restore: self._restore,
             StepBack: self._step_back,
@@ -459,6 +461,7 @@ class Worker:
 
 _DOING: dict[type, Doing] = {
     Load: "loading",
+    RunCameras: "loading",
     SingleStep: "stepping",
     Reset: "resetting",
     Restore: "resetting",

@@ -6,16 +6,22 @@ import io
 import sys
 import tokenize
 import types
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import PurePath
 from typing import Any
 
 import numpy as np
+from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.sensors.camera import CameraConfig, parse_camera_configs
+from mani_skill.utils import sapien_utils
 
-from workbench.authoring.camera_source.rotations import unit
-from workbench.core.camera_settings import CameraSettings
+from workbench.authoring.camera_source.cameras import HOOKS as KINDS
+from workbench.authoring.camera_source.cameras import Ran, Run
+from workbench.authoring.camera_source.run_hooks import camera_run, noting_calls, owners
+from workbench.authoring.source.rotations import unit
+from workbench.authoring.source.text import Refused
+from workbench.core.camera_settings import CameraKey, CameraSettings
 
 FILE = "/author/task.py"
 HEADER = """\
@@ -43,12 +49,14 @@ HOOKS = ("_default_sensor_configs", "_default_human_render_camera_configs", "_se
 def _modules(sources: Mapping[str, str]) -> Iterator[dict[str, Any]]:
     """The sources executed as modules, whichever order they need."""
     made = {PurePath(path).stem: types.ModuleType(PurePath(path).stem) for path in sources}
+    for path in sources:
+        made[PurePath(path).stem].__file__ = path
     before = {name: sys.modules.get(name) for name in made}
     try:
         for path in sorted(sources, key=lambda path: path == FILE):
             name = PurePath(path).stem
             sys.modules[name] = made[name]
-            exec(compile(sources[path], path, "exec"), vars(made[name]))
+            exec(compile(sources[path].removeprefix("\ufeff"), path, "exec"), vars(made[name]))
         yield vars(made[PurePath(FILE).stem])
     finally:
         for name, module in before.items():
@@ -68,6 +76,38 @@ def real_configs(sources: Mapping[str, str], class_name: str = "Task") -> dict[t
             if hasattr(task, hook)
             for name, config in parse_camera_configs(getattr(task, hook)).items()
         }
+
+
+def run_class(sources: Mapping[str, str], class_name: str = "Task") -> Ran:
+    """As a worker runs the hooks of an env: of an object of the class, made by these texts."""
+    try:
+        with noting_calls(sources) as noted, _modules(sources) as names:
+            cls = names[class_name]
+            task = cls.__new__(cls) if issubclass(cls, BaseEnv) else cls()
+            configs: dict[CameraKey, CameraConfig] = {
+                (KINDS[hook], name): config
+                for hook in (() if issubclass(cls, BaseEnv) else HOOKS)
+                if hasattr(task, hook)
+                for name, config in parse_camera_configs(getattr(task, hook)).items()
+            }
+            return Ran({key: camera_run(config, noted) for key, config in configs.items()}, owners(cls))
+    except (SyntaxError, NameError, TypeError, AttributeError) as error:
+        raise Refused(f"with it the file fails: {error}") from error
+
+
+def run_as(class_name: str) -> Run:
+    return lambda sources: run_class(sources, class_name)
+
+
+def key_of(source: str, uid: str = "cam") -> CameraKey:
+    """Of the one camera of that name."""
+    ((hook, _),) = [key for key in real_configs({FILE: source}) if key[1] == uid]
+    return KINDS[hook], uid
+
+
+def looking(eye: Sequence[float], target: Sequence[float]) -> tuple[float, float, float, float]:
+    """The orientation of ManiSkill's own look_at, made of unit length."""
+    return unit(sapien_utils.look_at(list(eye), list(target)).raw_pose[0, 3:].tolist())
 
 
 def settings_of(config: CameraConfig) -> CameraSettings:

@@ -404,6 +404,13 @@ WRITTEN: dict[str, str] = {
         return [camera()]
         """
     ),
+    "two branches with the same values": _hook(
+        """\
+            if self.robot_uids == "panda":
+                return [CameraConfig("cam", sapien_utils.look_at([0.3, 0, 0.6], [0, 0, 0]), 128, 128, 1.0)]
+            return [CameraConfig("cam", sapien_utils.look_at([0.3, 0, 0.6], [0, 0, 0]), 128, 128, 1.0)]
+            """
+    ),
     "all on one line of code": _hook(
         "x = 0.3; return [CameraConfig('cam', sapien.Pose([x, 0, 0.5]), 128, 128, 1.0)]\n"
     ),
@@ -419,7 +426,7 @@ REFUSED: dict[str, tuple[str, str]] = {
             return cameras
             """
         ),
-        "no CameraConfig",
+        "loop",
     ),
     "a loop with a plain name": (
         _hook(
@@ -494,16 +501,6 @@ REFUSED: dict[str, tuple[str, str]] = {
             before='EYES = {"panda": [0.3, 0, 0.6]}\n\n\n',
         ).replace('    robot_uids = "panda"', '    robot_uids = str("panda")'),
         "only the running task knows",
-    ),
-    "two branches with the same values": (
-        _hook(
-            """\
-            if self.robot_uids == "panda":
-                return [CameraConfig("cam", sapien_utils.look_at([0.3, 0, 0.6], [0, 0, 0]), 128, 128, 1.0)]
-            return [CameraConfig("cam", sapien_utils.look_at([0.3, 0, 0.6], [0, 0, 0]), 128, 128, 1.0)]
-            """
-        ),
-        "the same values",
     ),
     "a look_at of one's own": (
         _hook(

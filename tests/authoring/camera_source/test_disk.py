@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.authoring.camera_source.real_cameras import FILE, real_settings
+from tests.authoring.camera_source.real_cameras import FILE, real_settings, run_class
 from tests.authoring.camera_source.shapes import WRITTEN
 from workbench.authoring.camera_source import Refusal, SourceEdit, apply, plan_edit, revert
 from workbench.authoring.camera_source.result import FileChange
@@ -24,7 +24,7 @@ def planned(path: Path, text: str | None = None) -> SourceEdit:
     text = decode(str(path), path.read_bytes()) if text is None else text
     before = real_settings({FILE: SOURCE}, "cam")
     after = dataclasses.replace(before, fov=0.9, near=0.05, shader_pack="default")
-    plan = plan_edit({str(path): text}, "cam", before, after)
+    plan = plan_edit({str(path): text}, ("sensor", "cam"), before, after, run_class)
     assert isinstance(plan, SourceEdit), plan
     return plan
 

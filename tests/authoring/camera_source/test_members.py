@@ -11,7 +11,10 @@ from tests.authoring.camera_source.real_cameras import (
     HEADER,
     close,
     comments,
+    key_of,
     real_configs,
+    run_as,
+    run_class,
     settings_of,
 )
 from tests.authoring.camera_source.shapes import REFUSED, WRITTEN
@@ -23,7 +26,7 @@ from workbench.authoring.camera_source import (
     plan_remove,
     plan_rename,
 )
-from workbench.authoring.camera_source.rotations import unit
+from workbench.authoring.source.rotations import unit
 from workbench.core.camera_frames import LookAt, pose_from_look_at, with_pose
 from workbench.core.camera_settings import CameraSettings
 from workbench.core.pictures import CameraKind
@@ -51,9 +54,9 @@ def same_cameras(a: dict[tuple[str, str], CameraSettings], b: dict[tuple[str, st
 @pytest.mark.parametrize("name", TOP)
 def test_a_camera_is_added_last(name: str) -> None:
     source = WRITTEN[name]
-    plan = plan_add({FILE: source}, FILE, "Task", "sensor", "added", NEW)
+    plan = plan_add({FILE: source}, FILE, "Task", ("sensor", "added"), NEW, run_as("Task"))
     if isinstance(plan, Refusal):
-        assert name == "branches with other values" and "2 returns" in plan.reason and plan.snippet
+        assert "branches with" in name and "2 returns" in plan.reason and plan.snippet
         return
     assert same_cameras(cameras(plan.new_text), cameras(source) | {(SENSOR, "added"): NEW}), plan.diff
     assert comments(plan.new_text) == comments(source)
@@ -63,30 +66,32 @@ def test_a_camera_is_added_last(name: str) -> None:
 @pytest.mark.parametrize("kind", ["sensor", "human"])
 def test_a_hook_is_made_where_there_is_none(kind: CameraKind) -> None:
     source = "from __future__ import annotations\n\nclass Task:\n    eye = 1\n\n\nx = 2\n"
-    plan = plan_add({FILE: source}, FILE, "Task", kind, "added", NEW)
+    plan = plan_add({FILE: source}, FILE, "Task", (kind, "added"), NEW, run_as("Task"))
     assert isinstance(plan, SourceEdit), plan
     hook = SENSOR if kind == "sensor" else HUMAN
     assert same_cameras(cameras(plan.new_text), {(hook, "added"): NEW})
     assert len(plan.notes) == 2
-    again = plan_add({FILE: plan.new_text}, FILE, "Task", kind, "more", NEW)
+    again = plan_add({FILE: plan.new_text}, FILE, "Task", (kind, "more"), NEW, run_as("Task"))
     assert isinstance(again, SourceEdit) and not again.notes
     assert list(cameras(again.new_text)) == [(hook, "added"), (hook, "more")]
-    twice = plan_add({FILE: plan.new_text}, FILE, "Task", kind, "added", NEW)
+    twice = plan_add({FILE: plan.new_text}, FILE, "Task", (kind, "added"), NEW, run_as("Task"))
     assert isinstance(twice, Refusal) and "already" in twice.reason
 
 
 def test_what_cannot_be_added_to_is_refused() -> None:
-    plan = plan_add({FILE: REFUSED["a comprehension"][0]}, FILE, "Task", "sensor", "added", NEW)
+    plan = plan_add(
+        {FILE: REFUSED["a comprehension"][0]}, FILE, "Task", ("sensor", "added"), NEW, run_as("Task")
+    )
     assert isinstance(plan, Refusal) and "neither" in plan.reason
     assert 'CameraConfig(\n    "added"' in plan.snippet
     parent = WRITTEN["a pose of nothing"] + "\n\nclass Child(Task):\n    pass\n"
-    plan = plan_add({FILE: parent}, FILE, "Child", "sensor", "added", NEW)
+    plan = plan_add({FILE: parent}, FILE, "Child", ("sensor", "added"), NEW, run_as("Child"))
     assert isinstance(plan, Refusal) and "inherits" in plan.reason
     library = "from mani_skill.envs.tasks import PickCubeEnv\n\n\nclass Task(PickCubeEnv):\n    pass\n"
-    plan = plan_add({FILE: library}, FILE, "Task", "sensor", "added", NEW)
+    plan = plan_add({FILE: library}, FILE, "Task", ("sensor", "added"), NEW, run_as("Task"))
     assert isinstance(plan, Refusal) and "would take away" in plan.reason
     for name in ("no name", 'x"); import os; ("', ""):
-        plan = plan_add({FILE: parent}, FILE, "Task", "sensor", name, NEW)
+        plan = plan_add({FILE: parent}, FILE, "Task", ("sensor", name), NEW, run_as("Task"))
         assert isinstance(plan, Refusal) and "is not a name" in plan.reason
 
 
@@ -95,7 +100,7 @@ def test_a_copy_stands_beside_its_original(name: str) -> None:
     source = WRITTEN[name]
     now = cameras(source)
     key = next(key for key in now if key[1] == "cam")
-    plan = plan_duplicate({FILE: source}, "cam", "copy", now[key])
+    plan = plan_duplicate({FILE: source}, key_of(source), "copy", now[key], run_class)
     if isinstance(plan, Refusal):
         assert "stands alone" in plan.reason and plan.snippet
         assert name in ALONE
@@ -108,19 +113,19 @@ def test_a_camera_has_another_name(name: str) -> None:
     source = WRITTEN[name]
     now = cameras(source)
     key = next(key for key in now if key[1] == "cam")
-    plan = plan_rename({FILE: source}, "cam", "front", now[key])
+    plan = plan_rename({FILE: source}, key_of(source), "front", now[key], run_class)
     assert isinstance(plan, SourceEdit), plan
     wanted = {(hook, "front" if uid == "cam" else uid): value for (hook, uid), value in now.items()}
     assert same_cameras(cameras(plan.new_text), wanted), plan.diff
     other = next((uid for _, uid in now if uid != "cam"), None)
     if other is not None:
-        assert isinstance(plan_rename({FILE: source}, "cam", other, now[key]), Refusal)
+        assert isinstance(plan_rename({FILE: source}, key_of(source), other, now[key], run_class), Refusal)
 
 
 @pytest.mark.parametrize("name", WRITTEN)
 def test_a_camera_is_taken_out(name: str) -> None:
     source = WRITTEN[name]
-    plan = plan_remove({FILE: source}, "cam")
+    plan = plan_remove({FILE: source}, key_of(source), run_class)
     if isinstance(plan, Refusal):
         assert "by hand" in plan.reason
         assert name in ALONE
@@ -133,9 +138,9 @@ def test_a_camera_is_taken_out(name: str) -> None:
 def test_what_is_made_in_a_loop_is_refused() -> None:
     source = REFUSED["a loop with a plain name"][0]
     for plan in (
-        plan_remove({FILE: source}, "cam"),
-        plan_rename({FILE: source}, "cam", "front", NEW),
-        plan_duplicate({FILE: source}, "cam", "front", NEW),
+        plan_remove({FILE: source}, key_of(source), run_class),
+        plan_rename({FILE: source}, key_of(source), "front", NEW, run_class),
+        plan_duplicate({FILE: source}, key_of(source), "front", NEW, run_class),
     ):
         assert isinstance(plan, Refusal) and "loop" in plan.reason
 
@@ -145,9 +150,12 @@ def test_settings_are_those_that_are_written() -> None:
     exact = dataclasses.replace(
         NEW, position=(1 / 3, 0.0, 2 / 3), quaternion=unit((1, 2, 3, 4)), fov=1.23456789
     )
-    plan = plan_add({FILE: source}, FILE, "Task", "sensor", "added", exact)
+    plan = plan_add({FILE: source}, FILE, "Task", ("sensor", "added"), exact, run_as("Task"))
     assert isinstance(plan, SourceEdit) and plan.settings is not None
-    assert plan.settings.position == (0.3333, 0.0, 0.6667) and plan.settings.fov == 1.2346
+    assert (
+        plan.settings.position == pytest.approx((0.3333, 0.0, 0.6667), abs=1e-7)
+        and plan.settings.fov == 1.2346
+    )
     assert close(plan.settings, cameras(plan.new_text)[SENSOR, "added"])
 
 
@@ -163,7 +171,15 @@ BESIDE_LOOK_AT = """\
 
 def test_a_new_camera_is_written_as_its_sibling_is_and_stands_in_a_line_as_that_does() -> None:
     wanted = with_pose(NEW, pose_from_look_at(LookAt((0.51234, 0.3, 0.6), (0.08, 0.0, 0.02))))
-    plan = plan_add({FILE: hook(BESIDE_LOOK_AT)}, FILE, "Task", "sensor", "side", wanted, (0.08, 0.0, 0.02))
+    plan = plan_add(
+        {FILE: hook(BESIDE_LOOK_AT)},
+        FILE,
+        "Task",
+        ("sensor", "side"),
+        wanted,
+        run_as("Task"),
+        (0.08, 0.0, 0.02),
+    )
     assert isinstance(plan, SourceEdit)
     assert (
         """\
@@ -183,7 +199,7 @@ def test_a_new_camera_is_written_as_its_sibling_is_and_stands_in_a_line_as_that_
 def test_straight_down_and_up_look_at_is_not_used(forward: tuple[float, float, float]) -> None:
     x, y, z = forward
     wanted = with_pose(NEW, pose_from_look_at(LookAt((0.1, 0.2, 0.9), (0.1 + x, 0.2 + y, 0.9 + z))))
-    plan = plan_add({FILE: hook(BESIDE_LOOK_AT)}, FILE, "Task", "sensor", "side", wanted)
+    plan = plan_add({FILE: hook(BESIDE_LOOK_AT)}, FILE, "Task", ("sensor", "side"), wanted, run_as("Task"))
     assert isinstance(plan, SourceEdit) and "q=[" in plan.diff
     assert close(wanted, cameras(plan.new_text)[SENSOR, "side"])
 
@@ -205,7 +221,7 @@ def test_what_stands_on_one_line_gets_a_line_each(held: str) -> None:
         camera = f'CameraConfig("{name}", sapien.Pose([0, 0, 1]), 8, 8, 1.0)'
         held = held.replace(name.upper(), camera)
     source = hook(f"        return {held}\n")
-    plan = plan_add({FILE: source}, FILE, "Task", "sensor", "added", NEW)
+    plan = plan_add({FILE: source}, FILE, "Task", ("sensor", "added"), NEW, run_as("Task"))
     assert isinstance(plan, SourceEdit), plan
     assert same_cameras(cameras(plan.new_text), cameras(source) | {(SENSOR, "added"): NEW}), plan.diff
     indents = [
@@ -221,7 +237,7 @@ def test_tidy_text_comes_of_it() -> None:
         "    def _default_sensor_configs(self):\n"
         '        return CameraConfig("cam", sapien.Pose([0.5, 0, 0.5]), 128, 128, 1.0)\n'
     )
-    plan = plan_add({FILE: source}, FILE, "Task", "sensor", "top", NEW)
+    plan = plan_add({FILE: source}, FILE, "Task", ("sensor", "top"), NEW, run_as("Task"))
     assert isinstance(plan, SourceEdit)
     assert plan.new_text.endswith(
         """\
@@ -240,6 +256,6 @@ def test_tidy_text_comes_of_it() -> None:
         ]
 """
     )
-    back = plan_remove({FILE: plan.new_text}, "cam")
+    back = plan_remove({FILE: plan.new_text}, ("sensor", "cam"), run_class)
     assert isinstance(back, SourceEdit)
     assert 'return [\n            CameraConfig(\n                "top"' in back.new_text

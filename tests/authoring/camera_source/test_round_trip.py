@@ -9,14 +9,16 @@ import re
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from mani_skill.utils import sapien_utils
 
-from tests.authoring.camera_source.real_cameras import FILE, close, real_settings
+from tests.authoring.camera_source.real_cameras import FILE, close, key_of, looking, real_settings, run_class
 from tests.authoring.camera_source.shapes import WRITTEN
 from workbench.authoring.camera_source import Refusal, SourceEdit, plan_edit
-from workbench.authoring.camera_source.read_camera import changed_fields
-from workbench.authoring.camera_source.rotations import angle_between, look_at, unit
-from workbench.core.camera_settings import CameraSettings
+from workbench.authoring.camera_source.cameras import changed_fields
+from workbench.authoring.source.rotations import angle_between, unit
+from workbench.core.camera_settings import CameraKey, CameraSettings
 
+KEY: CameraKey = ("sensor", "cam")
 FORMS = (
     "a list, positional to the end",
     "sapien.Pose, positional",
@@ -46,7 +48,7 @@ def poses(draw: st.DrawFn) -> tuple[tuple[float, ...], tuple[float, ...]]:
         target = (eye[0] + aside, eye[1] - aside / 2, eye[2] + draw(st.sampled_from((-1, 1))))
     else:
         target = draw(points)
-    quaternion = look_at(eye, target)
+    quaternion = tuple(sapien_utils.look_at(eye, target).raw_pose[0, 3:].tolist())
     length = math.hypot(*quaternion)
     if abs(length - 1) > 1e-4:
         quaternion = draw(st.sampled_from(((0.5, 0.5, 0.5, -0.5), (0.7071068, 0, -0.7071068, 0))))
@@ -62,7 +64,7 @@ def test_write_and_read_back(form: str, pose: tuple, fov: float | None) -> None:
     before = _before(form)
     after = dataclasses.replace(before, position=pose[0], quaternion=pose[1], fov=fov or before.fov)
     assume(changed_fields(before, after))
-    plan = plan_edit({FILE: source}, "cam", before, after)
+    plan = plan_edit({FILE: source}, KEY, before, after, run_class)
     if isinstance(plan, Refusal):
         assert "smaller than what is written" in plan.reason
         assume(False)
@@ -88,7 +90,7 @@ def test_a_second_edit_goes_on_from_the_first() -> None:
     before = real_settings({FILE: source}, "cam")
     for pose in (((0.4, 0.1, 0.7), (0.1, 0.2, 0.3, 0.4)), ((0.2, 0.0, 0.9), (0.5, 0.5, 0.5, -0.5))):
         after = dataclasses.replace(before, position=pose[0], quaternion=unit(pose[1]))
-        plan = plan_edit({FILE: source}, "cam", before, after)
+        plan = plan_edit({FILE: source}, KEY, before, after, run_class)
         assert isinstance(plan, SourceEdit) and plan.settings is not None
         source, before = plan.new_text, plan.settings
     assert "q=[0.5, 0.5, 0.5, -0.5]" in source
@@ -98,12 +100,12 @@ def test_a_point_that_the_camera_was_aimed_at_is_written() -> None:
     source = WRITTEN["a list, positional to the end"]
     before = real_settings({FILE: source}, "cam")
     eye, aim = (0.5, 0.25, 0.75), (0.125, 0.0, 0.02)
-    after = dataclasses.replace(before, position=eye, quaternion=unit(look_at(eye, aim)))
-    plan = plan_edit({FILE: source}, "cam", before, after, target=aim)
+    after = dataclasses.replace(before, position=eye, quaternion=looking(eye, aim))
+    plan = plan_edit({FILE: source}, KEY, before, after, run_class, target=aim)
     assert isinstance(plan, SourceEdit)
     assert "look_at(eye=[0.5, 0.25, 0.75], target=[0.125, 0, 0.02])" in plan.new_text
     # A point that it does not look at is none.
-    elsewhere = plan_edit({FILE: source}, "cam", before, after, target=(1.0, 1.0, 1.0))
+    elsewhere = plan_edit({FILE: source}, KEY, before, after, run_class, target=(1.0, 1.0, 1.0))
     assert isinstance(elsewhere, SourceEdit) and elsewhere.settings is not None
     assert angle_between(elsewhere.settings.quaternion, after.quaternion) <= math.radians(0.01)
 
@@ -114,8 +116,8 @@ def test_a_camera_that_is_turned_keeps_the_distance_of_what_it_looks_at(name: st
     before = real_settings({FILE: source}, "cam")
     old_eye, old_target = _look_at_numbers(source)
     for eye, point in ((old_eye, (1.5, 0.25, 0.3)), ((0.5, 0.25, 0.75), (-0.5, -2.0, 0.7))):
-        after = dataclasses.replace(before, position=eye, quaternion=unit(look_at(eye, point)))
-        plan = plan_edit({FILE: source}, "cam", before, after)
+        after = dataclasses.replace(before, position=eye, quaternion=looking(eye, point))
+        plan = plan_edit({FILE: source}, key_of(source), before, after, run_class)
         assert isinstance(plan, SourceEdit)
         new_eye, new_target = _look_at_numbers(plan.new_text)
         assert math.dist(new_eye, eye) < 1e-4
@@ -128,8 +130,8 @@ def test_a_target_that_was_at_the_eye_comes_to_stand_before_it() -> None:
     )
     before = real_settings({FILE: source}, "cam")
     eye = before.position
-    after = dataclasses.replace(before, quaternion=unit(look_at(eye, (eye[0], 2.0, 0.5))))
-    plan = plan_edit({FILE: source}, "cam", before, after)
+    after = dataclasses.replace(before, quaternion=looking(eye, (eye[0], 2.0, 0.5)))
+    plan = plan_edit({FILE: source}, KEY, before, after, run_class)
     assert isinstance(plan, SourceEdit)
     new_eye, new_target = _look_at_numbers(plan.new_text)
     assert math.dist(new_eye, new_target) == pytest.approx(0.1, abs=2e-4)

@@ -13,13 +13,16 @@ from tests.authoring.camera_source.real_cameras import (
     FILE,
     close,
     comments,
+    key_of,
+    looking,
     real_configs,
     real_settings,
+    run_class,
     settings_of,
 )
 from tests.authoring.camera_source.shapes import REFUSED, WRITTEN
 from workbench.authoring.camera_source import Refusal, SourceEdit, plan_edit
-from workbench.authoring.camera_source.rotations import angle_between, look_at, unit
+from workbench.authoring.source.rotations import angle_between, unit
 from workbench.core.camera_settings import CameraSettings
 
 Edit = Callable[[CameraSettings], CameraSettings]
@@ -32,7 +35,7 @@ def moved(now: CameraSettings) -> CameraSettings:
 
 def level(now: CameraSettings) -> CameraSettings:
     eye = (now.position[0] + 0.1, now.position[1] - 0.2034, now.position[2] + 0.3)
-    return dataclasses.replace(now, position=eye, quaternion=unit(look_at(eye, (0.05, 0.1, 0.02))))
+    return dataclasses.replace(now, position=eye, quaternion=looking(eye, (0.05, 0.1, 0.02)))
 
 
 def down(now: CameraSettings) -> CameraSettings:
@@ -55,7 +58,7 @@ def test_what_is_written_is_what_maniskill_then_makes(name: str, edit: Edit) -> 
     source = WRITTEN[name]
     before = real_settings({FILE: source}, "cam")
     after = edit(before)
-    plan = plan_edit({FILE: source}, "cam", before, after)
+    plan = plan_edit({FILE: source}, key_of(source), before, after, run_class)
     if name == "more arguments by **" and edit is lens:
         assert isinstance(plan, Refusal) and "`near` is given by * or **" in plan.reason
         return
@@ -92,7 +95,7 @@ def test_what_cannot_be_edited_safely_is_refused_with_reason_and_snippet(name: s
     source, reason = REFUSED[name]
     before = real_settings({FILE: source}, "cam")
     after = level(before)
-    plan = plan_edit({FILE: source}, "cam", before, after)
+    plan = plan_edit({FILE: source}, key_of(source), before, after, run_class)
     assert isinstance(plan, Refusal), plan.diff
     assert reason in plan.reason
     assert ast.parse(plan.snippet)

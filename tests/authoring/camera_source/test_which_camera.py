@@ -10,9 +10,11 @@ from typing import Any
 
 import pytest
 
-from tests.authoring.camera_source.real_cameras import FILE, HEADER, real_settings
+from tests.authoring.camera_source.real_cameras import FILE, HEADER, real_settings, run_as, run_class
 from workbench.authoring.camera_source import Refusal, SourceEdit, plan_edit
-from workbench.core.camera_settings import CallSite, CameraSettings
+from workbench.authoring.camera_source.cameras import Ran, Run
+from workbench.authoring.source.trace import Place, Read
+from workbench.core.camera_settings import CallSite, CameraKey, CameraSettings
 
 TWO = HEADER + dedent(
     """\
@@ -52,35 +54,32 @@ def edited_line(plan: SourceEdit | Refusal) -> int:
 
 def test_kind_tells_a_sensor_from_a_camera_for_people() -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    assert edited_line(plan_edit({FILE: TWO}, "cam", before, higher(before), kind="sensor")) == LINE
+    assert edited_line(plan_edit({FILE: TWO}, ("sensor", "cam"), before, higher(before), run_class)) == LINE
     people = real_settings({FILE: TWO}, "cam", "_default_human_render_camera_configs")
-    assert edited_line(plan_edit({FILE: TWO}, "cam", people, higher(people), kind="human")) == LINE + 4
+    assert (
+        edited_line(plan_edit({FILE: TWO}, ("human", "cam"), people, higher(people), run_class)) == LINE + 4
+    )
 
 
-def test_two_of_one_name_and_value_are_told_apart_by_the_place_alone() -> None:
+def test_two_of_one_name_and_value_are_told_apart_by_the_place() -> None:
     source = TWO.replace("512, 512", "128, 128").replace('f"{name}"', '"cam"')
     before = real_settings({FILE: source}, "cam", "_default_sensor_configs")
-    plan = plan_edit({FILE: source}, "cam", before, higher(before))
-    assert isinstance(plan, Refusal) and "the same values" in plan.reason
-    for line, function in (
-        (LINE, "Task._default_sensor_configs"),
-        (LINE + 11, "Other._default_sensor_configs"),
-    ):
-        plan = plan_edit({FILE: source}, "cam", before, higher(before), CallSite(FILE, line, function))
+    for class_name, line in (("Task", LINE), ("Other", LINE + 11)):
+        plan = plan_edit({FILE: source}, ("sensor", "cam"), before, higher(before), run_as(class_name))
         assert edited_line(plan) == line
 
 
 def test_a_computed_name_is_found_by_its_place() -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    site = CallSite(FILE, LINE + 11, "Other._default_sensor_configs")
-    assert edited_line(plan_edit({FILE: TWO}, "cam", before, higher(before), site)) == LINE + 11
+    plan = plan_edit({FILE: TWO}, ("sensor", "cam"), before, higher(before), run_as("Other"))
+    assert edited_line(plan) == LINE + 11
 
 
-def test_a_place_that_remarks_have_moved_is_still_found() -> None:
+def test_remarks_above_it_since_it_ran_do_not_matter() -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    for line in (1, LINE + 4, 1000):
-        site = CallSite(FILE, line, "Task._default_sensor_configs")
-        assert edited_line(plan_edit({FILE: TWO}, "cam", before, higher(before), site)) == LINE
+    moved = TWO.replace("class Task(Base):", "# more\n\n# Größe\n\nclass Task(Base):")
+    plan = plan_edit({FILE: moved}, ("sensor", "cam"), before, higher(before), run_class)
+    assert edited_line(plan) == LINE + 4
 
 
 @pytest.mark.parametrize(
@@ -99,57 +98,109 @@ def test_a_place_that_remarks_have_moved_is_still_found() -> None:
 )
 def test_what_is_no_camera_never_reaches_the_file(change: dict[str, Any]) -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    plan = plan_edit({FILE: TWO}, "cam", before, dataclasses.replace(before, **change), kind="sensor")
+    plan = plan_edit({FILE: TWO}, ("sensor", "cam"), before, dataclasses.replace(before, **change), run_class)
     assert isinstance(plan, Refusal) and not plan.snippet
 
 
 def test_the_snippet_of_a_mounted_camera_has_its_mount() -> None:
     source = TWO.replace(
-        "sapien.Pose([0.5, 0, 0.5]), 128, 128, 1.0)", "POSE.inv(), 128, 128, 1.0, mount=self.link)"
+        "sapien.Pose([0.5, 0, 0.5]), 128, 128, 1.0)",
+        "sapien.Pose([-0.5, 0, -0.5]).inv(), 128, 128, 1.0, mount=self.camera_link)",
     )
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    plan = plan_edit({FILE: source}, "cam", before, higher(before), kind="sensor")
-    assert isinstance(plan, Refusal) and "    mount=self.link,\n" in plan.snippet
+    plan = plan_edit({FILE: source}, ("sensor", "cam"), before, higher(before), run_class)
+    assert isinstance(plan, Refusal) and "    mount=self.camera_link,\n" in plan.snippet
+
+
+def told(ran: Ran, **changes: Any) -> Run:
+    """A worker that says something else of the camera."""
+    key: CameraKey = ("sensor", "cam")
+    return lambda sources: Ran(
+        {**ran.cameras, key: dataclasses.replace(ran.cameras[key], **changes)}, ran.owners
+    )
 
 
 @pytest.mark.parametrize(
-    ("site", "reason"),
+    ("changes", "reason"),
     [
-        (CallSite("/usr/site-packages/x.py", 3, "f"), "copy the task"),
-        (CallSite("/other/x.py", 3, "f"), "not one of your files"),
-        (CallSite(FILE, 1, "f"), "edited since"),
+        ({"site": CallSite("/usr/site-packages/x.py", 3, "f")}, "copy the task"),
+        ({"site": CallSite("/other/x.py", 3, "f"), "trace": None}, "not one of your files"),
+        ({"site": CallSite(FILE, 1, "f"), "trace": None}, "a function or class of its own"),
+        ({"site": None, "trace": None}, "is no CameraConfig"),
+        ({"made": None}, "cannot be said in numbers"),
     ],
 )
-def test_a_place_that_is_none_is_refused(site: CallSite, reason: str) -> None:
+def test_a_place_that_is_none_is_refused(changes: dict[str, Any], reason: str) -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    plan = plan_edit({FILE: TWO}, "cam", before, higher(before), site)
+    run = told(run_class({FILE: TWO}), **changes)
+    plan = plan_edit({FILE: TWO}, ("sensor", "cam"), before, higher(before), run)
     assert isinstance(plan, Refusal) and reason in plan.reason
     assert "p=[0.5, 0.0, 0.75]" in plan.snippet
+
+
+@pytest.mark.parametrize(
+    ("place", "reason"),
+    [
+        (Place("/etc/passwd", 0, 10), "not one of your files"),
+        (Place(FILE, -5, 10**9), "another text"),
+        (Place(FILE, 3, 17), "another text"),
+    ],
+)
+@pytest.mark.parametrize("of", ["call", "argument", "read", "part"])
+def test_a_worker_that_lies_about_places_changes_nothing(place: Place, reason: str, of: str) -> None:
+    before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
+    ran = run_class({FILE: TWO})
+    trace = ran.cameras["sensor", "cam"].trace
+    assert trace is not None
+    pose = trace.parts["pose"]
+    if of == "call":
+        trace = dataclasses.replace(trace, at=place)
+    elif of == "read":
+        lie = dataclasses.replace(pose, reads=(Read(place, "somebody"),))
+        trace = dataclasses.replace(trace, parts={**trace.parts, "pose": lie})
+    elif of == "argument":
+        lie = dataclasses.replace(pose, at=place)
+        trace = dataclasses.replace(trace, parts={**trace.parts, "pose": lie})
+    else:
+        item = dataclasses.replace(pose.parts["p"].parts["2"], at=place)
+        vector = dataclasses.replace(pose.parts["p"], parts={**pose.parts["p"].parts, "2": item})
+        lie = dataclasses.replace(pose, parts={**pose.parts, "p": vector})
+        trace = dataclasses.replace(trace, parts={**trace.parts, "pose": lie})
+    plan = plan_edit({FILE: TWO}, ("sensor", "cam"), before, higher(before), told(ran, trace=trace))
+    assert isinstance(plan, Refusal) and reason in plan.reason
 
 
 def test_an_installed_file_is_left_alone() -> None:
     path = "/usr/lib/python3/site-packages/mani_skill/envs/tasks/task.py"
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    plan = plan_edit({path: TWO}, "cam", before, higher(before), kind="sensor")
+    plan = plan_edit({path: TWO}, ("sensor", "cam"), before, higher(before), run_class)
     assert isinstance(plan, Refusal) and "copy the task" in plan.reason
 
 
 def test_what_is_not_in_the_files_or_not_python_is_refused() -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    plan = plan_edit({FILE: TWO}, "hand", before, higher(before))
+    plan = plan_edit({FILE: TWO}, ("sensor", "hand"), before, higher(before), run_class)
     assert isinstance(plan, Refusal) and "'hand'" in plan.reason
-    plan = plan_edit({FILE: "cam = (\n"}, "cam", before, higher(before))
+    plan = plan_edit({FILE: "cam = (\n"}, ("sensor", "cam"), before, higher(before), run_class)
     assert isinstance(plan, Refusal) and "not valid Python" in plan.reason
 
 
 def test_a_class_of_that_name_in_the_files_is_not_taken_for_maniskills() -> None:
-    own = "class CameraConfig:\n    pass\n"
+    own = (
+        "from mani_skill.sensors.camera import CameraConfig as Stock\n\n\nclass CameraConfig(Stock):\n"
+        "    def __init__(self, *given):\n        super().__init__(*given)\n"
+    )
     source = TWO.replace("from mani_skill.sensors.camera import", "from configs import")
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    plan = plan_edit({FILE: source, "/author/configs.py": own}, "cam", before, higher(before), kind="sensor")
-    assert isinstance(plan, Refusal) and "no CameraConfig" in plan.reason
+    plan = plan_edit(
+        {FILE: source, "/author/configs.py": own}, ("sensor", "cam"), before, higher(before), run_class
+    )
+    assert isinstance(plan, Refusal) and "is given by * or **" in plan.reason
     handed_on = TWO.replace("from mani_skill.sensors.camera import", "from mani_skill.sensors import")
-    assert edited_line(plan_edit({FILE: handed_on}, "cam", before, higher(before), kind="sensor")) == LINE
+    assert (
+        edited_line(plan_edit({FILE: handed_on}, ("sensor", "cam"), before, higher(before), run_class))
+        == LINE
+    )
 
 
 PLACES = """\
@@ -175,7 +226,7 @@ IMPORTING = HEADER + dedent(
 def test_a_constant_of_another_file_is_changed_there() -> None:
     sources = {FILE: IMPORTING, "/author/places.py": PLACES}
     before = real_settings(sources, "cam")
-    plan = plan_edit(sources, "cam", before, higher(before))
+    plan = plan_edit(sources, ("sensor", "cam"), before, higher(before), run_class)
     assert isinstance(plan, SourceEdit), plan
     assert plan.file == "/author/places.py"
     assert "EYE = np.array([0.5, 0, 0.75])  # above the table" in plan.new_text
@@ -189,7 +240,7 @@ def test_a_constant_that_another_file_reads_is_left_as_it_is() -> None:
         "/author/more.py": "from places import EYE\nx = EYE\n",
     }
     before = real_settings(sources, "cam")
-    plan = plan_edit(sources, "cam", before, higher(before))
+    plan = plan_edit(sources, ("sensor", "cam"), before, higher(before), run_class)
     assert isinstance(plan, SourceEdit) and plan.file == FILE
     assert "sapien.Pose([0.5, 0, 0.75])" in plan.new_text
     assert any("more.py" in note for note in plan.notes)
@@ -199,7 +250,7 @@ def test_a_change_of_two_files_is_one_plan_with_both() -> None:
     sources = {FILE: IMPORTING, "/author/places.py": PLACES}
     before = real_settings(sources, "cam")
     after = dataclasses.replace(higher(before), height=100)
-    plan = plan_edit(sources, "cam", before, after)
+    plan = plan_edit(sources, ("sensor", "cam"), before, after, run_class)
     assert isinstance(plan, SourceEdit), plan
     assert [change.file for change in plan.changes] == [FILE, "/author/places.py"]
     assert "places.SIZE, 100, 1.0" in plan.new_text and "[0.5, 0, 0.75]" in plan.others[0].new_text
@@ -211,17 +262,19 @@ def test_a_change_of_two_files_is_one_plan_with_both() -> None:
 def test_what_an_argument_of_the_env_decides_is_left_alone_and_said() -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
     running = dataclasses.replace(before, width=640, height=480)
-    plan = plan_edit({FILE: TWO}, "cam", running, higher(running), kind="sensor")
+    plan = plan_edit({FILE: TWO}, ("sensor", "cam"), running, higher(running), run_class)
     assert isinstance(plan, SourceEdit) and plan.settings is not None
     assert (plan.settings.width, plan.settings.height) == (640, 480)
     assert "left alone" in plan.notes[-1]
-    plan = plan_edit({FILE: TWO}, "cam", running, dataclasses.replace(running, width=320), kind="sensor")
+    plan = plan_edit(
+        {FILE: TWO}, ("sensor", "cam"), running, dataclasses.replace(running, width=320), run_class
+    )
     assert isinstance(plan, Refusal) and "gym.make" in plan.reason
 
 
 def test_nothing_changed_is_said() -> None:
     before = real_settings({FILE: TWO}, "cam", "_default_sensor_configs")
-    assert isinstance(plan_edit({FILE: TWO}, "cam", before, before, kind="sensor"), Refusal)
+    assert isinstance(plan_edit({FILE: TWO}, ("sensor", "cam"), before, before, run_class), Refusal)
 
 
 def test_an_intrinsic_takes_the_place_of_a_fov_and_back() -> None:
@@ -240,10 +293,10 @@ def test_an_intrinsic_takes_the_place_of_a_fov_and_back() -> None:
     for uid in ("cam", "other"):
         before = real_settings({FILE: source}, uid)
         after = dataclasses.replace(before, fov=None, intrinsic=matrix)
-        plan = plan_edit({FILE: source}, uid, before, after)
+        plan = plan_edit({FILE: source}, ("sensor", uid), before, after, run_class)
         assert isinstance(plan, SourceEdit), plan
         assert real_settings({FILE: plan.new_text}, uid) == plan.settings == after
-        back = plan_edit({FILE: plan.new_text}, uid, after, before)
+        back = plan_edit({FILE: plan.new_text}, ("sensor", uid), after, before, run_class)
         assert isinstance(back, SourceEdit), back
         assert real_settings({FILE: back.new_text}, uid) == back.settings == before
 
@@ -275,6 +328,6 @@ def test_a_change_that_another_camera_would_make_too_is_refused() -> None:
     )
     sources = {FILE: source, "/author/places.py": PLACES}
     before = real_settings(sources, "cam")
-    plan = plan_edit(sources, "cam", before, higher(before))
+    plan = plan_edit(sources, ("sensor", "cam"), before, higher(before), run_class)
     assert isinstance(plan, Refusal) and "of the camera hand as well" in plan.reason
     assert "p=[0.5, 0.0, 0.75]" in plan.snippet

@@ -1,8 +1,9 @@
 """A camera's settings written into the author's file, as the smallest edit that says them.
 
-Text in, text out: nothing of the author's is executed and no simulator is imported, since the server process does
-this. `plan_edit` and its siblings give a `SourceEdit`, to be shown and then handed to `apply`, or a `Refusal` with
-the reason and a snippet to copy.
+Text in, text out, in the server process, which executes nothing of the author's and imports no simulator. What it knows
+of the cameras, and the proof of an edit, comes from a worker that runs the hooks with a text (`Run`; there it is
+`run_hooks`). `plan_edit` and its siblings give a `SourceEdit`, to be shown and then handed to `apply`, or a `Refusal`
+with the reason and a snippet to copy.
 """
 
 from workbench.authoring.camera_source.disk import apply, not_writable, revert

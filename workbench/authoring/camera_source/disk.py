@@ -20,10 +20,10 @@ import tokenize
 from contextlib import suppress
 from pathlib import Path
 
-from workbench.authoring.camera_source.find import check_own
-from workbench.authoring.camera_source.result import FileChange, Refusal, Refused, SourceEdit
-from workbench.authoring.camera_source.source_file import BOM
+from workbench.authoring.camera_source.cameras import check_own
+from workbench.authoring.camera_source.result import FileChange, Refusal, SourceEdit
 from workbench.authoring.modules import MOST_SOURCE_BYTES
+from workbench.authoring.source.text import BOM, Refused
 from workbench.machine.regular_file import read_regular_file
 
 _LINES = re.compile(r"[^\r\n]*(?:\r\n|\r|\n|$)")

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from workbench.authoring.camera_source.definitions import Project
-from workbench.authoring.camera_source.find import check_own
+from workbench.authoring.camera_source.cameras import Run, check_others, check_own, run_first
 from workbench.authoring.camera_source.hooks import (
     HOOK_OF,
-    Hook,
     at_end_of_class,
     class_named,
     needed_imports,
 )
-from workbench.authoring.camera_source.members import as_written, checked
-from workbench.authoring.camera_source.result import Refusal, Refused, SourceEdit
+from workbench.authoring.camera_source.result import Refusal, SourceEdit
 from workbench.authoring.camera_source.snippet import repr_text, snippet
-from workbench.authoring.camera_source.wanted import check_wanted
-from workbench.core.camera_settings import CallSite, CameraSettings
+from workbench.authoring.source.text import Refused
+from workbench.core.camera_settings import CallSite, CameraSettings, why_no_camera
 from workbench.core.pictures import CameraKind
 
 _PARSE = ("parse_camera_configs", "from mani_skill.sensors.camera import parse_camera_configs\n")
@@ -46,49 +43,36 @@ def plan_override(
     uid: str,
     settings: CameraSettings,
     site: CallSite,
+    run: Run,
     more: Sequence[str] = (),
 ) -> SourceEdit | Refusal:
     """The edit that gives `class_name` such a hook; `site` is where the parent makes the camera."""
-    try:
-        check_wanted(settings)
-    except Refused as refused:
-        return Refusal(refused.reason)
+    why = why_no_camera(settings)
+    if why is not None:
+        return Refusal(why)
     hook, parent = HOOK_OF[kind], site.function.rpartition(".")[0]
     try:
-        project = Project(sources)
-        return _plan(project, file, class_name, hook, kind, uid, settings, parent, more)
+        project, ran = run_first(sources, run)
+        source = project.given(file)
+        check_own(file)
+        cls = class_named(source, class_name)
+        own = hook in project.bindings(source, cls)
+        owner, where = (class_name, file) if own else ran.owners.get(hook, ("", ""))
+        if where in sources:
+            raise Refused(
+                f"{uid} is made by {parent}, and the {hook} of {owner} ({project.file(where).name}) hands it on: put the "
+                "text below in its place there"
+            )
+        imports, notes = needed_imports(project, source, settings, more=(_PARSE,))
+        replacement = at_end_of_class(
+            source, cls, hook, lambda indent: override_text(kind, uid, settings, more, indent)
+        )
+        new_text = source.replaced([*imports, replacement])
+        found = check_others(ran, run({**sources, file: new_text}), (kind, uid), (kind, uid))
     except Refused as refused:
         return Refusal(refused.reason, snippet(uid, settings, more=more))
-
-
-def _plan(
-    project: Project,
-    path: str,
-    class_name: str,
-    hook: Hook,
-    kind: CameraKind,
-    uid: str,
-    settings: CameraSettings,
-    parent: str,
-    more: Sequence[str],
-) -> SourceEdit:
-    file = project.file(path)
-    check_own(path)
-    cls = class_named(file, class_name)
-    for where, owner in project.above(file, cls, []):
-        if hook in project.bindings(where, owner):
-            raise Refused(
-                f"{uid} is made by {parent}, and the {hook} of {owner.name.value} ({where.name}) hands it on: put the text "
-                "below in its place there"
-            )
-    imports, notes = needed_imports(project, file, settings, more=(_PARSE,))
-    replacement = at_end_of_class(
-        file, cls, hook, lambda indent: override_text(kind, uid, settings, more, indent)
-    )
-    new_text = file.replaced([*imports, replacement])
-    found = checked(project, file, None, new_text, uid)
     told = (
         f"{uid} is made by {parent}, from which {class_name} inherits: {class_name} gets a {hook} of its own, with all "
         f"cameras of {parent} and this one in place of its {uid}"
     )
-    return SourceEdit(file.path, file.text, new_text, (told, *notes), as_written(found, settings))
+    return SourceEdit(file, source.text, new_text, (told, *notes), found)

@@ -18,11 +18,14 @@ class FileChange:
     new_text: str
 
     @property
+    def name(self) -> str:
+        return PurePath(self.file).name
+
+    @property
     def diff(self) -> str:
         """As ``diff -u`` writes it, with three lines around each change."""
-        name = PurePath(self.file).name
         lines = difflib.unified_diff(
-            self.old_text.splitlines(), self.new_text.splitlines(), name, name, lineterm=""
+            self.old_text.splitlines(), self.new_text.splitlines(), self.name, self.name, lineterm=""
         )
         return "\n".join(lines)
 
@@ -50,7 +53,7 @@ class SourceEdit:
     @property
     def names(self) -> str:
         """Of the files, for a sentence."""
-        return " and ".join(PurePath(change.file).name for change in self.changes)
+        return " and ".join(change.name for change in self.changes)
 
     @property
     def diff(self) -> str:
@@ -65,11 +68,3 @@ class Refusal:
     reason: str
     snippet: str = ""
     """``CameraConfig(...)`` with the wanted settings; empty where there are none."""
-
-
-class Refused(Exception):
-    """Ends a plan from anywhere inside; the public functions turn it into a `Refusal`."""
-
-    @property
-    def reason(self) -> str:
-        return str(self.args[0])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 
-from workbench.authoring.camera_source.number_text import (
+from workbench.authoring.source.numbers import (
     list_text,
     matrix_text,
     number_text,

@@ -8,20 +8,24 @@ the zero vector there), so those are never written with it.
 
 from __future__ import annotations
 
+import ast
 import math
 from collections.abc import Sequence
 
-import libcst as cst
-
-from workbench.authoring.camera_source import rotations
-from workbench.authoring.camera_source.changes import Changes, settled
-from workbench.authoring.camera_source.definitions import Project
-from workbench.authoring.camera_source.evaluate import MANISKILL_POSE, SAPIEN_POSE
-from workbench.authoring.camera_source.number_text import list_text, quaternion_texts
-from workbench.authoring.camera_source.read_camera import ANGLE_STEP
-from workbench.authoring.camera_source.source_file import Replacement, SourceFile
-from workbench.authoring.camera_source.values import Angles, Number, PoseValue, Vector
+from workbench.authoring.source import rotations
+from workbench.authoring.source.changes import Changes, settled
+from workbench.authoring.source.names import Project
+from workbench.authoring.source.numbers import list_text, quaternion_texts
+from workbench.authoring.source.text import Replacement, SourceFile
+from workbench.authoring.source.trace import Part
 from workbench.core.camera_settings import CameraSettings
+
+POSITION_STEP = 1e-4
+"""0.1 mm: what is written."""
+ANGLE_STEP = 1.745e-4
+"""0.01 degree."""
+_SAPIEN_POSE = ("sapien.Pose", "sapien.core.Pose", "sapien.pysapien.Pose")
+_MANISKILL_POSE = ("mani_skill.utils.structs.Pose", "mani_skill.utils.structs.pose.Pose")
 
 _STILL_AT_TARGET = 3e-5
 _LEAST_DISTANCE = 0.1
@@ -31,76 +35,100 @@ _METRES = (4, 5, 6)
 Triple = tuple[float, float, float]
 
 
+def why_not_a_pose(changes: Changes, pose: Part) -> str | None:
+    """Why a pose cannot be written in the form that it has; None where it can."""
+    p, q = pose.parts.get("p"), pose.parts.get("q")
+    if pose.function == "look_at":
+        triples = [
+            pose.parts.get("eye"),
+            pose.parts.get("target"),
+            pose.parts.get("up", pose.parts.get("eye")),
+        ]
+    elif pose.function == "pose":
+        triples = [] if p is None or p.value is None else [p]
+    else:
+        return f"`{changes.short(pose.at)}` is computed when the task runs"
+    if any(part is None or not _is_vector(part, 3) for part in triples):
+        return f"`{changes.short(pose.at)}` is not a pose that can be read"
+    if q is None or q.value is None or (not q.function and _is_vector(q, 4)):
+        return None
+    angles = [q.parts.get(name) for name in ("ai", "aj", "ak")]
+    if q.function != "euler" or not all(
+        part is not None and isinstance(part.value, float) for part in angles
+    ):
+        return f"`{changes.short(q.at)}` is computed when the task runs"
+    axes = q.parts.get("axes")
+    return (
+        None if axes is None or axes.value == "sxyz" else f"`{changes.short(q.at)}` uses other axes than sxyz"
+    )
+
+
+def _is_vector(part: Part, length: int) -> bool:
+    return isinstance(part.value, tuple) and len(part.value) == len(part.numbers) == length
+
+
 def write_pose(
-    changes: Changes, project: Project, pose: PoseValue, after: CameraSettings, target: Triple | None
+    changes: Changes, project: Project, pose: Part, after: CameraSettings, target: Triple | None
 ) -> None:
     """`target` is where the camera was aimed at, if somebody has said so."""
-    if pose.form == "look_at":
-        if _look_at(changes, pose, after, target):
-            return
-        _as_quaternion(changes, project, pose, after)
+    if pose.function == "look_at":
+        if not _look_at(changes, pose, after, target):
+            _as_quaternion(changes, project, pose, after)
         return
-    _position(changes, pose, "p", after.position)
-    if rotations.angle_between(pose.quaternion, after.quaternion) <= ANGLE_STEP / 10:
+    _position(changes, pose, after.position)
+    quaternion = pose.numbers[3:]
+    if rotations.angle_between(quaternion, after.quaternion) <= ANGLE_STEP / 10:
         return
     part = pose.parts.get("q")
-    if isinstance(part, Angles) and _euler(changes, part, after):
+    if part is not None and part.function and _euler(changes, part, after):
         return
-    wanted = _same_side(after.quaternion, pose.quaternion)
-    texts = quaternion_texts(wanted)
+    texts = quaternion_texts(_same_side(after.quaternion, quaternion))
     if part is None:
         changes.added.setdefault(pose, []).append(f"q=[{', '.join(texts)}]")
-    elif isinstance(part, Vector) and part.literal:
-        for item, text in zip(part.items, texts, strict=True):
-            if isinstance(item, Number) and abs(item.value - float(text)) > 1e-7:
+    elif part.literal and part.parts:
+        for item, text in zip(part.parts.values(), texts, strict=True):
+            if abs(item.numbers[0] - float(text)) > 1e-7:
                 changes.texts[item] = text
     else:
         changes.texts[part] = f"[{', '.join(texts)}]"
 
 
-def _position(
-    changes: Changes, pose: PoseValue, name: str, wanted: Sequence[float], decimals: int = 4
-) -> None:
-    part = pose.parts.get(name)
-    if isinstance(part, Vector):
-        _vector(changes, part, wanted, decimals)
-    elif max(abs(a - b) for a, b in zip(pose.position, wanted, strict=True)) > 0.5 * 10**-decimals:
-        changes.added.setdefault(pose, []).append(f"{name}={list_text(wanted, decimals)}")
+def _position(changes: Changes, pose: Part, wanted: Sequence[float]) -> None:
+    part = pose.parts.get("p")
+    if part is not None and part.value is not None:
+        _vector(changes, part, wanted, 4)
+    elif max(abs(a - b) for a, b in zip(pose.numbers, wanted, strict=False)) > 0.5e-4:
+        if part is None:
+            changes.added.setdefault(pose, []).append(f"p={list_text(wanted, 4)}")
+        else:
+            changes.texts[part] = list_text(wanted, 4)
 
 
-def _vector(changes: Changes, vector: Vector, wanted: Sequence[float], decimals: int) -> None:
+def _vector(changes: Changes, vector: Part, wanted: Sequence[float], decimals: int) -> None:
     if vector.literal:
-        for item, number in zip(vector.items, wanted, strict=True):
-            assert isinstance(item, Number)
+        for item, number in zip(vector.parts.values(), wanted, strict=True):
             changes.number(item, number, decimals)
     elif _settled(vector, wanted, decimals) != vector.numbers:
         text = list_text(wanted, decimals)
-        code = vector.at.file.code(vector.at.node)
+        code = changes.code(vector.at)
         changes.texts[vector] = text
         changes.note(f"`{code}` became {text}: it is no longer computed")
 
 
-def _settled(vector: Vector, wanted: Sequence[float], decimals: int) -> Triple:
+def _settled(vector: Part, wanted: Sequence[float], decimals: int) -> tuple[float, ...]:
     """What `vector` will be when `wanted` has been written."""
     if vector.literal:
-        x, y, z = (
-            settled(item, number, decimals)
-            for item, number in zip(vector.items, wanted, strict=True)
-            if isinstance(item, Number)
-        )
-    else:
-        x, y, z = vector.numbers
-        if max(abs(a - b) for a, b in zip((x, y, z), wanted, strict=True)) > 0.5 * 10**-decimals:
-            x, y, z = (round(number, decimals) for number in wanted)
-    return x, y, z
+        pairs = zip(vector.parts.values(), wanted, strict=True)
+        return tuple(settled(item, number, decimals) for item, number in pairs)
+    if max(abs(a - b) for a, b in zip(vector.numbers, wanted, strict=True)) > 0.5 * 10**-decimals:
+        return tuple(round(number, decimals) for number in wanted)
+    return vector.numbers
 
 
-def _look_at(changes: Changes, pose: PoseValue, after: CameraSettings, aim: Triple | None) -> bool:
+def _look_at(changes: Changes, pose: Part, after: CameraSettings, aim: Triple | None) -> bool:
     """Write eye and target, if a look_at can say where the camera looks."""
     eye, target = pose.parts["eye"], pose.parts["target"]
-    assert isinstance(eye, Vector) and isinstance(target, Vector)
-    up_part = pose.parts.get("up")
-    up = up_part.numbers if isinstance(up_part, Vector) else (0.0, 0.0, 1.0)
+    up = pose.parts["up"].numbers if "up" in pose.parts else (0.0, 0.0, 1.0)
     forward = rotations.matrix(after.quaternion)[:, 0].tolist()
     # As close to `up` as this, 0.1 mm of the target turns the picture.
     if abs(_cosine(forward, up)) > math.cos(1e-3):
@@ -108,9 +136,7 @@ def _look_at(changes: Changes, pose: PoseValue, after: CameraSettings, aim: Trip
 
     def error(a: Sequence[float], b: Sequence[float]) -> float:
         quaternion = rotations.look_at(a, b, up)
-        if abs(sum(part * part for part in quaternion) - 1) > 1e-3:
-            return math.inf
-        return rotations.angle_between(quaternion, after.quaternion)
+        return math.inf if quaternion is None else rotations.angle_between(quaternion, after.quaternion)
 
     for point in (aim, target.numbers):
         if point is None or error(after.position, point) > _STILL_AT_TARGET:
@@ -121,7 +147,7 @@ def _look_at(changes: Changes, pose: PoseValue, after: CameraSettings, aim: Trip
                 _vector(changes, eye, after.position, decimals)
                 _vector(changes, target, point, decimals)
                 return True
-    distance = max(_LEAST_DISTANCE, math.dist(pose.position, target.numbers))
+    distance = max(_LEAST_DISTANCE, math.dist(pose.numbers[:3], target.numbers))
     for decimals in _METRES:
         from_eye = _settled(eye, after.position, decimals)
         wanted = [a + distance * b for a, b in zip(from_eye, forward, strict=True)]
@@ -145,15 +171,16 @@ def look_at_text(name: str, settings: CameraSettings, aim: Triple | None) -> str
     for target in (ahead,) if aim is None else (aim, ahead):
         for decimals in _METRES:
             eye, point = ([round(x, decimals) for x in numbers] for numbers in (settings.position, target))
-            if rotations.angle_between(rotations.look_at(eye, point), settings.quaternion) <= ANGLE_STEP:
+            made = rotations.look_at(eye, point)
+            if made is not None and rotations.angle_between(made, settings.quaternion) <= ANGLE_STEP:
                 return f"{name}(eye={list_text(eye, decimals)}, target={list_text(point, decimals)})"
     return None
 
 
-def _as_quaternion(changes: Changes, project: Project, pose: PoseValue, after: CameraSettings) -> None:
+def _as_quaternion(changes: Changes, project: Project, pose: Part, after: CameraSettings) -> None:
     """A pose in place of a look_at, with the author's own expression for where the camera stands."""
-    file, node = pose.at.file, pose.at.node
-    assert isinstance(node, cst.Call)
+    file, node = changes.find(pose.at)
+    assert isinstance(node, ast.Call)
     height = float(rotations.matrix(after.quaternion)[2, 0])
     if abs(height) > math.cos(1e-3):
         changes.note(
@@ -166,24 +193,24 @@ def _as_quaternion(changes: Changes, project: Project, pose: PoseValue, after: C
             "a quaternion"
         )
     eye = pose.parts["eye"]
-    assert isinstance(eye, Vector)
     _vector(changes, eye, after.position, 4)
     call = pose_call(changes, project, file)
     quaternion = f"[{', '.join(quaternion_texts(_same_side(after.quaternion, (1, 0, 0, 0))))}]"
-    shared = any(read.others is not None for read in pose.at.reads)
-    if len(node.args) == 2 and not shared:
+    shared = any(read.others is not None for read in pose.reads)
+    if len(node.args) + len(node.keywords) == 2 and not shared:
         # Word by word, so that what the author remarked between the arguments stays.
-        changes.replacements.append((file, Replacement(*file.span(node.func), call)))
-        for index, arg in enumerate(node.args):
-            name = ("eye", "target")[index] if arg.keyword is None else arg.keyword.value
-            if arg.keyword is not None:
-                new = "p" if name == "eye" else "q"
-                changes.replacements.append((file, Replacement(*file.span(arg.keyword), new)))
+        changes.replace(file, node.func, call)
+        for index, arg in enumerate((*node.args, *node.keywords)):
+            name = ("eye", "target")[index] if isinstance(arg, ast.expr) else arg.arg
+            if isinstance(arg, ast.keyword):
+                start = file.inner_span(arg)[0]
+                new = Replacement(start, start + len(arg.arg or ""), "p" if name == "eye" else "q")
+                changes.replacements.append((file, new))
             if name == "target":
-                changes.replacements.append((file, Replacement(*file.span(arg.value), quaternion)))
+                changes.replace(file, arg.value if isinstance(arg, ast.keyword) else arg, quaternion)
         return
-    position = changes.rendered(eye, len(pose.at.reads), file)
-    for value in (eye, *eye.items):
+    position = changes.rendered(eye, len(pose.reads), file)
+    for value in eye.walk():
         changes.texts.pop(value, None)
     changes.texts[pose] = f"{call}(p={position}, q={quaternion})"
 
@@ -192,51 +219,26 @@ def pose_call(changes: Changes, project: Project, file: SourceFile) -> str:
     """How `file` calls the class of poses. Imports sapien if it has none."""
     for name, bindings in project.bindings(file, file.module).items():
         dotted = bindings[-1].dotted
-        if dotted is None:
-            continue
-        if f"{dotted}.Pose" in SAPIEN_POSE:
+        if f"{dotted}.Pose" in _SAPIEN_POSE:
             return f"{name}.Pose"
-        if dotted in SAPIEN_POSE:
+        if dotted in _SAPIEN_POSE:
             return name
-        if dotted in MANISKILL_POSE:
+        if dotted in _MANISKILL_POSE:
             return f"{name}.create_from_pq"
-    start = import_place(file)
+    start = file.import_place()
     if not any(change.text == "import sapien\n" for _, change in changes.replacements):
         changes.replacements.append((file, Replacement(start, start, "import sapien\n")))
         changes.note("`import sapien` is added at the top of the file")
     return "sapien.Pose"
 
 
-def import_place(file: SourceFile) -> int:
-    """Where an import can be added: before the first one, after what has to come before any."""
-    place = 0
-    for index, statement in enumerate(file.module.body):
-        small = statement.body[0] if isinstance(statement, cst.SimpleStatementLine) else None
-        future = isinstance(small, cst.ImportFrom) and file.code(small.module or small) == "__future__"
-        text = isinstance(small, cst.Expr) and isinstance(
-            small.value, (cst.SimpleString, cst.ConcatenatedString)
-        )
-        if isinstance(small, (cst.Import, cst.ImportFrom)) and not future:
-            return file.line_start(file.line(statement))
-        if future or (text and index == 0):
-            end = file.inner_span(statement)[1]
-            place = (
-                file.line_start(file.line_at(end) + 1) if file.line_at(end) < file.lines else len(file.text)
-            )
-        elif index == 0:
-            # Above it may be lines that have to be the first: an interpreter's, an encoding's.
-            decorators = getattr(statement, "decorators", ())
-            place = file.line_start(file.line(decorators[0] if decorators else statement))
-    return place
-
-
-def _euler(changes: Changes, angles: Angles, after: CameraSettings) -> bool:
-    old = [item.value for item in angles.items]
-    wanted = rotations.to_euler(after.quaternion, old)
+def _euler(changes: Changes, angles: Part, after: CameraSettings) -> bool:
+    items = [angles.parts[name] for name in ("ai", "aj", "ak")]
+    wanted = rotations.to_euler(after.quaternion, [item.numbers[0] for item in items])
     for decimals in (4, 5, 6):
-        found = [settled(item, w, decimals) for item, w in zip(angles.items, wanted, strict=True)]
-        if rotations.angle_between(rotations.from_euler(*found), after.quaternion) <= ANGLE_STEP:
-            for item, w in zip(angles.items, wanted, strict=True):
+        roll, pitch, yaw = (settled(item, w, decimals) for item, w in zip(items, wanted, strict=True))
+        if rotations.angle_between(rotations.from_euler(roll, pitch, yaw), after.quaternion) <= ANGLE_STEP:
+            for item, w in zip(items, wanted, strict=True):
                 changes.number(item, w, decimals)
             return True
     return False

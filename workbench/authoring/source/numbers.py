@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from workbench.authoring.camera_source import rotations
+from workbench.authoring.source import rotations
 
 
 def number_text(value: float, decimals: int, like: str = "0.0") -> str:

@@ -1,0 +1,1 @@
+"""Values traced to where they stand in the author's files, and smallest edits of them."""

@@ -1,0 +1,295 @@
+"""Where a name gets its value, and who else reads it there, as far as the text of the author's files tells.
+
+Branches depend on what only the running task knows, so what stands in them may hold afterwards and may not. Who else
+reads a definition is asked before it is changed, and there any file that has the name counts, since too many readers
+only means that the value is written elsewhere.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+from workbench.authoring.source.text import FUNCTIONS, LOOPS, Refused, Scope, SourceFile, parsed, walk
+
+
+@dataclass(frozen=True, eq=False)
+class Binding:
+    file: SourceFile
+    name: str
+    node: ast.AST
+    """The statement or argument that binds it."""
+    value: ast.expr | None
+    """The expression of its value; None where reading does not tell it."""
+    why: str = ""
+    """What it is, where `value` is None."""
+    imported: tuple[str, str] | None = None
+    """Of an import: the module, with its leading dots, and the name in it, empty for the module itself."""
+
+    @property
+    def dotted(self) -> str:
+        """What an import binds it to; empty for anything else."""
+        return "" if self.imported is None else ".".join(filter(None, self.imported))
+
+
+class Project:
+    """The author's files, parsed as they are asked for."""
+
+    def __init__(self, texts: Mapping[str, str]) -> None:
+        self.texts = texts
+        self._bindings: dict[ast.AST, dict[str, list[Binding]]] = {}
+
+    def file(self, path: str) -> SourceFile:
+        return parsed(path, self.texts[path])
+
+    def given(self, path: str) -> SourceFile:
+        """Raises Refused for what is none of them."""
+        if path not in self.texts:
+            raise Refused(f"{path} is not one of your files")
+        return self.file(path)
+
+    def mentioning(self, word: str) -> Iterator[SourceFile]:
+        """The files in which `word` stands as a word."""
+        pattern = re.compile(rf"\b{re.escape(word)}\b")
+        for path, text in self.texts.items():
+            if pattern.search(text):
+                yield self.file(path)
+
+    def bindings(self, file: SourceFile, scope: Scope) -> dict[str, list[Binding]]:
+        """What `scope` itself binds, in the order of the text."""
+        if scope not in self._bindings:
+            found: dict[str, list[Binding]] = {}
+            for binding in _bound_in(file, scope):
+                found.setdefault(binding.name, []).append(binding)
+            self._bindings[scope] = found
+        return self._bindings[scope]
+
+    def of_name(self, file: SourceFile, node: ast.Name) -> tuple[list[Binding], Scope | None]:
+        """The bindings that may hold where `node` is read, and their scope; none for a builtin or a starred import's name."""
+        for outer in file.ancestors(node):
+            for inside in getattr(outer, "generators", ()):
+                if any(isinstance(n, ast.Name) and n.id == node.id for n in walk(inside.target)):
+                    return [
+                        Binding(file, node.id, inside.target, None, "it changes in a comprehension")
+                    ], None
+        for depth, scope in enumerate(file.scopes(node)):
+            if isinstance(scope, ast.ClassDef) and depth > 0:
+                continue
+            here = self.bindings(file, scope).get(node.id)
+            if here:
+                return reaching(file, here, node if depth == 0 else None, scope), scope
+        return [], None
+
+    # --- readers ------------------------------------------------------------------------------------
+
+    def name_readers(self, binding: Binding, file: SourceFile, read: ast.AST) -> str | None:
+        """Who reads a plain name's `binding`, other than `read` in `file`."""
+        home, name = binding.file, binding.name
+        for node in home.nodes:
+            if (
+                isinstance(node, ast.Name)
+                and node.id == name
+                and isinstance(node.ctx, ast.Load)
+                and node is not read
+            ):
+                if not _other_element(home, node, read) and read not in home.ancestors(node):
+                    if binding in self.of_name(home, node)[0]:
+                        return _where(home, node, file)
+        if binding.imported is not None or not isinstance(home.scopes(binding.node)[0], ast.Module):
+            return None
+        for other in self.mentioning(name):
+            if other is home:
+                continue
+            for node in other.nodes:
+                if node is read or _other_element(other, node, read):
+                    continue
+                named = isinstance(node, ast.Name) and node.id == name
+                named = named or (isinstance(node, ast.Attribute) and node.attr == name)
+                if named or (isinstance(node, ast.alias) and other is not file and node.name == name):
+                    return _where(other, node, file)
+        return None
+
+    def attribute_readers(self, binding: Binding, reader: SourceFile, read: ast.AST) -> str | None:
+        """Who reads an attribute of that name, other than `read`."""
+        name = binding.name
+        for file in self.mentioning(name):
+            for node in file.nodes:
+                if node is read or _other_element(file, node, read):
+                    continue
+                if isinstance(node, ast.Attribute):
+                    found = node.attr == name and not (isinstance(node.ctx, ast.Store))
+                elif isinstance(node, ast.Name):
+                    found = node.id == name and isinstance(node.ctx, ast.Load)
+                    found = found and binding in self.of_name(file, node)[0]
+                else:
+                    found = isinstance(node, ast.Constant) and node.value == name
+                if found:
+                    return _where(file, node, reader)
+        return None
+
+    def attribute_stores(self, name: str) -> list[Binding]:
+        """Everything that sets an attribute of that name, of whatever object."""
+        return [
+            _stored(file, node)
+            for file in self.mentioning(name)
+            for node in file.nodes
+            if isinstance(node, ast.Attribute) and node.attr == name and _is_set(file, node)
+        ]
+
+
+def _bound_in(file: SourceFile, scope: Scope) -> Iterator[Binding]:
+    if isinstance(scope, FUNCTIONS):
+        what = "a lambda" if isinstance(scope, ast.Lambda) else scope.name
+        for node in ast.walk(scope.args):
+            if isinstance(node, ast.arg):
+                yield Binding(file, node.arg, node, None, f"it is a parameter of {what}")
+    body = scope.body if isinstance(scope.body, list) else [scope.body]
+    waiting: list[ast.AST] = [*reversed(body)]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, ast.Name) and not isinstance(node.ctx, ast.Load):
+            yield from _bound_name(file, node)
+        elif isinstance(node, ast.Subscript) and not isinstance(node.ctx, ast.Load):
+            # NAME[0] = ...: what the name stands for is no longer what was assigned to it.
+            base = _base(node)
+            if isinstance(base, ast.Name):
+                yield Binding(file, base.id, _statement(file, node), None, "a part of it is set")
+        elif isinstance(node, (*FUNCTIONS, ast.ClassDef)) and not isinstance(node, ast.Lambda):
+            yield Binding(file, node.name, node, None, f"it is the file's own {node.name}")
+        elif isinstance(node, (ast.Import, ast.ImportFrom)):
+            yield from _imported(file, node)
+        elif isinstance(node, (ast.ExceptHandler, ast.MatchAs, ast.MatchStar)) and node.name is not None:
+            yield Binding(file, node.name, node, None, "it is computed")
+        if not isinstance(node, (*FUNCTIONS, ast.ClassDef)):
+            waiting += reversed(list(ast.iter_child_nodes(node)))
+
+
+def _bound_name(file: SourceFile, node: ast.Name) -> Iterator[Binding]:
+    if any(isinstance(outer, ast.comprehension) for outer in file.ancestors(node)):
+        return  # of the comprehension's own scope
+    statement, value = _statement(file, node), _assigned(file, node)
+    if isinstance(statement, ast.AnnAssign) and statement.value is None:
+        return
+    why = "it changes in a loop" if isinstance(statement, (ast.For, ast.AsyncFor)) else "it is computed"
+    yield Binding(file, node.id, statement, value, why)
+
+
+def _assigned(file: SourceFile, target: ast.AST) -> ast.expr | None:
+    """The expression that a target gets, where it can be told."""
+    outer = file.parents[target]
+    if isinstance(outer, (ast.Assign, ast.AnnAssign, ast.NamedExpr)):
+        return outer.value
+    if isinstance(outer, (ast.Tuple, ast.List)):
+        value = _assigned(file, outer)
+        given = value.elts if isinstance(value, (ast.Tuple, ast.List)) else []
+        if len(given) == len(outer.elts) and not any(
+            isinstance(e, ast.Starred) for e in (*given, *outer.elts)
+        ):
+            return next(v for t, v in zip(outer.elts, given, strict=True) if t is target)
+    return None
+
+
+def _statement(file: SourceFile, node: ast.AST) -> ast.AST:
+    return next(outer for outer in file.ancestors(node) if isinstance(outer, (ast.stmt, ast.NamedExpr)))
+
+
+def _imported(file: SourceFile, node: ast.Import | ast.ImportFrom) -> Iterator[Binding]:
+    for alias in node.names:
+        if isinstance(node, ast.ImportFrom):
+            imported = ("." * node.level + (node.module or ""), alias.name)
+        else:
+            imported = (alias.name if alias.asname else alias.name.partition(".")[0], "")
+        bound = alias.asname or (imported[1] or imported[0])
+        yield Binding(
+            file, bound, node, None, f"it is imported: {'.'.join(filter(None, imported))}", imported
+        )
+
+
+def _base(node: ast.expr) -> ast.expr:
+    while isinstance(node, ast.Subscript):
+        node = node.value
+    return node
+
+
+def _is_set(file: SourceFile, node: ast.Attribute) -> bool:
+    outer: ast.AST = node
+    while isinstance(file.parents[outer], ast.Subscript) and file.parents[outer].value is outer:  # type: ignore[attr-defined]
+        outer = file.parents[outer]
+    return not isinstance(outer.ctx, ast.Load)  # type: ignore[attr-defined]
+
+
+def _stored(file: SourceFile, node: ast.Attribute) -> Binding:
+    outer, value = file.parents[node], None
+    looped = any(isinstance(o, (ast.For, ast.While, ast.If)) for o in file.ancestors(node))
+    if isinstance(outer, (ast.Assign, ast.AnnAssign)) and file.code(node.value) == "self" and not looped:
+        value = outer.value
+    return Binding(file, node.attr, _statement(file, node), value, "it is set")
+
+
+def reaching(file: SourceFile, bindings: list[Binding], use: ast.AST | None, scope: Scope) -> list[Binding]:
+    """Those of one name's `bindings` that may hold at `use`; at the end of their scope for None."""
+    found: list[Binding] = []
+    around = [scope] if use is None else list(file.ancestors(use))
+    for binding in bindings:
+        if use is not None and file.inner_span(binding.node)[0] >= file.inner_span(use)[0]:
+            if any(isinstance(o, LOOPS) and o in around for o in file.ancestors(binding.node)):
+                found.append(Binding(file, binding.name, binding.node, None, "it changes in a loop"))
+            continue
+        if isinstance(binding.node, (ast.Assign, ast.AnnAssign, ast.AugAssign, ast.NamedExpr)):
+            if binding.node in around:
+                continue  # the right-hand side of its own assignment
+        if use is not None and _exclusive(file, binding.node, use):
+            continue
+        # What holds for certain hides what was there before.
+        certain = isinstance(binding.node, ast.arg) or _block(file, binding.node) in _blocks(file, use, scope)
+        found = [binding] if certain else [*found, binding]
+    return found
+
+
+def _block(file: SourceFile, node: ast.AST) -> tuple[ast.AST, str]:
+    """The statement, and the part of it, whose list of statements `node` is in."""
+    inner = node
+    for outer in file.ancestors(node):
+        for part in ("body", "orelse", "finalbody"):
+            held = getattr(outer, part, None)
+            if isinstance(held, list) and inner in held:
+                return outer, part
+        inner = outer
+    return file.module, "body"
+
+
+def _blocks(file: SourceFile, use: ast.AST | None, scope: Scope) -> list[tuple[ast.AST, str]]:
+    if use is None:
+        return [(scope, "body")]
+    return [_block(file, node) for node in (use, *file.ancestors(use))]
+
+
+def _exclusive(file: SourceFile, a: ast.AST, b: ast.AST) -> bool:
+    """True if they are in two branches of one ``if``."""
+    above = dict(_blocks(file, a, file.module))
+    return any(
+        isinstance(outer, ast.If) and above.get(outer, part) != part
+        for outer, part in _blocks(file, b, file.module)
+    )
+
+
+def _other_element(file: SourceFile, node: ast.AST, mine: ast.AST) -> bool:
+    """True for ``CAMERA["fov"]`` where mine is the name in ``CAMERA["eye"]``."""
+    keys = []
+    for name in (node, mine):
+        outer = file.parents.get(name)
+        if (
+            not isinstance(outer, ast.Subscript)
+            or outer.value is not name
+            or not isinstance(outer.slice, ast.Constant)
+        ):
+            return False
+        keys.append(outer.slice.value)
+    return keys[0] != keys[1]
+
+
+def _where(file: SourceFile, node: ast.AST, reader: SourceFile) -> str:
+    line = f"line {file.line(node)}"
+    return line if file is reader else f"{file.name}, {line}"

@@ -1,0 +1,464 @@
+"""Where the values that a running call was given stand in the author's files.
+
+The frame that makes the call knows every name's value, and its code the call's exact place. A name is followed to the
+assignment that it has its value from, by the text alone where only one can hold, else to the one whose value is the
+running one. What is not understood is said to be unknown, with the reason; that is the answer wherever there is doubt,
+since on it rests whether a line of somebody's file is changed.
+"""
+
+from __future__ import annotations
+
+import ast
+import copy
+import importlib.util
+import math
+import operator
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import islice
+from types import FrameType, ModuleType, SimpleNamespace
+from typing import Any
+
+from workbench.authoring.source.library import Known, known_functions, plain
+from workbench.authoring.source.names import Binding, Project, reaching
+from workbench.authoring.source.text import FUNCTIONS, Scope, SourceFile, arguments, is_starred
+from workbench.authoring.source.trace import Part, Place, Plain, Read, Trace
+
+DEGREE = math.pi / 180
+_DEPTH = 40
+"""Names defined by names: beyond this they go in a circle."""
+_TESTS = (
+    ast.Name,
+    ast.Attribute,
+    ast.Constant,
+    ast.Compare,
+    ast.cmpop,
+    ast.BoolOp,
+    ast.boolop,
+    ast.UnaryOp,
+    ast.Not,
+)
+_TESTS += (ast.expr_context,)
+_READ = (ast.Name, ast.Attribute, ast.Subscript)
+Reads = tuple[Read, ...]
+
+
+class Unknown(Exception):
+    """It is not understood; the reason is for the author."""
+
+
+def trace_call(
+    project: Project, frame: FrameType, parameters: Sequence[str], values: Mapping[str, Any]
+) -> Trace | None:
+    """The call that `frame` is making.
+
+    Args:
+        parameters: of what is called, in their order.
+        values: what it came to have, by parameter, of those that are wanted.
+
+    Returns:
+        None where the call stands in none of the project's files.
+    """
+    code = frame.f_code
+    place = next(islice(code.co_positions(), frame.f_lasti // 2, None), (None,) * 4)
+    if code.co_filename not in project.texts or None in place:
+        return None
+    file = project.file(code.co_filename)
+    line, end_line, column, end_column = place
+    call = file.at(line, end_line, column, end_column)  # type: ignore[arg-type]
+    if not isinstance(call, ast.Call):
+        return None
+    reader = ValueReader(project, file, call, frame)
+    parts: dict[str, Part] = {}
+    unknown: dict[str, str] = {}
+    given, starred = arguments(call, parameters), is_starred(call)
+    for name, value in values.items():
+        if name not in given:
+            if starred:
+                unknown[name] = f"`{name}` is given by * or **"
+            continue
+        try:
+            parts[name] = part = reader.part(file, given[name])
+            if not _same(part.value, plain(value)):
+                raise reader.computed(file, given[name])
+        except Unknown as exc:
+            parts.pop(name, None)
+            unknown[name] = str(exc)
+    return Trace(Place(file.path, *file.inner_span(call)), file.qualname(call), parts, unknown)
+
+
+def _same(a: Plain, b: Plain) -> bool:
+    """But for what single precision takes away."""
+    if isinstance(a, tuple) and isinstance(b, tuple):
+        return len(a) == len(b) and all(_same(x, y) for x, y in zip(a, b, strict=True))
+    if isinstance(a, float) and isinstance(b, float):
+        return math.isclose(a, b, rel_tol=1e-5, abs_tol=1e-6)
+    return a == b
+
+
+class ValueReader:
+    """Follows the arguments of one call while its frame stands."""
+
+    def __init__(self, project: Project, file: SourceFile, call: ast.expr, frame: FrameType) -> None:
+        self._project, self._frame = project, frame
+        self._around = file.scopes(call)
+
+    def computed(self, file: SourceFile, node: ast.AST) -> Unknown:
+        return Unknown(f"`{file.short(node)}` is computed when the task runs")
+
+    def part(self, file: SourceFile, node: ast.expr, reads: Reads = ()) -> Part:
+        """What an expression is made of. Raises Unknown."""
+        if len(reads) > _DEPTH:
+            raise Unknown(f"`{file.code(node)}` is defined by itself")
+        if isinstance(node, ast.IfExp):
+            return self.part(file, node.body if self._test(file, node.test) else node.orelse, reads)
+        if isinstance(node, _READ) and not self._is_a_librarys(file, node):
+            where, value, others = self._followed(file, node)
+            return self.part(where, value, (*reads, Read(Place(file.path, *file.inner_span(node)), others)))
+        place = Place(file.path, *file.inner_span(node))
+        if isinstance(node, ast.Call):
+            return self._call(file, node, place, reads)
+        self._check(file, node)
+        value = self._value(file, node)
+        if isinstance(node, (ast.List, ast.Tuple)):
+            parts = {str(i): self.part(file, item, reads) for i, item in enumerate(node.elts)}
+            return Part(place, reads, value, parts=parts, literal=True)
+        if _is_number(node) or not isinstance(value, float):
+            return Part(place, reads, value, literal=_is_number(node))
+        return self._with_a_number_in_it(file, node, Part(place, reads, value))
+
+    # --- values -------------------------------------------------------------------------------------
+
+    def _value(self, file: SourceFile, node: ast.expr) -> Plain:
+        """What an expression that is allowed is worth."""
+        try:
+            return plain(self._run(file, node))
+        except Exception as exc:  # whatever the author's classes raise
+            raise self.computed(file, node) from exc
+
+    def _run(self, file: SourceFile, node: ast.expr, at: ast.AST | None = None) -> Any:
+        names, own = self._namespace(file, file.scopes(node if at is None else at)[0])
+        return eval(compile(ast.Expression(node), file.path, "eval"), names, own)
+
+    def _namespace(self, file: SourceFile, scope: Scope) -> tuple[dict[str, Any], Mapping[str, Any]]:
+        """Globals and locals of code in a scope, as they are now."""
+        running = self._frame
+        names = running.f_globals if file.path == running.f_code.co_filename else vars(_module(file.path))
+        if scope in self._around and isinstance(scope, FUNCTIONS):
+            return names, running.f_locals
+        if isinstance(scope, ast.ClassDef):
+            return names, vars(operator.attrgetter(file.qualname(scope))(SimpleNamespace(**names)))
+        # Another method of the same object, such as its constructor.
+        return names, {name: running.f_locals[name] for name in ("self", "cls") if name in running.f_locals}
+
+    def _check(self, file: SourceFile, node: ast.AST) -> None:
+        """Raises Unknown for what is more than numbers, names that can be followed, and known functions."""
+        if isinstance(node, _READ):
+            if not self._is_a_librarys(file, node):
+                self.part(file, node)
+        elif isinstance(node, ast.Call):
+            self._known(file, node)
+            for given in (*node.args, *(keyword.value for keyword in node.keywords)):
+                self._check(file, given)
+        elif isinstance(node, (ast.List, ast.Tuple, ast.BinOp)) or (
+            isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.USub, ast.UAdd))
+        ):
+            for child in ast.iter_child_nodes(node):
+                if isinstance(child, ast.expr):
+                    self._check(file, child)
+        elif not isinstance(node, ast.Constant) or isinstance(node.value, (bytes, bool)):
+            raise self.computed(file, node)
+
+    def _test(self, file: SourceFile, node: ast.expr) -> bool:
+        """Which way a choice went."""
+        if not all(isinstance(inner, _TESTS) for inner in ast.walk(node)):
+            raise self.computed(file, node)
+        try:
+            return bool(self._run(file, node))
+        except Exception as exc:  # whatever the author's classes raise
+            raise self.computed(file, node) from exc
+
+    def _with_a_number_in_it(self, file: SourceFile, node: ast.expr, whole: Part) -> Part:
+        """With the number of the expression that is best changed, if there is one.
+
+        That is the 60 of ``60 * np.pi / 180`` and the 0.2 of ``HEIGHT + 0.2``, which goes on following HEIGHT.
+        """
+        leaves = list(_leaves(node))
+        named = any(not _is_number(leaf) and not self._is_a_librarys(file, leaf) for leaf in leaves)
+        best: tuple[bool, ast.expr, float, float] | None = None
+        for leaf in leaves:
+            if self._is_a_librarys(file, leaf):
+                continue
+            at = self._value(file, leaf)
+            literal = _is_number(leaf)
+            if not isinstance(at, float):
+                continue
+            values = [self._with(file, node, leaf, at + step) for step in (0.0, 1.0, 2.0)]
+            slope, further = values[1] - values[0], values[2] - values[1]
+            offset = values[0] - slope * at
+            of_degrees = math.isclose(slope, DEGREE, rel_tol=1e-9)
+            added = literal and named and math.isclose(abs(slope), 1.0, rel_tol=1e-9)
+            if math.isclose(slope, further, rel_tol=1e-6) and (of_degrees or added):
+                if best is None or literal >= best[0]:
+                    best = literal, leaf, DEGREE if of_degrees else float(round(slope)), offset
+        if best is None:
+            return whole
+        _, leaf, slope, offset = best
+        parts = {"of": self.part(file, leaf, whole.reads)}
+        return Part(whole.at, whole.reads, whole.value, parts=parts, slope=slope, offset=offset)
+
+    def _with(self, file: SourceFile, node: ast.expr, leaf: ast.expr, value: float) -> float:
+        """What the expression is with another number in place of `leaf`."""
+        found = plain(self._run(file, _put(node, leaf, value), node))
+        return found if isinstance(found, float) else math.nan
+
+    # --- calls --------------------------------------------------------------------------------------
+
+    def _known(self, file: SourceFile, node: ast.Call) -> Known:
+        """The function that it calls; Raises Unknown for any that is not known, and for arguments by ``*``."""
+        if not is_starred(node) and all(
+            isinstance(n, (ast.Name, ast.Attribute, ast.Load)) for n in ast.walk(node.func)
+        ):
+            try:
+                found = known_functions().get(self._run(file, node.func))
+            except Exception as exc:  # whatever the author's classes raise
+                raise self.computed(file, node) from exc
+            if found is not None:
+                return found
+        raise self.computed(file, node)
+
+    def _call(self, file: SourceFile, node: ast.Call, place: Place, reads: Reads) -> Part:
+        known = self._known(file, node)
+        if known.same and (node.args or node.keywords):
+            inner = self.part(file, node.args[0] if node.args else node.keywords[0].value, reads)
+            if inner.function or isinstance(inner.value, float) or (inner.literal and inner.reads == reads):
+                return inner  # what is within is changed, and the call around it stays
+            return Part(place, reads, inner.value, parts=inner.parts, literal=inner.literal)
+        if not known.parameters:
+            self._check(file, node)
+            return self._with_a_number_in_it(file, node, Part(place, reads, self._value(file, node)))
+        given = arguments(node, known.parameters)
+        if len(given) != len(node.args) + len(node.keywords) or not set(given) <= set(known.parameters):
+            raise self.computed(file, node)
+        given.pop("device", None)
+        parts = {name: self.part(file, value, reads) for name, value in given.items()}
+        return Part(place, reads, self._value(file, node), known.name, parts)
+
+    # --- names --------------------------------------------------------------------------------------
+
+    def _is_a_librarys(self, file: SourceFile, node: ast.AST) -> bool:
+        """True for ``np.pi``, and for ``pi`` that was imported."""
+        if isinstance(node, ast.Attribute):
+            owner = self._object(file, node.value)
+            return (
+                isinstance(owner, ModuleType) and getattr(owner, "__file__", None) not in self._project.texts
+            )
+        if not isinstance(node, ast.Name):
+            return False
+        found, _ = self._project.of_name(file, node)
+        if not found:  # by ``from x import *``
+            return node.id in self._namespace(file, file.module)[0]
+        imported = [b for b in found if b.imported is not None and b.imported[1]]
+        return (
+            bool(imported) and len(imported) == len(found) and all(self._beside(b) is None for b in imported)
+        )
+
+    def _object(self, file: SourceFile, node: ast.expr) -> Any:
+        """What a name or a module's attribute means now; None for anything else."""
+        if isinstance(node, ast.Attribute):
+            owner = self._object(file, node.value)
+            return vars(owner).get(node.attr) if isinstance(owner, ModuleType) else None
+        try:
+            return self._run(file, node) if isinstance(node, ast.Name) else None
+        except (NameError, AttributeError):  # of a class that is not there yet
+            return None
+
+    def _beside(self, binding: Binding) -> SourceFile | None:
+        """The author's file that an import is from."""
+        assert binding.imported is not None
+        names = self._namespace(binding.file, binding.file.module)[0]
+        try:
+            name = importlib.util.resolve_name(binding.imported[0], names.get("__package__") or "")
+        except ImportError:
+            return None
+        path = str(getattr(sys.modules.get(name), "__file__", None))
+        return self._project.file(path) if path in self._project.texts else None
+
+    def _followed(self, file: SourceFile, node: ast.expr) -> tuple[SourceFile, ast.expr, str | None]:
+        """The expression that a name stands for, and who else reads it there. Raises Unknown."""
+        project = self._project
+        if isinstance(node, ast.Subscript):
+            return self._element(file, node)
+        if isinstance(node, ast.Name):
+            bindings, scope = project.of_name(file, node)
+            names, own = self._namespace(file, scope or file.module)
+            return self._bound(
+                file,
+                node,
+                bindings,
+                project.name_readers,
+                lambda: own[node.id] if node.id in own else names[node.id],
+            )
+        assert isinstance(node, ast.Attribute)
+        owner = self._object(file, node.value)
+        if isinstance(owner, ModuleType):
+            beside = project.file(owner.__file__ or "")
+            inside = project.bindings(beside, beside.module).get(node.attr, [])
+            return self._bound(file, node, inside, project.name_readers, lambda: vars(owner)[node.attr])
+        bindings = self._of_attribute(file, node)
+        return self._bound(file, node, bindings, project.attribute_readers, lambda: self._run(file, node))
+
+    def _bound(
+        self,
+        file: SourceFile,
+        node: ast.expr,
+        bindings: Sequence[Binding],
+        readers: Callable[[Binding, SourceFile, ast.AST], str | None],
+        now: Callable[[], Any],
+    ) -> tuple[SourceFile, ast.expr, str | None]:
+        code = file.code(node)
+        if not bindings:
+            raise Unknown(f"where `{code}` gets its value cannot be read in the file")
+        binding = bindings[0] if len(bindings) == 1 else self._of_this_run(file, node, bindings, now)
+        if binding.imported is not None:
+            beside = self._beside(binding) if binding.imported[1] else None
+            inside = (
+                []
+                if beside is None
+                else self._project.bindings(beside, beside.module).get(binding.imported[1], [])
+            )
+            if not inside:
+                raise Unknown(f"`{code}` comes from {binding.dotted}, which is not one of your files")
+            others = readers(binding, file, node)
+            where, value, more = self._bound(file, node, inside, self._project.name_readers, now)
+            return where, value, others or more
+        if binding.value is None:
+            home = "the file" if binding.file is file else binding.file.name
+            raise Unknown(f"`{code}` cannot be read in {home}: {binding.why}")
+        others = readers(binding, file, node)
+        if isinstance(binding.node, ast.Assign) and len(binding.node.targets) > 1:
+            others = others or f"line {binding.file.line(binding.node)} gives it to several names"
+        return binding.file, binding.value, others
+
+    def _of_this_run(
+        self, file: SourceFile, node: ast.expr, bindings: Sequence[Binding], now: Callable[[], Any]
+    ) -> Binding:
+        """Of several the one whose value is the running one."""
+        fitting = []
+        for binding in bindings:
+            try:
+                if binding.value is not None and _same(
+                    self.part(binding.file, binding.value).value, plain(now())
+                ):
+                    fitting.append(binding)
+            except (Unknown, LookupError, AttributeError, ValueError):
+                continue  # of that one nothing can be said, so it is not the one
+        if len(fitting) == 1:
+            return fitting[0]
+        lines = " and ".join(str(b.file.line(b.node)) for b in fitting or bindings)
+        why = (
+            "the same values, and which of them holds cannot be told"
+            if fitting
+            else "other values than it has"
+        )
+        raise Unknown(f"`{file.code(node)}` is given {why} in lines {lines}")
+
+    def _of_attribute(self, file: SourceFile, node: ast.Attribute) -> list[Binding]:
+        """The bindings of ``self.NAME``, ``cls.NAME`` or ``Class.NAME``."""
+        try:
+            owner = self._run(file, node.value)
+        except Exception as exc:  # whatever the author's classes raise
+            raise self.computed(file, node) from exc
+        stores = self._project.attribute_stores(node.attr)
+        own: list[Binding] = []
+        for cls in (owner if isinstance(owner, type) else type(owner)).__mro__:
+            if node.attr in vars(cls):
+                own = self._in_class(cls, node.attr)
+                break
+        if not stores:
+            return own
+        if len(stores) == 1 and not own:
+            return stores
+        first = stores[0]
+        why = f"it is set again at line {first.file.line(first.node)}"
+        return [Binding(first.file, node.attr, first.node, None, why)]
+
+    def _in_class(self, cls: type, name: str) -> list[Binding]:
+        path = str(getattr(sys.modules.get(cls.__module__), "__file__", None))
+        if path not in self._project.texts:
+            return []
+        file = self._project.file(path)
+        for node in file.nodes:
+            if isinstance(node, ast.ClassDef) and file.qualname(node) == cls.__qualname__:
+                return reaching(file, self._project.bindings(file, node).get(name, []), None, node)
+        return []
+
+    def _element(self, file: SourceFile, node: ast.Subscript) -> tuple[SourceFile, ast.expr, str | None]:
+        code = file.short(node)
+        try:
+            key = self.part(file, node.slice).value
+        except Unknown as exc:
+            raise Unknown(f"`{code}` depends on what only the running task knows") from exc
+        where, base, others = file, node.value, None
+        for _ in range(_DEPTH):
+            if not isinstance(base, _READ):
+                break
+            where, base, more = self._followed(where, base)
+            others = others or more
+        found = _entry(where, base, key)
+        if found is None:
+            raise Unknown(f"`{code}` is computed when the task runs")
+        return where, found, others
+
+
+def _entry(file: SourceFile, base: ast.expr, key: Plain) -> ast.expr | None:
+    """The element of a list, a dict or a ``dict(...)`` as it is written."""
+    if isinstance(base, (ast.List, ast.Tuple)) and isinstance(key, float) and key == int(key):
+        if -len(base.elts) <= key < len(base.elts) and not any(isinstance(e, ast.Starred) for e in base.elts):
+            return base.elts[int(key)]
+    entries: list[tuple[ast.expr | None, ast.expr]] = []
+    if isinstance(base, ast.Dict):
+        entries = list(zip(base.keys, base.values, strict=True))
+    elif isinstance(base, ast.Call) and file.code(base.func) == "dict":
+        entries = [(k.arg and ast.Constant(k.arg), k.value) for k in base.keywords]  # type: ignore[misc]
+    if any(name is None for name, _ in entries):
+        return None
+    return next((v for name, v in entries if isinstance(name, ast.Constant) and name.value == key), None)
+
+
+def _is_number(node: ast.AST) -> bool:
+    """Written as nothing but a number, perhaps with a sign."""
+    if isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.USub, ast.UAdd)):
+        node = node.operand
+    return isinstance(node, ast.Constant) and type(node.value) in (int, float)
+
+
+def _leaves(node: ast.AST) -> Iterator[ast.expr]:
+    """The numbers and names that an expression is made of."""
+    if _is_number(node) or isinstance(node, _READ):
+        assert isinstance(node, ast.expr)
+        yield node
+        return
+    inside = [*node.args, *node.keywords] if isinstance(node, ast.Call) else ast.iter_child_nodes(node)
+    for child in inside:
+        yield from _leaves(child)
+
+
+def _put(node: ast.AST, leaf: ast.AST, value: float) -> Any:
+    """A copy with a number in place of `leaf`."""
+    if node is leaf:
+        return ast.copy_location(ast.Constant(value), node)
+    made = copy.copy(node)
+    for name, held in ast.iter_fields(node):
+        if isinstance(held, ast.AST):
+            setattr(made, name, _put(held, leaf, value))
+        elif isinstance(held, list):
+            setattr(made, name, [_put(h, leaf, value) if isinstance(h, ast.AST) else h for h in held])
+    return made
+
+
+def _module(path: str) -> ModuleType:
+    for module in list(sys.modules.values()):
+        if getattr(module, "__dict__", {}).get("__file__") == path:
+            return module
+    raise LookupError(f"{path} was not imported")
