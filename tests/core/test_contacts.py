@@ -18,8 +18,8 @@ from mani_skill.utils.structs.pose import Pose
 
 from tests.core.by_hand import box
 from tests.core.single_env_judge import Bare, batch_of, put_in_same_state, single
-from workbench.core.body_table import build_body_table
 from workbench.core.contact_list import Contact, list_contacts
+from workbench.core.scene_index import scene_index
 from workbench.core.task_env import TaskEnv
 
 pytestmark = pytest.mark.thorough
@@ -199,10 +199,9 @@ def test_the_list_is_that_of_a_stock_env(piles: tuple[Any, list[Any]]) -> None:
 
 def test_forces_in_the_list_hold_up_what_lies_there(piles: tuple[Any, list[Any]]) -> None:
     batch, _ = piles
-    table = build_body_table(batch)
     for env in range(N):
         up = {"floor": 0.0, "low": 0.0, "high": 0.0}
-        for contact in list_contacts(batch, env, table):
+        for contact in list_contacts(batch, env):
             first, second = contact.bodies
             up[first] += float(contact.force[2])
             up[second] -= float(contact.force[2])
@@ -217,7 +216,7 @@ def test_forces_in_the_list_hold_up_what_lies_there(piles: tuple[Any, list[Any]]
         assert up["floor"] == pytest.approx(-weight["low"] - weight["high"], rel=0.02)
 
 
-def test_a_robots_links_are_named_as_in_the_body_table() -> None:
+def test_a_robots_links_are_named_as_in_the_scenes_index() -> None:
     batch, stocks = prepared("StackCube-v1", in_the_hand(lambda env: env.cubeA))
     for _ in range(4):
         batch.step(np.tile(GRASP, (N, 1)))
@@ -227,7 +226,7 @@ def test_a_robots_links_are_named_as_in_the_body_table() -> None:
     for our, their in zip(ours, theirs):
         assert equal(our, their), (our, their)
     names = {name for contact in ours for name in contact.bodies}
-    assert names <= set(build_body_table(batch).names)
+    assert names <= set(scene_index(batch).names)
     assert {"cubeA", *(f"panda_wristcam/panda_{side}finger" for side in ("left", "right"))} <= names
     for env in (batch, *stocks):
         env.close()
@@ -248,13 +247,11 @@ def test_nothing_touches_before_the_first_step_in_the_air(piles: tuple[Any, list
     env.close()
 
 
-def test_a_wrong_env_and_an_old_table_are_refused(piles: tuple[Any, list[Any]]) -> None:
-    batch, stocks = piles
+def test_a_wrong_env_is_refused(piles: tuple[Any, list[Any]]) -> None:
+    batch, _ = piles
     for env in (-1, N):
         with pytest.raises(IndexError, match="out of range for 3 envs"):
             list_contacts(batch, env)
-    with pytest.raises(ValueError, match="rebuilt"):
-        list_contacts(batch, 0, build_body_table(stocks[0]))
 
 
 def test_a_running_task_tells_its_contacts(piles: tuple[Any, list[Any]]) -> None:

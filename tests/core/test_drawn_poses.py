@@ -19,7 +19,7 @@ from mani_skill.utils.structs.pose import Pose
 
 import workbench
 from tests.core.drawn_envs import batched
-from workbench.core.body_table import build_body_table, read_poses
+from workbench.core.scene_index import read_poses, scene_index
 from workbench.core.step_pictures import observed_pictures
 from workbench.core.take_pictures import take_pictures
 from workbench.core.task_env import TaskEnv
@@ -123,9 +123,8 @@ def test_what_the_page_draws_of_it_agrees(hiding: Any) -> None:
     """Its pictures, its 3-D scene and what it says of a camera."""
     obs, _ = hiding.reset(seed=3)
     people = hiding.render_rgb_array()
-    table = build_body_table(hiding)
-    poses = read_poses(hiding, table)
-    assert (poses[:, table.names.index("cube"), 2] > AWAY / 2).tolist() == [False, True]
+    poses = read_poses(hiding)
+    assert (poses[:, scene_index(hiding).names.index("cube"), 2] > AWAY / 2).tolist() == [False, True]
     for e, (sensor, on_cube) in enumerate(drawn(hiding, SENSOR, ON_CUBE)):
         for picture in (sensor, on_cube):
             data = obs["sensor_data"][picture.camera]
@@ -134,7 +133,7 @@ def test_what_the_page_draws_of_it_agrees(hiding: Any) -> None:
         assert (on_cube.pose[2] > AWAY / 2) == (e == 1)
         (human,) = take_pictures(hiding, e, [HUMAN])
         np.testing.assert_array_equal(human.rgb, people[e])
-    report = judge_camera(hiding, ("sensor", "base_camera"), range(N), table=table)
+    report = judge_camera(hiding, ("sensor", "base_camera"), range(N))
     cube = next(seen for seen in report.objects if seen.name == "cube")
     assert (cube.pixels > 0).tolist() == [True, False]
     seen = observed_pictures(_task(hiding, obs), [ON_CUBE])
@@ -221,7 +220,7 @@ def write_nan(env: Any) -> None:
 def test_bodies_are_drawn_where_the_tensors_have_them(change: Callable[[Any], None], pushing: Any) -> None:
     before = drawn(pushing, SENSOR)
     change(pushing)
-    poses = read_poses(pushing, build_body_table(pushing))
+    poses = read_poses(pushing)
     packs = pushing.scene.px.packs()
     observed = pushing.get_obs({})["sensor_data"]["base_camera"]
     for e, (picture,) in enumerate(drawn(pushing, SENSOR)):
@@ -238,7 +237,7 @@ def test_bodies_are_drawn_where_the_tensors_have_them(change: Callable[[Any], No
     pushing.scene.px.drop_writes()
     pushing.scene._gpu_fetch_all()
     after = drawn(pushing, SENSOR)
-    poses = read_poses(pushing, build_body_table(pushing))
+    poses = read_poses(pushing)
     for e in range(N):
         (wanted,) = take_pictures(pushing, e, [SENSOR], poses[e])
         np.testing.assert_array_equal(after[e][0].segmentation, wanted.segmentation)

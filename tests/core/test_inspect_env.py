@@ -18,6 +18,7 @@ from tests.drive.envs import PICK_CUBE, batched
 from workbench.core import actions, seams
 from workbench.core.inspect_env import MOST_VALUES, inspect_env
 from workbench.core.inspection import SECTIONS, Inspection
+from workbench.core.scene_index import scene_index
 from workbench.core.task_env import TaskEnv
 
 
@@ -71,8 +72,7 @@ def test_contacts_add_up_to_those_of_sapien(pick: TaskEnv) -> None:
     for env in range(3):
         own: dict[frozenset[str], np.ndarray] = {}
         for contact in seams.batched_system(pick.env.scene).systems[env].get_contacts():
-            names = [pick.table.slot_of[id(body.entity)] % len(pick.table.names) for body in contact.bodies]
-            first, second = (pick.table.names[name] for name in names)
+            first, second = (str(scene_index(pick.env).name_of(body)) for body in contact.bodies)
             impulse = sum((np.array(point.impulse) for point in contact.points), np.zeros(3))
             sign = 1 if first <= second else -1
             pair = frozenset((first, second))

@@ -16,7 +16,7 @@ from mani_skill.utils.structs.pose import Pose
 
 from tests.core.single_env_judge import batch_of, put_in_same_state, single
 from tests.core.watched import RENDERED, Watched, pictures
-from workbench.core.body_table import build_body_table, read_poses
+from workbench.core.scene_index import read_poses
 from workbench.core.take_pictures import take_pictures
 
 N = 3
@@ -115,8 +115,7 @@ def test_a_moment_of_the_past_is_drawn_from_poses_and_nothing_moves(env: Any) ->
         (name, "sensor", ("rgb", "depth", "segmentation")) for name in ("on_link", "on_actor", "beside")
     ]
     env.reset(seed=[0, 1, 2])
-    table = build_body_table(env)
-    then_poses = read_poses(env, table)[1]
+    then_poses = read_poses(env)[1]
     then = take_pictures(env, 1, requests)
     for _ in range(6):
         env.step(None)
@@ -124,10 +123,10 @@ def test_a_moment_of_the_past_is_drawn_from_poses_and_nothing_moves(env: Any) ->
     pose[:, 1] += 0.4
     env.rider.set_pose(Pose.create(pose))
     env.apply()
-    now_poses = read_poses(env, table)
+    now_poses = read_poses(env)
     now = take_pictures(env, 1, requests)
     drawn = take_pictures(env, 1, requests, then_poses)
-    assert np.array_equal(read_poses(env, table), now_poses, equal_nan=True)
+    assert np.array_equal(read_poses(env), now_poses, equal_nan=True)
     for was, again, other in zip(then, drawn, now, strict=True):
         np.testing.assert_allclose(again.pose, was.pose, atol=1e-5)
         # A pose that was taken apart and put together again may move an edge by a pixel.

@@ -14,9 +14,9 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.structs import Pose
 
 from tests.core.drawn_envs import batched, stock
-from workbench.core.body_table import build_body_table
 from workbench.core.pictures import Picture
 from workbench.core.render_device import keep_render_device
+from workbench.core.scene_index import scene_index
 from workbench.core.take_pictures import list_cameras, segmentation_names, take_pictures
 
 pytestmark = pytest.mark.usefixtures("renderer")
@@ -137,8 +137,7 @@ def test_only_what_is_asked_for_is_given() -> None:
 def test_cameras_are_described_and_stand_where_maniskill_says() -> None:
     env = batched("PegInsertionSide-v1")
     act(env)
-    table = build_body_table(env)
-    info = {c.name: c for c in list_cameras(env, table)}
+    info = {c.name: c for c in list_cameras(env)}
     assert set(info) == {"base_camera", "hand_camera", "render_camera"}
     assert info["hand_camera"].mount == "panda_wristcam/camera_link" and info["base_camera"].mount is None
     assert info["render_camera"].kind == "human" and set(ALL) <= set(info["base_camera"].modalities)
@@ -190,10 +189,10 @@ def test_depth_is_metres_also_where_maniskills_own_ends(shader: str) -> None:
 
 def test_envs_that_are_built_alike_share_their_segmentation() -> None:
     env = batched("PegInsertionSide-v1", num_envs=3)
-    table = build_body_table(env)
-    whole = segmentation_names(env, table)
-    assert set(whole.values()) == set(table.names)
-    assert all(segmentation_names(env, table, e) == whole for e in range(3))
+    names = segmentation_names(env)
+    assert set(names.values()) == set(scene_index(env).names)
+    ids = [[entity.per_scene_id for entity in row] for row in scene_index(env).entities]
+    assert ids[0] == ids[1] == ids[2]
     env.close()
 
 

@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from tests.core.drawn_envs import batched, stock
-from workbench.core.body_table import build_body_table, read_poses
 from workbench.core.geometry import SceneGeometry, Visual
-from workbench.core.scene_geometry import Detail, read_geometry
+from workbench.core.scene_geometry import read_geometry
+from workbench.core.scene_index import read_poses, scene_index
 from workbench.core.take_pictures import list_cameras, segmentation_names, take_pictures
 
 pytestmark = pytest.mark.usefixtures("renderer")
 
-EVERYTHING = Detail(max_faces_per_visual=None, max_texture_size=None)
+EVERYTHING: dict[str, int] = {"max_faces": 10**9, "max_texels": 10**9}
 
 
 # --- what it looks like ----------------------------------------------------------------------------
@@ -62,15 +62,15 @@ def painted(
     return np.asarray(image)[fine // 2 :: fine, fine // 2 :: fine].astype(np.int64)
 
 
-@pytest.mark.parametrize("detail", [EVERYTHING, Detail()], ids=["whole", "reduced"])
-def test_silhouettes_are_those_of_the_renderer(detail: Detail) -> None:
+@pytest.mark.parametrize("detail", [EVERYTHING, {}], ids=["whole", "reduced"])
+def test_silhouettes_are_those_of_the_renderer(detail: dict[str, int]) -> None:
     size = 512
     env = batched("PickCube-v1", 2, sensor_configs={"width": size, "height": size})
     env.step(None)
-    table = build_body_table(env)
-    geometry, poses = read_geometry(env, table, detail), read_poses(env, table)
-    camera = next(c for c in list_cameras(env, table) if c.name == "base_camera")
-    names = segmentation_names(env, table)
+    table = scene_index(env)
+    geometry, poses = read_geometry(env, **detail), read_poses(env)
+    camera = next(c for c in list_cameras(env) if c.name == "base_camera")
+    names = segmentation_names(env)
     drawn = [i for i, n in enumerate(table.names) if n == "cube" or n.startswith("panda/")]
     visuals = [v for v in geometry.visuals if v.bodies[0] in drawn]
     for index in range(2):
@@ -132,11 +132,10 @@ def redrawn(
 
 def test_a_plain_scene_drawn_from_its_geometry_is_the_same_picture() -> None:
     env = stock("MS-CartpoleBalance-v1", human_render_camera_configs={"shader_pack": "minimal"})
-    table = build_body_table(env)
-    geometry = read_geometry(env, table, EVERYTHING)
+    geometry = read_geometry(env, **EVERYTHING)
     (picture,) = take_pictures(env, 0, [("render_camera", "human", ["rgb"])])
     assert picture.rgb is not None and picture.rgb.std() > 2
-    again = redrawn(geometry, read_poses(env, table), env, "minimal", "Color")
+    again = redrawn(geometry, read_poses(env), env, "minimal", "Color")
     difference = np.abs(again.astype(int) - picture.rgb)
     assert (difference > 2).mean() < 1e-4
     env.close()
@@ -145,15 +144,14 @@ def test_a_plain_scene_drawn_from_its_geometry_is_the_same_picture() -> None:
 def test_colours_and_textures_are_those_of_the_renderer() -> None:
     """Albedo: colour before light, so that only colours, textures, uvs and shapes can differ."""
     env = stock("PickCube-v1", human_render_camera_configs={"shader_pack": "default"})
-    table = build_body_table(env)
-    geometry = read_geometry(env, table, EVERYTHING)
+    geometry = read_geometry(env, **EVERYTHING)
     textured = {v.name.split("/")[0] for v in geometry.visuals if v.material.texture is not None}
     assert textured == {"table-workspace", "ground"}
     component = env._human_render_cameras["render_camera"].camera._render_cameras[0]
     env.scene.sub_scenes[0].update_render()
     component.take_picture()
     wanted = component.get_picture("Albedo")[..., :3]
-    again = redrawn(geometry, read_poses(env, table), env, "default", "Albedo")
+    again = redrawn(geometry, read_poses(env), env, "default", "Albedo")
     difference = np.abs(again - wanted).max(axis=-1)
     assert wanted.std() > 0.1
     assert (difference > 0.02).mean() < 1e-3
@@ -165,8 +163,8 @@ def test_colours_and_textures_are_those_of_the_renderer() -> None:
 
 def test_equal_shapes_of_all_envs_are_one_visual() -> None:
     env = batched("PickCube-v1", 4)
-    table = build_body_table(env)
-    geometry = read_geometry(env, table)
+    table = scene_index(env)
+    geometry = read_geometry(env)
     assert len({v.name for v in geometry.visuals}) == len(geometry.visuals)
     assert geometry.body_names == table.names and geometry.num_envs == 4
     for visual in geometry.visuals:
@@ -187,8 +185,8 @@ def test_equal_shapes_of_all_envs_are_one_visual() -> None:
 
 def test_shapes_that_differ_between_envs_are_each_drawn_in_their_own_env() -> None:
     env = batched("PegInsertionSide-v1", 3)
-    table = build_body_table(env)
-    geometry = read_geometry(env, table)
+    table = scene_index(env)
+    geometry = read_geometry(env)
     peg = table.names.index("peg")
     for index, half_size in enumerate(env.peg_half_sizes.numpy()):
         worn = [v for v in geometry.visuals if index in v.envs[v.bodies == peg]]
@@ -201,8 +199,7 @@ def test_shapes_that_differ_between_envs_are_each_drawn_in_their_own_env() -> No
 @pytest.mark.parametrize("task", ["PushCube-v1", "PegInsertionSide-v1", "MS-CartpoleBalance-v1"])
 def test_every_mesh_is_sound(task: str) -> None:
     env = batched(task, 2)
-    table = build_body_table(env)
-    for visual in read_geometry(env, table).visuals:
+    for visual in read_geometry(env).visuals:
         mesh = visual.mesh
         assert mesh.vertices.dtype == np.float32 and mesh.faces.dtype == np.uint32
         assert mesh.faces.max() < len(mesh.vertices) and np.isfinite(mesh.vertices).all()
@@ -265,8 +262,7 @@ def odd_shapes(tmp_path: Path) -> Any:
 
 
 def test_primitives_have_their_size_and_place(odd_shapes: Any) -> None:
-    table = build_body_table(odd_shapes)
-    visual = {v.name: v for v in read_geometry(odd_shapes, table).visuals}
+    visual = {v.name: v for v in read_geometry(odd_shapes).visuals}
     half = {
         "box/0": [0.3, 0.1, 0.2],
         "ball/0": [0.1] * 3,
@@ -282,7 +278,7 @@ def test_primitives_have_their_size_and_place(odd_shapes: Any) -> None:
 
 
 def test_a_ghost_is_transparent_and_linear_textures_are_encoded(odd_shapes: Any) -> None:
-    visual = {v.name: v for v in read_geometry(odd_shapes, build_body_table(odd_shapes)).visuals}
+    visual = {v.name: v for v in read_geometry(odd_shapes).visuals}
     assert visual["ghost/0"].material.base_color[3] == pytest.approx(0.25)
     texture = visual["linear/0"].material.texture
     assert texture is not None and texture.shape == (4, 4, 4)
@@ -290,9 +286,7 @@ def test_a_ghost_is_transparent_and_linear_textures_are_encoded(odd_shapes: Any)
 
 
 def test_a_mesh_with_uneven_scale_has_normals_across_its_faces(odd_shapes: Any) -> None:
-    (visual,) = [
-        v for v in read_geometry(odd_shapes, build_body_table(odd_shapes)).visuals if "mirrored" in v.name
-    ]
+    (visual,) = [v for v in read_geometry(odd_shapes).visuals if "mirrored" in v.name]
     mesh = visual.mesh
     np.testing.assert_allclose(np.sort(np.ptp(mesh.vertices, axis=0)), [0.5, 1.0, 2.0], atol=1e-5)
     corner = mesh.vertices[mesh.faces].astype(float)
@@ -304,7 +298,7 @@ def test_a_mesh_with_uneven_scale_has_normals_across_its_faces(odd_shapes: Any) 
 
 def test_an_edited_mesh_file_is_read_again(odd_shapes: Any) -> None:
     def width(env: Any) -> float:
-        visuals = read_geometry(env, build_body_table(env)).visuals
+        visuals = read_geometry(env).visuals
         (visual,) = [v for v in visuals if v.name == "mirrored/0"]
         return float(np.ptp(visual.mesh.vertices, axis=0).max())
 
@@ -317,15 +311,14 @@ def test_an_edited_mesh_file_is_read_again(odd_shapes: Any) -> None:
 
 def test_without_a_renderer_the_collision_shapes_are_drawn() -> None:
     env = batched("PickCube-v1", 2, render=False)
-    table = build_body_table(env)
-    geometry = read_geometry(env, table)
+    geometry = read_geometry(env)
     visual = {v.name: v for v in geometry.visuals}
     np.testing.assert_allclose(np.ptp(visual["cube/0"].mesh.vertices, axis=0), 0.04, atol=1e-6)
     assert {"table-workspace/0", "ground/0", "panda/panda_hand/0"} <= set(visual)
     assert 1000 < sum(len(v.mesh.faces) for v in geometry.visuals) < 10_000
     hull = visual["panda/panda_link2/0"].mesh
     rendered = batched("PickCube-v1", 1)
-    whole = read_geometry(rendered, build_body_table(rendered), EVERYTHING)
+    whole = read_geometry(rendered, **EVERYTHING)
     link = np.concatenate([v.mesh.vertices for v in whole.visuals if v.name.startswith("panda/panda_link2/")])
     np.testing.assert_allclose(hull.vertices.min(0), link.min(0), atol=0.02)
     np.testing.assert_allclose(hull.vertices.max(0), link.max(0), atol=0.02)
@@ -334,10 +327,14 @@ def test_without_a_renderer_the_collision_shapes_are_drawn() -> None:
     rendered.close()
 
 
-def test_geometry_of_an_old_scene_is_refused() -> None:
-    env = stock("MS-CartpoleBalance-v1")
-    table = build_body_table(env)
-    env.reset(seed=0, options={"reconfigure": True})
-    with pytest.raises(ValueError, match="build_body_table"):
-        read_geometry(env, table)
+def test_geometry_is_that_of_the_scene_that_stands_now() -> None:
+    env: Any = stock("PegInsertionSide-v1")
+    lengths = []
+    for seed in (0, 1):
+        env.reset(seed=seed, options={"reconfigure": True})
+        peg = scene_index(env).names.index("peg")
+        meshes = [v.mesh.vertices for v in read_geometry(env).visuals if peg in v.bodies]
+        lengths.append(float(np.ptp(np.concatenate(meshes)[:, 0])))
+        np.testing.assert_allclose(lengths[-1], 2 * env.peg_half_sizes[0, 0], rtol=1e-5)
+    assert lengths[0] != lengths[1]
     env.close()

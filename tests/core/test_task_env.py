@@ -22,6 +22,7 @@ from tests.drive.envs import PUSH_CUBE, batched, stock
 from workbench.core import actions, backends
 from workbench.core.assets import MissingAssets
 from workbench.core.backends import BackendUnavailable, choose_backend, why_no_gpu_simulation
+from workbench.core.scene_index import scene_index
 from workbench.core.task_env import EnvOptions, TaskEnv, default_reward_mode, make_env
 
 N = 4
@@ -47,7 +48,7 @@ def test_a_step_is_plain_arrays_with_the_envs_first(push: TaskEnv) -> None:
     assert step.reward.dtype == np.float32 and step.reward.shape == (N,)
     assert step.terminated.dtype == np.bool_ and step.truncated.dtype == np.bool_
     assert all(isinstance(v, np.ndarray) and len(v) == N for v in step.evaluate.values())
-    assert step.poses.shape == (N, len(push.table.names), 7) and step.poses.dtype == np.float32
+    assert step.poses.shape == (N, len(scene_index(push.env).names), 7) and step.poses.dtype == np.float32
 
 
 def test_what_a_step_returned_does_not_change_with_the_next(push: TaskEnv) -> None:
@@ -201,9 +202,9 @@ def test_a_scene_that_a_reset_builds_anew_is_the_one_that_is_read_and_acted_on()
     env.reset(seed=0)
     old, scene = env.parts, env.env.scene
     step = env.reset(seed=1, options={"reconfigure": True})
-    assert env.env.scene is not scene and env.table.scene is env.env.scene
+    assert env.env.scene is not scene
     assert env.parts is not old and env.parts[0].controller is env.env.agent.controller.controllers["arm"]
-    cube = env.table.names.index("cube")
+    cube = scene_index(env.env).names.index("cube")
     assert np.array_equal(step.poses[:, cube, :3], env.env.obj.pose.p.numpy())
     start = env.env.agent.robot.qpos.clone()
     env.step(actions.hold_action(env.parts, 2))

@@ -13,10 +13,10 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 
 from tests.drive.envs import batched
-from workbench.core.body_table import build_body_table, read_poses
 from workbench.core.camera_frames import LookAt, compose, pose_from_look_at, relative_to, with_pose
 from workbench.core.camera_report import CameraReport, ObjectSeen, join_reports
 from workbench.core.camera_settings import CameraSettings
+from workbench.core.scene_index import read_poses, scene_index
 from workbench.core.take_pictures import cameras_of, list_cameras, segmentation_names, take_pictures
 from workbench.core.visibility import (
     Placement,
@@ -118,7 +118,7 @@ def test_judging_leaves_no_trace(env: Any) -> None:
         ]
 
     before = state()
-    poses = read_poses(env, build_body_table(env))
+    poses = read_poses(env)
     poses[..., 2] += 0.1
     judge_camera(env, SENSOR, range(N), settings=looking(FAR_FLOOR), poses=poses)
     judge_camera(env, PEOPLE, [1], size=(32, 32))
@@ -214,9 +214,8 @@ def test_depth_says_background_far_floor_and_where_the_planes_may_stand(env: Any
 
 
 def test_a_mounted_placement_rides_along_in_every_env(env: Any) -> None:
-    table = build_body_table(env)
-    hand = table.names.index("panda/panda_hand")
-    poses = read_poses(env, table)
+    hand = scene_index(env).names.index("panda/panda_hand")
+    poses = read_poses(env)
     x, y, _ = cube_at(env, 0)
     world = pose_from_look_at(LookAt((x, y - 0.1, 0.4), (x, y, 0.0)))
     local = relative_to(poses[0, hand], world)
@@ -228,18 +227,16 @@ def test_a_mounted_placement_rides_along_in_every_env(env: Any) -> None:
 
 
 def test_a_moment_of_the_past_is_judged_where_its_bodies_were(env: Any) -> None:
-    table = build_body_table(env)
-    cube = table.names.index("cube")
-    past = read_poses(env, table)
+    cube = scene_index(env).names.index("cube")
+    past = read_poses(env)
     past[:, cube, :3] += [0.0, 5.0, 0.0]
     assert (seen(judge_camera(env, SENSOR, [0], poses=past), "cube").pixels == 0).all()
     assert (seen(judge_camera(env, SENSOR, [0]), "cube").pixels > 0).all()
 
 
 def test_reports_are_joined_and_the_worst_env_comes_first(env: Any) -> None:
-    table = build_body_table(env)
-    past = read_poses(env, table)
-    past[:, table.names.index("cube"), :3] += [0.0, 5.0, 0.0]
+    past = read_poses(env)
+    past[:, scene_index(env).names.index("cube"), :3] += [0.0, 5.0, 0.0]
     now, then = judge_camera(env, SENSOR, [0, 2]), judge_camera(env, SENSOR, [1], poses=past)
     both = join_reports([now, then])
     assert both.envs == (0, 2, 1) and both.worst_first()[0] == 2

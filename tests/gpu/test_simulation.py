@@ -21,6 +21,7 @@ from tests.gpu.conftest import Simulation
 from workbench.core import actions
 from workbench.core.assets import MissingAssets
 from workbench.core.contact_list import list_contacts
+from workbench.core.scene_index import scene_index
 from workbench.core.snapshot import restore_snapshot, take_snapshot
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env
 
@@ -61,7 +62,7 @@ def test_it_opens_with_the_bodies_actions_and_observations_of_the_cpu(
 ) -> None:
     env, judge = picks
     assert env.env.device.type == ("cuda" if simulation == "gpu" else "cpu")
-    assert env.table.names == judge.table.names
+    assert scene_index(env.env).names == scene_index(judge.env).names
     assert [part.names for part in env.parts] == [part.names for part in judge.parts]
     assert env.env.action_space == judge.env.action_space
     assert env.env.observation_space.shape == judge.env.observation_space.shape

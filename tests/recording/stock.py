@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tests.drive.episodes import Made, Track
-from workbench.core.body_table import BodyTable, build_body_table, read_poses
 from workbench.core.pictures import CameraInfo
 from workbench.core.scene_geometry import read_geometry
+from workbench.core.scene_index import read_poses
 from workbench.recording.episode import EpisodeInfo
 
 STEPS = 8
@@ -53,16 +53,15 @@ def record_stock(task: str, size: int = SIZE, steps: int = STEPS, **kwargs: Any)
 def _play(env: gym.Env, task: str, steps: int) -> Recorded:
     base: Any = env.unwrapped
     obs, _ = env.reset(seed=SEED)
-    table = build_body_table(base)
     seen = [obs]
-    states = [_state(base, table)]
+    states = [_state(base)]
     outcomes: list[tuple[NDArray, float, bool, bool]] = []
     env.action_space.seed(SEED)
     for _ in range(steps):
         action = env.action_space.sample()
         obs, reward, ended, cut, _ = env.step(action)
         seen.append(obs)
-        states.append(_state(base, table))
+        states.append(_state(base))
         outcomes.append((action, float(reward), bool(ended), bool(cut)))
 
     def of_cameras(group: str, key: str) -> dict[str, NDArray]:
@@ -97,7 +96,7 @@ def _play(env: gym.Env, task: str, steps: int) -> Recorded:
             env_kwargs={"robot_uids": "panda_wristcam"},
             max_episode_steps=50,
         ),
-        geometry=read_geometry(base, table),
+        geometry=read_geometry(base),
         segmentation={int(key): body.name for key, body in base.segmentation_id_map.items()},
         poses=np.stack([state["poses"] for state in states]),
         action=np.stack(actions).astype(np.float32),
@@ -118,9 +117,9 @@ def _play(env: gym.Env, task: str, steps: int) -> Recorded:
     )
 
 
-def _state(base: Any, table: BodyTable) -> dict[str, Any]:
+def _state(base: Any) -> dict[str, Any]:
     return {
-        "poses": read_poses(base, table)[0].copy(),
+        "poses": read_poses(base)[0].copy(),
         "evaluate": {key: value[0].numpy().copy() for key, value in base.evaluate().items()},
         "env_states": _flat(base.get_state_dict()),
         "camera poses": {

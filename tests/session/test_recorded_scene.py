@@ -12,7 +12,7 @@ import pytest
 from mani_skill.utils.wrappers.record import RecordEpisode
 from numpy.typing import NDArray
 
-from workbench.core.body_table import build_body_table, read_poses
+from workbench.core.scene_index import read_poses, scene_index
 from workbench.recording.episode import Episode
 from workbench.recording.read_episode import read_maniskill
 from workbench.session.recorded_scene import SceneError, SceneProcess
@@ -35,12 +35,11 @@ def recorded(
     poses, names = [], ()
     for seed in (4, 5):
         env.reset(seed=seed)
-        table = build_body_table(base)
-        names = table.names
-        track = [read_poses(base, table)[0]]
+        names = scene_index(base).names
+        track = [read_poses(base)[0]]
         for _ in range(STEPS):
             env.step(env.action_space.sample())
-            track.append(read_poses(base, table)[0])
+            track.append(read_poses(base)[0])
         poses.append(np.stack(track))
     env.close()
     return next(folder.glob("*.h5")), poses, names

@@ -243,9 +243,7 @@ def _check_pictures(env: TaskEnv, row: Row) -> None:
     assert frames.dtype == torch.uint8 and all(len(frame.unique()) > 1 for frame in frames), (
         "render() is blank"
     )
-    wanted: list[Request] = [
-        (camera.name, camera.kind, ["rgb"]) for camera in list_cameras(env.env, env.table)
-    ]
+    wanted: list[Request] = [(camera.name, camera.kind, ["rgb"]) for camera in list_cameras(env.env)]
     for picture in take_pictures(env.env, RESET[0], wanted):
         assert picture.rgb is not None and len(np.unique(picture.rgb)) > 1, f"{picture.camera} is blank"
     row.cameras = [name for name, _, _ in wanted]

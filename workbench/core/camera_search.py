@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.body_table import BodyTable, build_body_table, read_poses
 from workbench.core.camera_frames import (
     LookAt,
     axes_of,
@@ -36,6 +35,7 @@ from workbench.core.camera_frames import (
 from workbench.core.camera_report import CameraReport
 from workbench.core.camera_settings import CameraSettings
 from workbench.core.pictures import CameraKind, Picture
+from workbench.core.scene_index import SceneIndex, read_poses, scene_index
 from workbench.core.temporary_camera import undrawn
 from workbench.core.visibility import (
     Measured,
@@ -137,7 +137,6 @@ def suggest_cameras(
     space: SearchSpace,
     envs: Sequence[int],
     *,
-    table: BodyTable | None = None,
     progress: Callable[[SearchProgress], None] = lambda progress: None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> tuple[Suggestion, ...]:
@@ -155,7 +154,7 @@ def suggest_cameras(
         IndexError: there is no such env.
         RuntimeError: the renderer failed.
     """
-    search = _Search(env, space, list(envs), table or build_body_table(env), progress, cancelled)
+    search = _Search(env, space, list(envs), progress, cancelled)
     return tuple(search.run())
 
 
@@ -184,7 +183,6 @@ class _Search:
         env: Any,
         space: SearchSpace,
         envs: list[int],
-        table: BodyTable,
         progress: Callable[[SearchProgress], None],
         cancelled: Callable[[], bool],
     ) -> None:
@@ -192,10 +190,10 @@ class _Search:
             raise ValueError("no env is named to search in")
         if any(not 0 <= e < env.num_envs for e in envs):
             raise IndexError(f"envs {envs} are out of range for {env.num_envs} envs")
-        self.env, self.space, self.envs, self.table = env, space, envs, table
+        self.env, self.space, self.envs, self.index = env, space, envs, scene_index(env)
         self.progress, self.cancelled = progress, cancelled
-        every = list_objects(env, table)
-        self.wanted = [_wanted(every, name, space.kind, self.table) for name in space.objects]
+        every = list_objects(env)
+        self.wanted = [_wanted(every, name, space.kind, self.index) for name in space.objects]
         # Each is also looked at alone; the others are drawn, and hide what they hide.
         # A link of the robot that is wanted is none of what may hide it.
         asked = {body for thing in self.wanted for body in thing.bodies}
@@ -285,7 +283,7 @@ class _Search:
         placement = Placement(self.space.lens, self.space.kind)
         local = [self._pose(candidate) for candidate in candidates]
         for position, e in enumerate(self.envs):
-            robots = [x for thing in self.objects if thing.robot for x in entities_of(thing, e, self.table)]
+            robots = [x for thing in self.objects if thing.robot for x in entities_of(thing, e, self.index)]
             poses = local if self.mounts is None else [compose(self.mounts[e], pose) for pose in local]
             with (
                 placed_camera(self.env, e, placement, self.size, None) as view,
@@ -296,7 +294,7 @@ class _Search:
                         return []
                     known = None if bare is None else bare[i][position]
                     measured[i].append(
-                        measure(view, pose, e, self.objects, self.table, self.space.kind, known)
+                        measure(view, pose, e, self.objects, self.index, self.space.kind, known)
                     )
                     self.done += 1
                     self.progress(SearchProgress(stage, self.done, self.total, self.best))
@@ -349,7 +347,7 @@ class _Search:
 
     def _places(self, things: Sequence[SceneObject]) -> NDArray[np.float64]:
         """(K, 3) where the bodies of some objects are, in all envs that have them; seen from the mount if there is one."""
-        bodies = read_poses(self.env, self.table)
+        bodies = read_poses(self.env)
         columns = [body for thing in things for body in thing.bodies]
         places = bodies[self.envs][:, columns, :3].astype(np.float64)
         if self.mounts is not None:
@@ -364,9 +362,9 @@ class _Search:
         name = self.space.mount
         if name is None:
             return None
-        if name not in self.table.names:
+        if name not in self.index.names:
             raise ValueError(f"there is no body {name!r} to mount a camera on")
-        mounts = read_poses(self.env, self.table)[:, self.table.names.index(name)]
+        mounts = read_poses(self.env)[:, self.index.names.index(name)]
         if not np.isfinite(mounts[self.envs]).all():
             raise ValueError(f"not every env has a body {name!r} to mount a camera on")
         return mounts
@@ -393,7 +391,7 @@ class _Search:
             target=(float(target[0]), float(target[1]), float(target[2])),
             score=score,
             report=report,
-            picture=picture_of(self.env, e, placement, self.table),
+            picture=picture_of(self.env, e, placement),
         )
 
 
@@ -402,10 +400,10 @@ def _look_at(candidate: _Candidate) -> LookAt:
     return LookAt((ex, ey, ez), (tx, ty, tz))
 
 
-def _wanted(objects: Sequence[SceneObject], name: str, kind: CameraKind, table: BodyTable) -> SceneObject:
+def _wanted(objects: Sequence[SceneObject], name: str, kind: CameraKind, index: SceneIndex) -> SceneObject:
     found = next((thing for thing in objects if thing.name == name), None)
-    if found is None and name in table.names:
-        body = table.names.index(name)
+    if found is None and name in index.names:
+        body = index.names.index(name)
         whole = next((thing for thing in objects if body in thing.bodies), None)
         found = None if whole is None else replace(whole, name=name, bodies=(body,), robot=False)
     there = ", ".join(thing.name for thing in objects if not (thing.robot or thing.name == "ground"))

@@ -22,8 +22,8 @@ import sapien.physx as physx
 from numpy.typing import NDArray
 
 from workbench.core import seams
-from workbench.core.body_table import BodyTable, build_body_table
 from workbench.core.open_env import open_env
+from workbench.core.scene_index import SceneIndex, scene_index
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Contact:
     """One pair of shapes in the last substep, with K points; float32, the env's own world frame."""
 
     bodies: tuple[str, str]
-    """Names as in `BodyTable.names`; the name of the ``sapien.Entity`` for what ManiSkill does not manage."""
+    """Names as in `SceneIndex.names`; the name of the ``sapien.Entity`` for what ManiSkill does not manage."""
     points: NDArray[np.float32]
     """(K, 3) metres."""
     normals: NDArray[np.float32]
@@ -54,7 +54,7 @@ class Contact:
         return self.impulse / np.float32(self.timestep)
 
 
-def list_contacts(env: Any, env_idx: int, table: BodyTable | None = None) -> tuple[Contact, ...]:
+def list_contacts(env: Any, env_idx: int) -> tuple[Contact, ...]:
     """All contacts of one env in its last substep, ordered by their bodies' names, then by their points.
 
     (SAPIEN's own order is that of memory addresses: it differs from run to run of the same episode.)
@@ -64,12 +64,10 @@ def list_contacts(env: Any, env_idx: int, table: BodyTable | None = None) -> tup
 
     Args:
         env: a ManiSkill env (reset at least once; wrappers are looked through): batched on the CPU, or stock.
-        table: the body table of the env's scene, if there is one already; making one costs milliseconds.
 
     Raises:
         IndexError: there is no such env.
         NotImplementedError: the env is simulated on the GPU.
-        ValueError: the env was rebuilt since the table was made.
     """
     env, env_idx = open_env(env), operator.index(env_idx)
     if not 0 <= env_idx < env.num_envs:
@@ -79,13 +77,9 @@ def list_contacts(env: Any, env_idx: int, table: BodyTable | None = None) -> tup
         raise NotImplementedError(
             "PhysX on the GPU keeps no list of contacts that can be read: open the task with the CPU backend."
         )
-    if table is None:
-        table = build_body_table(env)
-    elif table.scene is not env.scene:
-        raise ValueError("the scene was rebuilt since this table was made: call build_body_table(env) again")
     system = env.scene.px if batched is None else batched.systems[env_idx]
-    timestep = env.scene.timestep
-    contacts = [_read(contact, table, timestep) for contact in system.get_contacts()]
+    index, timestep = scene_index(env), env.scene.timestep
+    contacts = [_read(contact, index, timestep) for contact in system.get_contacts()]
     return tuple(sorted(contacts, key=_place))
 
 
@@ -94,11 +88,11 @@ def _place(contact: Contact) -> tuple[Any, ...]:
     return contact.bodies, contact.points.tolist(), contact.separations.tolist(), contact.impulses.tolist()
 
 
-def _read(contact: physx.PhysxContact, table: BodyTable, timestep: float) -> Contact:
+def _read(contact: physx.PhysxContact, index: SceneIndex, timestep: float) -> Contact:
     first, second = contact.bodies
     points = contact.points
     return Contact(
-        bodies=(_name(first, table), _name(second, table)),
+        bodies=(index.name_of(first) or first.entity.name, index.name_of(second) or second.entity.name),
         points=_rows([point.position for point in points]),
         normals=_rows([point.normal for point in points]),
         impulses=_rows([point.impulse for point in points]),
@@ -109,8 +103,3 @@ def _read(contact: physx.PhysxContact, table: BodyTable, timestep: float) -> Con
 
 def _rows(vectors: Sequence[Any]) -> NDArray[np.float32]:
     return np.array(vectors, dtype=np.float32).reshape(-1, 3)
-
-
-def _name(body: Any, table: BodyTable) -> str:
-    slot = table.slot_of.get(id(body.entity))
-    return body.entity.name if slot is None else table.names[slot % len(table.names)]

@@ -28,14 +28,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import sapien
-import torch
 from numpy.typing import NDArray
 
-from workbench.core import seams
-from workbench.core.body_table import build_body_table
 from workbench.core.cpu_layout import BODY
 from workbench.core.cpu_system import BatchedCpuSystem
 from workbench.core.fresh_physics import renew_physics
+from workbench.core.scene_index import hidden_poses, once_a_scene, scene_index
+from workbench.core.seams import batched_system
 
 _ATTEMPTS = 4
 """How often a root pose is asked for; in all tasks that were tried, two were enough."""
@@ -88,10 +87,7 @@ class CpuEnvState(NamedTuple):
 
 @dataclass
 class CpuStatePlan:
-    """What of a built scene belongs to which env; made once a scene.
-
-    Holds SAPIEN's objects and none of ManiSkill's, which would keep the scene alive that it is kept for.
-    """
+    """What of a built scene belongs to which env."""
 
     contents: list[Contents]
     """Of each env; envs that are alike share one object."""
@@ -106,20 +102,20 @@ class CpuStatePlan:
     held: list[Any]
     """Objects whose ids are used: pybind11 gives an id anew once its object is gone."""
     offsets: dict[int, tuple[int, int]]
-    """Env and offset in its packed floats of an actor, by the ``id`` of its entity."""
+    """Env and offset in its packed floats of an actor, by the slot of its entity (`SceneIndex`)."""
     settled: list[dict[int, tuple[bytes, bytes]]]
     """Of each env, by offset in its packed bytes: a root pose that was wanted, and which was asked for to get it."""
 
 
+@once_a_scene
 def plan_cpu_state(env: Any) -> CpuStatePlan:
-    """Lay out what `read_cpu_state` and `write_cpu_state` need; costs as much as a body table."""
-    px = seams.batched_system(env.scene)
+    """What `read_cpu_state` and `write_cpu_state` need to know of the scene that an env has now."""
+    px = batched_system(env.scene)
     assert px is not None, "only for the batched CPU simulation"
-    table = build_body_table(env)
+    scene = scene_index(env)
 
     def name_of(component: Any) -> str:
-        slot = table.slot_of.get(id(component.entity))
-        return component.entity.name if slot is None else table.names[slot % len(table.names)]
+        return scene.name_of(component) or component.entity.name
 
     alike: dict[Contents, Contents] = {}
     plan = CpuStatePlan([], [], [], {}, [], [], {}, [{} for _ in px.systems])
@@ -127,13 +123,14 @@ def plan_cpu_state(env: Any) -> CpuStatePlan:
     for index, system in enumerate(px.systems):
         bodies, links = system.rigid_dynamic_components, system.articulation_link_components
         statics = system.rigid_static_components
-        plan.held += [*bodies, *links, *statics, *(body.entity for body in bodies)]
+        plan.held += [*bodies, *links, *statics]
         by_name = {name_of(c): id(c) for c in [*statics, *links, *bodies]}
         plan.bodies.append(by_name)
         plan.names.update({component: (index, name) for name, component in by_name.items()})
         parts, sleepers = [], []
         for body in bodies:
-            plan.offsets[id(body.entity)] = index, sum(part.size for part in parts)
+            if id(body.entity) in scene.slot_of:
+                plan.offsets[scene.slot_of[id(body.entity)]] = index, sum(part.size for part in parts)
             if not body.kinematic:
                 sleepers.append((len(parts), _getter(body, "is_sleeping"), body))
             parts.append(Part(name_of(body), None))
@@ -159,11 +156,12 @@ def _getter(component: Any, name: str) -> Callable[[], bool]:
     return partial(getattr(type(component), name).fget, component)
 
 
-def read_cpu_state(env: Any, plan: CpuStatePlan, env_idx: list[int]) -> list[CpuEnvState]:
+def read_cpu_state(env: Any, env_idx: list[int]) -> list[CpuEnvState]:
     """The simulation state of the envs in `env_idx`, one each."""
     px: BatchedCpuSystem = env.scene.px
+    plan = plan_cpu_state(env)
     packs = px.packs()
-    true_poses = _true_poses(env, plan)
+    hidden = _hidden(env, plan)
     qf = px.cuda_articulation_qf.torch().numpy().copy()
     driven = np.stack(px.drive_flags)
     touching = _touching(px, plan)
@@ -171,10 +169,10 @@ def read_cpu_state(env: Any, plan: CpuStatePlan, env_idx: list[int]) -> list[Cpu
     states = []
     for i in env_idx:
         packed, contents, rows = packs[i], plan.contents[i], plan.articulations[i]
-        if i in true_poses:
+        if i in hidden:
             numbers = np.frombuffer(packed, dtype=np.float32).copy()
-            for offset, pose in true_poses[i]:
-                numbers[offset : offset + 7] = pose
+            for offset, pose in hidden[i]:
+                numbers[offset : offset + 7] = pose[[3, 4, 5, 6, 0, 1, 2]]
             packed = numbers.tobytes()
         sleeping = [part for part, is_asleep, _ in plan.sleepers[i] if is_asleep()]
         asleep = (
@@ -185,7 +183,7 @@ def read_cpu_state(env: Any, plan: CpuStatePlan, env_idx: list[int]) -> list[Cpu
 
 
 def write_cpu_state(
-    env: Any, plan: CpuStatePlan, env_idx: list[int], states: list[CpuEnvState], fresh_physics: bool
+    env: Any, env_idx: list[int], states: list[CpuEnvState], fresh_physics: bool
 ) -> tuple[dict[str, None], dict[str, str]]:
     """Put ``states[k]`` into env ``env_idx[k]``; the other envs are not touched. The tensors are fetched.
 
@@ -195,6 +193,7 @@ def write_cpu_state(
     carried: dict[str, None] = {}
     missed: dict[str, str] = {}
     px: BatchedCpuSystem = env.scene.px
+    plan = plan_cpu_state(env)
     own = px.packs()
     for i in env_idx:
         for _, _, component in plan.sleepers[i]:
@@ -204,7 +203,7 @@ def write_cpu_state(
     if fresh_physics:
         for i in renew_physics(env.scene, env_idx):
             missed[f"fresh physics of env {i}"] = "entities were removed from its scene since it was built"
-    hidden = _hidden_rows(env, plan)
+    hidden = _hidden(env, plan)
     packed: dict[int, bytes] = {}
     matches: dict[int, list[int | None]] = {}
     alike: dict[int, Contents] = {}
@@ -239,16 +238,16 @@ def write_cpu_state(
     return carried, missed
 
 
-def begin_cpu_state_anew(env: Any, plan: CpuStatePlan, env_idx: list[int]) -> None:
+def begin_cpu_state_anew(env: Any, env_idx: list[int]) -> None:
     """Give these envs a PhysX scene without a past, and the state that they have.
 
     What follows can then be had again to the last bit, from a snapshot of now and the same actions. A root of an
     articulation that PhysX does not give back as it is set is moved by some last bits, to where it does.
     """
-    left, states, dice = env_idx, read_cpu_state(env, plan, env_idx), np.random.default_rng(0)
+    left, states, dice = env_idx, read_cpu_state(env, env_idx), np.random.default_rng(0)
     for attempt in range(_TRIES):
-        write_cpu_state(env, plan, left, states, fresh_physics=True)
-        found = read_cpu_state(env, plan, left)
+        write_cpu_state(env, left, states, fresh_physics=True)
+        found = read_cpu_state(env, left)
         other = [
             k for k, (now, was) in enumerate(zip(found, states, strict=True)) if now.packed != was.packed
         ]
@@ -399,40 +398,21 @@ def _touching(px: BatchedCpuSystem, plan: CpuStatePlan) -> dict[int, tuple[Touch
     return {index: tuple(touches) for index, touches in found.items()}
 
 
-def _hidden_poses(env: Any) -> list[tuple[Any, torch.Tensor]]:
-    actors = [*env.scene.actors.values(), *env.scene.actor_views.values()]
-    kept = [(actor, seams.pose_before_hiding(actor)) for actor in actors]
-    return [(actor, pose) for actor, pose in kept if pose is not None]
+def _hidden(env: Any, plan: CpuStatePlan) -> dict[int, list[tuple[int, NDArray[np.float32]]]]:
+    """Of each env with hidden actors: their offsets in its packed floats, and the poses [p, q] that are kept of them."""
+    found: dict[int, list[tuple[int, NDArray[np.float32]]]] = {}
+    for slots, poses in hidden_poses(env):
+        for slot, pose in zip(slots.tolist(), poses, strict=True):
+            if slot in plan.offsets:
+                index, offset = plan.offsets[slot]
+                found.setdefault(index, []).append((offset, pose))
+    return found
 
 
-def _true_poses(env: Any, plan: CpuStatePlan) -> dict[int, list[tuple[int, NDArray[np.float32]]]]:
-    """Of each env with hidden actors: their offsets in its packed floats, and their poses [q, p]."""
-    poses: dict[int, list[tuple[int, NDArray[np.float32]]]] = {}
-    for actor, pose in _hidden_poses(env):
-        entities = seams.objects_of(actor)
-        rows = np.broadcast_to(pose.numpy(), (len(entities), 7))
-        for entity, row in zip(entities, rows, strict=True):
-            if id(entity) in plan.offsets:
-                index, offset = plan.offsets[id(entity)]
-                poses.setdefault(index, []).append((offset, row[[3, 4, 5, 6, 0, 1, 2]]))
-    return poses
-
-
-def _hidden_rows(env: Any, plan: CpuStatePlan) -> dict[int, list[tuple[int, torch.Tensor]]]:
-    """Of each env with hidden actors: offset in its packed floats, and the row of the pose that is kept."""
-    rows: dict[int, list[tuple[int, torch.Tensor]]] = {}
-    for actor, pose in _hidden_poses(env):
-        for k, entity in enumerate(seams.objects_of(actor)):
-            if id(entity) in plan.offsets:
-                index, offset = plan.offsets[id(entity)]
-                rows.setdefault(index, []).append((offset, pose[k] if pose.ndim > 1 else pose))
-    return rows
-
-
-def _hide(packed: bytes, hidden: list[tuple[int, torch.Tensor]]) -> bytes:
+def _hide(packed: bytes, hidden: list[tuple[int, NDArray[np.float32]]]) -> bytes:
     numbers = np.frombuffer(packed, dtype=np.float32).copy()
     for offset, kept in hidden:
         pose = numbers[offset : offset + 7]
-        kept.copy_(torch.from_numpy(pose[[4, 5, 6, 0, 1, 2, 3]]))
+        kept[:] = pose[[4, 5, 6, 0, 1, 2, 3]]
         pose[4:] += _FAR
     return numbers.tobytes()

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -19,12 +18,13 @@ from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
 from workbench.core import seams
+from workbench.core.scene_index import in_every_env, once_a_scene, scene_index
 from workbench.core.task_env import flat_entries
 
 
 @dataclass
 class _Plan:
-    """Where the states lie. Names and row numbers only: ManiSkill's structs would keep the scene alive that this is kept for."""
+    """Where the states lie."""
 
     bodies: list[str]
     """Names, in the order of `rows`; actors first."""
@@ -40,19 +40,15 @@ class _Plan:
     """Actors and articulations that not every env has."""
 
 
-_plans: WeakKeyDictionary[Any, _Plan] = WeakKeyDictionary()
-
-
 def env_states(env: BaseEnv) -> dict[str, Any]:
     """(N, D) by name: ``actors/cube``, ``articulations/panda``, and ``controller/...`` where a controller has a state.
 
     Tensors, or on the CPU arrays; copies of the simulation's own."""
     if type(env).get_state_dict is not BaseEnv.get_state_dict or not env.scene.gpu_sim_enabled:
         whole: Any = env.get_state_dict()
-        return dict(_widened(env, name, value) for name, value in flat_entries(whole))
-    plan = _plans.get(env.scene)
-    if plan is None:
-        plan = _plans[env.scene] = _planned(env)
+        known = scene_index(env).states
+        return {name: in_every_env(env, known.get(name), value) for name, value in flat_entries(whole)}
+    plan, structs = _planned(env), scene_index(env).states
     scene: Any = env.scene
     data, qpos, qvel = (
         # numpy's calls on a few hundred numbers take a quarter of torch's.
@@ -67,17 +63,15 @@ def env_states(env: BaseEnv) -> dict[str, Any]:
     if plan.still:
         data[:, plan.still, 7:] = 0.0
     states: dict[str, Any] = {}
-    actors = _actors(scene)
     for k, name in enumerate(plan.bodies[: plan.actors]):
-        actor = actors[name.removeprefix("actors/")]
-        states[name] = actor.get_state() if actor.hidden else data[:, k]
+        states[name] = structs[name].get_state() if structs[name].hidden else data[:, k]
     for k, (rows, dof) in enumerate(plan.joints, plan.actors):
         parts = [data[:, k], qpos[rows, :dof], qvel[rows, :dof]]
         states[plan.bodies[k]] = (
             np.concatenate(parts, axis=1) if isinstance(data, np.ndarray) else torch.cat(parts, dim=1)
         )
     for name in plan.others:
-        states[name] = _widened(env, name, _structs(scene)[name].get_state())[1]
+        states[name] = in_every_env(env, structs[name], structs[name].get_state())
     if env.agent is not None:
         controllers: Any = env.agent.get_controller_state()
         states.update(flat_entries(controllers, "controller/"))
@@ -93,7 +87,7 @@ def states_of_steps(
         bodies: (K, rows, 13) copies of ``cuda_rigid_body_data``, `qpos` and `qvel` (K, articulations, joints) of theirs.
         hidden: ``actors/goal`` to (K, N, 7), where it really is, of actors that are hidden.
     """
-    plan = _plans[env.scene]
+    plan = _planned(env)
     data = bodies[:, plan.rows].reshape(len(bodies), env.num_envs, -1, 13)
     if plan.still:
         data[:, :, plan.still, 7:] = 0.0
@@ -110,34 +104,22 @@ def told_by_rows(env: BaseEnv) -> bool:
     """Whether `states_of_steps` can say all that `env_states` does."""
     if type(env).get_state_dict is not BaseEnv.get_state_dict or not env.scene.gpu_sim_enabled:
         return False
-    plan = _plans.get(env.scene)
-    if plan is None:
-        plan = _plans[env.scene] = _planned(env)
+    plan = _planned(env)
     return env.device.type == "cpu" and not plan.others
 
 
 def actors_with_states(env: BaseEnv) -> dict[str, Any]:
     """The actors among what `env_states` names, by that name."""
-    actors = _actors(env.scene)
-    plan = _plans[env.scene]
-    return {name: actors[name.removeprefix("actors/")] for name in plan.bodies[: plan.actors]}
+    plan = _planned(env)
+    return {name: scene_index(env).states[name] for name in plan.bodies[: plan.actors]}
 
 
-def _actors(scene: Any) -> dict[str, Any]:
-    return {actor.name: actor for actor in scene.state_dict_registry.actors.values()}
-
-
-def _structs(scene: Any) -> dict[str, Any]:
-    registry = scene.state_dict_registry
-    found = {f"actors/{a.name}": a for a in registry.actors.values() if a.px_body_type != "static"}
-    return found | {f"articulations/{a.name}": a for a in registry.articulations.values()}
-
-
+@once_a_scene
 def _planned(env: BaseEnv) -> _Plan:
     plan = _Plan([], 0, None, [], [], [])
     every = list(range(env.num_envs))
     rows: list[torch.Tensor] = []
-    for name, struct in _structs(env.scene).items():
+    for name, struct in scene_index(env).states.items():
         if list(seams.envs_of(struct)) != every:
             plan.others.append(name)
         elif name.startswith("actors/"):
@@ -158,15 +140,3 @@ def _planned(env: BaseEnv) -> _Plan:
 
 def _index(rows: torch.Tensor) -> Any:
     return rows.long().numpy() if rows.device.type == "cpu" else rows.long()
-
-
-def _widened(env: BaseEnv, name: str, value: torch.Tensor) -> tuple[str, torch.Tensor]:
-    """(N, ...) of rows for some envs only."""
-    if not isinstance(value, torch.Tensor) or len(value) == env.num_envs:
-        return name, value
-    struct = _structs(env.scene).get(name)
-    rows = None if struct is None else torch.as_tensor(seams.envs_of(struct), device=value.device)
-    whole = value.new_full((env.num_envs, *value.shape[1:]), torch.nan)
-    if rows is not None and len(rows) == len(value):
-        whole[rows] = value
-    return name, whole

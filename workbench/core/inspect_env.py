@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from workbench.core import seams
 from workbench.core.contact_list import Contact
 from workbench.core.inspection import Inspection, JointReadings, Leaf, Section, Touching
+from workbench.core.scene_index import scene_index
 from workbench.core.snapshot import restore_memory, take_memory
 from workbench.core.task_env import TaskEnv, flat_entries, to_numpy
 
@@ -90,15 +91,11 @@ def read_observation(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
 
 def read_state(task: TaskEnv, env: int) -> tuple[Leaf, ...]:
     """``get_state_dict()``; 13 numbers of a body and 13 + 2 J of an articulation by what they are."""
-    registry = task.env.scene.state_dict_registry
-    rows: dict[str, Any] = {}
-    for group, structs in (("actors", registry.actors), ("articulations", registry.articulations)):
-        for struct in structs.values():
-            rows[f"{group}/{struct.name}"] = struct
+    structs = scene_index(task.env).states
     leaves: list[Leaf] = []
     state: Any = task.env.get_state_dict()
     for name, value in flat_entries(state):
-        struct = rows.get(name)
+        struct = structs.get(name)
         if struct is None:
             leaves.append(_leaf(name, _row(value, env, task.num_envs)))
             continue

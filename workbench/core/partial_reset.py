@@ -34,7 +34,7 @@ from workbench.core.assignments import find_assignment
 from workbench.core.broken_rule import BrokenRule
 from workbench.core.env_numbers import env_numbers, envs_of_batch
 from workbench.core.kept_rows import rows_of_tensors
-from workbench.core.seams import drawing_from, set_episode_seeds, task_class
+from workbench.core.seams import agents, drawing_from, set_episode_seeds, task_class
 
 _CORE = str(Path(__file__).parent)
 
@@ -59,14 +59,10 @@ class KeptControllers:
 
 def active_controllers(env: Any) -> list[BaseController]:
     """The controllers in use, those within combined ones singly; none for a task without a robot."""
-    agent = env.agent
-    if agent is None:
-        return []
-    several = agent.controller.values() if isinstance(agent.controller, dict) else [agent.controller]
     single: list[BaseController] = []
-    for controller in several:
-        combined = isinstance(controller, CombinedController)
-        single += controller.controllers.values() if combined else [controller]
+    for agent in agents(env):
+        combined = isinstance(agent.controller, CombinedController)
+        single += agent.controller.controllers.values() if combined else [agent.controller]
     return single
 
 

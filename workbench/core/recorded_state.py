@@ -12,7 +12,7 @@ robot did would be to run to where it stood before.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 from workbench.core import seams
 from workbench.core.fresh_physics import renew_physics
 from workbench.core.partial_reset import active_controllers
+from workbench.core.scene_index import in_every_env, scene_index
+from workbench.core.task_env import flat_entries, to_numpy
 
 _POSE = 7
 _FIXED = 13
@@ -36,7 +38,7 @@ def misfits(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> dict[str, s
         state: (D,) by name, as `RecordedRun.state` gives it.
     """
     missed: dict[str, str] = {}
-    structs = _structs(env)
+    structs = scene_index(env).states
     for name, struct in structs.items():
         if env_idx not in seams.envs_of(struct):
             continue
@@ -55,7 +57,7 @@ def misfits(env: Any, env_idx: int, state: Mapping[str, NDArray]) -> dict[str, s
 def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
     """Put a recorded state into each of these envs, but for its `misfits`. The others are not touched, and the
     tensors are fetched."""
-    for name, struct in _structs(env).items():
+    for name, struct in scene_index(env).states.items():
         width = _width(struct)
         rows: dict[int, NDArray] = {}
         for i in seams.envs_of(struct).tolist():
@@ -80,9 +82,9 @@ def settle_robot(env: Any, env_idx: Sequence[int]) -> None:
     seams.set_reset_mask(env, list(range(env.num_envs)))
     targets = env.scene.px.cuda_articulation_target_qpos.torch()
     velocities = env.scene.px.cuda_articulation_target_qvel.torch()
-    for robot in seams.robots(env):
-        qpos = robot.get_qpos()
-        rows = seams.data_rows_of_articulation(robot)[chosen].long()
+    for agent in seams.agents(env):
+        qpos = agent.robot.get_qpos()
+        rows = seams.data_rows_of_articulation(agent.robot)[chosen].long()
         targets[rows, : qpos.shape[1]] = qpos[chosen]
         velocities[rows] = 0.0
     _apply(env)
@@ -96,13 +98,8 @@ def new_physics(env: Any, env_idx: Sequence[int]) -> None:
 
 def read_states(env: Any) -> dict[str, NDArray[np.float32]]:
     """(N, D) of every actor and articulation of the env, by the names of a recording; NaN in envs without it."""
-    states: dict[str, NDArray[np.float32]] = {}
-    for name, struct in _structs(env).items():
-        value = struct.get_state().cpu().numpy()
-        whole = np.full((env.num_envs, value.shape[1]), np.nan, np.float32)
-        whole[seams.envs_of(struct)] = value
-        states[name] = whole
-    return states
+    states = scene_index(env).states
+    return {name: to_numpy(in_every_env(env, struct, struct.get_state())) for name, struct in states.items()}
 
 
 def apart(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tuple[float, float]:
@@ -141,12 +138,6 @@ def _or_inf(value: float) -> float:
     return value if np.isfinite(value) else float("inf")
 
 
-def _structs(env: Any) -> dict[str, Any]:
-    registry = env.scene.state_dict_registry
-    found = {f"actors/{a.name}": a for a in registry.actors.values() if a.px_body_type != "static"}
-    return {**found, **{f"articulations/{a.name}": a for a in registry.articulations.values()}}
-
-
 def _width(struct: Any) -> int:
     return _FIXED + 2 * int(getattr(struct, "max_dof", 0))
 
@@ -161,16 +152,8 @@ def _write_controllers(env: Any, states: Mapping[int, Mapping[str, NDArray]]) ->
     """What controllers with a target of their own remember, where it was recorded (``controller/arm/target_qpos``)."""
     if env.agent is None:
         return
-    for name, value in _leaves(env.agent.get_controller_state(), "controller/"):
+    for name, value in flat_entries(env.agent.get_controller_state(), "controller/"):
         for i, state in states.items():
             recorded = state.get(name)
             if recorded is not None and recorded.shape == tuple(value.shape[1:]):
                 value[i] = torch.as_tensor(recorded, dtype=value.dtype, device=value.device)
-
-
-def _leaves(tree: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, torch.Tensor]]:
-    for key, value in tree.items():
-        if isinstance(value, Mapping):
-            yield from _leaves(value, f"{prefix}{key}/")
-        else:
-            yield f"{prefix}{key}", value

@@ -24,24 +24,18 @@ import sapien.render
 from numpy.typing import NDArray
 from PIL import Image
 
-from workbench.core.body_table import BodyTable
 from workbench.core.collision_geometry import collision_parts
 from workbench.core.geometry import BodyKind, Material, Mesh, SceneGeometry, Visual
 from workbench.core.mesh_detail import drop_uvs, flat_rectangle, reduce_mesh, with_normals
+from workbench.core.scene_index import scene_index
 
 _FLAT_FACES = 100
 """Meshes of more faces than this are tried as a flat rectangle."""
 _KEPT_MESHES = 1000
-
-
-@dataclass(frozen=True)
-class Detail:
-    """How much of the scene's detail to keep. None keeps all of it."""
-
-    max_faces_per_visual: int | None = 800
-    """A Panda of 136,000 triangles becomes 14,000 and still looks like one."""
-    max_texture_size: int | None = 1024
-    """Longest side of a texture in pixels."""
+MOST_FACES = 800
+"""Of a visual: a Panda of 136,000 triangles becomes 14,000 and still looks like one."""
+MOST_TEXELS = 1024
+"""On the longest side of a texture."""
 
 
 @dataclass(frozen=True)
@@ -53,24 +47,19 @@ class Part:
     read: Callable[[], tuple[Mesh, Material]]
 
 
-def read_geometry(env: Any, table: BodyTable, detail: Detail | None = None) -> SceneGeometry:
-    """Meshes, materials and instances of all bodies in `table`.
+def read_geometry(env: Any, max_faces: int = MOST_FACES, max_texels: int = MOST_TEXELS) -> SceneGeometry:
+    """Meshes, materials and instances of all bodies of a scene.
 
     Bodies that are hidden now are included; `SceneGeometry.body_hidden` names those that the task
     hides from its sensors. Without a render device the collision shapes are given, in grey.
-
-    Raises:
-        ValueError: the env was rebuilt since the table was made.
     """
-    if env.scene is not table.scene:
-        raise ValueError("the scene was rebuilt since this table was made: call build_body_table(env) again")
-    walk = _RenderWalk(detail or Detail())
+    index = scene_index(env)
+    walk = _RenderWalk(max_faces, max_texels)
     rendered = env.scene.can_render()
     instances: dict[Hashable, list[tuple[int, int]]] = {}
     first: dict[Hashable, Part] = {}
-    for body, kind in enumerate(table.kinds):
-        for env_index in range(table.num_envs):
-            entity = table.entities[env_index, body]
+    for body, kind in enumerate(index.kinds):
+        for env_index, entity in enumerate(index.entities[:, body]):
             if entity is None:
                 continue
             for part in walk.parts(entity) if rendered else _collision_parts(entity, kind):
@@ -87,7 +76,7 @@ def read_geometry(env: Any, table: BodyTable, detail: Detail | None = None) -> S
         where = np.array(places, dtype=np.int32)
         visuals.append(
             Visual(
-                name=f"{table.names[body]}/{number}",
+                name=f"{index.names[body]}/{number}",
                 mesh=mesh,
                 material=material,
                 envs=where[:, 0].copy(),
@@ -95,10 +84,10 @@ def read_geometry(env: Any, table: BodyTable, detail: Detail | None = None) -> S
             )
         )
     return SceneGeometry(
-        num_envs=table.num_envs,
-        body_names=table.names,
-        body_kinds=table.kinds,
-        body_hidden=table.hidden,
+        num_envs=env.num_envs,
+        body_names=index.names,
+        body_kinds=index.kinds,
+        body_hidden=index.hidden,
         visuals=tuple(visuals),
     )
 
@@ -111,8 +100,8 @@ def _collision_parts(entity: Any, kind: BodyKind) -> Iterator[Part]:
 class _RenderWalk:
     """One walk over the render bodies of a scene; remembers the textures that it met."""
 
-    def __init__(self, detail: Detail) -> None:
-        self._detail = detail
+    def __init__(self, max_faces: int, max_texels: int) -> None:
+        self._max_faces, self._max_texels = max_faces, max_texels
         self._textures: list[tuple[Any, NDArray[np.uint8] | None]] = []
 
     def parts(self, entity: Any) -> Iterator[Part]:
@@ -132,7 +121,7 @@ class _RenderWalk:
     def _read(
         self, source: _Source, place: _Placement, material: Material, texture: int | None
     ) -> tuple[Mesh, Material]:
-        mesh = _reduced(source, texture is not None, self._detail.max_faces_per_visual)
+        mesh = _reduced(source, texture is not None, self._max_faces)
         if texture is None:
             return place.apply(mesh), material
         return place.apply(mesh), replace(material, texture=self._pixels(texture))
@@ -158,7 +147,7 @@ class _RenderWalk:
     def _pixels(self, index: int) -> NDArray[np.uint8]:
         texture, pixels = self._textures[index]
         if pixels is None:
-            pixels = _rgba(texture, self._detail.max_texture_size)
+            pixels = _rgba(texture, self._max_texels)
             self._textures[index] = (texture, pixels)
         return pixels
 
@@ -257,7 +246,7 @@ def _material_key(material: Material) -> Hashable:
 _kept_meshes: OrderedDict[Hashable, Mesh] = OrderedDict()
 
 
-def _reduced(source: _Source, textured: bool, max_faces: int | None) -> Mesh:
+def _reduced(source: _Source, textured: bool, max_faces: int) -> Mesh:
     key = (source.key, textured, max_faces)
     if key in _kept_meshes:
         _kept_meshes.move_to_end(key)
@@ -268,7 +257,7 @@ def _reduced(source: _Source, textured: bool, max_faces: int | None) -> Mesh:
     flat = flat_rectangle(mesh) if len(mesh.faces) > _FLAT_FACES else None
     if flat is not None:
         mesh = flat
-    elif max_faces is not None:
+    else:
         mesh = reduce_mesh(mesh, max_faces)
     if source.keep:
         _kept_meshes[key] = mesh
@@ -289,7 +278,7 @@ def _read_part(source: _Source) -> Mesh:
     return replace(mesh, normals=normals)
 
 
-def _rgba(texture: Any, max_size: int | None) -> NDArray[np.uint8]:
+def _rgba(texture: Any, max_size: int) -> NDArray[np.uint8]:
     """(H, W, 4) pixels of a ``RenderTexture2D``, sRGB encoded whatever it holds."""
     pixels = np.asarray(texture.download())
     if pixels.dtype == np.uint8 and pixels.shape[-1] == 4 and texture.is_srgb:
@@ -311,9 +300,9 @@ def _rgba(texture: Any, max_size: int | None) -> NDArray[np.uint8]:
     return _at_most(np.round(values * 255).astype(np.uint8), max_size)
 
 
-def _at_most(pixels: NDArray[np.uint8], max_size: int | None) -> NDArray[np.uint8]:
+def _at_most(pixels: NDArray[np.uint8], max_size: int) -> NDArray[np.uint8]:
     longest = max(pixels.shape[:2])
-    if max_size is None or longest <= max_size:
+    if longest <= max_size:
         return pixels
     height, width = (max(1, round(side * max_size / longest)) for side in pixels.shape[:2])
     return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX))

@@ -156,17 +156,13 @@ def substeps_are_unwatched(env: Any, task: type) -> bool:
     for hook in _BETWEEN_SUBSTEPS:
         if getattr(task, hook) is not getattr(BaseEnv, hook) or hook in vars(env):
             return False
-    agent = env.agent
-    if agent is None:
-        return True
-    agents = [agent, *agent.agents] if isinstance(agent, MultiAgent) else [agent]
-    of_agents = {type(a).before_simulation_step for a in agents}
+    of_agents = {type(a).before_simulation_step for a in (env.agent, *agents(env)) if a is not None}
     if not of_agents <= {BaseAgent.before_simulation_step, MultiAgent.before_simulation_step}:
         return False
     return all(
         "before_simulation_step" not in vars(part)
         and type(part).before_simulation_step.__module__.startswith("mani_skill.agents.controllers.")
-        for robot in (agent.agents if isinstance(agent, MultiAgent) else [agent])
+        for robot in agents(env)
         for part in (robot.controller, *getattr(robot.controller, "controllers", {}).values())
     )
 
@@ -278,10 +274,10 @@ def data_rows_of(struct: Any) -> torch.Tensor:
     return struct._body_data_index
 
 
-def robots(env: Any) -> list[Articulation]:
-    """Those of ``env.agent``, which must be there."""
+def agents(env: Any) -> list[Any]:
+    """One for each robot of ``env.agent``; none for a task without a robot."""
     agent = env.agent
-    return [one.robot for one in (agent.agents if isinstance(agent, MultiAgent) else [agent])]
+    return agent.agents if isinstance(agent, MultiAgent) else [] if agent is None else [agent]
 
 
 def data_rows_of_articulation(articulation: Any) -> torch.Tensor:

@@ -33,9 +33,7 @@ from numpy.typing import NDArray
 from workbench.core import seams
 from workbench.core.cpu_state import (
     CpuEnvState,
-    CpuStatePlan,
     begin_cpu_state_anew,
-    plan_cpu_state,
     read_cpu_state,
     write_cpu_state,
 )
@@ -101,7 +99,7 @@ def take_snapshot(env: Any, env_idx: Sequence[int] | int | None = None) -> Snaps
     chosen = envs_of_batch(range(env.num_envs) if env_idx is None else env_idx, env.num_envs)
     px = seams.batched_system(env.scene)
     if px is not None:
-        simulation: Any = read_cpu_state(env, _plan(env), chosen)
+        simulation: Any = read_cpu_state(env, chosen)
     else:
         _require_gpu(env)
         simulation = read_gpu_state(env, chosen)
@@ -152,7 +150,7 @@ def restore_snapshot(
             "a snapshot of CPU simulation cannot be put into GPU simulation, nor the other way round"
         )
     if px is not None:
-        carried, missed = write_cpu_state(env, _plan(env), targets, states, fresh_physics)
+        carried, missed = write_cpu_state(env, targets, states, fresh_physics)
     else:
         _require_gpu(env)
         carried, missed = write_gpu_state(env, targets, states)
@@ -172,14 +170,13 @@ def begin_anew(env: Any, env_idx: list[int]) -> None:
     Args:
         env: batched on the CPU and reset at least once; wrappers are looked through.
     """
-    env = open_env(env)
-    begin_cpu_state_anew(env, _plan(env), env_idx)
+    begin_cpu_state_anew(open_env(env), env_idx)
 
 
 def in_this_state(env: Any, env_idx: int, snapshot: Snapshot, source: int) -> bool:
     """Whether an env is where env `source` of the snapshot was, to the last byte of what PhysX gives out."""
     wanted = snapshot.simulation[snapshot.env_idx.index(source)]
-    return _essence(read_cpu_state(env, _plan(env), [env_idx])[0]) == _essence(wanted)
+    return _essence(read_cpu_state(env, [env_idx])[0]) == _essence(wanted)
 
 
 def _essence(state: Any) -> tuple[Any, ...] | None:
@@ -224,14 +221,7 @@ def restore_memory(
     return write_task_state(env, memory.task, env_idx, positions)
 
 
-_plans: WeakKeyDictionary[Any, CpuStatePlan] = WeakKeyDictionary()
 _rng_readers: WeakKeyDictionary[Any, RngReader] = WeakKeyDictionary()
-
-
-def _plan(env: BaseEnv) -> CpuStatePlan:
-    if env.scene not in _plans:
-        _plans[env.scene] = plan_cpu_state(env)
-    return _plans[env.scene]
 
 
 def _chosen(items: list[RngState], positions: list[int]) -> list[RngState]:

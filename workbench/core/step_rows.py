@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from workbench.core import seams
 from workbench.core.entries import split_entries
 from workbench.core.env_states import actors_with_states, states_of_steps, told_by_rows
+from workbench.core.scene_index import scene_index
 from workbench.core.state_columns import observed, parts_of, taken_apart
 from workbench.core.state_names import STATE
 from workbench.core.step import OtherEntry
@@ -38,17 +39,13 @@ class StepRows:
 
     def __init__(self, task: TaskEnv) -> None:
         """Raises ValueError where the task's steps cannot be told later."""
-        if not told_by_rows(task.env) or task.table.rows is None:
+        self._task, self._table = task, scene_index(task.env)
+        if not told_by_rows(task.env) or self._table.rows is None:
             raise ValueError("the states of this task have to be read at once")
-        self._task, self._table = task, task.table
-        self._rows: NDArray[np.int64] = task.table.rows.numpy()
+        self._rows: NDArray[np.int64] = self._table.rows.numpy()
         self._named = {id(actor): name for name, actor in actors_with_states(task.env).items()}
-        if not self._named.keys() <= {id(actor) for actor in task.table.actors}:
+        if not self._named.keys() <= {id(actor) for actor, _ in self._table.actors}:
             raise ValueError("an actor with a state is not among the bodies")
-        self._slots = [
-            np.array([self._table.slot_of.get(id(e), -1) for e in seams.objects_of(actor)], np.int64)
-            for actor in self._table.actors
-        ]
         self._parts: dict[tuple[str, int], Any] = {}
         self.others: Mapping[str, OtherEntry] = {}
         """Of the step that was read last: what `StepResult.others` would be."""
@@ -77,7 +74,7 @@ class StepRows:
         found += [
             (_BATCH + name, entry.numbers) for name, entry in self.others.items() if entry.numbers is not None
         ]
-        for index, actor in enumerate(self._table.actors):
+        for index, (actor, _) in enumerate(self._table.actors):
             if actor.hidden and (kept := seams.pose_before_hiding(actor)) is not None:
                 found.append((f"{_HIDDEN}{index}", _array(kept)))
         if env.agent is not None:
@@ -102,7 +99,7 @@ class StepRows:
         """(K, N, ...) of every column of K steps, from what `read` gave, each (K, ...); in the order of `batch_columns`."""
         table, bodies = self._table, held[_BODIES]
         steps = len(bodies)
-        shape = (steps, table.num_envs)
+        shape = (steps, len(table.entities))
         poses = np.repeat(table.fixed[None], steps, axis=0)
         flat = poses.reshape(steps, -1, 7)
         flat[:, table.slots] = bodies[:, self._rows, :7]
@@ -110,11 +107,11 @@ class StepRows:
         for name, kept in held.items():
             if name.startswith(_HIDDEN):
                 index = int(name[len(_HIDDEN) :])
-                slots = self._slots[index]
+                actor, slots = table.actors[index]
                 true = np.broadcast_to(kept.reshape(steps, -1, 7), (steps, len(slots), 7))
                 flat[:, slots[slots >= 0]] = true[:, slots >= 0]
-                if (actor := self._named.get(id(table.actors[index]))) is not None:
-                    hidden[actor] = true
+                if id(actor) in self._named:
+                    hidden[self._named[id(actor)]] = true
         columns: dict[str, NDArray] = {
             "poses": poses,
             "action": held["action"].reshape(*shape, -1),

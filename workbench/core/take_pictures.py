@@ -25,10 +25,10 @@ import torch
 from numpy.typing import NDArray
 
 from workbench.core import seams
-from workbench.core.body_table import BodyTable, build_body_table
 from workbench.core.camera_configs import rows_of_pose, settings_of, target_of
 from workbench.core.drawn_poses import NOWHERE_ELSE, Places, drawn_at
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
+from workbench.core.scene_index import hidden_poses, scene_index
 
 _MODALITIES = ("rgb", "depth", "segmentation", "position", "normal", "albedo")
 _INT16_END = 32.767
@@ -39,22 +39,16 @@ Request = tuple[str, CameraKind, Sequence[str]]
 """Name, kind and modalities of a camera whose picture is wanted."""
 
 
-def list_cameras(env: Any, table: BodyTable | None = None) -> tuple[CameraInfo, ...]:
+def list_cameras(env: Any) -> tuple[CameraInfo, ...]:
     """All cameras of a ManiSkill env: its sensors (the robot's too), then its human render cameras.
 
     Empty where nothing can be rendered. Sensors that are no plain cameras are left out.
-
-    Args:
-        table: the env's bodies, to name what a camera is mounted on; made anew if left out.
     """
-    cameras = cameras_of(env)
-    table = table or (build_body_table(env) if cameras else None)
     infos = []
-    for (kind, name), camera in cameras.items():
+    for (kind, name), camera in cameras_of(env).items():
         components = _components(camera)
         component = components[0]
         gives = {m for modalities in camera.config.shader_config.texture_names.values() for m in modalities}
-        mount = camera.camera.mount
         infos.append(
             CameraInfo(
                 name=name,
@@ -65,7 +59,7 @@ def list_cameras(env: Any, table: BodyTable | None = None) -> tuple[CameraInfo, 
                 near=float(component.near),
                 far=float(component.far),
                 intrinsic=np.array(component.get_intrinsic_matrix(), dtype=np.float32),
-                mount=None if mount is None or table is None else body_name(mount, table),
+                mount=mount_of(env, camera),
                 modalities=tuple(m for m in _MODALITIES if m in gives),
                 settings=settings_of(camera.config),
                 varies=_varies(camera.config, components),
@@ -76,18 +70,16 @@ def list_cameras(env: Any, table: BodyTable | None = None) -> tuple[CameraInfo, 
     return tuple(infos)
 
 
-def segmentation_names(
-    env: Any, table: BodyTable | None = None, env_index: int | None = None
-) -> dict[int, str]:
+def segmentation_names(env: Any) -> dict[int, str]:
     """Body name of every id in a segmentation picture; 0, the background, is not among them.
 
     Ids count the entities of a sub-scene, so they are the same in all envs that are built alike.
-    Where envs differ, give `env_index`; without it an id that means two things is called ``a | b``.
+    Where envs differ an id that means two things is called ``a | b``.
     """
-    table = table or build_body_table(env)
+    index = scene_index(env)
     names: dict[int, list[str]] = {}
-    for row in table.entities if env_index is None else table.entities[[env_index]]:
-        for entity, name in zip(row, table.names, strict=True):
+    for row in index.entities:
+        for entity, name in zip(row, index.names, strict=True):
             if entity is not None:
                 known = names.setdefault(int(entity.per_scene_id), [])
                 if name not in known:
@@ -101,7 +93,7 @@ def take_pictures(
     """Render the cameras that are asked for, in env `env_index`; in the order asked.
 
     Args:
-        poses: (B, 7) where to draw the env's bodies, as `body_table.read_poses` gives them; None for where the
+        poses: (B, 7) where to draw the env's bodies, as `read_poses` gives them; None for where the
             tensors have them, applied or not (`drawn_poses`). Only what is drawn moves, so a moment of the past can be looked at while the simulation is
             elsewhere. A camera rides along with the body that it is mounted on; colours and lights are today's.
 
@@ -184,7 +176,7 @@ def places_to_draw(env: Any, env_index: int, poses: NDArray[np.float32] | None) 
         poses: as in `take_pictures`.
     """
     if poses is not None:
-        each = zip(build_body_table(env).entities[env_index], poses, strict=True)
+        each = zip(scene_index(env).entities[env_index], poses, strict=True)
         return {id(entity): (entity, pose) for entity, pose in each if np.isfinite(pose).all()}
     px = seams.batched_system(env.scene)
     return NOWHERE_ELSE if px is None else px.elsewhere([env_index]).get(env_index, NOWHERE_ELSE)
@@ -214,11 +206,10 @@ def _varies(config: Any, components: Sequence[Any]) -> bool:
     return bool((said != said[:1]).any() or np.abs(real - said[:1]).max() > 1e-5)
 
 
-def body_name(mount: Any, table: BodyTable) -> str | None:
-    thing = seams.objects_of(mount)[0]
-    entity = thing if isinstance(thing, sapien.Entity) else thing.entity
-    slot = table.slot_of.get(id(entity))
-    return None if slot is None else table.names[slot % len(table.names)]
+def mount_of(env: Any, camera: Any) -> str | None:
+    """Name of the body that a camera rides on; `camera` as `cameras_of` gives it."""
+    mount = camera.camera.mount
+    return None if mount is None else scene_index(env).name_of(seams.objects_of(mount)[0])
 
 
 def _check(
@@ -242,22 +233,23 @@ def hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]:
     """Draw the task's hidden objects in this env, or do not, and put everything back afterwards."""
     was_visible: list[tuple[Any, float]] = []
     was_at: list[tuple[Any, sapien.Pose]] = []
+    slot_of = scene_index(env).slot_of
+    true = (
+        {slot: pose for rows in hidden_poses(env) for slot, pose in zip(*rows, strict=True)} if shown else {}
+    )
     try:
         for actor in seams.hidden_objects(env):
-            kept = seams.pose_before_hiding(actor)
-            here = zip(seams.objects_of(actor), seams.envs_of(actor), strict=True)
-            for row, (entity, env_of) in enumerate(here):
+            for entity, env_of in zip(seams.objects_of(actor), seams.envs_of(actor), strict=True):
                 body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
                 if env_of != env_index or body is None:
                     continue
                 was_visible.append((body, body.visibility))
                 # A ghost of visibility 0.3 stays one; only what is switched off is switched on.
                 body.visibility = (body.visibility or 1.0) if shown else 0.0
-                if shown and kept is not None:
-                    true = np.atleast_2d(kept.cpu().numpy())
-                    true = true[row if len(true) > 1 else 0]
+                pose = true.get(slot_of[id(entity)]) if id(entity) in slot_of else None
+                if pose is not None:
                     was_at.append((entity, entity.pose))
-                    entity.pose = sapien.Pose(true[:3], true[3:])
+                    entity.pose = sapien.Pose(pose[:3], pose[3:])
         yield
     finally:
         for body, visibility in reversed(was_visible):

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from workbench.core import actions
 from workbench.core.assets import refuse_downloads, require_assets, robots_of
 from workbench.core.backends import Backend, choose_backend
-from workbench.core.body_table import BodyTable, build_body_table, read_poses
 from workbench.core.broken_rule import BrokenRules, warn_of
 from workbench.core.constructors import refuse_unbuilt_env
 from workbench.core.contact_list import Contact, list_contacts
@@ -30,6 +29,7 @@ from workbench.core.env_numbers import envs_of_batch
 from workbench.core.partial_reset import in_ascending_order, seeded
 from workbench.core.render_device import keep_render_device
 from workbench.core.rules import Degree, Finding, degrees_of
+from workbench.core.scene_index import read_poses
 from workbench.core.seams import (
     episode_seeds,
     flatten_observation,
@@ -160,7 +160,7 @@ class TaskEnv:
         self.env = env
         self.max_episode_steps = max_episode_steps
         self.parts = actions.action_parts(env) if like is None else like.parts
-        self.table: BodyTable = build_body_table(env) if like is None else like.table
+        self._scene = env.scene if like is None else like._scene
         self.obs: Any = None if like is None else like.obs
         """The last observation, as the task's ``obs_mode`` gives it."""
         self._check = check
@@ -291,7 +291,7 @@ class TaskEnv:
             truncated=_batch(to_numpy(truncated).astype(bool), count),
             evaluate=evaluate,
             others=others,
-            poses=read_poses(self.env, self.table),
+            poses=read_poses(self.env),
             action=action,
         )
 
@@ -312,15 +312,15 @@ class TaskEnv:
 
     def contacts(self, env: int) -> tuple[Contact, ...]:
         """What touches what in one env, in its last substep; see `list_contacts`."""
-        return list_contacts(self.env, env, self.table)
+        return list_contacts(self.env, env)
 
     def close(self) -> None:
         self.env.close()
 
     def _refresh_if_rebuilt(self) -> None:
-        # With `reconfiguration_freq` a reset may replace the scene, and with it every body.
-        if self.table.scene is not self.env.scene:
-            self.table = build_body_table(self.env)
+        # With `reconfiguration_freq` a reset may replace the scene, and with it every robot.
+        if self._scene is not self.env.scene:
+            self._scene = self.env.scene
             self.parts = actions.action_parts(self.env)
 
     def _terminated(self, info: Mapping[str, Any]) -> NDArray[np.bool_]:
@@ -345,7 +345,7 @@ class TaskEnv:
             truncated=truncated,
             evaluate=evaluate,
             others=others,
-            poses=read_poses(self.env, self.table),
+            poses=read_poses(self.env),
             action=None if action is None else np.array(action, dtype=np.float32),
             sound_obs=_sound(self.obs, self.num_envs),
         )

@@ -26,12 +26,12 @@ from mani_skill.utils.scene_builder import SceneBuilder
 from numpy.typing import NDArray
 
 from workbench.core import seams
-from workbench.core.body_table import BodyTable, build_body_table, read_poses
 from workbench.core.camera_frames import compose, intrinsic_of, make_pose, matrix3, scaled_intrinsic
 from workbench.core.camera_report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen, ObjectToSee
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.pictures import CameraKind, Picture
-from workbench.core.take_pictures import body_name, cameras_of
+from workbench.core.scene_index import SceneIndex, read_poses, scene_index
+from workbench.core.take_pictures import cameras_of, mount_of
 from workbench.core.temporary_camera import TemporaryCamera, temporary_camera, undrawn
 
 SMALL = 64
@@ -45,7 +45,7 @@ class SceneObject:
     name: str
     """An actor's or an articulation's."""
     bodies: tuple[int, ...]
-    """Columns of the body table: one of an actor, all links of an articulation."""
+    """Columns of the scene's index: one of an actor, all links of an articulation."""
     robot: bool
     scenery: bool
     """The ground, static, or put there by one of ManiSkill's scene builders and not to be moved (its table)."""
@@ -63,73 +63,67 @@ class Placement:
     """Name of the body whose frame `settings` speaks of; None for the env's."""
 
 
-def list_objects(env: Any, table: BodyTable | None = None) -> tuple[SceneObject, ...]:
+def list_objects(env: Any) -> tuple[SceneObject, ...]:
     """The objects of a scene: its actors, then its articulations."""
-    table = table or build_body_table(env)
-    agent = env.agent
-    agents = [] if agent is None else getattr(agent, "agents", [agent])
-    robots = {agent.robot.name for agent in agents}
+    index = scene_index(env)
+    robots = {agent.robot.name for agent in seams.agents(env)}
     built = _built_by_scene_builders(env)
-    scene = env.scene
-    labels = [str(name) for name in (*scene.articulations, *scene.articulation_views)]
     members: dict[tuple[bool, str], list[int]] = {}
-    for body, (name, kind) in enumerate(zip(table.names, table.kinds, strict=True)):
-        owners = [label for label in labels if name.startswith(label + "/")] if kind == "link" else []
-        members.setdefault((kind == "link", max(owners, key=len, default=name)), []).append(body)
+    for body, (owner, kind) in enumerate(zip(index.owners, index.kinds, strict=True)):
+        members.setdefault((kind == "link", owner), []).append(body)
     found = []
     for (linked, name), bodies in members.items():
-        entities = [e for e in table.entities[:, bodies].ravel() if e is not None]
-        kinds = {table.kinds[body] for body in bodies}
+        entities = [e for e in index.entities[:, bodies].ravel() if e is not None]
+        kinds = {index.kinds[body] for body in bodies}
         found.append(
             SceneObject(
                 name=name,
                 bodies=tuple(bodies),
                 robot=linked and name in robots,
                 scenery=name == "ground"
-                or all(table.kinds[body] == "static" for body in bodies)
+                or kinds == {"static"}
                 # Scene builders also put things there that are to be picked up.
                 or (kinds <= {"kinematic", "static"} and all(id(entity) in built for entity in entities)),
-                hidden=all(table.hidden[body] for body in bodies),
+                hidden=all(index.hidden[body] for body in bodies),
             )
         )
     return tuple(found)
 
 
-def objects_to_see(env: Any, table: BodyTable | None = None) -> tuple[ObjectToSee, ...]:
+def objects_to_see(env: Any) -> tuple[ObjectToSee, ...]:
     """What of a scene a camera may be asked to see, as plain data."""
-    table = table or build_body_table(env)
-    objects = list_objects(env, table)
+    names, objects = scene_index(env).names, list_objects(env)
     seen = tuple(
         ObjectToSee(
             thing.name,
             thing.hidden,
-            tuple(table.names[body] for body in thing.bodies) if len(thing.bodies) > 1 else (),
+            tuple(names[body] for body in thing.bodies) if len(thing.bodies) > 1 else (),
         )
         for thing in objects
         if not (thing.robot or thing.scenery)
     )
     robots = [thing for thing in objects if thing.robot]
-    return seen + tuple(ObjectToSee(t.name, False, _links_from_the_hand(env, t, table), True) for t in robots)
+    return seen + tuple(ObjectToSee(t.name, False, _links_from_the_hand(env, t), True) for t in robots)
 
 
-def _links_from_the_hand(env: Any, robot: SceneObject, table: BodyTable) -> tuple[str, ...]:
+def _links_from_the_hand(env: Any, robot: SceneObject) -> tuple[str, ...]:
     """Names of a robot's links that have something to be seen: its hand, then what is near its tool centre point.
 
     That point is a link that ManiSkill's agents have under the name ``tcp``, where they have a hand. The hand is the
     link that carries it: the fingers may be nearer to it, but a hand is what people ask to see. Without a tool the last
     link comes first.
     """
-    drawn = [body for body in reversed(robot.bodies) if _is_drawn(table.entities[0, body])]
-    agents = getattr(env.agent, "agents", [env.agent])
-    tools = [getattr(agent, "tcp", None) for agent in agents if agent.robot.name == robot.name]
+    names, entities = scene_index(env).names, scene_index(env).entities[0]
+    drawn = [body for body in reversed(robot.bodies) if _is_drawn(entities[body])]
+    tools = [getattr(agent, "tcp", None) for agent in seams.agents(env) if agent.robot.name == robot.name]
     name = f"{robot.name}/{getattr(tools[0], 'name', '')}" if tools else ""
-    if name in table.names:
-        places = read_poses(env, table)[0, :, :3]
-        tool = table.names.index(name)
-        hand = _carrier(table.entities[0, tool])
+    if name in names:
+        places = read_poses(env)[0, :, :3]
+        tool = names.index(name)
+        hand = _carrier(entities[tool])
         drawn.sort(key=lambda body: float(np.linalg.norm(places[body] - places[tool])))
-        drawn.sort(key=lambda body: table.entities[0, body] is not hand)
-    return tuple(table.names[body] for body in drawn)
+        drawn.sort(key=lambda body: entities[body] is not hand)
+    return tuple(names[body] for body in drawn)
 
 
 def _carrier(entity: Any) -> Any:
@@ -154,7 +148,6 @@ def judge_camera(
     settings: CameraSettings | None = None,
     size: tuple[int, int] | None = None,
     poses: NDArray[np.float32] | None = None,
-    table: BodyTable | None = None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> CameraReport:
     """Judge a camera of the env, as it stands or as `settings` would have it, in some envs at their present moment.
@@ -163,7 +156,6 @@ def judge_camera(
         settings: in the frame of the camera's mount, the same in all envs; None for each env's own camera.
         size: of the pictures that are judged, None for the camera's own; the view stays the same (`small_size`).
         poses: (N, B, 7) where to draw the bodies, as `read_poses` gives them; None for where the tensors have them.
-        table: the env's bodies; made anew if left out.
         cancelled: asked before each env; when it says yes, the report is of the envs that were judged until then.
 
     Raises:
@@ -175,15 +167,13 @@ def judge_camera(
     if camera not in cameras:
         there = ", ".join(f"{name} ({kind})" for kind, name in cameras) or "none"
         raise ValueError(f"there is no {camera[0]} camera {camera[1]!r} to judge; there are: {there}")
-    table = table or build_body_table(env)
     there = cameras[camera]
-    on = there.camera.mount
-    mount = None if on is None else body_name(on, table)
+    mount = mount_of(env, there)
 
     def placement(e: int) -> Placement:
         return Placement(settings or settings_of(there, e), camera[0], mount)
 
-    return _judge(env, camera, placement, envs, size, poses, table, cancelled)
+    return _judge(env, camera, placement, envs, size, poses, cancelled)
 
 
 def judge_placement(
@@ -194,7 +184,6 @@ def judge_placement(
     name: str = "suggested",
     size: tuple[int, int] | None = None,
     poses: NDArray[np.float32] | None = None,
-    table: BodyTable | None = None,
     cancelled: Callable[[], bool] = lambda: False,
 ) -> CameraReport:
     """Judge a camera that does not exist; arguments and errors as `judge_camera`'s.
@@ -202,21 +191,18 @@ def judge_placement(
     Raises:
         ValueError: also where no body is called as the mount.
     """
-    table = table or build_body_table(env)
-    return _judge(env, (placement.kind, name), lambda e: placement, envs, size, poses, table, cancelled)
+    return _judge(env, (placement.kind, name), lambda e: placement, envs, size, poses, cancelled)
 
 
 def picture_of(
     env: Any,
     e: int,
     placement: Placement,
-    table: BodyTable,
     poses: NDArray[np.float32] | None = None,
     size: tuple[int, int] | None = None,
 ) -> Picture:
     """What a camera that does not exist sees of one env, in its own size or another; raises as `judge_placement`."""
-    bodies = read_poses(env, table)[e] if poses is None else poses
-    pose = pose_in_env(placement, bodies, table)
+    pose = pose_in_env(placement, read_poses(env)[e] if poses is None else poses, scene_index(env))
     with placed_camera(env, e, placement, size, poses) as view:
         segmentation, depth = view.look(pose)
         rgb = view.colours()
@@ -282,7 +268,6 @@ def _judge(
     envs: Sequence[int],
     size: tuple[int, int] | None,
     poses: NDArray[np.float32] | None,
-    table: BodyTable,
     cancelled: Callable[[], bool],
 ) -> CameraReport:
     began = time.perf_counter()
@@ -290,8 +275,8 @@ def _judge(
         raise ValueError("no env is named to judge the camera in")
     if any(not 0 <= e < env.num_envs for e in envs):
         raise IndexError(f"envs {list(envs)} are out of range for {env.num_envs} envs")
-    objects = list_objects(env, table)
-    bodies = read_poses(env, table) if poses is None else poses
+    objects, index = list_objects(env), scene_index(env)
+    bodies = read_poses(env) if poses is None else poses
     measured: list[Measured] = []
     judged: list[int] = []
     shown: list[Placement] = []
@@ -300,8 +285,8 @@ def _judge(
             break
         placement = placement_in(e)
         with placed_camera(env, e, placement, size, None if poses is None else poses[e]) as view:
-            pose = pose_in_env(placement, bodies[e], table)
-            measured.append(measure(view, pose, e, objects, table, camera[0]))
+            pose = pose_in_env(placement, bodies[e], index)
+            measured.append(measure(view, pose, e, objects, index, camera[0]))
         judged.append(e)
         shown.append(placement)
     milliseconds = 1000 * (time.perf_counter() - began)
@@ -350,14 +335,14 @@ def placed_camera(
     return temporary_camera(env, e, placement.kind, size or own, intrinsic, s.near, s.far, poses)
 
 
-def pose_in_env(placement: Placement, bodies: NDArray[np.float32], table: BodyTable) -> NDArray[np.float64]:
+def pose_in_env(placement: Placement, bodies: NDArray[np.float32], index: SceneIndex) -> NDArray[np.float64]:
     """(7,) of a placement in the env's frame, where the bodies stand at `bodies` (B, 7)."""
     local = make_pose(placement.settings.position, placement.settings.quaternion)
     if placement.mount is None:
         return local
-    if placement.mount not in table.names:
+    if placement.mount not in index.names:
         raise ValueError(f"there is no body {placement.mount!r} to mount a camera on")
-    mount = bodies[table.names.index(placement.mount)]
+    mount = bodies[index.names.index(placement.mount)]
     if not np.isfinite(mount).all():
         raise ValueError(f"this env has no body {placement.mount!r} to mount a camera on")
     return compose(mount, local)
@@ -368,7 +353,7 @@ def measure(
     pose: NDArray,
     e: int,
     objects: Sequence[SceneObject],
-    table: BodyTable,
+    index: SceneIndex,
     kind: CameraKind,
     bare: Measured | None = None,
 ) -> Measured:
@@ -377,7 +362,7 @@ def measure(
     Args:
         bare: what was measured from this pose with the robot not drawn, if that was; then one look is enough.
     """
-    entities = [entities_of(thing, e, table) for thing in objects]
+    entities = [entities_of(thing, e, index) for thing in objects]
     ids = [[entity.per_scene_id for entity in row] for row in entities]
     segmentation, depth = view.look(pose)
     pictures = 1
@@ -395,7 +380,7 @@ def measure(
                 without, _ = view.look(pose)
             pictures += 1
         left = set(np.unique(without).tolist())
-        every = [entity for entity in table.entities[e] if entity is not None]
+        every = [entity for entity in index.entities[e] if entity is not None]
         for i, (thing, row) in enumerate(zip(objects, ids, strict=True)):
             mask = _mask(without, left.intersection(row))
             unhindered[i] = mask.sum()
@@ -433,9 +418,9 @@ def measure(
     )
 
 
-def entities_of(thing: SceneObject, e: int, table: BodyTable) -> list[Any]:
+def entities_of(thing: SceneObject, e: int, index: SceneIndex) -> list[Any]:
     """The ``sapien.Entity`` of each body of an object that env `e` has."""
-    return [entity for entity in table.entities[e, list(thing.bodies)] if entity is not None]
+    return [entity for entity in index.entities[e, list(thing.bodies)] if entity is not None]
 
 
 def _mask(segmentation: NDArray[np.int32], numbers: Collection[int]) -> NDArray[np.bool_]:

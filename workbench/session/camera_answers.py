@@ -70,11 +70,10 @@ def _looked_at(opened: OpenedTask, question: DrawCamera) -> tuple[Picture, ...]:
     size = (max(1, round(settings.width * scale)), max(1, round(settings.height * scale)))
     info = next((info for info in opened.description.cameras if info.key == question.key), None)
     placement = Placement(settings, question.key[0], None if info is None else info.mount)
-    table = opened.env.table
     made = []
     for e in question.envs:
         moment = None if question.poses is None else question.poses[e]
-        picture = picture_of(opened.env.env, e, placement, table, moment, size)
+        picture = picture_of(opened.env.env, e, placement, moment, size)
         wanted = question.modalities
         made.append(
             replace(
@@ -124,7 +123,6 @@ def _judged(opened: OpenedTask, question: JudgeCamera) -> CameraJudged:
         settings=question.settings,
         size=small_size(width, height, JUDGED_SIDE),
         poses=question.poses,
-        table=opened.env.table,
     )
     return CameraJudged(question.number, report)
 
@@ -155,7 +153,6 @@ def _suggested(
             mount=None if info is None else info.mount,
         ),
         question.envs,
-        table=opened.env.table,
         progress=progress,
         cancelled=cancelled,
     )

@@ -261,15 +261,15 @@ def describe(
         control_mode=control_mode,
         control_dt=task.control_dt,
         actions=tuple(dimensions),
-        geometry=read_geometry(env, task.table),
-        cameras=list_cameras(env, task.table),
-        segmentation=segmentation_names(env, task.table),
+        geometry=read_geometry(env),
+        cameras=list_cameras(env),
+        segmentation=segmentation_names(env),
         can_render=can_render,
         chosen=loaded.chosen,
         others=loaded.others if loaded.followed else (),
         in_place_of=None if loaded.in_place_of is None else loaded.in_place_of.name,
         env_kwargs=env_kwargs(env, {**loaded.default_kwargs, **given}),
-        objects=objects_to_see(env, task.table),
+        objects=objects_to_see(env),
     )
 
 

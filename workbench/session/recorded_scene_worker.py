@@ -111,13 +111,13 @@ def make(wanted: SceneWanted) -> TaskEnv:
 
 def scene_of(env: TaskEnv, wanted: SceneWanted, connection: Connection) -> SceneMade:
     """Its geometry, and the poses of every body at each recorded state."""
-    from workbench.core.body_table import read_poses
     from workbench.core.recorded_state import misfits, write_states
     from workbench.core.scene_geometry import read_geometry
+    from workbench.core.scene_index import read_poses
 
     seed = wanted.seed if wanted.seed >= 0 else None
     env.reset(seed=seed, options=wanted.reset_options)
-    geometry = read_geometry(env.env, env.table)
+    geometry = read_geometry(env.env)
     states = wanted.env_states
     count = min(len(values) for values in states.values())
     poses: list[Any] = []
@@ -126,7 +126,7 @@ def scene_of(env: TaskEnv, wanted: SceneWanted, connection: Connection) -> Scene
         if row % _SAY_EVERY == 0:
             connection.send(Said(f"putting it into state {row} of {count - 1}"))
         write_states(env.env, {0: {name: values[row] for name, values in states.items()}})
-        poses.append(read_poses(env.env, env.table)[0])
+        poses.append(read_poses(env.env)[0])
     return SceneMade(geometry, np.stack(poses), tuple(f"{name}: {why}" for name, why in missed.items()))
 
 

@@ -282,7 +282,7 @@ def _exchange(
         notices=notices_of(loaded, running.request.options),
     )
     if change.level == "cameras":
-        description = replace(description, cameras=list_cameras(env, task.table))
+        description = replace(description, cameras=list_cameras(env))
     report = ReloadReport(change.level, change.reason, 0.0, not_carried=left)
     return OpenedTask(loaded, task, description, first, clock.laps), report
 

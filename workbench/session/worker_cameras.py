@@ -195,7 +195,7 @@ class WorkerCameras:
         said = {c.key: c for c in opened.description.cameras}
         infos = tuple(
             replace(info, settings=before.settings, varies=before.varies, site=before.site)
-            for info in list_cameras(env, opened.env.table)
+            for info in list_cameras(env)
             if (before := said.get(info.key)) is not None
         )
         self._held.opened = replace(opened, description=replace(opened.description, cameras=infos))

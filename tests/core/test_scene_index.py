@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from typing import Any
 
 import mani_skill.envs  # noqa: F401 (registers the tasks)
@@ -13,7 +15,7 @@ from mani_skill.envs.tasks.tabletop.push_cube import PushCubeEnv
 from mani_skill.utils.structs import Actor, Pose
 
 from tests.drive.envs import batched, stock
-from workbench.core.body_table import BodyTable, build_body_table, read_poses
+from workbench.core.scene_index import hidden_poses, read_poses, scene_index
 
 TASKS = ["PickCube-v1", "PushCube-v1", "PegInsertionSide-v1", "MS-CartpoleBalance-v1"]
 
@@ -23,8 +25,8 @@ def begun(env: Any) -> Any:
     return env
 
 
-def assert_poses_are_those_of_the_structs(env: Any, table: BodyTable) -> None:
-    poses = read_poses(env, table)
+def assert_poses_are_those_of_the_structs(env: Any) -> None:
+    table, poses = scene_index(env), read_poses(env)
     assert poses.shape == (env.num_envs, len(table.names), 7) and poses.dtype == np.float32
     checked = np.zeros(poses.shape[:2], bool)
     named = {**env.scene.actors, **env.scene.actor_views}
@@ -42,15 +44,14 @@ def assert_poses_are_those_of_the_structs(env: Any, table: BodyTable) -> None:
 @pytest.mark.parametrize("task", TASKS)
 def test_poses_are_those_of_maniskill(task: str, make: Any) -> None:
     env = make(task)
-    table = build_body_table(env)
+    table = scene_index(env)
     assert len(set(table.names)) == len(table.names)
     for _ in range(3):
         env.step(torch.from_numpy(np.atleast_2d(env.action_space.sample())))
-        assert_poses_are_those_of_the_structs(env, table)
+        assert_poses_are_those_of_the_structs(env)
     env.reset(seed=2)
     # PegInsertionSide makes new pegs for every episode of a single env.
-    table = table if table.scene is env.scene else build_body_table(env)
-    assert_poses_are_those_of_the_structs(env, table)
+    assert_poses_are_those_of_the_structs(env)
     env.close()
 
 
@@ -58,10 +59,10 @@ def test_poses_are_those_of_maniskill(task: str, make: Any) -> None:
 def test_poses_are_those_of_the_physics(task: str) -> None:
     """Against the entities themselves, which know nothing of ManiSkill's tensors."""
     env = begun(batched(task, 4))
-    table = build_body_table(env)
+    table = scene_index(env)
     env.step(torch.from_numpy(env.action_space.sample()))
     env.reset(options={"env_idx": torch.tensor([1, 3])})
-    poses = read_poses(env, table)
+    poses = read_poses(env)
     for e in range(env.num_envs):
         for b in range(len(table.names)):
             pose = table.entities[e, b].pose
@@ -71,7 +72,7 @@ def test_poses_are_those_of_the_physics(task: str) -> None:
 
 def test_names_are_readable_and_kinds_are_right() -> None:
     env = begun(stock("PickCube-v1"))
-    table = build_body_table(env)
+    table = scene_index(env)
     kind = dict(zip(table.names, table.kinds, strict=True))
     assert kind["cube"] == "dynamic" and kind["ground"] == "static" and kind["goal_site"] == "kinematic"
     assert kind["panda/panda_hand"] == "link"
@@ -81,26 +82,26 @@ def test_names_are_readable_and_kinds_are_right() -> None:
 
 def test_objects_that_differ_between_envs_are_one_body() -> None:
     env = begun(batched("PegInsertionSide-v1", 4))
-    table = build_body_table(env)
+    table = scene_index(env)
     assert "peg" in table.names and "box_with_hole" in table.names
     assert not [name for name in table.names if name.startswith("peg_")]
-    assert not np.isnan(read_poses(env, table)).any()
+    assert not np.isnan(read_poses(env)).any()
     env.close()
 
 
 def test_a_hidden_body_is_where_it_would_be_seen() -> None:
     env: Any = begun(batched("PickCube-v1", 4))
-    table = build_body_table(env)
+    table = scene_index(env)
     goal = table.names.index("goal_site")
-    shown = read_poses(env, table)
+    shown = read_poses(env)
     env.goal_site.hide_visual()
-    np.testing.assert_array_equal(read_poses(env, table), shown)
+    np.testing.assert_array_equal(read_poses(env), shown)
     env.reset(seed=5)
-    moved = read_poses(env, table)
+    moved = read_poses(env)
     assert np.abs(moved[:, goal, :3]).max() < 2.0
     assert (moved[:, goal, :3] != shown[:, goal, :3]).any()
     env.goal_site.show_visual()
-    np.testing.assert_array_equal(read_poses(env, table), moved)
+    np.testing.assert_array_equal(read_poses(env), moved)
     env.close()
 
 
@@ -123,35 +124,82 @@ class SparseBodiesEnv(PushCubeEnv):
 
 def test_a_body_that_an_env_lacks_is_nan_there_only() -> None:
     env = begun(batched(SparseBodiesEnv, 4))
-    table = build_body_table(env)
-    missing = np.isnan(read_poses(env, table)).all(axis=-1)
+    table = scene_index(env)
+    missing = np.isnan(read_poses(env)).all(axis=-1)
     assert np.argwhere(missing).tolist() == [[1, table.names.index("rare")], [3, table.names.index("rare")]]
-    assert_poses_are_those_of_the_structs(env, table)
+    assert_poses_are_those_of_the_structs(env)
     env.close()
 
 
 def test_a_view_over_two_bodies_of_one_env_leaves_them_their_names() -> None:
     env = begun(batched(SparseBodiesEnv, 2))
-    table = build_body_table(env)
+    table = scene_index(env)
     assert {"left", "right"} < set(table.names) and "pair" not in table.names
     env.close()
 
 
 def test_a_stock_env_may_gain_an_entity() -> None:
     env = begun(stock("PushCube-v1"))
-    table = build_body_table(env)
-    before = read_poses(env, table)
+    before = read_poses(env)
     env.scene.sub_scenes[0].add_entity(sapien.Entity())
-    np.testing.assert_array_equal(read_poses(env, table), before)
+    np.testing.assert_array_equal(read_poses(env), before)
     env.close()
 
 
-def test_a_table_of_an_old_scene_is_refused() -> None:
-    env = begun(stock("PushCube-v1"))
-    table = build_body_table(env)
+def test_a_scene_is_looked_over_once_and_a_new_one_anew() -> None:
+    env = begun(batched("PickCube-v1", 2))
+    before = scene_index(env)
+    env.step(torch.from_numpy(env.action_space.sample()))
+    assert scene_index(env) is before
     env.reset(seed=0, options={"reconfigure": True})
-    with pytest.raises(ValueError, match="build_body_table"):
-        read_poses(env, table)
+    after = scene_index(env)
+    assert after is not before and after.names == before.names
+    assert not {id(e) for e in after.entities.ravel()} & {id(e) for e in before.entities.ravel()}
+    assert_poses_are_those_of_the_structs(env)
+    env.close()
+
+
+def test_what_is_known_of_a_scene_goes_with_it() -> None:
+    env = begun(batched("PickCube-v1", 2))
+    scene, index = weakref.ref(env.scene), weakref.ref(scene_index(env))
+    env.close()
+    del env
+    gc.collect()
+    assert scene() is None and index() is None
+
+
+def test_what_is_hidden_is_told_where_it_is_and_can_be_moved_there() -> None:
+    env: Any = begun(batched("PickCube-v1", 3))
+    index, goal = scene_index(env), scene_index(env).names.index("goal_site")
+    env.goal_site.show_visual()
+    assert list(hidden_poses(env)) == []
+    shown = read_poses(env)[:, goal]
+    env.goal_site.hide_visual()
+    ((slots, poses),) = hidden_poses(env)
+    assert (slots // len(index.names)).tolist() == [0, 1, 2] and (slots % len(index.names) == goal).all()
+    np.testing.assert_array_equal(poses, shown)
+    poses[1, 2] += 0.5
+    assert (env.goal_site.pose.p[:, 2].numpy() - shown[:, 2]).tolist() == pytest.approx([0, 0.5, 0], abs=1e-6)
+    env.close()
+
+
+@pytest.mark.parametrize("make", [stock, batched])
+def test_names_of_states_are_those_of_the_state_dict(make: Any) -> None:
+    env = begun(make("PegInsertionSide-v1"))
+    said = env.get_state_dict()
+    names = [f"{group}/{name}" for group in ("actors", "articulations") for name in said[group]]
+    assert list(scene_index(env).states) == names
+    env.close()
+
+
+def test_a_body_knows_its_actor_or_articulation() -> None:
+    env = begun(stock("RotateValveLevel0-v1"))
+    index = scene_index(env)
+    of = dict(zip(index.names, index.owners, strict=True))
+    assert of["valve_station/valve"] == "valve_station" and of["ground"] == "ground"
+    (link,) = env.valve_link._objs
+    assert index.name_of(link) == index.name_of(link.entity) == "valve_station/valve"
+    assert index.name_of(sapien.Entity()) is None
     env.close()
 
 
@@ -159,5 +207,5 @@ def test_all_envs_in_one_sub_scene_are_refused() -> None:
     env = begun(stock("PushCube-v1"))
     env.scene.parallel_in_single_scene = True  # ManiSkill itself allows it only with a GPU
     with pytest.raises(NotImplementedError, match="parallel_in_single_scene"):
-        build_body_table(env)
+        scene_index(env)
     env.close()
