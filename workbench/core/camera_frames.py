@@ -14,8 +14,8 @@ The three conventions differ only in what the camera's own axes are called:
 * ``opengl`` (also Blender, NeRF): x right, y up, z backward.
 
 The lens is OpenCV's pinhole: (u, v, 1) z = K (x, y, z), pixels counted from the outer edge of the picture's top left
-pixel, which makes the middle of a picture W / 2, H / 2, as SAPIEN has it. Only numpy is imported, since the server
-turns a page's numbers around with it.
+pixel, which makes the middle of a picture W / 2, H / 2, as SAPIEN has it. Nothing of a simulator is imported, since the
+server turns a page's numbers around with it.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from transforms3d.euler import euler2mat, euler2quat
+from transforms3d.quaternions import mat2quat, qconjugate, qmult, quat2mat
 
 from workbench.core.camera_settings import CameraSettings, Matrix3
 
@@ -82,43 +84,16 @@ def normalised(quaternion: ArrayLike) -> Floats:
 
 def rotation_matrix(quaternion: ArrayLike) -> Floats:
     """(3, 3) of a wxyz quaternion of any length."""
-    w, x, y, z = normalised(quaternion)
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return quat2mat(normalised(quaternion))
 
 
 def quaternion_of(rotation: ArrayLike) -> Floats:
     """(4,) wxyz of a rotation matrix (3, 3); of the nearest rotation, if it is a little off.
 
-    The largest of the four is computed from the diagonal and the others from it (Shepperd 1978): any other order
-    divides by a number that may be zero.
-
     Raises:
         ValueError: the matrix is no rotation; says what is wrong with it.
     """
-    r = nearest_rotation(rotation)
-    squares = np.array(
-        [
-            1 + r[0, 0] + r[1, 1] + r[2, 2],
-            1 + r[0, 0] - r[1, 1] - r[2, 2],
-            1 - r[0, 0] + r[1, 1] - r[2, 2],
-            1 - r[0, 0] - r[1, 1] + r[2, 2],
-        ]
-    )
-    products = np.array(
-        [
-            [squares[0], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
-            [r[2, 1] - r[1, 2], squares[1], r[1, 0] + r[0, 1], r[0, 2] + r[2, 0]],
-            [r[0, 2] - r[2, 0], r[1, 0] + r[0, 1], squares[2], r[2, 1] + r[1, 2]],
-            [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[2, 1] + r[1, 2], squares[3]],
-        ]
-    )
-    return normalised(products[int(np.argmax(squares))])
+    return normalised(mat2quat(nearest_rotation(rotation)))
 
 
 def nearest_rotation(matrix: ArrayLike) -> Floats:
@@ -196,16 +171,7 @@ def rpy_of(quaternion: ArrayLike) -> tuple[float, float, float]:
 
 def quaternion_from_rpy(roll: float, pitch: float, yaw: float) -> Floats:
     """(4,) wxyz of roll, pitch and yaw in degrees; see `rpy_of` for what they mean."""
-    half = np.radians(_vector([roll, pitch, yaw], 3, "roll, pitch and yaw")) / 2
-    (cr, cp, cy), (sr, sp, sy) = np.cos(half), np.sin(half)
-    return normalised(
-        [
-            cr * cp * cy + sr * sp * sy,
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-        ]
-    )
+    return normalised(euler2quat(*np.radians(_vector([roll, pitch, yaw], 3, "roll, pitch and yaw"))))
 
 
 # --- poses -------------------------------------------------------------------------------------------------------
@@ -232,15 +198,14 @@ def make_pose(position: ArrayLike, quaternion: ArrayLike) -> Floats:
 def inverse(pose: ArrayLike) -> Floats:
     """(7,) the pose that undoes this one: world to camera of camera to world."""
     p = _vector(pose, 7, "a pose")
-    w, x, y, z = p[3:]
-    return make_pose(-rotation_matrix(p[3:]).T @ p[:3], [w, -x, -y, -z])
+    return make_pose(-rotation_matrix(p[3:]).T @ p[:3], qconjugate(p[3:]))
 
 
 def compose(mount: ArrayLike, local: ArrayLike) -> Floats:
     """(7,) in the env's frame: the pose `local`, which is said in the frame of a body that stands at `mount`."""
     m, p = _vector(mount, 7, "a mount's pose"), _vector(local, 7, "a pose")
     r = rotation_matrix(m[3:])
-    return make_pose(m[:3] + r @ p[:3], _product(normalised(m[3:]), normalised(p[3:])))
+    return make_pose(m[:3] + r @ p[:3], qmult(normalised(m[3:]), normalised(p[3:])))
 
 
 def relative_to(mount: ArrayLike, world: ArrayLike) -> Floats:
@@ -260,7 +225,7 @@ def pose_from_look_at(look_at: LookAt) -> Floats:
     if np.linalg.norm(target - eye) < 1e-9:
         raise ValueError("eye and target are the same point: the camera needs a direction to look in")
     forward = _direction(target - eye, "forward")
-    turned = upright(forward) @ _about_x(look_at.roll)
+    turned = upright(forward) @ euler2mat(look_at.roll, 0, 0)
     return np.concatenate([eye, quaternion_of(turned)])
 
 
@@ -445,16 +410,6 @@ def _direction(vector: ArrayLike, what: str) -> Floats:
     if length < 1e-12:
         raise ValueError(f"{what} has no length, and so no direction")
     return v / length
-
-
-def _product(a: Floats, b: Floats) -> Floats:
-    w, v, s, u = a[0], a[1:], b[0], b[1:]
-    return np.concatenate([[w * s - v @ u], w * u + s * v + np.cross(v, u)])
-
-
-def _about_x(angle: float) -> Floats:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
 
 
 def _check_size(width: int, height: int) -> None:
