@@ -213,7 +213,7 @@ class BatchedCpuSystem:
         # The tensors exist from `gpu_init` on: a task that asks earlier is told what it did wrong.
         if name.startswith("cuda_") and self.__dict__.get("_layout") is None:
             raise RuntimeError(_TOO_EARLY)
-        return uncommon_member(self, name)
+        return uncommon_member(name)
 
     def _setters(self, method: str) -> Setters:
         """What sets one kind of drive target, of each active joint of each articulation."""
