@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from workbench.recording.camera_pictures import cameras_by_name, picture_index
-from workbench.recording.episode import Episode
+from workbench.recording.episode import Episode, flag_of
 
 COLUMNS = 8
 CELL = 176
@@ -80,19 +80,14 @@ def chosen_states(episode: Episode, columns: int) -> list[int]:
 
 def _first(episode: Episode, name: str) -> int | None:
     """The first state at which this entry of ``evaluate()`` was true."""
-    values = episode.evaluate.get(name)
-    if values is None or values.ndim != 1:
-        return None
-    found = np.flatnonzero(np.nan_to_num(values.astype(np.float64)))
-    return int(found[0]) if len(found) else None
+    flag = flag_of(episode.evaluate.get(name))
+    return None if flag is None or not flag.any() else int(flag.argmax())
 
 
 def _title(episode: Episode) -> str:
     info = episode.info
     seed = f"   seed {info.seed}" if info.seed >= 0 else ""
-    success = episode.evaluate.get("success")
-    ended = ""
-    if success is not None and success.ndim == 1:
-        ended = "   success" if bool(np.nan_to_num(success[-1])) else "   no success"
+    success = flag_of(episode.evaluate.get("success"))
+    ended = "" if success is None else "   success" if success[-1] else "   no success"
     total = float(np.sum(episode.reward, dtype=np.float64))
     return f"{info.task}{seed}   {episode.length} steps   return {total:.2f}{ended}"

@@ -202,7 +202,4 @@ def _relative(path: str, folder: str) -> str:
     """Where a source file lies as seen from the task's: the folders above it are nobody's business."""
     if not folder:
         return os.path.basename(path)
-    try:
-        return Path(os.path.relpath(path, folder)).as_posix()
-    except ValueError:  # another drive, on Windows
-        return os.path.basename(path)
+    return os.path.relpath(path, folder)

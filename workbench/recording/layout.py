@@ -33,6 +33,7 @@ import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import Chunk
+from transforms3d.quaternions import qconjugate, qmult
 
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo
@@ -406,12 +407,12 @@ def xyzw(wxyz: NDArray) -> NDArray:
 
 def optical_pose(pose: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Translation (P, 3) and xyzw (P, 4) of the OpenCV camera frame, from ManiSkill poses (P, 7)."""
-    w, x, y, z = pose[:, 3:].astype(np.float64).T
-    a, b, c, d = _OPTICAL_FROM_CAMERA
-    product = [
-        w * a - x * b - y * c - z * d,
-        w * b + x * a + y * d - z * c,
-        w * c - x * d + y * a + z * b,
-        w * d + x * c - y * b + z * a,
-    ]
-    return pose[:, :3], xyzw(np.stack(product, axis=-1)).astype(np.float32)
+    turned = qmult(pose[:, 3:].T.astype(np.float64), _OPTICAL_FROM_CAMERA).T
+    return pose[:, :3], xyzw(turned).astype(np.float32)
+
+
+def wxyz_from_optical(rows: NDArray[np.float32]) -> NDArray[np.float32]:
+    """ManiSkill poses (P, 7) of cameras, from translation and xyzw of their OpenCV frame: `optical_pose`, undone."""
+    wxyz = np.roll(rows[:, 3:], 1, axis=1).T.astype(np.float64)
+    turned = qmult(wxyz, qconjugate(_OPTICAL_FROM_CAMERA)).T
+    return np.concatenate([rows[:, :3], turned.astype(np.float32)], axis=1)

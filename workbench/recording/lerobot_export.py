@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from workbench.recording import lerobot_format as form
-from workbench.recording.episode import Episode
+from workbench.recording.episode import Episode, flag_of
 from workbench.recording.lerobot_frames import Choice, Frames, feature_name, frames_of
 from workbench.recording.mp4 import Encoding, FilmWriter
 
@@ -351,12 +351,8 @@ def _arrow(values: np.ndarray) -> pa.Array:
 
 
 def _succeeds(episode: Episode) -> bool:
-    values = episode.evaluate.get("success")
-    return (
-        values is not None
-        and values.ndim == 1
-        and bool((np.nan_to_num(values.astype(np.float64)) != 0).any())
-    )
+    flag = flag_of(episode.evaluate.get("success"))
+    return flag is not None and bool(flag.any())
 
 
 def _difference(one: dict[str, dict], other: dict[str, dict]) -> str:

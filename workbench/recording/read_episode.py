@@ -33,12 +33,13 @@ from workbench.recording.layout import (
     body_entities,
     camera_entities,
     evaluate_entity,
+    wxyz_from_optical,
 )
 from workbench.recording.maniskill_h5 import TRAJECTORY
 from workbench.recording.read_maniskill import leaves
 from workbench.recording.read_maniskill import read_maniskill as read_maniskill
 from workbench.recording.read_maniskill import trajectories as trajectories
-from workbench.recording.rerun_table import RerunTable, rows_at, wxyz_from_optical
+from workbench.recording.rerun_table import RerunTable, rows_at
 from workbench.recording.safe_h5 import open_h5
 from workbench.recording.survey import camera_from
 from workbench.recording.unreadable import UnreadableRecording as UnreadableRecording

@@ -239,16 +239,3 @@ def _plain(values: pa.Array) -> NDArray:
     while pa.types.is_fixed_size_list(values.type) or pa.types.is_list(values.type):
         values = values.flatten()
     return values.to_numpy(zero_copy_only=False)
-
-
-def wxyz_from_optical(rows: NDArray[np.float32]) -> NDArray[np.float32]:
-    """ManiSkill poses (P, 7) of cameras, from translation and xyzw of their OpenCV frame: `layout.optical_pose`, undone."""
-    x, y, z, w = rows[:, 3:].astype(np.float64).T
-    a, b, c, d = 0.5, 0.5, -0.5, 0.5  # the conjugate of the rotation from one frame to the other
-    product = [
-        w * a - x * b - y * c - z * d,
-        w * b + x * a + y * d - z * c,
-        w * c - x * d + y * a + z * b,
-        w * d + x * c - y * b + z * a,
-    ]
-    return np.concatenate([rows[:, :3], np.stack(product, axis=-1).astype(np.float32)], axis=1)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from transforms3d.quaternions import mat2quat, quat2mat
 
 from workbench.core.camera_frames import triple
 from workbench.recording.episode import Episode
@@ -35,14 +36,14 @@ class Eye:
             left = np.cross([1.0, 0.0, 0.0] if abs(forward[0]) < 0.9 else [0.0, 1.0, 0.0], forward)
         left /= np.linalg.norm(left)
         axes = np.stack([forward, left, np.cross(forward, left)], axis=1)
-        return np.concatenate([self.position, _wxyz(axes)]).astype(np.float32)
+        return np.concatenate([self.position, mat2quat(axes)]).astype(np.float32)
 
 
 def usual_eye(episode: Episode) -> Eye:
     """The recorded human-render camera's where there is one, else one that has all that moves in view."""
     for camera in episode.cameras:
         if camera.info.kind == "human" and len(camera.pose):
-            position, forward = camera.pose[0, :3], _forward(camera.pose[0, 3:])
+            position, forward = camera.pose[0, :3], quat2mat(camera.pose[0, 3:])[:, 0]
             look_at = position + forward
             return Eye(triple(position), triple(look_at), fovy=float(camera.info.fovy))
     assert episode.poses is not None and episode.geometry is not None
@@ -57,23 +58,3 @@ def usual_eye(episode: Episode) -> Eye:
     radius = max(float(np.linalg.norm(high - low)) / 2, 0.25) * 1.1
     direction = FROM_THE_FRONT / np.linalg.norm(FROM_THE_FRONT)
     return Eye(triple(middle + direction * radius / np.sin(FOVY / 2)), triple(middle))
-
-
-def _forward(wxyz: NDArray) -> NDArray:
-    """The x axis of the frame that is turned so."""
-    w, x, y, z = (float(value) for value in wxyz)
-    return np.array([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)])
-
-
-def _wxyz(axes: NDArray) -> NDArray:
-    """The quaternion of a rotation matrix, by the eigenvector of its largest eigenvalue (Bar-Itzhack, 2000)."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = axes
-    symmetric = np.array(
-        [
-            [xx + yy + zz, zy - yz, xz - zx, yx - xy],
-            [zy - yz, xx - yy - zz, xy + yx, xz + zx],
-            [xz - zx, xy + yx, yy - xx - zz, yz + zy],
-            [yx - xy, xz + zx, yz + zy, zz - xx - yy],
-        ]
-    )
-    return np.linalg.eigh(symmetric)[1][:, -1]

@@ -17,8 +17,14 @@ from pathlib import Path
 from typing import IO
 
 from workbench.machine.terminal_text import only_colours
-from workbench.recording.rerun_command import quiet_environment, rerun_command
-from workbench.recording.rerun_process import LOOPBACK, await_port, end, free_port
+from workbench.recording.rerun_process import (
+    LOOPBACK,
+    await_port,
+    end,
+    free_port,
+    quiet_environment,
+    rerun_command,
+)
 
 
 @dataclass
@@ -100,7 +106,5 @@ def _print_all(said: IO[bytes]) -> None:
 
 
 def has_screen(environment: Mapping[str, str]) -> bool:
-    """Whether a window can be opened: always on Windows and macOS, elsewhere where a display is named."""
-    if sys.platform in ("win32", "darwin"):
-        return True
+    """Whether a window can be opened: where a display is named."""
     return bool(environment.get("DISPLAY") or environment.get("WAYLAND_DISPLAY"))

@@ -19,8 +19,15 @@ import urllib.request
 from importlib.metadata import version
 from pathlib import Path
 
-from workbench.recording.rerun_command import quiet_environment, rerun_command
-from workbench.recording.rerun_process import LOOPBACK, START_SECONDS, await_port, end, free_port
+from workbench.recording.rerun_process import (
+    LOOPBACK,
+    START_SECONDS,
+    await_port,
+    end,
+    free_port,
+    quiet_environment,
+    rerun_command,
+)
 
 VIEWER_FILES = {
     "index.html": "text/html; charset=utf-8",
