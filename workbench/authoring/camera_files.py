@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import yaml
 from numpy.typing import ArrayLike, NDArray
+from transforms3d.axangles import axangle2mat
 
 from workbench.core.camera_frames import (
     Convention,
@@ -419,8 +420,5 @@ def _rotation(array: Floats) -> Floats | None:
         return array.reshape(3, 3)
     if array.size != 3:
         return None
-    vector = array.ravel()
-    angle = float(np.linalg.norm(vector))
-    x, y, z = vector / angle if angle > 0 else vector
-    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.eye(3) + np.sin(angle) * across + (1 - np.cos(angle)) * across @ across
+    angle = float(np.linalg.norm(array))
+    return np.eye(3) if angle == 0 else axangle2mat(array.ravel() / angle, angle, is_normalized=True)
