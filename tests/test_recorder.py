@@ -102,10 +102,10 @@ def test_what_came_before_an_unseen_reset_is_kept(tmp_path: Path) -> None:
     for _ in range(3):
         env.step(env.action_space.sample())
     env.unwrapped.reset(seed=5)
-    env.step(env.action_space.sample())
     with pytest.warns(UserWarning, match="step 4 was expected and step 1 came"):
-        env.close()
+        env.step(env.action_space.sample())
     assert env.problem is not None
+    env.close()
     assert sorted(episode.length for episode in episodes_in(tmp_path)) == [3, 3]
 
 
@@ -124,7 +124,7 @@ for step in range(1, 10**6):
 
 
 def test_a_killed_program_loses_a_second(child_process: None, tmp_path: Path) -> None:
-    """Its steps wait in memory to be taken apart together, and a second is for all that waits anywhere."""
+    """A second is for all that waits anywhere."""
     child = subprocess.Popen([sys.executable, "-c", CHILD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
     assert child.stdout is not None and child.stdout.readline() == "begun\n"
     time.sleep(random.uniform(1.2, 3.0))  # at any moment, when there are steps older than a second

@@ -27,7 +27,7 @@ from workbench.ui.commands import Command
 from workbench.ui.door import Door, DoorError, DoorOptions, open_door
 from workbench.ui.pages import Which
 from workbench.ui.put_together import Workplace
-from workbench.ui.share_part import Sharing
+from workbench.ui.share_panel import Sharing
 from workbench.ui.step_in import offer_going_back_in
 
 

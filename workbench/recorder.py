@@ -34,7 +34,6 @@ from mani_skill.utils.gym_utils import find_max_episode_steps_value
 from workbench.authoring.load import task_of_class
 from workbench.core import actions
 from workbench.core.open_env import open_env
-from workbench.core.pictures import Picture
 from workbench.core.seams import draws_its_own_seeds, task_class
 from workbench.core.state_columns import read_state_columns
 from workbench.core.step import StepResult
@@ -47,7 +46,6 @@ from workbench.recording.landing import RecordingError
 from workbench.recording.recover import recover
 from workbench.session.episode_files import EpisodeFinisher
 from workbench.session.episodes import EpisodeGatherer, GatheredEpisode
-from workbench.session.gather_later import LaterSteps
 from workbench.session.messages import Stepped, TaskDescription
 from workbench.session.open_task import describe
 from workbench.session.record_live import recovered_in_words
@@ -102,7 +100,6 @@ class Recorder(gym.Wrapper):
         self._made: list[Future[EpisodeFiles | str]] = []
         """Episodes that are over, and not known to have their files."""
         self._gatherer: EpisodeGatherer | None = None
-        self._later: LaterSteps | None = None
         self._scene: Any = None
         self._description: TaskDescription | None = None
         self._seeds = np.full(base.num_envs, NO_SEED, np.int64)
@@ -115,7 +112,6 @@ class Recorder(gym.Wrapper):
         return self._finisher.finished.count
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        self._catch_up()
         obs, info = self.env.reset(seed=seed, options=options)
         count = self._task.num_envs
         mask = np.zeros(count, bool)
@@ -153,8 +149,6 @@ class Recorder(gym.Wrapper):
             obs, reward, terminated, truncated, info = given
             if made is None:
                 made = np.zeros((task.num_envs, 0), np.float32)
-            if self._took_later(given, made):
-                return given  # type: ignore[return-value]
             step = task.result_of(info, reward, terminated, truncated, made)
             self._take(step, np.zeros(task.num_envs, bool))
         return given  # type: ignore[return-value]
@@ -187,23 +181,16 @@ class Recorder(gym.Wrapper):
                 self._description, self._envs, self._folder, self._over, ends="reset"
             )
             self._gatherer.acted_by = self._acted_by
-            try:
-                self._later = LaterSteps(self._task, self._gatherer, self._wanted())
-            except ValueError:
-                self._later = None  # every step is told in full
 
     def _take(self, step: StepResult, reset_mask: np.ndarray) -> None:
         gatherer, task = self._gatherer, self._task
         if gatherer is None or self._description is None:
             return
-        pictures: tuple[Picture, ...] = ()
-        if self._pictures:
-            wanted = self._wanted()
-            for env in self._envs:
-                pictures += step_pictures(task, env, wanted)
+        wanted = self._wanted()
+        pictures = [picture for env in self._envs for picture in step_pictures(task, env, wanted)]
         columns = read_state_columns(task)
         try:
-            gatherer.take(Stepped(step, reset_mask, pictures, self._seeds.copy(), columns=columns))
+            gatherer.take(Stepped(step, reset_mask, tuple(pictures), self._seeds.copy(), columns=columns))
         except (RecordingError, ValueError) as error:
             self._give_up(error)
         self._say_what_failed()
@@ -216,29 +203,7 @@ class Recorder(gym.Wrapper):
             cameras = [camera for camera in cameras if camera.name in self._pictures]
         return recorded_pictures(cameras)
 
-    def _took_later(self, given: tuple[Any, ...], made: np.ndarray) -> bool:
-        if self._later is None:
-            return False
-        try:
-            taken = self._later.take(given, made)
-            if not taken:
-                self._later.flush()
-        except (RecordingError, ValueError) as error:
-            self._give_up(error)
-            taken = True
-        self._say_what_failed()
-        return taken
-
-    def _catch_up(self) -> None:
-        """What was taken is with the gatherer, which knows nothing of the steps that wait."""
-        if self._later is not None:
-            try:
-                self._later.flush()
-            except (RecordingError, ValueError) as error:
-                self._give_up(error)
-
     def _give_up(self, error: Exception) -> None:
-        self._later = None
         self._end()
         self.problem = str(error)
         warnings.warn(f"the recording ended: {error}", stacklevel=4)
@@ -247,8 +212,6 @@ class Recorder(gym.Wrapper):
         self._made.append(self._finisher.finish(episode))
 
     def _end(self) -> None:
-        self._catch_up()
-        self._later = None
         gatherer, self._gatherer = self._gatherer, None
         if gatherer is not None:
             gatherer.finish()
@@ -259,5 +222,5 @@ class Recorder(gym.Wrapper):
         problems = [result for future in done if isinstance(result := future.result(), str)]
         if problems and self.problem is None:
             self.problem = problems[0]
-            self._gatherer = self._later = None
+            self._gatherer = None
             warnings.warn(f"the recording ended: {self.problem}", stacklevel=4)

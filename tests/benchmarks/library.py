@@ -43,11 +43,11 @@ class Options:
 
 def write_one(folder: Path) -> Path:
     """A recording of 50 steps of a scene of two bodies with one camera; returns its ``.json``."""
+    from tests.drive.rows import EpisodeRow, append
     from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
     from workbench.core.pictures import CameraInfo, Picture
     from workbench.recording.episode import EpisodeInfo
     from workbench.recording.episode_writer import EpisodeWriter
-    from workbench.recording.row import EpisodeRow
 
     rng = np.random.default_rng(0)
     corner = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.uint32))
@@ -76,7 +76,7 @@ def write_one(folder: Path) -> Path:
         picture = Picture("base", "sensor", 0, poses[0], noise)
         action = None if step == 0 else np.zeros(2, np.float32)
         done = np.array(step == 50)
-        writer.append(EpisodeRow(poses, {"success": done}, action=action, reward=0.1, pictures=(picture,)))
+        append(writer, EpisodeRow(poses, {"success": done}, action=action, reward=0.1, pictures=(picture,)))
     return writer.finish().json
 
 

@@ -20,7 +20,7 @@ from mani_skill.utils.structs.pose import Pose
 import workbench
 from tests.core.drawn_envs import batched
 from workbench.core.scene_index import read_poses, scene_index
-from workbench.core.step_pictures import observed_pictures
+from workbench.core.step_pictures import step_pictures
 from workbench.core.take_pictures import take_pictures
 from workbench.core.task_env import TaskEnv
 from workbench.core.visibility import judge_camera
@@ -136,8 +136,8 @@ def test_what_the_page_draws_of_it_agrees(hiding: Any) -> None:
     report = judge_camera(hiding, ("sensor", "base_camera"), range(N))
     cube = next(seen for seen in report.objects if seen.name == "cube")
     assert (cube.pixels > 0).tolist() == [True, False]
-    seen = observed_pictures(_task(hiding, obs), [ON_CUBE])
-    assert seen is not None and (seen[0].poses[:, 2] > AWAY / 2).tolist() == [False, True]
+    observed = [step_pictures(_task(hiding, obs), e, [ON_CUBE])[0] for e in range(N)]
+    assert [picture.pose[2] > AWAY / 2 for picture in observed] == [False, True]
 
 
 def _task(env: Any, obs: Any) -> TaskEnv:

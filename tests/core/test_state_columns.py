@@ -12,7 +12,7 @@ from mani_skill.utils import common
 
 from tests.drive.envs import batched
 from workbench.core.state_columns import read_state_columns
-from workbench.core.state_names import observation_of, states_of
+from workbench.core.state_names import states_of
 from workbench.core.task_env import TaskEnv
 
 
@@ -58,4 +58,3 @@ def test_what_an_env_does_not_have_is_left_out_of_its_states() -> None:
     }
     assert states_of(columns, 0) == {}
     assert list(states_of(columns, 1)) == ["actors/mug"]
-    assert list(observation_of(columns, 0)) == ["agent/qpos"]

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tests.drive.rows import EpisodeRow, append
 from tests.ui.scenes import camera, table_scene
 from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.recording.episode import Episode, EpisodeInfo
 from workbench.recording.episode_writer import SCENE_SUFFIX, EpisodeFiles, EpisodeWriter
 from workbench.recording.journal import Journal
-from workbench.recording.row import EpisodeRow
 from workbench.recording.scene_file import read_scene
-from workbench.recording.survey import Header, JournalReader
+from workbench.recording.survey import Header, read_header
 
 BODY = {"ground": 0, "table": 1, "arm/hand": 2, "cube": 3}
 
@@ -86,7 +86,7 @@ def journal_of(writer: EpisodeWriter) -> Journal:
 
 def header_of(journal: Path) -> Header:
     """As `recover` reads it, of a journal that has one."""
-    header = JournalReader(journal).header(read_scene(journal.with_suffix(SCENE_SUFFIX)))
+    header = read_header(journal, read_scene(journal.with_suffix(SCENE_SUFFIX)))
     assert header is not None
     return header
 
@@ -111,13 +111,14 @@ def appended(folder: Path, episode: Episode, pictures: bool, every: int = 1) -> 
             depth=np.full((6, 8), state / 10, np.float32),
             segmentation=np.ones((6, 8), np.int32),
         )
-        writer.append(
+        append(
+            writer,
             row_at(
                 episode,
                 state,
                 pictures=(seen,) if pictures and state % every == 0 else (),
                 others=episode.others_at(state),
-            )
+            ),
         )
     return writer
 
@@ -188,5 +189,5 @@ class Made:
     def write(self, folder: Path) -> EpisodeFiles:
         writer = self.writer(folder)
         for row in self.rows():
-            writer.append(row)
+            append(writer, row)
         return writer.finish()

@@ -10,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from workbench.recording.columns import RowPacker, assemble, layout_type, merge
-from workbench.recording.row import EpisodeRow
+from tests.drive.rows import EpisodeRow, packed
+from workbench.core.step import OtherEntry, StepResult
+from workbench.recording.columns import BatchPacker, assemble, layout_type
+from workbench.session.episodes import batch_columns
 
 
 def row(action: Any = (0.0, 0.0), **evaluate: Any) -> EpisodeRow:
@@ -21,21 +23,11 @@ def row(action: Any = (0.0, 0.0), **evaluate: Any) -> EpisodeRow:
 
 
 def through(rows: list[EpisodeRow]) -> dict[str, np.ndarray]:
-    """`rows` packed, and unpacked as columns; two halves, as a journal is read in pieces."""
-    packer = RowPacker(2, 2)
-    layouts, packed = [], []
-    for one in rows:
-        number, content, text = packer.pack(one)
-        if text is not None:
-            layouts.append(layout_type(text))
-        packed.append(np.frombuffer(content, layouts[number]))
-    counts: dict[np.dtype, int] = {}
-    for run in packed:
-        counts[run.dtype] = counts.get(run.dtype, 0) + 1
-    columns = merge(counts)
-    half = len(packed) // 2
-    parts = [assemble(part, columns) for part in (packed[:half], packed[half:]) if part]
-    return {name: np.concatenate([part[name] for part in parts]) for name in columns}
+    """`rows` packed, and unpacked as columns."""
+    packer = BatchPacker()
+    contents = [packed(one, packer, 2) for one in rows]
+    runs = [np.frombuffer(content, layout_type(layout.text)) for layout, content in contents]
+    return assemble(runs)
 
 
 def test_types_are_kept_where_every_row_has_the_entry() -> None:
@@ -61,16 +53,20 @@ def test_entries_that_change_their_shape_are_padded() -> None:
     np.testing.assert_array_equal(columns["evaluate/d"], [[1, np.nan], [2, 2]])
 
 
+def check(one: EpisodeRow, bodies: int = 2) -> None:
+    packed(one, BatchPacker(), 2)[0].check(bodies, 2)
+
+
 def test_what_is_no_number_is_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"evaluate\(\)\['phase'\] has dtype <U5"):
-        RowPacker(2, 2).pack(row(phase="reach"))
+        check(row(phase="reach"))
 
 
 def test_actions_and_bodies_must_fit() -> None:
     with pytest.raises(ValueError, match="3 numbers, but 2 action names"):
-        RowPacker(2, 2).pack(row(action=(0, 0, 0)))
+        check(row(action=(0, 0, 0)))
     with pytest.raises(ValueError, match="the scene has 3 bodies"):
-        RowPacker(3, 2).pack(row())
+        check(row(), bodies=3)
 
 
 VALUE = st.sampled_from([np.bool_, np.int64, np.float32, np.float64]).flatmap(
@@ -103,3 +99,45 @@ def test_any_rows_come_back(entries: list[dict[str, np.ndarray]]) -> None:
                 same = value.reshape(-1).astype(column.dtype)
                 np.testing.assert_array_equal(kept[: value.size], same)
                 assert value.size == kept.size or np.isnan(kept[value.size :]).all()
+
+
+def test_a_batch_is_packed_as_its_envs_are() -> None:
+    rng = np.random.default_rng(0)
+    step = StepResult(
+        elapsed_steps=np.array([1, 4, 2], np.int32),
+        reward=rng.random(3, np.float32),
+        terminated=np.array([False, True, False]),
+        truncated=np.array([True, False, False]),
+        evaluate={"success": np.array([True, False, True]), "reward_terms/reach": rng.random((3, 2))},
+        poses=rng.random((3, 5, 7), np.float32),
+        action=rng.random((3, 4), np.float32),
+        others={
+            "progress": OtherEntry("float", numbers=np.array(0.5)),
+            "goal": OtherEntry("float32 tensor of shape (2,)", numbers=np.ones(2, np.float32)),
+            "phase": OtherEntry("str", ("reach",)),
+        },
+    )
+    columns = {
+        "state/actors/cube": rng.random((3, 13, 2), np.float32)[:, :, 0],  # not in one piece
+        "state/actors/mug": np.full((3, 13), np.nan, np.float32),
+        "obs/agent/qpos": rng.random((3, 9), np.float32),
+        "obs/extra/none": np.zeros((3, 0), np.float32),
+    }
+    packer = BatchPacker()
+    together = batch_columns(step, columns, frozenset({"actors/cube"}))
+    layout, rows = packer.pack(together)
+    assert step.action is not None
+    for env in range(3):
+        by_hand = EpisodeRow(
+            step.poses[env],
+            {name: values[env] for name, values in step.evaluate.items()},
+            {"actors/cube": columns["state/actors/cube"][env]},
+            {name[4:]: values[env] for name, values in columns.items() if name.startswith("obs/")},
+            step.action[env],
+            float(step.reward[env]),
+            bool(step.terminated[env]),
+            bool(step.truncated[env]),
+            others=step.others,
+        )
+        assert packed(by_hand, packer, 4) == (layout, rows[env])
+    assert packer.pack(together)[0] is layout

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from tests.drive.episodes import Made, Track
+from tests.drive.rows import append
 from tests.drive.waiting import until
 from workbench.core.pictures import CameraInfo
 from workbench.recording import encode_soon
@@ -58,7 +59,7 @@ def pictures_of(path: Path) -> list[int]:
 def test_steps_do_not_wait_for_their_pictures(seen: Made, held_back: threading.Event, tmp_path: Path) -> None:
     writer = seen.writer(tmp_path)
     for row in seen.rows():
-        writer.append(row)
+        append(writer, row)
     assert not held_back.is_set()
     held_back.set()
     assert pictures_of(writer.finish().json) == list(range(STATES))
@@ -74,13 +75,13 @@ def test_what_is_too_much_to_wait_is_encoded_at_once(
 def test_what_is_no_picture_is_refused_at_its_own_step(seen: Made, tmp_path: Path) -> None:
     writer = seen.writer(tmp_path)
     first, second, *_ = seen.rows()
-    writer.append(first)
+    append(writer, first)
     (picture,) = second.pictures
     assert picture.segmentation is not None
     wrong = dataclasses.replace(picture, segmentation=picture.segmentation.astype(np.float32))
     with pytest.raises(ValueError, match="float32"):
-        writer.append(dataclasses.replace(second, pictures=(wrong,)))
-    writer.append(second)
+        append(writer, dataclasses.replace(second, pictures=(wrong,)))
+    append(writer, second)
     assert pictures_of(writer.finish().json) == [0, 1]
 
 
@@ -98,7 +99,7 @@ def test_a_picture_that_cannot_be_encoded_is_told_and_what_came_before_it_is_kep
     writer = seen.writer(tmp_path)
     with pytest.raises(RecordingError, match="no room for a picture"):
         for row in seen.rows():
-            writer.append(row)
+            append(writer, row)
         writer.finish()
     writer.close()
     (files,) = recover(tmp_path)

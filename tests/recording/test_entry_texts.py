@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from tests.drive.entries import ENTRIES
 from tests.drive.episodes import Made, journal_of
+from tests.drive.rows import append
 from tests.recording.read_rrd import read_rrd
 from tests.recording.verify_rrd import verify_rrd
 from workbench.core.entries import split_entries
@@ -44,7 +45,7 @@ def write(made: Made, folder: Path, others: list[Others], finish: bool = True) -
     """An episode whose states have these `others`."""
     writer = made.writer(folder)
     for row, entries in zip(made.rows(), others, strict=True):
-        writer.append(dataclasses.replace(row, others=entries))
+        append(writer, dataclasses.replace(row, others=entries))
     if finish:
         return writer.finish()
     journal_of(writer).sync()
@@ -145,12 +146,13 @@ def test_whatever_evaluate_returns_is_recorded(
     with tempfile.TemporaryDirectory() as folder:
         writer = made.writer(Path(folder))
         for row, (columns, others) in zip(made.rows(), halves, strict=True):
-            writer.append(
+            append(
+                writer,
                 dataclasses.replace(
                     row,
                     evaluate={name: values[env] for name, values in columns.items()},
                     others={name: entry.of_env(env) for name, entry in others.items()},
-                )
+                ),
             )
         files = writer.finish()
         episode = read_episode(files.json)

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.drive.episodes import Made
+from tests.drive.rows import append
 from tests.recording.refused_calls import descriptors, refused
 from workbench.recording.episode_writer import EpisodeWriter
 from workbench.recording.journal import FOLDER
@@ -25,7 +26,7 @@ def recorded(make_episode: Maker, folder: Path) -> EpisodeWriter:
     episode = make_episode(2)
     writer = episode.writer(folder)
     for row in episode.rows():
-        writer.append(row)
+        append(writer, row)
     return writer
 
 

@@ -21,6 +21,7 @@ import numpy as np
 import psutil
 import pytest
 
+from tests.drive.rows import EpisodeRow, append
 from tests.recording.foreign_h5 import write as write_h5
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo, Picture
@@ -30,7 +31,6 @@ from workbench.recording.episode_writer import EpisodeWriter
 from workbench.recording.lerobot_export import export_lerobot
 from workbench.recording.library_scan import scan_folder
 from workbench.recording.read_episode import read_episode
-from workbench.recording.row import EpisodeRow
 from workbench.recording.unreadable import UnreadableRecording
 from workbench.session.review_events import happenings
 
@@ -80,7 +80,7 @@ def record(folder: Path) -> Path:
             0.1,
             pictures=(picture,),
         )
-        writer.append(row)
+        append(writer, row)
     return writer.finish().json
 
 

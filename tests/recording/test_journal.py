@@ -45,22 +45,22 @@ def numbers(*values: int) -> list[bytes]:
 def test_a_folder_that_vanished_is_told_at_the_next_row(
     tmp_path: Path, journal: Journal, removed: str
 ) -> None:
-    journal.put("row", 0, b"0")
+    journal.append(Entry("row", 0, b"0"))
     journal.sync()
-    journal.put("row", 0, b"1")
+    journal.append(Entry("row", 0, b"1"))
     if removed == "folder":
         shutil.rmtree(tmp_path / "folder")
     else:
         journal.path.unlink()
     journal.sync()
-    for tell in (lambda: journal.put("row", 0, b"2"), journal.commit, journal.finish):
+    for tell in (lambda: journal.append(Entry("row", 0, b"2")), journal.append, journal.finish):
         with pytest.raises(FileNotFoundError, match="was removed during the recording"):
             tell()
 
 
 def test_a_folder_that_was_renamed_keeps_its_journal(tmp_path: Path, journal: Journal) -> None:
     (tmp_path / "folder").rename(tmp_path / "elsewhere")
-    journal.put("row", 0, b"0")
+    journal.append(Entry("row", 0, b"0"))
     journal.finish()
     assert rows(tmp_path / "elsewhere" / "a.arrow") == [b"0"]
 
@@ -68,12 +68,12 @@ def test_a_folder_that_was_renamed_keeps_its_journal(tmp_path: Path, journal: Jo
 def test_an_error_of_the_disk_is_told_at_the_next_row_and_the_next_sync_makes_no_good_of_it(
     journal: Journal,
 ) -> None:
-    journal.put("row", 0, b"0")
+    journal.append(Entry("row", 0, b"0"))
     with refused(1, ("fsync",)):
         journal.sync()
     for _ in range(2):
         journal.sync()
-        for tell in (lambda: journal.put("row", 0, b"1"), journal.commit):
+        for tell in (lambda: journal.append(Entry("row", 0, b"1")), journal.append):
             with pytest.raises(OSError, match="Input/output error"):
                 tell()
     journal.finish()
@@ -87,10 +87,10 @@ def test_what_could_not_be_written_is_written_once_there_is_room(
     journal: Journal, monkeypatch: pytest.MonkeyPatch, number: int, then: int, half: int
 ) -> None:
     """Also where half of it was, and what is to take that back fails too."""
-    journal.put("row", 0, b"0")
+    journal.append(Entry("row", 0, b"0"))
     journal.write()
     for value in numbers(1, 2):
-        journal.put("row", 0, value * 3000)
+        journal.append(Entry("row", 0, value * 3000))
     write = os.pwrite
     with monkeypatch.context() as patch:
         if half:
@@ -98,7 +98,7 @@ def test_what_could_not_be_written_is_written_once_there_is_room(
         with refused(2 if half else 1, ("pwrite",), number, then):
             journal.write()
     with pytest.raises(OSError) as told:
-        journal.put("row", 0, b"not kept")
+        journal.append(Entry("row", 0, b"not kept"))
     assert told.value.errno == number
     assert rows(journal.path) == [b"0"]
     journal.finish()
@@ -106,23 +106,17 @@ def test_what_could_not_be_written_is_written_once_there_is_room(
     assert journal.size == journal.path.stat().st_size
 
 
-@pytest.mark.parametrize("by", ["put", "commit"])
+@pytest.mark.parametrize("alone", [True, False])
 def test_a_row_that_was_taken_is_kept_and_one_that_was_refused_is_not(
-    journal: Journal, monkeypatch: pytest.MonkeyPatch, by: str
+    journal: Journal, monkeypatch: pytest.MonkeyPatch, alone: bool
 ) -> None:
     """Also a row so large that whoever brings it writes it."""
     monkeypatch.setattr(journals, "_BATCH_BYTES", 100)
 
     def bring(value: bytes) -> bool:
         try:
-            if by == "put":
-                journal.put("row", 0, value)
-            else:
-                journal.add("camera/0", 0, value)
-                journal.add("row", 0, value)
-                journal.commit()
+            journal.append(*([] if alone else [Entry("camera/0", 0, value)]), Entry("row", 0, value))
         except OSError:
-            journal.rollback()
             return False
         return True
 
@@ -133,25 +127,11 @@ def test_a_row_that_was_taken_is_kept_and_one_that_was_refused_is_not(
     assert rows(journal.path) == taken
 
 
-def test_rows_that_were_rolled_back_are_not_there(journal: Journal) -> None:
-    journal.add("row", 0, b"0")
-    journal.commit()
-    journal.add("row", 0, b"1")
-    journal.rollback()
-    journal.add("row", 0, b"2")
-    journal.commit()
-    journal.add("row", 0, b"not committed")
-    journal.finish()
-    assert rows(journal.path) == [b"0", b"2"]
-
-
 def test_what_waits_is_counted_until_it_is_written(journal: Journal) -> None:
     begin = journal.size
     made: Future[list[Entry]] = Future()
-    journal.put("row", 0, b"0" * 100)
-    journal.take(made)
-    journal.add("row", 0, b"1" * 100)
-    journal.commit()
+    journal.append(Entry("row", 0, b"0" * 100))
+    journal.append(made, Entry("row", 0, b"1" * 100))
     waiting = journal.size
     assert begin + 200 < waiting < begin + 300
     made.set_result([Entry("picture/0/rgb", 1, b"p" * 1000)])
@@ -164,11 +144,8 @@ def test_what_waits_is_counted_until_it_is_written(journal: Journal) -> None:
 def test_a_picture_that_could_not_be_made_is_told_and_costs_its_own_state_alone(journal: Journal) -> None:
     made: Future[list[Entry]] = Future()
     made.set_exception(MemoryError("no room"))
-    journal.put("row", 0, b"0")
-    journal.add("camera/0", 1, b"pose")
-    journal.take(made)
-    journal.add("row", 0, b"1")
-    journal.commit()
+    journal.append(Entry("row", 0, b"0"))
+    journal.append(Entry("camera/0", 1, b"pose"), made, Entry("row", 0, b"1"))
     for _ in range(2):
         with pytest.raises(OSError, match="could not be encoded .*no room"):
             journal.finish()
@@ -179,11 +156,11 @@ def test_rows_that_come_while_the_disk_fails_keep_their_order(
     journal: Journal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> int:
-        journal.put("row", 0, b"2")
+        journal.append(Entry("row", 0, b"2"))
         raise OSError(errno.ENOSPC, "No space left on device")
 
     for value in (b"0", b"1"):
-        journal.put("row", 0, value)
+        journal.append(Entry("row", 0, value))
     with monkeypatch.context() as patch:
         patch.setattr(os, "pwrite", full)
         journal.write()
@@ -273,7 +250,7 @@ def test_a_disk_that_does_not_give_what_was_written_is_no_end(
 ) -> None:
     """A journal may end anywhere, but what a network drive does not give for a moment is not lost."""
     for value in numbers(0, 1, 2):
-        journal.put("row", 0, value * 5000)
+        journal.append(Entry("row", 0, value * 5000))
         journal.write()
     opened = journals.open_regular_file
 
@@ -325,7 +302,7 @@ def test_threads_write_all_journals_and_end_with_the_last(
     (thread,) = set(threading.enumerate()) - before
     assert thread.daemon, "the end of a process does not wait for it"
     for journal in three:
-        journal.put("row", 0, b"x")
+        journal.append(Entry("row", 0, b"x"))
     until(
         lambda: all(rows(journal.path) == [b"x"] and str(journal.path) in lasting for journal in three),
         "every row on the disk",
@@ -337,33 +314,29 @@ def test_threads_write_all_journals_and_end_with_the_last(
     assert not thread.is_alive()
 
 
-def test_what_is_held_back_is_written_to_all_journals_before_the_disk_is_waited_for_once(
+def test_what_waits_is_written_to_all_journals_before_the_disk_is_waited_for_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(journals, "_keeper", type(journals._keeper)())
+    keeper = type(journals._keeper)()
+    monkeypatch.setattr(journals, "_keeper", keeper)
     monkeypatch.setattr(journals, "SYNC_SECONDS", 0.01)
     three: list[Journal] = []
+    put: list[bool] = []
     seen: list[list[list[bytes]]] = []
     fsync = os.fsync
 
-    class HoldsBack:
-        flushed = False
-
-        def flush(self) -> None:
-            if not self.flushed:
-                for number, journal in enumerate(three):
-                    journal.put("row", 0, bytes([number]))
-            self.flushed = True
-
     def noted(descriptor: int) -> None:
-        if holder.flushed:
+        if put:
             seen.append([rows(journal.path) for journal in three])
         fsync(descriptor)
+        # The last of a round, so that the next one begins with all of them.
+        if len(three) == 3 and not put and descriptor == list(keeper._journals)[-1]._descriptor:
+            for number, journal in enumerate(three):
+                journal.append(Entry("row", 0, bytes([number])))
+            put.append(True)
 
-    holder = HoldsBack()
     monkeypatch.setattr(os, "fsync", noted)
     three += [Journal(tmp_path / f"{number}.arrow") for number in range(3)]
-    journals.before_writing(holder.flush)
     until(lambda: len(seen) >= 3, "three writes")
     assert seen[0] == [[b"\0"], [b"\1"], [b"\2"]]
     for journal in three:

@@ -28,11 +28,11 @@ CHILD = """
 import sys, time
 from pathlib import Path
 import numpy as np
+from tests.drive.rows import EpisodeRow, append
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.episode_writer import EpisodeWriter
-from workbench.recording.row import EpisodeRow
 
 folder, steps = Path(sys.argv[1]), int(sys.argv[2])
 mesh = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.uint32))
@@ -52,7 +52,7 @@ for episode in range(10**6):
     info = EpisodeInfo("Killed-v1", 0, episode, None, "", {}, 0.05, None, "cpu")
     writer = EpisodeWriter(folder, info, geometry, {}, ("a",), (camera,))
     for k in range(steps + 1):
-        writer.append(row(k))
+        append(writer, row(k))
         # What the parent holds it to: this row was appended then.
         sys.stdout.write(f"{episode} {k} {time.time()}\\n")
         sys.stdout.flush()

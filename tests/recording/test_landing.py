@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
-import resource
 import threading
 from pathlib import Path
 
 import pytest
 
 from tests.recording.refused_calls import descriptors, left_open, refused
-from workbench.recording.landing import SafeFile, make_last, publish, reason
+from workbench.recording.landing import make_last, publish, reason
 
 SUFFIXES = (".rrd", ".h5", ".json")
 
@@ -97,30 +96,6 @@ def test_whatever_call_fails_all_three_have_names_or_none_has(
             assert names(folder) == [], call
         if links:
             assert all(path.exists() for path in paths), call
-
-
-def test_a_file_of_the_disk_keeps_its_first_error_and_nothing_of_what_comes_after(tmp_path: Path) -> None:
-    """HDF5 asks for one after the other and does not take a failing disk well: it is told once, at the end."""
-    before = descriptors()
-    safe = SafeFile(tmp_path / "a.h5")
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
-    try:
-        assert safe.write(bytes(50_000)) == 50_000 and safe.error is None
-        assert safe.write(b"x" * 200_000) == 200_000
-        safe.flush()
-        assert safe.error is not None and safe.error.errno == errno.EFBIG
-        assert safe.truncate(400_000) == 400_000 and safe.seek(10) == 10
-        assert safe.write(b"more") == 4
-        safe.flush()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    for _ in range(2):
-        with pytest.raises(OSError, match="File too large"):
-            safe.finish()
-    assert left_open(before) == []
-    with pytest.raises(FileExistsError):
-        SafeFile(tmp_path / "a.h5")
 
 
 @pytest.mark.parametrize(

@@ -15,11 +15,11 @@ CHILD = """
 import json, sys, time
 from pathlib import Path
 import numpy as np
+from tests.drive.rows import EpisodeRow, append
 from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.episode_writer import EpisodeWriter
-from workbench.recording.row import EpisodeRow
 
 def peak():
     # Not getrusage, whose peak is that of the parent where this process was forked from a larger one.
@@ -57,7 +57,7 @@ info = EpisodeInfo("Long-v1", 0, 0, None, "", {}, 0.05, None, "cpu")
 writer = EpisodeWriter(folder, info, geometry, {}, [f"a{i}" for i in range(8)], cameras)
 began = time.perf_counter()
 for k in range(steps + 1):
-    writer.append(row(k))
+    append(writer, row(k))
 appended, taken = peak(), time.perf_counter() - began
 began = time.perf_counter()
 files = writer.finish()

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from tests.drive.episodes import Made, header_of, journal_of
+from tests.drive.rows import append
 from tests.drive.waiting import until
 from tests.recording.refused_calls import descriptors, refused
 from workbench.core.geometry import Mesh
@@ -34,7 +35,7 @@ def test_a_killed_writer_was_given_time_to_lose_nothing(make_episode: Maker, tmp
     for k, row in enumerate(episode.rows()):
         if k == 4:
             writer.acted_by("somebody else")
-        writer.append(row)
+        append(writer, row)
     journal = next((tmp_path / FOLDER).glob("*.arrow"))
     until(
         lambda: sum(entry.kind == "row" for entries in read_journal(journal) for entry in entries) == 6,
@@ -54,7 +55,7 @@ def test_a_journal_may_end_anywhere(make_episode: Maker, tmp_path: Path) -> None
     writer = episode.writer(tmp_path)
     ends = []
     for row in episode.rows():
-        writer.append(row)
+        append(writer, row)
         journal_of(writer).write()
         ends.append(journal_of(writer).size)
     journal_of(writer).write()
@@ -74,7 +75,7 @@ def test_garbage_at_the_end_is_left_out(make_episode: Maker, tmp_path: Path) -> 
     episode = make_episode(4)
     writer = episode.writer(tmp_path)
     for row in episode.rows():
-        writer.append(row)
+        append(writer, row)
     journal_of(writer).write()
     writer.close()
     journal = next((tmp_path / FOLDER).glob("*.arrow"))
@@ -91,7 +92,7 @@ def test_a_writer_that_died_between_two_names(
     episode = make_episode()
     writer = episode.writer(tmp_path)
     for row in episode.rows():
-        writer.append(row)
+        append(writer, row)
     link = os.link
     done: list[str] = []
 
@@ -127,7 +128,7 @@ def test_a_writer_that_died_between_two_names(
 
 def test_a_journal_without_a_step_is_cleared_away(make_episode: Maker, tmp_path: Path) -> None:
     writer = make_episode().writer(tmp_path)
-    writer.append(next(iter(make_episode().rows())))
+    append(writer, next(iter(make_episode().rows())))
     journal_of(writer).write()
     writer.close()
     Journal(tmp_path / FOLDER / "empty.arrow").close()
@@ -142,7 +143,7 @@ def test_without_its_meshes_an_episode_is_recovered_bare(make_episode: Maker, tm
     episode = make_episode()
     writer = episode.writer(tmp_path)
     for row in episode.rows():
-        writer.append(row)
+        append(writer, row)
     journal_of(writer).write()
     writer.close()
     scene = next((tmp_path / FOLDER).glob("*.scene"))
@@ -170,7 +171,7 @@ def left(episode: Made, folder: Path, **info: object) -> Path:
     episode.info = dataclasses.replace(episode.info, **info)  # type: ignore[arg-type]
     writer = episode.writer(folder)
     for row in episode.rows():
-        writer.append(row)
+        append(writer, row)
     journal_of(writer).write()
     writer.close()
     return folder / FOLDER / f"{episode.info.id}.arrow"
@@ -294,10 +295,9 @@ def changed(path: Path, kind: str, change: Callable[[bytes], bytes], more: Entry
     journal = Journal(path)
     for number, entry in enumerate(entries):
         if more is not None and number == len(entries) - 1:
-            journal.add(*more)
+            journal.append(more)
         value = change(entry.value) if entry.kind == kind else entry.value
-        journal.add(entry.kind, entry.number, value)
-    journal.commit()
+        journal.append(Entry(entry.kind, entry.number, value))
     journal.finish()
     journal.close()
 

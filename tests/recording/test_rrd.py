@@ -18,13 +18,14 @@ import rerun as rr
 from rerun.chunk import Chunk, LazyChunkStream, RrdReader
 
 from tests.drive.episodes import Made, header_of, journal_of
+from tests.drive.rows import append
 from tests.recording.verify_rrd import verify_rrd
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.machine.child_python import child_environment, python_command
 from workbench.recording import rrd
 from workbench.recording.blueprint_in_file import blueprint_stream
 from workbench.recording.read_episode import read_episode
-from workbench.recording.survey import JournalReader
+from workbench.recording.survey import read_pictures, read_survey
 
 Maker = Callable[..., Made]
 
@@ -36,18 +37,17 @@ def test_a_disk_that_is_full_at_any_byte_is_an_error_of_the_disk(
     episode = make_episode(30, action=np.random.default_rng(0).random((30, 1)).astype(np.float32))
     writer = episode.writer(tmp_path)
     for row in episode.rows():
-        writer.append(row)
+        append(writer, row)
     journal = journal_of(writer)
     journal.finish()
-    reader = JournalReader(journal.path)
-    survey = reader.survey(header_of(journal.path))
+    survey = read_survey(journal.path, header_of(journal.path))
     path = tmp_path / "some.rrd"
 
     def size_with_room(room: int) -> int:
         soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
         resource.setrlimit(resource.RLIMIT_FSIZE, (room, hard))
         try:
-            rrd.write_rrd(survey, reader.pieces(survey), path)
+            rrd.write_rrd(survey, read_pictures(journal.path, survey), path)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
         return path.stat().st_size
@@ -131,18 +131,18 @@ def test_a_material_of_whole_numbers_leaves_those_behind_it_as_they_are(
 import sys
 from pathlib import Path
 import numpy as np
+from tests.drive.rows import EpisodeRow, append
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.episode_writer import EpisodeWriter
-from workbench.recording.row import EpisodeRow
 mesh, zero = Mesh(np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.uint32)), np.zeros(1, np.int32)
 for seed, material in enumerate((Material((1, 0, 0, 1), 1, 0), Material((0.8, 0.5, 0.2, 1.0), 0.25, 0.5))):
     visual = Visual("cube/0", mesh, material, zero, zero)
     geometry = SceneGeometry(1, ("cube",), ("dynamic",), (False,), (visual,))
     info = EpisodeInfo("Painted-v1", 0, seed, None, "", {}, 0.05, None, "cpu")
     writer = EpisodeWriter(Path(sys.argv[1]), info, geometry, {}, (), ())
-    writer.append(EpisodeRow(np.array([[0, 0, 0, 1, 0, 0, 0]], np.float32), {}, {}, {}, None, 0.0))
-    writer.append(EpisodeRow(np.array([[0, 0, 0, 1, 0, 0, 0]], np.float32), {}, {}, {}, np.zeros(0, np.float32), 0.0))
+    append(writer, EpisodeRow(np.array([[0, 0, 0, 1, 0, 0, 0]], np.float32), {}, {}, {}, None, 0.0))
+    append(writer, EpisodeRow(np.array([[0, 0, 0, 1, 0, 0, 0]], np.float32), {}, {}, {}, np.zeros(0, np.float32), 0.0))
     print(writer.finish().rrd)
 """
     command = python_command("-c", program, str(tmp_path))

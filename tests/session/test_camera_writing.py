@@ -19,7 +19,7 @@ from workbench.session.camera_writing import CameraWriting, Wish, copy, plan
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
 from workbench.session.studio_view import Writing
-from workbench.ui.camera_change import writing_html
+from workbench.ui.camera_writing import writing_html
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

@@ -15,10 +15,10 @@ from workbench.core.camera_report import ObjectToSee
 from workbench.core.camera_settings import CameraSettings
 from workbench.core.pictures import CameraInfo
 from workbench.session.studio_view import StudioCamera
-from workbench.ui.arrival import Arrival
 from workbench.ui.camera_compare import what_differs
 from workbench.ui.camera_export import as_lists, file_name, matrices_html
 from workbench.ui.camera_suggest import box_edges, choices_of
+from workbench.ui.camera_work import Arrival
 
 SETTINGS = CameraSettings(
     position=(0.3, 0.0, 0.6),

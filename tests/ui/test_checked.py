@@ -11,8 +11,14 @@ import viser
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from workbench.ui.checked import checked_choice, checked_int, checked_number, checked_text
-from workbench.ui.control_values import check_value, name_control
+from workbench.ui.control_values import (
+    check_value,
+    checked_choice,
+    checked_int,
+    checked_number,
+    checked_text,
+    name_control,
+)
 
 unhurried = settings(deadline=None)  # a busy machine is no failure
 anything = st.one_of(

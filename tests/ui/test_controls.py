@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import pytest
 
 from tests.drive.panels import Clock, Panels
-from workbench.ui.checked import checked_int
+from workbench.ui.control_values import checked_int
 from workbench.ui.controls import HANDS_OFF, Control
 
 SETTLES = 3600.0

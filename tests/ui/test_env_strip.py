@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tests.ui.env_rows import FELL, rows_of
 from workbench.session.env_table import KEPT_REWARDS, EnvRows, LastEpisode, Outcome
-from workbench.ui.env_strip import (
+from workbench.ui.env_panel import (
     FILTERS,
     MOST_ENTRIES,
     columns,

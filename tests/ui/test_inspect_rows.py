@@ -8,8 +8,15 @@ import pytest
 from tests.ui.scenes import running
 from workbench.core.inspection import Inspection, JointReadings, Leaf, Touching
 from workbench.ui.force_arrows import LONGEST, METRES_AT_ONE_NEWTON, arrows_of
-from workbench.ui.inspect_panel import CHOICES, inspect_html
-from workbench.ui.inspect_rows import contact_rows, joint_rows, leaf_rows, number, pose_rows
+from workbench.ui.inspect_panel import (
+    CHOICES,
+    contact_rows,
+    inspect_html,
+    joint_rows,
+    leaf_rows,
+    number,
+    pose_rows,
+)
 
 
 def leaf(name: str, *values: float, shape: tuple[int, ...] | None = None) -> Leaf:
@@ -94,7 +101,7 @@ def test_arrows_start_at_the_points_and_are_bounded() -> None:
 def test_a_pose_is_copied_as_python_that_makes_it_again() -> None:
     poses = np.array([[0.1, -2, 0, 1, 0, 0, 0], [np.nan] * 7], np.float32)
     [row] = pose_rows(("cube", "absent"), poses)
-    assert row["copy"] == "sapien.Pose(p=[0.1, -2, 0], q=[1, 0, 0, 0])"
+    assert row["code"] == "sapien.Pose(p=[0.1, -2, 0], q=[1, 0, 0, 0])"
 
 
 @pytest.mark.parametrize(
@@ -127,6 +134,8 @@ def test_the_tab_never_shows_another_envs_reading_and_escapes_names(choice: str)
         "observation": "&lt;script",
         "state": "s</b>",
     }
+    if choice == "poses":
+        assert 'data-copy="sapien.Pose(p=[' in own
     if choice in expected:
         assert expected[choice] in own
         assert choice == "poses" or expected[choice] not in other

@@ -8,7 +8,7 @@ import pytest
 
 from workbench.authoring.task_content import source_hash
 from workbench.recording.episode import EpisodeInfo
-from workbench.ui.judged_with import RECORDED, TODAYS, codes_for
+from workbench.ui.rescore_panel import RECORDED, TODAYS, codes_for
 
 TASK = '@register_env("Push-v1")\nclass Push(BaseEnv):\n    pass\n'
 

@@ -13,8 +13,7 @@ from tests.drive.panels import Clock, Panels, told_so_far
 from tests.recording.library_files import describe
 from workbench.recording.library import Library
 from workbench.ui.commands import register
-from workbench.ui.library_commands import Action
-from workbench.ui.library_list import MOST_ROWS, RANGE, TOGGLE
+from workbench.ui.library_list import MOST_ROWS, RANGE, TOGGLE, Action
 from workbench.ui.library_panel import OPEN, LibraryPanel
 from workbench.ui.presses import NUMBERS
 

@@ -9,16 +9,16 @@ from hypothesis import strategies as st
 
 from workbench.machine.terminal_text import Run, Style, coloured_runs
 from workbench.session.printed import Printed, PrintedLine, PrintedLog
-from workbench.ui.log_colours import (
+from workbench.ui.log_panel import (
     DARK_PAGE,
     LIGHT_PAGE,
     MOST_SPANS,
     READABLE,
     contrast,
+    log_html,
     readable_on,
     spans_of_lines,
 )
-from workbench.ui.log_panel import log_html
 
 CSS = (Path(__file__).parents[2] / "web_assets" / "panels" / "page.css").read_text()
 BYTE = st.integers(0, 255)

@@ -14,7 +14,7 @@ from tests.ui.scenes import step_of, table_scene
 from workbench.core.entries import split_entries
 from workbench.core.step import OtherEntry
 from workbench.ui.fragments import render
-from workbench.ui.numbers_table import MOST_ROWS, NumberRow, number_rows
+from workbench.ui.numbers_panel import MOST_ROWS, NumberRow, number_rows
 
 _, POSES = table_scene(4)
 

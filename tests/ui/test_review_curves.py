@@ -12,7 +12,7 @@ from tests.drive.episodes import made
 from workbench.session.review_events import happenings
 from workbench.session.review_view import Opened, ReviewView
 from workbench.ui.fragments import render
-from workbench.ui.numbers_table import NumberRow
+from workbench.ui.numbers_panel import NumberRow
 from workbench.ui.review_curves import ReviewCurves, compared, known
 
 

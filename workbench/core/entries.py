@@ -52,14 +52,8 @@ _short.maxdeque = _short.maxarray = 20
 _short.maxstring = _short.maxlong = _short.maxother = MOST_LETTERS
 
 
-def split_entries(
-    info: Mapping[Any, Any], num_envs: int, copy: bool = True
-) -> tuple[dict[str, NDArray], dict[str, OtherEntry]]:
-    """The entries of `info` that are real numbers with a row for each env, (N, ...) each; and the others.
-
-    Args:
-        copy: False gives columns that are good until the next step, where they can be had without a copy.
-    """
+def split_entries(info: Mapping[Any, Any], num_envs: int) -> tuple[dict[str, NDArray], dict[str, OtherEntry]]:
+    """The entries of `info` that are real numbers with a row for each env, (N, ...) each; and the others. All are copies."""
     columns: dict[str, NDArray] = {}
     others: dict[str, OtherEntry] = {}
     left_out = 0
@@ -70,7 +64,7 @@ def split_entries(
             left_out += 1
             continue
         name = _name(path, columns, others)
-        array = _array(value, copy)
+        array = _array(value)
         if array is None:
             others[name] = _other(value, num_envs)
         elif array.ndim and len(array) == num_envs:
@@ -117,27 +111,27 @@ def _clean_name(path: str) -> str:
     return name if len(name) <= _MOST_NAME else name[: _MOST_NAME - 1] + "…"
 
 
-def _array(value: Any, copy: bool) -> NDArray | None:
+def _array(value: Any) -> NDArray | None:
     """`value` as booleans or real numbers; None where it is none, or is not all there to be read."""
     if isinstance(value, torch.Tensor):
-        return _of_tensor(value, copy)
+        return _of_tensor(value)
     if isinstance(value, np.ndarray):
-        return (value.copy() if copy else value) if value.dtype.kind in _REAL else None
+        return value.copy() if value.dtype.kind in _REAL else None
     if isinstance(value, (bool, int, float, np.bool_, np.integer, np.floating)):
         found = np.asarray(value)
         return found if found.dtype.kind in _REAL else None  # an int of more than 64 bits is an object
     if isinstance(value, (list, tuple)) and value:
         return _of_list(value)
     if isinstance(value, Pose):
-        return _of_tensor(value.raw_pose, copy)
+        return _of_tensor(value.raw_pose)
     return None
 
 
-def _of_tensor(value: torch.Tensor, copy: bool) -> NDArray | None:
+def _of_tensor(value: torch.Tensor) -> NDArray | None:
     if value.dtype in _PLAIN and value.layout is torch.strided and value.device.type == "cpu":
         # Nearly always; the general way takes three times as long.
         found = value.detach().numpy() if value.requires_grad else value.numpy()
-        return found.copy() if copy else found
+        return found.copy()
     if value.is_complex() or value.numel() > _MOST_READ:
         return None
     try:
@@ -148,13 +142,13 @@ def _of_tensor(value: torch.Tensor, copy: bool) -> NDArray | None:
         found = value.numpy(force=True)
     except (RuntimeError, TypeError, NotImplementedError):
         return None  # of the meta device, say: there is nothing to be read
-    return found.copy() if copy else found
+    return found.copy()
 
 
 def _of_list(value: list[Any] | tuple[Any, ...]) -> NDArray | None:
     if len(value) > _MOST_READ or any(isinstance(item, (str, bytes, Mapping)) for item in value):
         return None
-    rows: list[Any] = [_of_tensor(item, False) if isinstance(item, torch.Tensor) else item for item in value]
+    rows: list[Any] = [_of_tensor(item) if isinstance(item, torch.Tensor) else item for item in value]
     if any(row is None for row in rows):
         return None
     try:

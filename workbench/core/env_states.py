@@ -8,14 +8,12 @@ an object that only some envs have; in the envs without it the row is NaN.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
-from numpy.typing import NDArray
 
 from workbench.core import seams
 from workbench.core.scene_index import in_every_env, once_a_scene, scene_index
@@ -76,42 +74,6 @@ def env_states(env: BaseEnv) -> dict[str, Any]:
         controllers: Any = env.agent.get_controller_state()
         states.update(flat_entries(controllers, "controller/"))
     return states
-
-
-def states_of_steps(
-    env: BaseEnv, bodies: NDArray, qpos: NDArray, qvel: NDArray, hidden: Mapping[str, NDArray]
-) -> dict[str, NDArray]:
-    """`env_states` of K steps at once, (K, N, D) by name, without what controllers say.
-
-    Args:
-        bodies: (K, rows, 13) copies of ``cuda_rigid_body_data``, `qpos` and `qvel` (K, articulations, joints) of theirs.
-        hidden: ``actors/goal`` to (K, N, 7), where it really is, of actors that are hidden.
-    """
-    plan = _planned(env)
-    data = bodies[:, plan.rows].reshape(len(bodies), env.num_envs, -1, 13)
-    if plan.still:
-        data[:, :, plan.still, 7:] = 0.0
-    for name, poses in hidden.items():
-        data[:, :, plan.bodies.index(name), :7] = poses
-    states = {name: data[:, :, k] for k, name in enumerate(plan.bodies[: plan.actors])}
-    for k, (rows, dof) in enumerate(plan.joints, plan.actors):
-        parts = [data[:, :, k], qpos[:, rows, :dof], qvel[:, rows, :dof]]
-        states[plan.bodies[k]] = np.concatenate(parts, axis=2)
-    return states
-
-
-def told_by_rows(env: BaseEnv) -> bool:
-    """Whether `states_of_steps` can say all that `env_states` does."""
-    if type(env).get_state_dict is not BaseEnv.get_state_dict or not env.scene.gpu_sim_enabled:
-        return False
-    plan = _planned(env)
-    return env.device.type == "cpu" and not plan.others
-
-
-def actors_with_states(env: BaseEnv) -> dict[str, Any]:
-    """The actors among what `env_states` names, by that name."""
-    plan = _planned(env)
-    return {name: scene_index(env).states[name] for name in plan.bodies[: plan.actors]}
 
 
 @once_a_scene

@@ -17,7 +17,7 @@ On a GPU each tensor that is fetched by itself waits for the device; so all of t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -41,40 +41,27 @@ def read_state_columns(task: TaskEnv) -> dict[str, NDArray]:
     """
     count = task.num_envs
     values: dict[str, Any] = {STATE + name: value for name, value in env_states(task.env).items()}
-    values.update(observed(task))
+    values.update(_observed(task))
     columns: dict[str, NDArray] = {}
     for name, column in _fetched(values, count, task.env.device).items():
-        columns.update(taken_apart(name, column, parts_of(task, name, values[name])))
+        parts = names_of_flat(task, values[name]) if name in (OBS, OBS + "state") else None
+        if parts is None:
+            columns[name] = column
+            continue
+        at = 0
+        for part, shape, _ in parts:
+            width = math.prod(shape)
+            columns[OBS + part] = column[:, at : at + width].reshape(count, *shape)
+            at += width
     return columns
 
 
-def observed(task: TaskEnv) -> Iterator[tuple[str, Any]]:
+def _observed(task: TaskEnv) -> Iterator[tuple[str, Any]]:
     """The entries of the last observation that have a value an env, pictures left out: ``obs/...`` and (N, ...)."""
     obs = task.obs if isinstance(task.obs, Mapping) else {} if task.obs is None else {"": task.obs}
     for name, value in flat_entries({k: v for k, v in obs.items() if k not in _PICTURES}):
         if len(getattr(value, "shape", ())) > 0 and len(value) == task.num_envs:
             yield OBS + name, value
-
-
-_Parts = Sequence[tuple[str, tuple[int, ...], str]]
-
-
-def parts_of(task: TaskEnv, name: str, value: Any) -> _Parts | None:
-    """What the flattened observation `value` was made of; None where it is none, or nobody knows."""
-    return names_of_flat(task, value) if name in (OBS, OBS + "state") else None
-
-
-def taken_apart(name: str, column: NDArray, parts: _Parts | None) -> Iterator[tuple[str, NDArray]]:
-    """`column` (..., D) as the `parts` that lie in it one behind the other."""
-    if parts is None:
-        yield name, column
-        return
-    at = 0
-    for part, shape, _ in parts:
-        width = shape[0] if len(shape) == 1 else math.prod(shape)
-        held = column[..., at : at + width]
-        yield OBS + part, held if len(shape) == 1 else held.reshape(*column.shape[:-1], *shape)
-        at += width
 
 
 def _fetched(values: Mapping[str, Any], count: int, device: torch.device) -> dict[str, NDArray]:

@@ -61,7 +61,7 @@ def arrangement(survey: Survey) -> Arrangement:
         if not name.startswith(REWARD_TERMS)
     ]
     entries += [(batch_entity(name), column) for name, column in survey.named(BATCH).items()]
-    drawn = (entity for entity, column in entries if 0 < math.prod(column.shape) <= MAX_SERIES)
+    drawn = (entity for entity, column in entries if 0 < math.prod(column.shape[1:]) <= MAX_SERIES)
     eye, looked_at = _eye(survey)
     return Arrangement(
         cameras=tuple(
@@ -146,7 +146,7 @@ def _curves(arranged: Arrangement) -> rrb.ContainerLike:
 def _eye(survey: Survey) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
     """Where the eye is and what it looks at: what can move. By itself rerun frames the whole scene, and a ground plane is 100 m wide."""
     kinds = np.array(survey.header.geometry.body_kinds)
-    points = survey.first_poses[np.isin(kinds, ("link", "dynamic")), :3]
+    points = survey.poses[0, np.isin(kinds, ("link", "dynamic")), :3]
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
         points = np.zeros((1, 3), dtype=np.float32)

@@ -3,7 +3,9 @@
 A control step of one env is thirty to fifty small arrays: poses, an action, entries of ``evaluate()``, env states,
 observations. Writing each with its name and type would cost more than the step; but from one step to
 the next names and types are the same. So a row is the bytes of its arrays one behind the other, and a *layout*, kept
-once, says what they are. A layout is a numpy structured type, so a thousand rows become columns by one call.
+once, says what they are. A layout is a numpy structured type, so a thousand rows become columns by one call. Envs of a
+batch step together, so their rows are packed together: each array of the batch is copied once, to its place in rows that
+stay from step to step.
 
 ``evaluate()`` of a task under way is not tidy: entries come, go and change their type while the author edits. Each change is
 a new layout. A column that every row has in one shape keeps its type. Otherwise it becomes
@@ -13,14 +15,12 @@ floating point and holds NaN where a row lacks it; rows of differing shape are f
 from __future__ import annotations
 
 import json
-from collections import Counter
-from collections.abc import Iterable, Mapping
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
-from workbench.recording.row import EpisodeRow
 
 EVALUATE = "evaluate/"
 BATCH = "batch/"
@@ -30,74 +30,28 @@ OBS = "obs/"
 FIXED = ("poses", "action", "reward", "terminated", "truncated")
 """Names of the columns that every row has; `EVALUATE`, `BATCH`, `STATE` and `OBS` begin those of the others."""
 
-_Key = tuple[tuple[str, np.dtype, tuple[int, ...]], ...]
 
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """What the bytes of a row are; one object a packer and key, so that it is known by identity."""
 
-@dataclass(frozen=True)
-class Column:
-    """What one column of a whole episode is, without its rows."""
+    key: tuple[tuple[str, np.dtype, tuple[int, ...]], ...]
+    """Name, type and shape of each array of a row."""
 
-    dtype: np.dtype
-    shape: tuple[int, ...]
-    """Of one row."""
+    @property
+    def text(self) -> str:
+        return json.dumps([[name, dtype.str, shape] for name, dtype, shape in self.key])
 
-
-class RowPacker:
-    """Packs the rows of one episode, and says when they change their layout."""
-
-    def __init__(self, bodies: int, actions: int) -> None:
-        self._bodies = bodies
-        self._no_action = np.zeros(actions, dtype=np.float32)
-        self._layouts: dict[_Key, int] = {}
-
-    def pack(self, row: EpisodeRow) -> tuple[int, bytes, str | None]:
-        """Number of `row`'s layout, `row` in bytes, and the layout as text where it is new.
-
-        Raises:
-            ValueError: `row` does not fit the scene or the actions, or holds what is no number.
-        """
-        action = self._no_action if row.action is None else row.action
-        arrays = [
-            np.asarray(row.poses, dtype=np.float32),
-            np.asarray(action, dtype=np.float32).reshape(-1),
-            np.float32(row.reward),
-            np.bool_(row.terminated),
-            np.bool_(row.truncated),
-        ]
-        names = [*FIXED]
-        batch = {name: entry.numbers for name, entry in row.others.items() if entry.numbers is not None}
-        parts = ((EVALUATE, row.evaluate), (BATCH, batch), (STATE, row.env_states), (OBS, row.obs))
-        for prefix, held in parts:
-            for name, value in held.items():
-                names.append(prefix + name)
-                arrays.append(np.asarray(value))
-        number, text = self.number_of(tuple([(name, a.dtype, a.shape) for name, a in zip(names, arrays)]))
-        return number, b"".join([array.tobytes() for array in arrays]), text
-
-    def number_of(self, key: _Key) -> tuple[int, str | None]:
-        """The layout of rows that were packed elsewhere, as `pack` gives it and raises."""
-        number = self._layouts.get(key)
-        if number is not None:
-            return number, None
-        self._check(key)
-        number = self._layouts[key] = len(self._layouts)
-        return number, layout_text(key)
-
-    def forget(self, number: int) -> None:
-        """Layout `number`, the last new one, was not kept."""
-        self._layouts = {key: held for key, held in self._layouts.items() if held != number}
-
-    def _check(self, key: _Key) -> None:
-        shapes = {name: shape for name, _, shape in key}
-        if shapes["poses"] != (self._bodies, 7):
+    def check(self, bodies: int, actions: int) -> None:
+        """Raises ValueError where its rows do not fit a scene of so many bodies and actions, or hold what is no number."""
+        shapes = {name: shape for name, _, shape in self.key}
+        if shapes["poses"] != (bodies, 7):
             raise ValueError(
-                f"poses are {shapes['poses']}, but the scene has {self._bodies} bodies: ({self._bodies}, 7)."
+                f"poses are {shapes['poses']}, but the scene has {bodies} bodies: ({bodies}, 7)."
             )
-        if shapes["action"] != self._no_action.shape:
-            raise ValueError(
-                f"an action of {shapes['action'][0]} numbers, but {len(self._no_action)} action names."
-            )
-        for name, dtype, _ in key:
+        if shapes["action"] != (actions,):
+            raise ValueError(f"an action of {shapes['action'][0]} numbers, but {actions} action names.")
+        for name, dtype, _ in self.key:
             if dtype.kind not in "biuf":
                 where, _, entry = name.partition("/")
                 what = f"evaluate()['{entry}']" if where == "evaluate" else f"{where} '{entry}'"
@@ -107,8 +61,29 @@ class RowPacker:
                 )
 
 
-def layout_text(key: _Key) -> str:
-    return json.dumps([[name, dtype.str, shape] for name, dtype, shape in key])
+class BatchPacker:
+    """Packs the rows of a batch, one step after the other."""
+
+    def __init__(self) -> None:
+        self._layouts: dict[object, Layout] = {}
+        self._last: Layout | None = None
+        self._rows = np.zeros(0, np.uint8)
+        self._parts: list[NDArray] = []
+        """Where in `_rows` each column goes."""
+
+    def pack(self, columns: Sequence[tuple[str, NDArray]]) -> tuple[Layout, list[bytes]]:
+        """The layout and (N) rows of `columns`, each a name and an array (N, ...): those of `FIXED`, then the others."""
+        key = tuple([(name, values.dtype, values.shape[1:]) for name, values in columns])
+        layout, count = self._last, len(columns[0][1])
+        if layout is None or layout.key != key or len(self._rows) != count:
+            layout = self._last = self._layouts.setdefault(key, Layout(key))
+            fields = [(f"f{i}", values.dtype, values.shape[1:]) for i, (_, values) in enumerate(columns)]
+            self._rows = np.zeros(count, fields)
+            self._parts = [self._rows[name] for name, *_ in fields]
+        for part, (_, values) in zip(self._parts, columns):
+            part[...] = values
+        size, together = self._rows.itemsize, self._rows.tobytes()
+        return layout, [together[i : i + size] for i in range(0, count * size, size)]
 
 
 def layout_type(text: str) -> np.dtype:
@@ -116,53 +91,32 @@ def layout_type(text: str) -> np.dtype:
     return np.dtype([(name, dtype, tuple(shape)) for name, dtype, shape in json.loads(text)])
 
 
-def merge(layouts: Mapping[np.dtype, int]) -> dict[str, Column]:
-    """The columns of an episode that has so many rows of each of these layouts, in the order in which names first appear."""
-    total = sum(layouts.values())
-    seen: dict[str, list[tuple[np.dtype, tuple[int, ...]]]] = {}
-    rows: Counter[str] = Counter()
-    for layout, count in layouts.items():
-        for name in layout.names or ():
-            dtype = layout[name]
-            seen.setdefault(name, []).append((dtype.base, dtype.shape))
-            rows[name] += count
-    return {name: _merged(kinds, rows[name] == total) for name, kinds in seen.items()}
+def assemble(runs: Sequence[NDArray]) -> dict[str, NDArray]:
+    """The rows of `runs`, each structured (n,), as columns (sum of n, ...) in the order in which their names first appear."""
+    names = dict.fromkeys(name for run in runs for name in run.dtype.names or ())
+    return {
+        name: _column([run[name] if name in (run.dtype.names or ()) else len(run) for run in runs])
+        for name in names
+    }
 
 
-def _merged(kinds: list[tuple[np.dtype, tuple[int, ...]]], complete: bool) -> Column:
-    dtypes, shapes = zip(*kinds)
-    if complete and len(set(shapes)) == 1:
-        return Column(np.result_type(*dtypes), shapes[0])
-    shape = shapes[0] if len(set(shapes)) == 1 else (max(int(np.prod(s)) for s in shapes),)
-    return Column(np.result_type(np.float32, *dtypes), shape)
-
-
-def assemble(runs: Iterable[NDArray], columns: Mapping[str, Column]) -> dict[str, NDArray]:
-    """The rows of `runs`, each structured (n,), as arrays (sum of n, ...) of `columns`."""
-    runs = list(runs)
-    total = sum(len(run) for run in runs)
-    held: dict[str, NDArray] = {}
-    for name, column in columns.items():
-        have = [name in (run.dtype.names or ()) for run in runs]
-        if all(have) and len(runs) == 1 and runs[0].dtype[name] == _of(column):
-            held[name] = np.ascontiguousarray(runs[0][name])
+def _column(parts: Sequence[NDArray | int]) -> NDArray:
+    """Of the runs of rows that have it, and how many rows there are of those that lack it."""
+    there = [part for part in parts if isinstance(part, np.ndarray)]
+    shapes = {part.shape[1:] for part in there}
+    if len(there) == len(parts) and len(shapes) == 1:
+        return np.concatenate(there)
+    dtype = np.result_type(np.float32, *[part.dtype for part in there])
+    shape = shapes.pop() if len(shapes) == 1 else (max(math.prod(shape) for shape in shapes),)
+    out = np.full(
+        (sum(part if isinstance(part, int) else len(part) for part in parts), *shape), np.nan, dtype
+    )
+    begin = 0
+    for part in parts:
+        if isinstance(part, int):
+            begin += part
             continue
-        fill = np.nan if column.dtype.kind == "f" else 0
-        out = np.full((total, *column.shape), fill, dtype=column.dtype)
-        begin = 0
-        for run, has in zip(runs, have):
-            if has:
-                part = run[name]
-                rows = out[begin : begin + len(run)]
-                if part.shape[1:] == column.shape:
-                    rows[...] = part
-                else:
-                    flat = part.reshape(len(run), -1)
-                    rows[:, : flat.shape[1]] = flat
-            begin += len(run)
-        held[name] = out
-    return held
-
-
-def _of(column: Column) -> np.dtype:
-    return np.dtype((column.dtype, column.shape))
+        rows = out[begin : begin + len(part)].reshape(len(part), -1)
+        rows[:, : math.prod(part.shape[1:])] = part.reshape(len(part), -1)
+        begin += len(part)
+    return out

@@ -27,6 +27,7 @@ import base64
 import io
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ from PIL import Image
 from workbench.core.geometry import SceneGeometry
 from workbench.machine.regular_file import read_regular_file
 from workbench.recording.checksums import checksum
-from workbench.recording.columns import BATCH, Column
+from workbench.recording.columns import BATCH
 from workbench.recording.entry_texts import tracks_words
 from workbench.recording.episode import EpisodeInfo, acted_by_from
 from workbench.recording.made_here import seal, seal_from
@@ -49,6 +50,15 @@ MOST_PARTS = 40
 """Folders in the place of a task that are looked for: the place is what a recording says."""
 MOST_SOURCE_BYTES = 4 << 20
 """Of a task's file that is looked for by what it names."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """What one column of a whole episode is, without its rows."""
+
+    dtype: np.dtype
+    shape: tuple[int, ...]
+    """Of one row."""
 
 
 def describe(survey: Survey) -> dict[str, Any]:
@@ -177,8 +187,8 @@ def columns_from(said: dict[str, Any]) -> dict[str, Column]:
     return {name: Column(np.dtype(dtype), tuple(shape)) for name, (dtype, shape) in said.items()}
 
 
-def _columns(columns: dict[str, Column]) -> dict[str, Any]:
-    return {name: [column.dtype.str, list(column.shape)] for name, column in columns.items()}
+def _columns(columns: dict[str, NDArray]) -> dict[str, Any]:
+    return {name: [column.dtype.str, list(column.shape[1:])] for name, column in columns.items()}
 
 
 def _scene(geometry: SceneGeometry) -> dict[str, Any]:

@@ -170,6 +170,13 @@ def _is_nan(value: NDArray | None) -> bool:
     return value is None or (value.dtype.kind == "f" and bool(np.isnan(value).all()))
 
 
+def flag_of(values: NDArray | None) -> NDArray[np.bool_] | None:
+    """(T + 1,) of a column of ``evaluate()`` that is one truth a state, NaN where it lacks it; None for another column."""
+    if values is None or values.ndim != 1:
+        return None
+    return np.nan_to_num(values.astype(np.float64)) != 0
+
+
 ActedBy = tuple[tuple[int, str], ...]
 
 

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.core.step import OtherEntry
-from workbench.recording.batch_rows import Layout
-from workbench.recording.columns import RowPacker
+from workbench.recording.columns import Layout
 from workbench.recording.encode_soon import encode_soon
 from workbench.recording.encoded_pictures import MODALITIES, Modality
 from workbench.recording.entry_texts import KIND as TEXT
@@ -32,7 +31,6 @@ from workbench.recording.journal import Item as JournalItem
 from workbench.recording.landing import RecordingError, reason
 from workbench.recording.make_files import EpisodeFiles as EpisodeFiles
 from workbench.recording.make_files import make_files
-from workbench.recording.row import EpisodeRow
 from workbench.recording.scene_file import keep_scene
 from workbench.recording.survey import Header, header_text
 
@@ -68,14 +66,11 @@ class EpisodeWriter:
         """
         self._folder = Path(folder)
         self._header = Header(info, geometry, dict(segmentation), tuple(action_names), tuple(cameras))
-        self._packer = RowPacker(len(geometry.body_names), len(self._header.action_names))
         self._cameras: dict[tuple[CameraKind, str], int] = {
             camera.key: index for index, camera in enumerate(self._header.cameras)
         }
         self._given: dict[int, tuple[Modality, ...]] = {}
-        self._shared: dict[Layout, int] = {}
-        self._encoded: dict[int | None, object] = {}
-        """By camera, the form of pictures that `encode` has found well."""
+        self._layouts: dict[Layout, int] = {}
         self._texts = TextWriter()
         self._states = 0
         self._written = False
@@ -86,8 +81,7 @@ class EpisodeWriter:
             self._journal = Journal(path)
             try:
                 keep_scene(geometry, self._scene)
-                self._journal.add("header", 0, header_text(self._header).encode())
-                self._journal.commit()
+                self._journal.append(Entry("header", 0, header_text(self._header).encode()))
             except OSError:
                 self.discard()
                 raise
@@ -97,6 +91,11 @@ class EpisodeWriter:
     @property
     def info(self) -> EpisodeInfo:
         return self._header.info
+
+    @property
+    def actions(self) -> int:
+        """Numbers of an action."""
+        return len(self._header.action_names)
 
     @property
     def folder(self) -> Path:
@@ -110,20 +109,43 @@ class EpisodeWriter:
     def __len__(self) -> int:
         return max(self._states - 1, 0)
 
-    def append(self, row: EpisodeRow) -> None:
-        """The next state.
+    def append(
+        self,
+        layout: Layout,
+        row: bytes,
+        pictures: Sequence[Picture] = (),
+        others: Mapping[str, OtherEntry] = NO_OTHERS,
+    ) -> None:
+        """The next state, as `BatchPacker` packs it: the first is that after a reset, the others hold the action that led there.
+
+        Args:
+            pictures: of this env alone; every state keeps the modalities that the first picture of a camera had. They are
+                encoded while the episode goes on, so nobody may write to them any more.
+            others: its entries of ``evaluate()`` that are no rows, each as `OtherEntry.of_env` gives it.
 
         Raises:
-            ValueError: `row` does not fit the episode; the episode is as it was.
+            ValueError: it does not fit the episode; the episode is as it was.
             RecordingError: the journal cannot be written any more (also of an earlier row, since writing lags behind).
         """
-        if (row.action is None) != (self._states == 0):
-            raise ValueError(
-                "the first row is the state after a reset, which no action led to."
-                if self._states == 0
-                else f"step {self._states} has no action, so it cannot be replayed."
-            )
-        self._append(*self._packer.pack(row), row.pictures, row.others)
+        number = self._layouts.get(layout)
+        items: list[JournalItem] = []
+        given: dict[int, tuple[Modality, ...]] = {}
+        if number is None:
+            layout.check(self._header.bodies, self.actions)
+            number = len(self._layouts)
+            items.append(Entry("layout", number, layout.text.encode()))
+        if pictures:
+            given, encoded = self._pictures_of(pictures)
+            items += encoded
+        if others or not self._texts.is_silent:
+            items += [Entry(TEXT, *line) for line in self._texts.news(self._states, others)]
+        try:
+            self._journal.append(*items, Entry("row", number, row))
+        except OSError as error:
+            raise self._failed(error) from error
+        self._layouts[layout] = number
+        self._given |= given
+        self._states += 1
 
     def acted_by(self, what: str) -> None:
         """What chooses the actions from the next one on, where it is not what `info` says.
@@ -132,111 +154,8 @@ class EpisodeWriter:
             RecordingError: as `append`.
         """
         try:
-            self._journal.put("acted", len(self), what.encode())
+            self._journal.append(Entry("acted", len(self), what.encode()))
         except OSError as error:
-            raise self._failed(error) from error
-
-    def append_steps(
-        self, layout: Layout, packed: bytes, steps: int, pictures: Sequence[JournalItem] = ()
-    ) -> None:
-        """As `append`, with the rows of several steps one behind the other, and what `encode` gave for them."""
-        if self._states == 0:
-            raise ValueError("the first row is the state after a reset, which no action led to.")
-        number, text = self._shared.get(layout), None
-        if number is None:
-            number, text = self._packer.number_of(layout.key)
-        self._keep(number, packed, text, pictures)
-        self._shared[layout] = number
-        self._states += steps
-
-    def encode(
-        self, state: int, camera: tuple[CameraKind, str], pose: NDArray, images: Mapping[Modality, NDArray]
-    ) -> list[JournalItem]:
-        """The pictures of a state to come, on their way: for `append_steps`. Nobody may write to `images` any more.
-
-        Args:
-            images: as in a `Picture`, all that the camera gives; depth may be whole millimetres.
-
-        Raises:
-            ValueError: they do not fit the episode.
-        """
-        index = self._cameras.get(camera)
-        form = (index, tuple([(name, image.shape, image.dtype) for name, image in images.items()]))
-        if form != self._encoded.get(index):
-            millimetres = images.get("depth")
-            checked = dict(images)
-            if millimetres is not None and millimetres.dtype.kind in "iu":
-                checked["depth"] = millimetres.astype(np.float32)
-            index = self._check(Picture(camera[1], camera[0], self.info.env_index, pose, **checked), {})
-            self._given[index] = tuple(modality for modality in MODALITIES if modality in images)
-            self._encoded[index] = form
-        assert index is not None
-        entry = Entry(f"camera/{index}", state, np.asarray(pose, dtype=np.float32).tobytes())
-        return [
-            entry,
-            encode_soon([(f"picture/{index}/{m}", state, m, image) for m, image in images.items()]),
-        ]
-
-    def texts(self, state: int, others: Mapping[str, OtherEntry]) -> list[JournalItem]:
-        """What a state to come says in texts: for `append_steps`. `others` as in an `EpisodeRow`; states in order."""
-        return [Entry(TEXT, *line) for line in self._texts.news(state, others)]
-
-    def append_packed(
-        self,
-        layout: Layout,
-        packed: bytes,
-        pictures: Sequence[Picture] = (),
-        others: Mapping[str, OtherEntry] = NO_OTHERS,
-    ) -> None:
-        """As `append`, with a row after the first that was packed together with those of other envs."""
-        if self._states == 0:
-            raise ValueError("the first row is the state after a reset, which no action led to.")
-        number = self._shared.get(layout)
-        # Nearly always: there is nothing but numbers, of a layout that is known.
-        if number is not None and not pictures and not others and self._texts.is_silent:
-            try:
-                self._journal.put("row", number, packed)
-            except OSError as error:
-                raise self._failed(error) from error
-            self._states += 1
-            return
-        text = None
-        if number is None:
-            number, text = self._packer.number_of(layout.key)
-        self._append(number, packed, text, pictures, others)
-        self._shared[layout] = number
-
-    def _append(
-        self,
-        number: int,
-        packed: bytes,
-        layout: str | None,
-        pictures: Sequence[Picture],
-        others: Mapping[str, OtherEntry],
-    ) -> None:
-        try:
-            given, items = self._pictures_of(pictures) if pictures else ({}, [])
-        except ValueError:
-            if layout is not None:
-                self._packer.forget(number)
-            raise
-        self._keep(number, packed, layout, [*items, *self.texts(self._states, others)])
-        self._given |= given
-        self._states += 1
-
-    def _keep(self, number: int, packed: bytes, layout: str | None, pictures: Sequence[JournalItem]) -> None:
-        journal = self._journal
-        try:
-            for item in pictures:
-                journal.take(item)
-            if layout is not None:
-                journal.add("layout", number, layout.encode())
-            journal.add("row", number, packed)
-            journal.commit()
-        except OSError as error:
-            journal.rollback()
-            if layout is not None:
-                self._packer.forget(number)
             raise self._failed(error) from error
 
     def finish(self) -> EpisodeFiles:

@@ -56,7 +56,7 @@ Item = Entry | Future[list[Entry]]
 
 
 class Journal:
-    """A journal that is being written. `add` entries, `commit` them once they make a whole state."""
+    """A journal that is being written."""
 
     def __init__(self, path: Path) -> None:
         """Begin the journal `path`, which must not exist; its folder is made. Raises OSError."""
@@ -64,7 +64,6 @@ class Journal:
         self._descriptor = _create(path)
         self._closer = weakref.finalize(self, os.close, self._descriptor)
         self._size = 0
-        self._pending: list[Item] = []  # the owner's alone
         self._waiting: list[Item] = []
         self._waiting_bytes = 0
         self._lock = threading.Lock()  # of what waits; never held while the disk works
@@ -85,50 +84,29 @@ class Journal:
         """Bytes written and waiting."""
         return self._size + self._waiting_bytes
 
-    def add(self, kind: str, number: int, value: bytes) -> None:
-        self._pending.append(Entry(kind, number, value))
+    def append(self, *items: Item) -> None:
+        """What belongs together, and will be on the disk soon: a state, its row last.
 
-    def take(self, item: Item) -> None:
-        """`add` it; entries that somebody is still working at keep this place, and whoever writes waits for them, not the owner."""
-        self._pending.append(item)
-
-    def commit(self) -> None:
-        """What was added belongs together from here on, and will be on the disk soon.
+        Entries that somebody is still working at keep their place, and whoever writes waits for them, not the owner.
 
         Raises:
-            OSError: something that was committed before could not be written, or not be made; this is not kept then.
+            OSError: something that was appended before could not be written, or not be made; this is not kept then.
         """
         if self._error is not None:
             raise self._error
-        pending, self._pending = self._pending, []
-        added = sum([_size(item) for item in pending if isinstance(item, Entry)])
+        added = sum([_size(item) for item in items if isinstance(item, Entry)])
         with self._lock:
-            self._waiting += pending
+            self._waiting += items
             self._waiting_bytes += added
             full = self._waiting_bytes > _BATCH_BYTES
-        for item in pending:
+        for item in items:
             if not isinstance(item, Entry):
                 item.add_done_callback(self._weigh)
         if full:
             self.write()  # where that fails the next one is told: this one is kept
 
-    def put(self, kind: str, number: int, value: bytes) -> None:
-        """`add` and `commit` of what is a whole state by itself, in one: sixty-four envs do it at every step."""
-        if self._error is not None:
-            raise self._error
-        entry = Entry(kind, number, value)
-        with self._lock:
-            self._waiting.append(entry)
-            self._waiting_bytes += _size(entry)
-        if self._waiting_bytes > _BATCH_BYTES:
-            self.write()
-
-    def rollback(self) -> None:
-        """Forget what was added since the last `commit`."""
-        self._pending = []
-
     def write(self) -> None:
-        """Hand what was committed to the system: a process that dies now loses nothing of it."""
+        """Hand what was appended to the system: a process that dies now loses nothing of it."""
         with self._writing:
             if self._error is not None or not self._closer.alive:
                 return
@@ -159,7 +137,7 @@ class Journal:
                 self._waiting_bytes += sum(map(_size, made.result()))
 
     def sync(self) -> None:
-        """Write what was committed and make it last, also through a power cut. An error is raised by the next `commit`."""
+        """Write what was appended and make it last, also through a power cut. An error is raised by the next `append`."""
         self._written(os.fsync)
 
     def finish(self) -> None:
@@ -247,7 +225,6 @@ class _Keeper:
     def __init__(self) -> None:
         self._journals: set[Journal] = set()
         self._changed = threading.Condition()
-        self._before: set[weakref.WeakMethod] = set()
         self._thread: threading.Thread | None = None
 
     def watch(self, journal: Journal) -> None:
@@ -262,11 +239,6 @@ class _Keeper:
             self._journals.discard(journal)
             self._changed.notify()
 
-    def before_writing(self, flush: Callable[[], None]) -> None:
-        with self._changed:
-            self._before = {held for held in self._before if held() is not None}
-            self._before.add(weakref.WeakMethod(flush))
-
     def _run(self) -> None:
         while True:
             with self._changed:
@@ -276,11 +248,6 @@ class _Keeper:
                 if not self._journals:
                     self._thread = None
                     return
-                before = [flush for held in self._before if (flush := held()) is not None]
-            for flush in before:
-                flush()
-            del before
-            with self._changed:
                 journals = list(self._journals)
             for journal in journals:
                 journal.write()  # all of them before the first fsync, which may take its time
@@ -289,14 +256,6 @@ class _Keeper:
 
 
 _keeper = _Keeper()
-
-
-def before_writing(flush: Callable[[], None]) -> None:
-    """Have the bound method `flush` called before journals are written, while its object lives: for who holds rows back.
-
-    On the thread of the journals, so it must not raise.
-    """
-    _keeper.before_writing(flush)
 
 
 def read_journal(path: Path) -> Iterator[list[Entry]]:

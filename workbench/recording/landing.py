@@ -3,16 +3,12 @@
 A recording outlives its session, so it must not lie: not half written after a full disk, not short of a camera, not written
 over yesterday's. The files of an episode are made under temporary names in a folder beside the journal, checked there (the .rrd by its end, the .h5 by opening it), and only
 then linked to their names, the .json last. **What has no .json is not there.**
-
-HDF5 does not take a failing disk well: it leaves files half open. So it never sees it fail: `SafeFile` keeps the first error to
-itself, swallows the rest, and tells at the end. What writes the .rrd raises at once.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import io
 import os
 import shutil
 import tempfile
@@ -39,83 +35,6 @@ def try_folder(folder: Path) -> None:
             pass
     except OSError as error:
         raise RecordingError(f"Cannot record to {folder}: {reason(error, folder)}") from error
-
-
-class SafeFile(io.RawIOBase):
-    """A new file that takes everything that it is given, whether the disk does or not; `finish` says which it was."""
-
-    def __init__(self, path: Path) -> None:
-        """Raises OSError where `path` exists or cannot be made."""
-        super().__init__()
-        self._file = path.open("x+b")
-        self._error: OSError | None = None
-
-    def write(self, content) -> int:
-        view = memoryview(content).cast("B")
-        try:
-            if self._error is None:
-                self._file.write(view)
-        except OSError as error:
-            self._error = error
-        return len(view)
-
-    def readinto(self, buffer) -> int:
-        return self._file.readinto(buffer)
-
-    def read(self, size: int = -1) -> bytes:
-        return self._file.read(size)
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        try:
-            return self._file.seek(offset, whence)
-        except OSError as error:  # it writes what is buffered
-            self._error = self._error or error
-            return offset
-
-    def tell(self) -> int:
-        return self._file.tell()
-
-    def truncate(self, size: int | None = None) -> int:
-        try:
-            return self._file.truncate(size)
-        except OSError as error:
-            self._error = self._error or error
-            return size or 0
-
-    def flush(self) -> None:
-        try:
-            if self._error is None and not self._file.closed:
-                self._file.flush()
-        except OSError as error:
-            self._error = error
-
-    def readable(self) -> bool:
-        return True
-
-    def writable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    @property
-    def error(self) -> OSError | None:
-        return self._error
-
-    def finish(self) -> None:
-        """Close it. Raises the first OSError that there was; that it lasts is `make_last`'s affair."""
-        self.flush()
-        self.close()
-        if self._error is not None:
-            raise self._error
-
-    def close(self) -> None:
-        if not self._file.closed:
-            try:
-                self._file.close()
-            except OSError as error:
-                self._error = self._error or error
-        super().close()
 
 
 def make_last(paths: Sequence[Path]) -> None:

@@ -1,4 +1,4 @@
-"""Which entity of a recording holds what: an episode laid out for rerun, a piece at a time.
+"""Which entity of a recording holds what: an episode laid out for rerun.
 
 A recording is read by people in the viewer and by programs, so where a thing lies is a contract:
 
@@ -14,8 +14,8 @@ that it earned, so the action of row k is ``episode.action[k - 1]`` and row 0 ha
 
 A row of numbers or of a pose that is between two equal ones is left out (`rerun_chunks.telling`): the state before it says what it is.
 
-Everything goes in as columns (one call an entity and piece), which research measured at forty times the speed
-of one call a row; pieces are long, since each is a chunk of the file that readers and the viewer handle as one. Rerun writes quaternions as xyzw and cameras in the OpenCV frame (x right, y down,
+Everything goes in as columns (one call an entity), which research measured at forty times the speed
+of one call a row. Rerun writes quaternions as xyzw and cameras in the OpenCV frame (x right, y down,
 z forward); ManiSkill has wxyz and x forward, y left, z up.
 """
 
@@ -37,10 +37,10 @@ from transforms3d.quaternions import qconjugate, qmult
 
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo
-from workbench.recording.columns import BATCH, EVALUATE, OBS, Column
+from workbench.recording.columns import BATCH, EVALUATE, OBS
 from workbench.recording.encoded_pictures import MILLIMETRES_PER_METRE, decode
 from workbench.recording.rerun_chunks import TimedChunks, series_chunk, static_chunk, still_pose
-from workbench.recording.survey import CameraSurvey, Piece, Survey
+from workbench.recording.survey import CameraSurvey, Pictures, Survey
 
 WORLD = "/world"
 CAMERAS = "/world/cameras"
@@ -75,51 +75,36 @@ def static_chunks(survey: Survey) -> Iterator[Chunk]:
         yield _texts(survey)
 
 
-def piece_chunks(survey: Survey, pieces: Iterable[Piece]) -> Iterator[Chunk]:
-    """What is in time, piece by piece in order; an entity has one chunk a piece, or none."""
+def time_chunks(survey: Survey, pictures: Iterable[Pictures]) -> Iterator[Chunk]:
+    """What is in time: numbers and poses whole, an entity a chunk; of pictures a chunk for each of `pictures`."""
     timed = TimedChunks(survey.info.control_dt)
-    cameras = camera_entities([camera.info for camera in survey.cameras])
+    states = np.arange(survey.states, dtype=np.int64)
     moving = {body: entity for body, entity in _present(survey) if not survey.still[body]}
-    for piece in pieces:
-        poses = piece.columns["poses"][:, list(moving)]
-        yield from timed.poses(list(moving.values()), piece.states, poses[..., _XYZW])
-        for (index, modality), (frames, blobs) in piece.pictures.items():
-            if len(frames):
-                yield _pictures(timed, survey.cameras[index], cameras[index], modality, frames, blobs)
-        yield from _camera_poses(timed, survey, cameras, piece.states)
-        yield from _numbers_in_time(timed, survey, piece)
-
-
-def _camera_poses(
-    timed: TimedChunks, survey: Survey, entities: Sequence[str], states: NDArray[np.int64]
-) -> Iterator[Chunk]:
-    for camera, entity in zip(survey.cameras, entities):
-        begin, end = np.searchsorted(camera.frames, [states[0], states[-1] + 1])
-        if begin < end and not camera.still:
-            pose = np.concatenate(optical_pose(camera.poses[begin:end]), axis=1)
-            yield from timed.poses([entity], camera.frames[begin:end], pose[:, None])
-
-
-def _numbers_in_time(timed: TimedChunks, survey: Survey, piece: Piece) -> Iterator[Chunk]:
-    states = piece.states
-    skip = 1 if piece.first == 0 else 0
-    found: list[tuple[str, NDArray[np.int64], NDArray]] = []
-    for name, entity, _ in _numbers(survey):
-        if name in ("action", "reward", "terminated", "truncated"):
-            # State 0 is a reset: nothing led to it.
-            found.append((entity, states[skip:], piece.columns[name][skip:]))
-        else:
-            found.append((entity, states, piece.columns[name]))
-    for name, values in survey.flags.items():
-        found.append((f"/episode/{name}", states, values[states]))
-    if observed := [piece.columns[OBS + name] for name in survey.named(OBS)]:
-        flat = [
-            np.asarray(v, dtype=np.float64).reshape(len(states), math.prod(v.shape[1:])) for v in observed
-        ]
-        found.append((OBSERVATION, states, np.concatenate(flat, axis=1)))
-    for entity, steps, values in found:
+    yield from timed.poses(list(moving.values()), states, survey.poses[:, list(moving)][..., _XYZW])
+    cameras = camera_entities([camera.info for camera in survey.cameras])
+    for camera, entity in zip(survey.cameras, cameras):
+        if not camera.still:
+            pose = np.concatenate(optical_pose(camera.pose), axis=1)
+            yield from timed.poses([entity], np.array(camera.frames, dtype=np.int64), pose[:, None])
+    for entity, steps, values in _numbers_in_time(survey, states):
         if np.size(values):
             yield timed.scalars(entity, steps, values)
+    for some in pictures:
+        yield _pictures(timed, survey.cameras[some.camera], cameras[some.camera], some)
+
+
+def _numbers_in_time(
+    survey: Survey, states: NDArray[np.int64]
+) -> Iterator[tuple[str, NDArray[np.int64], NDArray]]:
+    for name, entity, _ in _numbers(survey):
+        # State 0 is a reset: nothing led to it.
+        first = 1 if name in ("action", "reward", "terminated", "truncated") else 0
+        yield entity, states[first:], survey.columns[name][first:]
+    for name, values in survey.flags.items():
+        yield f"/episode/{name}", states, values
+    if observed := survey.named(OBS).values():
+        flat = [np.asarray(v, dtype=np.float64).reshape(len(v), math.prod(v.shape[1:])) for v in observed]
+        yield OBSERVATION, states, np.concatenate(flat, axis=1)
 
 
 def _present(survey: Survey) -> list[tuple[int, str]]:
@@ -183,7 +168,7 @@ def _scene(survey: Survey) -> Iterator[Chunk]:
     entities = dict(_present(survey))
     for body, entity in entities.items():
         if survey.still[body]:
-            pose = survey.first_poses[body]
+            pose = survey.poses[0, body]
             yield still_pose(entity, pose[:3], xyzw(pose[3:]))
     worn: Counter[int] = Counter()
     for visual in survey.header.geometry.visuals:
@@ -268,7 +253,7 @@ def _lenses(survey: Survey) -> Iterator[Chunk]:
     for camera, entity in zip(survey.cameras, camera_entities([camera.info for camera in survey.cameras])):
         info = camera.info
         if camera.still:
-            translation, quaternion = optical_pose(camera.poses[0][None])
+            translation, quaternion = optical_pose(camera.pose[:1])
             yield still_pose(entity, translation[0], quaternion[0])
         pinhole = rr.Pinhole(
             image_from_camera=info.intrinsic,
@@ -295,19 +280,12 @@ def _ids(camera: CameraSurvey) -> np.dtype:
     return np.dtype(np.int32 if camera.wide else np.uint16)
 
 
-def _pictures(
-    timed: TimedChunks,
-    camera: CameraSurvey,
-    entity: str,
-    modality: str,
-    frames: Sequence[int],
-    blobs: Sequence[bytes],
-) -> Chunk:
-    steps = np.array(frames, dtype=np.int64)
+def _pictures(timed: TimedChunks, camera: CameraSurvey, entity: str, some: Pictures) -> Chunk:
+    steps, modality, blobs = np.array(some.frames, dtype=np.int64), some.modality, some.blobs
     if modality == "rgb":
-        columns = rr.EncodedImage.columns(blob=list(blobs))
+        columns = rr.EncodedImage.columns(blob=blobs)
     elif modality == "depth":
-        columns = rr.EncodedDepthImage.columns(blob=list(blobs))
+        columns = rr.EncodedDepthImage.columns(blob=blobs)
     else:
         # Rerun shows names over ids only where they are plain; its files compress them again.
         ids = np.stack([decode("segmentation", blob) for blob in blobs]).astype(_ids(camera))
@@ -334,11 +312,11 @@ def _numbers(survey: Survey) -> list[tuple[str, str, list[str]]]:
     return found
 
 
-def series_names(name: str, column: Column) -> list[str]:
+def series_names(name: str, column: NDArray) -> list[str]:
     """``name``, or ``name[0]``, ``name[1]`` ... where a step has more than one number of it."""
-    if column.shape == ():
+    if column.ndim == 1:
         return [name]
-    return [f"{name}[{', '.join(map(str, index))}]" for index in np.ndindex(column.shape)]
+    return [f"{name}[{', '.join(map(str, index))}]" for index in np.ndindex(column.shape[1:])]
 
 
 def _series(survey: Survey) -> Iterator[Chunk]:
@@ -365,8 +343,8 @@ def events(survey: Survey) -> list[tuple[int, str, str]]:
     for name, level in (("success", "INFO"), ("fail", "WARN")):
         if name in survey.flags:
             found += [(step, level, name) for step in onsets(survey.flags[name])]
-    for name, values in (("terminated", survey.terminated), ("truncated", survey.truncated)):
-        found += [(step, "INFO", name) for step in onsets(np.concatenate([[False], values]))]
+    for name, values in ((name, survey.columns[name]) for name in ("terminated", "truncated")):
+        found += [(step, "INFO", name) for step in onsets(values)]
     return sorted(found, key=lambda event: event[0])
 
 

@@ -10,15 +10,14 @@ import contextlib
 import datetime
 import errno
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.landing import RecordingError, make_last, publish, reason
-from workbench.recording.maniskill_h5 import h5_writer, write_json
+from workbench.recording.maniskill_h5 import write_h5, write_json
 from workbench.recording.rrd import write_rrd
-from workbench.recording.survey import Header, JournalReader, Piece, Survey
+from workbench.recording.survey import Header, read_pictures, read_survey
 
 SUFFIXES = (".rrd", ".h5", ".json")
 
@@ -39,10 +38,9 @@ def make_files(journal: Path, header: Header, folder: Path, states: int | None =
         RecordingError: the files cannot be written; none of them is there then.
         ValueError: the journal holds no state, or what rerun refuses.
     """
-    reader = JournalReader(journal)
     temporaries = temporary_files(journal)
     try:
-        survey = reader.survey(header)
+        survey = read_survey(journal, header)
         if survey.states == 0:
             raise ValueError("the episode has no state yet: its first row is the state after the reset.")
         if states is not None and survey.states != states:
@@ -51,7 +49,10 @@ def make_files(journal: Path, header: Header, folder: Path, states: int | None =
             )
         for path in temporaries:
             path.unlink(missing_ok=True)
-        _write(reader, survey, temporaries, folder)
+        rrd, h5, json = temporaries
+        write_h5(survey, h5)
+        write_rrd(survey, read_pictures(journal, survey), rrd)
+        write_json(survey, json, folder, (rrd, h5))
         make_last(temporaries)
         return EpisodeFiles(*publish(temporaries, folder, episode_stem(header.info)))
     except OSError as error:
@@ -69,19 +70,6 @@ def make_files(journal: Path, header: Header, folder: Path, states: int | None =
 def temporary_files(journal: Path) -> tuple[Path, ...]:
     """What the files of an episode are called until they are whole."""
     return tuple(journal.with_suffix(suffix) for suffix in SUFFIXES)
-
-
-def _write(reader: JournalReader, survey: Survey, paths: tuple[Path, ...], folder: Path) -> None:
-    rrd, h5, json = paths
-    with h5_writer(survey, h5) as other:
-
-        def pieces() -> Iterator[Piece]:
-            for piece in reader.pieces(survey):
-                other.take(piece)
-                yield piece
-
-        write_rrd(survey, pieces(), rrd)
-    write_json(survey, json, folder, (rrd, h5))
 
 
 def episode_stem(info: EpisodeInfo) -> str:

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from workbench.core.geometry import SceneGeometry
 from workbench.core.shared_shapes import SharedShapes
 from workbench.recording.checksums import check
-from workbench.recording.columns import Column
-from workbench.recording.description import columns_from, info_from, task_file
+from workbench.recording.description import Column, columns_from, info_from, task_file
 from workbench.recording.encoded_pictures import EncodedPictures, Modality
 from workbench.recording.entry_texts import tracks_from
 from workbench.recording.episode import CameraTrack, Episode, Unread

@@ -24,7 +24,7 @@ from workbench.recording.make_files import (
     temporary_files,
 )
 from workbench.recording.scene_file import read_scene
-from workbench.recording.survey import JournalReader, recovered
+from workbench.recording.survey import read_header, read_survey, recovered
 
 
 def recover(folder: Path) -> list[EpisodeFiles]:
@@ -68,12 +68,11 @@ def _recover(journal: Path, folder: Path) -> EpisodeFiles | None:
     if descriptor is None:
         return None
     try:
-        reader = JournalReader(journal)
-        header = reader.header(read_scene(journal.with_suffix(SCENE_SUFFIX)))
+        header = read_header(journal, read_scene(journal.with_suffix(SCENE_SUFFIX)))
         files = None
         if header is not None and not _already_made(header.info, journal, folder):
             header = recovered(header)
-            if reader.survey(header).length > 0:
+            if read_survey(journal, header).length > 0:
                 files = make_files(journal, header, folder)
         journal.unlink(missing_ok=True)
         return files

@@ -1,6 +1,6 @@
-"""Write an episode as an ``.rrd``, a piece at a time.
+"""Write an episode as an ``.rrd``.
 
-Its chunks are made while rerun writes them, so that an episode of any length is never in memory as a whole, and what the disk refuses is
+Its chunks are made while rerun writes them, so that its pictures are never in memory all at once, and what the disk refuses is
 an error here and not on a thread of rerun's.
 """
 
@@ -25,27 +25,27 @@ from workbench.recording.blueprint import Arrangement, arrangement, blueprint_of
 from workbench.recording.blueprint_in_file import BlueprintBytes, add_blueprint, encode_blueprint
 from workbench.recording.description import describe
 from workbench.recording.episode import EpisodeInfo, acted_by_in_words
-from workbench.recording.layout import piece_chunks, static_chunks
+from workbench.recording.layout import static_chunks, time_chunks
 from workbench.recording.rerun_chunks import property_chunk, static_chunk
-from workbench.recording.survey import Piece, Survey
+from workbench.recording.survey import Pictures, Survey
 
 
-def write_rrd(survey: Survey, pieces: Iterable[Piece], path: Path) -> None:
-    """Write the episode of `survey`, whose `pieces` come in order, to `path`; what lies there is written over.
+def write_rrd(survey: Survey, pictures: Iterable[Pictures], path: Path) -> None:
+    """Write the episode of `survey` with its `pictures` to `path`; what lies there is written over.
 
     Raises:
         OSError: it cannot be written.
         ValueError: rerun refuses something in it.
-        Whatever `pieces` raises.
+        Whatever `pictures` raises.
     """
     application_id = _application_id(survey.info)
     # Without strict mode a mesh that rerun refuses is a warning, and the file lacks it.
     with catch_and_log_exceptions(strict=True):
-        write_chunks(_chunks(survey, pieces), path, application_id)
+        write_chunks(_chunks(survey, pictures), path, application_id)
         add_blueprint(path, _blueprint(application_id, arrangement(survey)))
 
 
-def _chunks(survey: Survey, pieces: Iterable[Piece]) -> Iterator[Chunk]:
+def _chunks(survey: Survey, pictures: Iterable[Pictures]) -> Iterator[Chunk]:
     written = datetime.datetime.fromisoformat(survey.info.written_at).timestamp()
     started = rr.encodings.TimeInt(seconds=written)
     info = rr.archetypes.RecordingInfo(name=_title(survey), start_time=started)
@@ -53,7 +53,7 @@ def _chunks(survey: Survey, pieces: Iterable[Piece]) -> Iterator[Chunk]:
     for name, values in properties(survey).items():
         yield property_chunk(name, values)
     yield from static_chunks(survey)
-    yield from piece_chunks(survey, pieces)
+    yield from time_chunks(survey, pictures)
 
 
 def write_chunks(chunks: Iterator[Chunk], path: Path, application_id: str) -> None:

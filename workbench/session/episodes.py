@@ -12,7 +12,7 @@ was lost, or a reset that went by unseen, would otherwise become a file that loo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -23,13 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.pictures import Picture
-from workbench.core.state_names import STATE, named_states_of, observation_of, states_of
+from workbench.core.state_names import STATE, states_of
 from workbench.core.step import OtherEntry, StepResult
-from workbench.recording.batch_rows import BatchPacker
+from workbench.recording.columns import BatchPacker
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.episode_writer import NO_OTHERS, EpisodeWriter
-from workbench.recording.journal import Item as JournalItem
-from workbench.recording.row import EpisodeRow
 from workbench.recording.side_files import side_files
 from workbench.session.messages import Stepped, TaskDescription
 
@@ -52,12 +50,36 @@ class GatheredEpisode:
     """Of the env states that its first row has."""
     acted_by: str = ""
     """What chose its last action."""
+    begun: bool = False
+    """Whether it has its first state."""
 
     def acts(self, what: str) -> None:
         """What chooses the next action; empty for no news. Raises RecordingError."""
         if what and what != self.acted_by:
             self.writer.acted_by(what)
             self.acted_by = what
+
+    def take(
+        self,
+        packer: BatchPacker,
+        step: StepResult,
+        row: int,
+        columns: Mapping[str, NDArray],
+        pictures: Sequence[Picture],
+    ) -> None:
+        """Its next state, row `row` of a batch; the first is that after a reset. Raises as `EpisodeWriter.append`."""
+        if not self.begun:
+            self.state_names = frozenset(states_of(columns, row))
+            count = len(step.reward)
+            no, nothing = np.zeros(count, np.bool_), np.zeros((count, self.writer.actions), np.float32)
+            step = replace(
+                step, action=nothing, reward=np.zeros(count, np.float32), terminated=no, truncated=no
+            )
+        batch = batch_columns(step, columns, self.state_names)
+        layout, (packed,) = packer.pack([(name, values[row : row + 1]) for name, values in batch])
+        self.writer.append(layout, packed, _of_env(pictures, row), others_of(step.others, row))
+        self.steps += self.begun
+        self.begun = True
 
 
 class EpisodeGatherer:
@@ -120,42 +142,6 @@ class EpisodeGatherer:
             if env in self._episodes and step.elapsed_steps[env] == 0:
                 self._begin(env, stepped)
 
-    def take_steps(
-        self,
-        elapsed: NDArray[np.integer],
-        columns: Mapping[str, NDArray],
-        pictures: Sequence[Mapping[int, Sequence[JournalItem]]],
-    ) -> None:
-        """Several control steps of the batch in which no env was reset, in one; raises as `take`. For ``ends="reset"``.
-
-        Args:
-            elapsed: (K, N) the number of each step in its episode.
-            columns: what `batch_columns` names, (K, N, ...) each, with the states of all envs.
-            pictures: (K) env to what `EpisodeWriter.encode` and `texts` gave for that step.
-        """
-        assert self._ends == "reset"
-        successes = columns.get("evaluate/success")
-        lost: ValueError | None = None
-        for names in {episode.state_names for episode in self.under_way}:
-            chosen = [(n, v) for n, v in columns.items() if n[:6] != STATE or n[6:] in names]
-            layout, rows = self._packer.pack_steps(chosen)
-            for episode in [e for e in self.under_way if e.state_names == names]:
-                env = episode.env
-                expected = episode.steps + 1 + np.arange(len(elapsed))
-                wrong = np.flatnonzero(elapsed[:, env] != expected)
-                good = int(wrong[0]) if len(wrong) else len(elapsed)
-                if good:
-                    items = [item for held in pictures[:good] for item in held.get(env, ())]
-                    episode.writer.append_steps(layout, rows[env, :good].tobytes(), good, items)
-                    episode.steps += good
-                    episode.total_reward += float(columns["reward"][:good, env].sum(dtype=np.float64))
-                    if successes is not None:
-                        episode.success = bool(np.any(successes[good - 1, env]))
-                if len(wrong):
-                    lost = lost or _lost(env, episode.steps + 1, int(elapsed[good, env]))
-        if lost is not None:
-            raise lost
-
     def finish(self) -> None:
         """End the episodes under way where they are."""
         for env in list(self._episodes):
@@ -193,14 +179,12 @@ class EpisodeGatherer:
             task.cameras,
         )
         try:
-            row = first_row(stepped.step, env, stepped.columns, stepped.captured)
-            writer.append(row)
+            begun = GatheredEpisode(writer, env, seed, acted_by=self.acted_by)
+            begun.take(self._packer, stepped.step, env, stepped.columns, stepped.captured)
         except BaseException:
             writer.discard()
             raise
-        self._episodes[env] = GatheredEpisode(
-            writer, env, seed, state_names=frozenset(row.env_states), acted_by=self.acted_by
-        )
+        self._episodes[env] = begun
 
     def _append(self, episodes: list[GatheredEpisode], state_names: frozenset[str], stepped: Stepped) -> None:
         """The rows of envs that have the same states."""
@@ -218,9 +202,8 @@ class EpisodeGatherer:
             env = episode.env
             if elapsed[env] != episode.steps + 1:
                 raise _lost(env, episode.steps + 1, elapsed[env])
-            pictures = [p for p in captured if p.env == env] if captured else ()
             episode.acts(stepped.acted_by)
-            episode.writer.append_packed(layout, rows[env], pictures, others_of(others, env))
+            episode.writer.append(layout, rows[env], _of_env(captured, env), others_of(others, env))
             episode.steps += 1
             episode.total_reward += reward[env]
             episode.success = None if success is None else success[env]
@@ -237,7 +220,7 @@ def _lost(env: int, expected: int, came: int) -> ValueError:
 def batch_columns(
     step: StepResult, columns: Mapping[str, NDArray], state_names: frozenset[str]
 ) -> list[tuple[str, NDArray]]:
-    """A control step of the batch, in the order in which `EpisodeRow` names what a row holds."""
+    """A control step of the batch, as `BatchPacker` takes it."""
     assert step.action is not None
     count = len(step.reward)
     rows = [
@@ -261,42 +244,13 @@ def batch_columns(
     return rows
 
 
+def _of_env(pictures: Sequence[Picture], env: int) -> Sequence[Picture]:
+    return [picture for picture in pictures if picture.env == env] if pictures else ()
+
+
 def others_of(others: Mapping[str, OtherEntry], env: int) -> Mapping[str, OtherEntry]:
     """`StepResult.others` of one env."""
     return {name: entry.of_env(env) for name, entry in others.items()} if others else NO_OTHERS
-
-
-def first_row(
-    step: StepResult, env: int, columns: Mapping[str, NDArray], pictures: Iterable[Picture]
-) -> EpisodeRow:
-    """One env after a reset; `pictures` may hold those of other envs."""
-    return EpisodeRow(
-        poses=step.poses[env],
-        evaluate={name: values[env] for name, values in step.evaluate.items()},
-        env_states=states_of(columns, env),
-        obs=observation_of(columns, env),
-        pictures=tuple(picture for picture in pictures if picture.env == env),
-        others=others_of(step.others, env),
-    )
-
-
-def next_row(
-    step: StepResult,
-    env: int,
-    columns: Mapping[str, NDArray],
-    pictures: Iterable[Picture],
-    state_names: Collection[str],
-) -> EpisodeRow:
-    """One env after a control step; `state_names` are those of its first row."""
-    assert step.action is not None
-    return replace(
-        first_row(step, env, columns, pictures),
-        env_states=named_states_of(columns, env, state_names),
-        action=step.action[env].reshape(-1),
-        reward=float(step.reward[env]),
-        terminated=bool(step.terminated[env]),
-        truncated=bool(step.truncated[env]),
-    )
 
 
 def episode_info(

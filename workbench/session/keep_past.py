@@ -21,11 +21,12 @@ from typing import TypeVar
 
 import numpy as np
 
+from workbench.recording.columns import BatchPacker
 from workbench.recording.episode_writer import EpisodeWriter
 from workbench.recording.landing import RecordingError
 from workbench.session.background import BackgroundProcess
 from workbench.session.episode_files import EpisodeFinisher
-from workbench.session.episodes import GatheredEpisode, episode_info, first_row, next_row
+from workbench.session.episodes import GatheredEpisode, episode_info
 from workbench.session.keep_status import KeepStatus
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
 from workbench.session.messages import (
@@ -141,7 +142,7 @@ class PastKeeper:
 
     def _capture_all(self, job: Job, what: WhatToKeep, writers: dict[int, GatheredEpisode]) -> None:
         names = [dimension.name for dimension in what.task.actions]
-        moments = moments_of(what.episodes)
+        moments, packer = moments_of(what.episodes), BatchPacker()
         rows: dict[int, dict[int, list[tuple[PastEpisode, bool]]]] = {}
         for episode in what.episodes:
             for index, (moment, env) in enumerate(episode.moments):
@@ -156,7 +157,6 @@ class PastKeeper:
             for env in envs:
                 for episode, is_first in rows[moment.serial][env]:
                     if is_first:
-                        row = first_row(step, env, columns, pictures)
                         writer = EpisodeWriter(
                             self._folder,
                             episode_info(what.task, episode.env, episode.seed),
@@ -165,16 +165,10 @@ class PastKeeper:
                             names,
                             what.task.cameras,
                         )
-                        gathered = GatheredEpisode(
-                            writer, episode.env, episode.seed, state_names=frozenset(row.env_states)
-                        )
-                        writers[episode.env] = gathered
-                        writer.append(row)
-                        continue
-                    gathered = writers[episode.env]
-                    gathered.acts(moment.acted_by)
-                    gathered.writer.append(next_row(step, env, columns, pictures, gathered.state_names))
-                    gathered.steps += 1
+                        writers[episode.env] = GatheredEpisode(writer, episode.env, episode.seed)
+                    else:
+                        writers[episode.env].acts(moment.acted_by)
+                    writers[episode.env].take(packer, step, env, columns, pictures)
 
     def _have_loaded(self, job: Job, what: WhatToKeep) -> None:
         if self._loaded is not None and self._loaded[1] != what.placed:

@@ -18,7 +18,7 @@ from workbench.session.studio_view import StudioCamera
 from workbench.session.view import SessionView
 from workbench.ui.camera_work import WorkBar
 from workbench.ui.fragments import render
-from workbench.ui.inline_pictures import data_address
+from workbench.ui.in_colours import data_address
 
 FILE, KEPT = "as in the file", "as kept (A)"
 LARGEST = 256

@@ -22,10 +22,10 @@ from workbench.core.camera_frames import (
 from workbench.core.camera_settings import CameraSettings
 from workbench.session.studio_view import StudioCamera
 from workbench.ui.camera_moves import kept_where_equal
-from workbench.ui.checked import checked_int
+from workbench.ui.camera_numbers import number_field, pair_field
+from workbench.ui.control_values import checked_int
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
-from workbench.ui.number_fields import number_field, pair_field
 from workbench.ui.placing import Placing
 
 FOV, INTRINSIC = "field of view", "intrinsic matrix"

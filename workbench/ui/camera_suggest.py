@@ -20,12 +20,11 @@ from workbench.session.messages import TaskDescription
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera
 from workbench.session.view import SessionView
-from workbench.ui.arrival import Arrival
-from workbench.ui.camera_work import WorkBar
-from workbench.ui.checked import checked_number
+from workbench.ui.camera_work import Arrival, WorkBar
+from workbench.ui.control_values import checked_number
 from workbench.ui.env_layout import box_corners
 from workbench.ui.fragments import render
-from workbench.ui.inline_pictures import data_address
+from workbench.ui.in_colours import data_address
 from workbench.ui.presses import Presses
 from workbench.ui.selection_mark import LineSet
 

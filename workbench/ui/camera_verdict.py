@@ -20,10 +20,9 @@ from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera, StudioView
 from workbench.session.view import SessionView
 from workbench.ui import camera_report_words as words
-from workbench.ui.arrival import Arrival
-from workbench.ui.camera_work import WorkBar
+from workbench.ui.camera_work import Arrival, WorkBar
 from workbench.ui.fragments import render
-from workbench.ui.inline_pictures import data_address
+from workbench.ui.in_colours import data_address
 from workbench.ui.presses import Presses
 
 AS_THEY_ARE, STEPS, FRESH = "the envs as they are", "this env's steps so far", "fresh resets"

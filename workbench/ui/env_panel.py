@@ -1,37 +1,209 @@
 """The batch, one row an env: sort it, filter it, press a row to select that env and go to its moment.
 
-What the rows say is in `env_strip`; how a row of HTML can be pressed, in `presses`. The table is drawn a few times
+What the rows say is in `env_panel`; how a row of HTML can be pressed, in `presses`. The table is drawn a few times
 a second, and at most `MOST_ROWS` rows of it: which those are is what sorting and filtering are for. Sorting and
 filter belong to the page's server, like the selected env, so two open pages show the same.
+
+What the rows of the batch say, and in which order: sorting, filtering, and the text of each cell.
+
+Pure functions of an `EnvRows`, so that what a person reads can be checked without a browser. Order matters more
+than it seems: ties keep the order of the envs (or rows would jump about while nothing changes), and an env that
+has no value in a column (never succeeded, episode not followed from its start) comes last whichever way it is
+sorted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from typing import Any, Literal
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
-from workbench.session.env_table import EnvRows
+from workbench.session.env_table import EnvRows, Outcome
+from workbench.session.number_text import number_text
 from workbench.session.session import Session
 from workbench.session.view import SessionView
-from workbench.ui.env_strip import (
-    FILTERS,
-    MEANS,
-    NONE_SO,
-    SHOWN_AS,
-    Filter,
-    columns,
-    entry_names,
-    first_flagged,
-    make_rows,
-    mask,
-    moment_of,
-    order,
-)
 from workbench.ui.fragments import render
 from workbench.ui.parts import Part
 from workbench.ui.presses import Paged, Presses
+from workbench.ui.timeline_strip import polylines
+
+Filter = Literal["all", "failed", "running", "flagged"]
+FILTERS: tuple[Filter, ...] = ("all", "failed", "running", "flagged")
+SHOWN_AS: dict[Filter, str] = {
+    "all": "all",
+    "failed": "last failed",
+    "running": "running",
+    "flagged": "flagged",
+}
+"""What a pill says. An env that runs may have failed before, so "failed 16" beside "running 16" puzzles."""
+MEANS: dict[Filter, str] = {
+    "all": "Every env",
+    "failed": "The last episode that came to an end ended without success: by fail, or at the time limit",
+    "running": "The episode under way has not come to its first end",
+    "flagged": "Something odd in the episode under way, or in the one before",
+}
+NONE_SO: dict[Filter, str] = {
+    "all": "There is no env.",
+    "failed": "In no env did the last episode fail.",
+    "running": "No env is running.",
+    "flagged": "No env is flagged.",
+}
+MOST_ENTRIES = 6
+"""Columns of bool entries; a row of more is wider than the view."""
+POINTS = 40
+"""Of a row's small curve: it is 60 pixels wide."""
+CURVE_WIDTH, CURVE_HEIGHT = 60, 14
+WORDS = {
+    Outcome.RUNNING: "running",
+    Outcome.SUCCESS: "success",
+    Outcome.FAIL: "fail",
+    Outcome.TRUNCATED: "truncated",
+}
+_GRAVITY = np.array([2, 3, 0, 1])
+"""Of an `Outcome` when sorted by: failed first, then cut off, then running, then solved."""
+
+
+def entry_names(rows: EnvRows) -> tuple[str, ...]:
+    """The bool entries that get a column: ``success`` and ``fail`` first."""
+    names = sorted(rows.first_true, key=lambda name: (name != "success", name != "fail", name))
+    return tuple(names[:MOST_ENTRIES])
+
+
+def columns(rows: EnvRows) -> tuple[str, ...]:
+    """Names by which rows can be sorted, as they stand in the table."""
+    return (
+        "env",
+        "state",
+        "steps",
+        "return",
+        "last",
+        "flags",
+        *(f"first {name}" for name in entry_names(rows)),
+    )
+
+
+def mask(rows: EnvRows, wanted: Filter) -> NDArray[np.bool_]:
+    """(N,) the envs that a filter lets through.
+
+    ``failed``: the present episode ended without success or, while it runs, the one before did.
+    ``flagged``: outliers in the present episode or the one before.
+    """
+    everyone = np.ones(rows.num_envs, bool)
+    if wanted == "failed":
+        running = rows.outcome == Outcome.RUNNING
+        bad = (Outcome.FAIL, Outcome.TRUNCATED)
+        return np.where(running, np.isin(rows.last.outcome, bad), np.isin(rows.outcome, bad))
+    if wanted == "running":
+        return rows.outcome == Outcome.RUNNING
+    if wanted == "flagged":
+        return np.isin(np.arange(rows.num_envs), [*rows.outliers, *rows.last.outliers])
+    return everyone
+
+
+def first_flagged(rows: EnvRows) -> int | None:
+    """The first env with something odd: in the episode under way, or else in the one before; None for none."""
+    return min(rows.outliers, default=None) if rows.outliers else min(rows.last.outliers, default=None)
+
+
+def order(rows: EnvRows, column: str, descending: bool, wanted: Filter = "all") -> NDArray[np.int64]:
+    """The envs that a filter lets through, sorted by a column; envs without a value last."""
+    envs = np.flatnonzero(mask(rows, wanted))
+    keys = _keys(rows, column)[envs]
+    keys = np.where(np.isnan(keys), np.inf, -keys if descending else keys)
+    return envs[np.argsort(keys, kind="stable")]
+
+
+def moment_of(rows: EnvRows, env: int) -> int | None:
+    """The step of its present episode that an env's row is about: its first outlier, else its end, else none."""
+    if env in rows.outliers:
+        return rows.outliers[env][0].step
+    return int(rows.end[env]) if rows.end[env] >= 0 else None
+
+
+def make_rows(rows: EnvRows, envs: NDArray[np.int64]) -> list[dict[str, Any]]:
+    """The cells of these envs. A curve is ``points`` of SVG polylines; reasons of flags are the oldest first."""
+    names = entry_names(rows)
+    curves = _curves(rows.rewards, envs)
+    made = []
+    for env, curve in zip(envs.tolist(), curves, strict=True):
+        outcome, last = Outcome(int(rows.outcome[env])), Outcome(int(rows.last.outcome[env]))
+        had_one = rows.last.steps[env] >= 0
+        before = [
+            f"{outlier.reason} (episode before, step {outlier.step})"
+            for outlier in rows.last.outliers.get(env, ())
+        ]
+        now = [f"{outlier.reason} (step {outlier.step})" for outlier in rows.outliers.get(env, ())]
+        made.append(
+            {
+                "env": env,
+                "state": WORDS[outcome],
+                "total": number_text(float(rows.total[env]), ".3g") if rows.followed[env] else "",
+                "steps": str(int(rows.steps[env])),
+                "first_true": tuple(_step(int(rows.first_true[name][env])) for name in names),
+                "curve": curve,
+                "last": f"{'cut short' if last == Outcome.RUNNING else WORDS[last]} {rows.last.steps[env]}"
+                if had_one
+                else "",
+                "last_state": WORDS[last],
+                "tally": f"{rows.succeeded[env]} of {rows.ended[env]} episodes ended in success",
+                "flags": tuple(now + before),
+            }
+        )
+    return made
+
+
+def _keys(rows: EnvRows, column: str) -> NDArray[np.float64]:
+    """(N,) NaN for no value."""
+    if column == "state":
+        return _GRAVITY[rows.outcome].astype(np.float64)
+    if column == "steps":
+        return rows.steps.astype(np.float64)
+    if column == "return":
+        return rows.total.astype(np.float64)
+    if column == "last":
+        return np.where(rows.last.steps < 0, np.nan, _GRAVITY[rows.last.outcome])
+    if column == "flags":
+        keys = np.full(rows.num_envs, np.nan)
+        keys[list(rows.last.outliers)] = 1.0
+        keys[list(rows.outliers)] = 0.0
+        return keys
+    if column.startswith("first "):
+        steps = rows.first_true.get(column.removeprefix("first "))
+        if steps is not None:
+            return np.where(steps < 0, np.nan, steps)
+    return np.arange(rows.num_envs, dtype=np.float64)
+
+
+def _curves(rewards: NDArray[np.float32], envs: NDArray[np.int64]) -> list[list[str]]:
+    """SVG points of each env's rewards, all on one scale: rows are there to be compared."""
+    chosen = rewards[envs].astype(np.float64)
+    finite = np.isfinite(chosen)
+    if not finite.any():
+        return [[] for _ in envs]
+    # As wide as the longest episode shown.
+    chosen = chosen[:, int(finite.any(axis=0).argmax()) :]
+    every = np.arange(0, chosen.shape[1], -(-chosen.shape[1] // POINTS))
+    # A single step without a number is seen too.
+    finite = np.logical_and.reduceat(np.isfinite(chosen), every, axis=1)
+    chosen = chosen[:, every]
+    if not finite.any():
+        return [[] for _ in envs]
+    low, high = chosen[finite].min(), chosen[finite].max()
+    span = high - low if high > low else 1.0
+    x = np.round(np.linspace(0, CURVE_WIDTH, chosen.shape[1]), 1)
+    y = np.round(CURVE_HEIGHT - 1 - (CURVE_HEIGHT - 2) * (np.where(finite, chosen, low) - low) / span, 1)
+    return [
+        polylines([f"{a:g},{b:g}" if there else None for a, b, there in zip(x, heights, ok, strict=True)])
+        for heights, ok in zip(y, finite, strict=True)
+    ]
+
+
+def _step(step: int) -> str:
+    return "" if step < 0 else str(step)
+
 
 MOST_ROWS = 64
 """On one page of the table."""

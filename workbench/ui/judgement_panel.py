@@ -3,6 +3,11 @@
 Nothing is here before there is something to say. The chart shows one number of the selected env, chosen from those
 that the task returns: the record thin and grey, what the new code says of the same moments over it. A row of the
 list selects its env and goes to the moment where it differs, in the timeline and so in the 3-D view.
+
+One line above the curves: that the past was judged again, and what came of it.
+
+What it is about, the new curve over the old one and the list, lies under the live curves, and on a small screen below
+the edge: who saved another reward and looks at the numbers would not learn of it. A press on the line scrolls there.
 """
 
 from __future__ import annotations
@@ -18,10 +23,9 @@ from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui import judged_in_words as words
 from workbench.ui.fragments import render
-from workbench.ui.line_chart import LONGEST
+from workbench.ui.line_chart import LONGEST, ThenAndNow
 from workbench.ui.parts import Part
 from workbench.ui.presses import Paged, Presses
-from workbench.ui.then_and_now import ThenAndNow
 
 MOST_ROWS = 8
 """Of the list, at a time."""
@@ -155,3 +159,14 @@ def chart_data(curve: JudgedCurve, shown: int | None) -> tuple[NDArray[np.float6
 
 def status_html(judged: JudgementView) -> str:
     return render("judgement", judged=judged, words=words)
+
+
+class JudgedAbove(Part[SessionView]):
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._line = server.gui.add_html("", visible=False)
+
+    def draw(self, view: SessionView) -> None:
+        says = words.in_a_line(view.judgement)
+        self._line.visible = bool(says)
+        if says:
+            self._line.content = render("judged_above", says=says)

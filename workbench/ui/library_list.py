@@ -4,15 +4,24 @@ Selection works as in every list of files: a press selects a row alone, control 
 all from the last one on; arrows walk, and shift takes what they walk over along. What is not listed is not selected,
 or a filter would hide what a deletion then takes. The list lives in the server, so all pages show the same; its
 methods are called from any thread.
+
+What can be done with the table of recordings from the keyboard, and with those that are selected in it.
+
+What is done with recordings is a button over the table and a command with a key, made from one description, so that
+neither is without the other.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from viser._messages import HotkeyKey, KeyModifier  # the types of add_command's arguments (viser 1.1.1)
 
 from workbench.recording.library import Library, LibraryView
 from workbench.recording.library_row import LibraryRow
+from workbench.ui.commands import Command
 from workbench.ui.library_rows import Column, Outcome, begins_descending, chosen, ordered
 
 MOST_ROWS = 50
@@ -161,3 +170,45 @@ class LibraryList:
 
     def _last_page(self, rows: list[LibraryRow]) -> int:
         return max(0, (len(rows) - 1) // MOST_ROWS * MOST_ROWS)
+
+
+@dataclass(frozen=True)
+class Action:
+    """Something to be done with the selected recordings."""
+
+    label: str
+    hint: str
+    run: Callable[[tuple[str, ...]], None]
+    most: int | None = None
+    """Recordings that it can take at once."""
+    named: str = ""
+    """Its name among the commands; empty leaves it to the buttons."""
+    key: HotkeyKey | None = None
+    modifier: KeyModifier | None = None
+
+
+def walking(listed: LibraryList) -> list[Command]:
+    """To go through the table and select in it."""
+
+    def move(by: int, held: int = 0) -> Callable[[], None]:
+        return lambda: listed.move(by, held)
+
+    return [
+        Command("The next recording of the table", move(1), "arrowdown"),
+        Command("The recording before it", move(-1), "arrowup"),
+        Command("Select the next recording too", move(1, RANGE), "arrowdown", "shift"),
+        Command("Select the one before it too", move(-1, RANGE), "arrowup", "shift"),
+        Command("The next page of recordings", lambda: listed.turn(1), "pagedown"),
+        Command("The page of recordings before it", lambda: listed.turn(-1), "pageup"),
+        Command("Select this recording, or no longer", listed.toggle_cursor, "X"),
+        Command("Select all recordings that are listed", listed.select_all, "A", "cmd/ctrl"),
+    ]
+
+
+def acting(actions: Sequence[Action], run: Callable[[Action], None]) -> list[Command]:
+    """What is done with the selected ones."""
+    return [
+        Command(action.named, lambda action=action: run(action), action.key, action.modifier)
+        for action in actions
+        if action.named
+    ]

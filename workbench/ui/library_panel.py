@@ -25,9 +25,8 @@ from workbench.recording.library import Library, LibraryView
 from workbench.recording.library_row import LibraryRow
 from workbench.ui.commands import Command
 from workbench.ui.fragments import render
-from workbench.ui.library_commands import Action, acting, walking
 from workbench.ui.library_edits import LibraryEdits
-from workbench.ui.library_list import MOST_ROWS, RANGE, TOGGLE, LibraryList
+from workbench.ui.library_list import MOST_ROWS, RANGE, TOGGLE, Action, LibraryList, acting, walking
 from workbench.ui.library_rows import (
     COLUMNS,
     HINTS,

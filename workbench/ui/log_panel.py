@@ -2,22 +2,127 @@
 
 Redrawn a few times a second and only the last lines of what fits the filter, so that a task that prints in every
 hook of every step costs the page no more than one that prints once.
+
+The colours of what an author's code printed, as the Log shows them: readable on the dark page and on the light one.
+
+Sixteen colours are the page's own (``page.css``). Others are what the author says, made lighter on the dark page and
+darker on the light one until they can be read; and with a background they are the author's on both.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
 
 import viser
 
+from workbench.machine.terminal_text import PLAIN, Colour, Rgb, Run, Style
 from workbench.session.kept_worker import Vitals
 from workbench.session.memory_limit import in_words
 from workbench.session.printed import Printed
 from workbench.session.view import SessionView
-from workbench.ui.checked import checked_text
+from workbench.ui.control_values import checked_text
 from workbench.ui.fragments import render
-from workbench.ui.log_colours import spans_of_lines
 from workbench.ui.parts import Part
+
+LIGHT_PAGE: Rgb = (241, 243, 245)
+DARK_PAGE: Rgb = (66, 66, 66)
+"""The Log's background, or a little nearer to the text than that."""
+READABLE = 4.5
+"""Contrast between text and background that WCAG 2.1 asks for."""
+MOST_SPANS = 1500
+"""Over all lines; older ones are shown plain. A line may change its colour with each character."""
+SIXTEEN: tuple[Rgb, ...] = (
+    (0, 0, 0), (205, 49, 49), (13, 138, 90), (170, 130, 0), (36, 114, 200), (188, 63, 188), (17, 130, 165), (229, 229, 229),
+    (102, 102, 102), (241, 76, 76), (35, 209, 139), (245, 245, 67), (59, 142, 234), (214, 112, 214), (41, 184, 219), (255, 255, 255),
+)  # fmt: skip
+"""Where one of them is a background, or stands on one."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """Text for the template; `look` and `css` hold nothing that the author wrote but numbers."""
+
+    text: str
+    look: str = ""
+    css: str = ""
+
+
+def spans_of_lines(lines: Sequence[tuple[str, tuple[Run, ...]]]) -> list[list[Span]]:
+    """The spans of each line, given as its text and its runs; no more than `MOST_SPANS` in all."""
+    left = MOST_SPANS
+    found: list[list[Span]] = []
+    for text, runs in reversed(lines):
+        left -= len(runs)
+        found.append([_span(run) for run in runs] if runs and left >= 0 else [Span(text)])
+    return found[::-1]
+
+
+def _span(run: Run) -> Span:
+    return Span(run.text) if run.style == PLAIN else Span(run.text, *_look(run.style))
+
+
+@lru_cache(maxsize=4096)
+def _look(style: Style) -> tuple[str, str]:
+    """Classes and inline style."""
+    switches = ("bold", "dim", "italic", "underline", "strike")
+    classes = [f"wb-ansi-{name}" for name in switches if getattr(style, name)]
+    colour, background = style.colour, style.background
+    if style.reverse:
+        if colour is None and background is None:
+            return " ".join((*classes, "wb-ansi-reverse")), ""
+        colour, background = background, colour if colour is not None else 7
+    if background is not None:
+        behind = _rgb(background)
+        text = _rgb(colour) if colour is not None else _plain_on(behind)
+        if contrast(text, behind) < READABLE / 2:
+            text = _plain_on(behind)
+        return " ".join(classes), f"color:{_hex(text)};background:{_hex(behind)}"
+    if isinstance(colour, int):
+        classes.append(f"wb-ansi-{colour}")
+    elif colour is not None:
+        classes.append("wb-ansi-rgb")
+        light, dark = readable_on(colour, LIGHT_PAGE), readable_on(colour, DARK_PAGE)
+        return " ".join(classes), f"--on-light:{_hex(light)};--on-dark:{_hex(dark)}"
+    return " ".join(classes), ""
+
+
+def readable_on(colour: Rgb, page: Rgb) -> Rgb:
+    """`colour`, or the nearest to it towards black or white that can be read on `page`."""
+    end = 255 if _luminance(page) < 0.2 else 0
+    found = colour
+    for share in range(1, 21):
+        if contrast(found, page) >= READABLE:
+            break
+        red, green, blue = (round(value + (end - value) * share / 20) for value in colour)
+        found = red, green, blue
+    return found
+
+
+def contrast(one: Rgb, other: Rgb) -> float:
+    """1 for the same, 21 for black on white, as WCAG 2.1 defines it."""
+    dark, light = sorted((_luminance(one), _luminance(other)))
+    return (light + 0.05) / (dark + 0.05)
+
+
+def _luminance(colour: Rgb) -> float:
+    parts = [value / 255 for value in colour]
+    red, green, blue = (p / 12.92 if p <= 0.04045 else ((p + 0.055) / 1.055) ** 2.4 for p in parts)
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+
+def _plain_on(behind: Rgb) -> Rgb:
+    return (0, 0, 0) if contrast((0, 0, 0), behind) >= contrast((255, 255, 255), behind) else (255, 255, 255)
+
+
+def _rgb(colour: Colour) -> Rgb:
+    return SIXTEEN[colour] if isinstance(colour, int) else colour
+
+
+def _hex(colour: Rgb) -> str:
+    return "#" + bytes(colour).hex()
+
 
 LINES_SHOWN = 200
 LONGEST_FILTER = 200

@@ -22,14 +22,13 @@ from workbench.ui.busy_banner import BusyBanner
 from workbench.ui.camera_frustums import LARGE, SMALL, CameraFrustums, without_the_viewpoint
 from workbench.ui.cameras_panel import CamerasPanel
 from workbench.ui.commands import Command, register
-from workbench.ui.curves_panel import CurvesPanel
+from workbench.ui.curves_panel import CurvesPanel, TermsPanel
 from workbench.ui.env_layout import EnvLayout, acting_box, env_under_ray, lay_out
 from workbench.ui.env_panel import EnvPanel
 from workbench.ui.force_arrows import ForceArrows
 from workbench.ui.fragments import render
 from workbench.ui.inspect_panel import InspectPanel
-from workbench.ui.judged_above import JudgedAbove
-from workbench.ui.judgement_panel import JudgementPanel
+from workbench.ui.judgement_panel import JudgedAbove, JudgementPanel
 from workbench.ui.log_panel import LogPanel
 from workbench.ui.numbers_panel import NumbersPanel
 from workbench.ui.parts import Clock, Part, Parts
@@ -41,7 +40,6 @@ from workbench.ui.selection_mark import SelectionMark
 from workbench.ui.stage import Stage
 from workbench.ui.status_line import StatusLine
 from workbench.ui.studio_panel import StudioPanel
-from workbench.ui.terms_panel import TermsPanel
 from workbench.ui.timeline_panel import HEIGHT as TIMELINE_HEIGHT
 from workbench.ui.timeline_panel import TimelinePanel
 from workbench.ui.version_panel import VersionPanel

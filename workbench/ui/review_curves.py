@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from workbench.session.review import MOST_COMPARED
 from workbench.session.review_events import ACTION, REWARD, TERMS, curves
 from workbench.session.review_view import ReviewView, column_at
+from workbench.ui.curves_panel import COLOURS as LINE_COLOURS
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import CURSOR, LONGEST, STEP, LineChart, line, span_of
-from workbench.ui.numbers_table import NumberRow, number_rows
+from workbench.ui.numbers_panel import NumberRow, number_rows
 from workbench.ui.parts import Part
 from workbench.ui.review_as_session import step_of
 from workbench.ui.review_scene import COLOURS, letter
-from workbench.ui.terms_panel import COLOURS as LINE_COLOURS
 
 CHARTS = {"reward": 150, "also": 150, "terms": 150, "action": 190}
 """Their heights, from the top."""

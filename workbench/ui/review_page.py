@@ -25,7 +25,7 @@ from workbench.session.review_view import ReviewView
 from workbench.ui.cameras_panel import CamerasPanel
 from workbench.ui.commands import Command, register
 from workbench.ui.fragments import render
-from workbench.ui.library_commands import Action
+from workbench.ui.library_list import Action
 from workbench.ui.library_panel import LibraryPanel
 from workbench.ui.parts import Clock, DrawDue, Part, Parts
 from workbench.ui.presses import Presses
@@ -33,9 +33,8 @@ from workbench.ui.redraw_loop import RedrawLoop, draw_apart
 from workbench.ui.review_as_session import as_session_view
 from workbench.ui.review_compare_panel import ReviewComparePanel
 from workbench.ui.review_curves import ReviewCurves, ReviewNumbers
-from workbench.ui.review_in_3d import ReviewIn3D
 from workbench.ui.review_panel import ReviewPanel
-from workbench.ui.review_scene import COLOURS, letter
+from workbench.ui.review_scene import COLOURS, ReviewIn3D, letter
 from workbench.ui.review_timeline import ReviewTimeline
 from workbench.ui.stage import Stage
 from workbench.ui.view_panel import ViewPanel

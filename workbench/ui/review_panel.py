@@ -18,7 +18,7 @@ from workbench.session.recorded_text import version_of
 from workbench.session.review import MOST_COMPARED, SPEEDS, Review
 from workbench.session.review_events import success_words
 from workbench.session.review_view import Opened, ReviewView
-from workbench.ui.checked import checked_choice
+from workbench.ui.control_values import checked_choice
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
 from workbench.ui.parts import Part

@@ -11,8 +11,7 @@ import viser
 
 from workbench.session.review import MOST_COMPARED, Review
 from workbench.session.review_view import Opened, ReviewView, column_at
-from workbench.ui.checked import checked_int
-from workbench.ui.control_values import name_control
+from workbench.ui.control_values import checked_int, name_control
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
 from workbench.ui.over_the_view import GAP, FitsTheView

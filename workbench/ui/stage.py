@@ -5,18 +5,34 @@ cube. So the bodies stay in the browser while one page takes the other's place. 
 again, and the view is never empty in between: until a live env is there, one sees the recording that it begins from.
 Where one looks from stays as well, if the same is to be seen; everything else (labels, frustums, marks, handles) goes
 with its page.
+
+The light of the 3-D view: soft from above, with one lamp that gives shapes their form.
+
+viser's own lights are made for bare grey meshes; on the white plastic of a robot and the textures of a
+table they burn out. No environment map either: it doubles what a pixel costs, and a browser without a
+graphics card pays for every pixel. No shadows: each would draw the whole batch a second time.
 """
 
 from __future__ import annotations
 
 import viser
 
-from workbench.ui.framing import Framing
-from workbench.ui.lights import light
 from workbench.ui.scene_view import NAMES as BODIES
 from workbench.ui.scene_view import SceneView
-from workbench.ui.viewpoint import FOV
+from workbench.ui.viewpoint import FOV, Framing
 from workbench.ui.viser_seam import remove_nodes_but
+
+
+def light(server: viser.ViserServer) -> None:
+    """Put the lights into the scene; once a server."""
+    server.scene.configure_default_lights(enabled=False, cast_shadow=False)
+    server.scene.configure_environment_map(None)
+    server.scene.add_light_hemisphere(
+        "/lights/sky", sky_color=(255, 255, 255), ground_color=(125, 125, 135), intensity=1.5
+    )
+    server.scene.add_light_directional(
+        "/lights/lamp", color=(255, 251, 244), intensity=1.5, position=(3.0, -2.0, 5.0), cast_shadow=False
+    )
 
 
 class Stage:

@@ -13,7 +13,7 @@ import viser
 from workbench.session.env_table import EnvRows
 from workbench.session.last_words import Busy
 from workbench.session.view import SessionView
-from workbench.ui.env_strip import first_flagged, mask
+from workbench.ui.env_panel import first_flagged, mask
 from workbench.ui.fragments import place, render
 from workbench.ui.parts import Clock, Part
 from workbench.ui.presses import Presses

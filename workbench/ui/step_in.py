@@ -2,7 +2,14 @@
 
 Where the task of the recording is open already, its selected env (or all) is put into the recorded state. Where it is
 not, or where the recorded text is wanted, another session is opened for it beside the one that is open, which goes on as it
-is and can be gone back to. The review stays until the live env is there (`going_live`). Sessions that are opened here are closed here, with the folder of a recorded text.
+is and can be gone back to. The review stays until the live env is there (`step_in`). Sessions that are opened here are closed here, with the folder of a recorded text.
+
+The way from a recording to the live env, while it takes: what is being done, and when one is there.
+
+Opening a task takes seconds, and making recorded actions again does too. A live page has nothing to show until then,
+so the review stays, with the recorded scene in the view, and says what it waits for. The page changes when the env
+stands in the recorded state; and before that where only the live page can help, because the task's code failed, or has
+been at one thing for so long that one may want to interrupt it.
 """
 
 from __future__ import annotations
@@ -34,14 +41,48 @@ from workbench.session.step_back import (
     why_not_into,
     write_source,
 )
+from workbench.session.view import SessionView
+from workbench.ui.busy_banner import is_shown as is_busy_for_long
 from workbench.ui.fragments import render
-from workbench.ui.going_live import GoingLive, begin_to_go
-from workbench.ui.judged_with import RECORDED, TODAYS
 from workbench.ui.parts import Part
 from workbench.ui.put_together import Workplace
-from workbench.ui.rescore_panel import RescoreChoices, RescorePanel
+from workbench.ui.rescore_panel import RECORDED, TODAYS, RescoreChoices, RescorePanel
 from workbench.ui.review_page import Places, ReviewOffers
 from workbench.ui.trust_dialog import TrustDialog
+
+
+@dataclass(frozen=True)
+class GoingLive:
+    session: Session
+    number: int
+    """What `TimelineView.entered` is when it is there."""
+    task: str
+    state: int
+    problems: int
+
+    def is_over(self, view: SessionView) -> bool:
+        """Whether the live page has something to show now."""
+        arrived = view.timeline.entered == self.number
+        failed = view.problem_serial > self.problems or view.state == "stopped"
+        return arrived or failed or is_busy_for_long(view)
+
+    def words(self, view: SessionView) -> str:
+        """What is waited for."""
+        if view.task is None:
+            doing = f"loading {self.task} at step {self.state}"
+        else:
+            doing = f"putting {self.task} into step {self.state}"
+        return f"{doing}: {view.activity}" if view.activity else f"{doing} …"
+
+
+def begin_to_go(
+    session: Session, run: RecordedRun, everywhere: bool, info: EpisodeInfo, state: int
+) -> GoingLive:
+    """Ask the session for a recorded moment."""
+    problems = session.view().problem_serial
+    number = session.step_back(run, everywhere, info.source_file, info.source)
+    return GoingLive(session, number, info.task, state, problems)
+
 
 ONE, ALL = "the selected env", "all envs"
 NEW_ENVS = 4

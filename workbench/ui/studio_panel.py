@@ -35,8 +35,8 @@ from workbench.ui.camera_numbers import CameraNumbers
 from workbench.ui.camera_pick import CameraPick
 from workbench.ui.camera_writing import CameraWriting
 from workbench.ui.cameras_panel import KIND_NAMES
-from workbench.ui.checked import checked_choice
 from workbench.ui.commands import Command
+from workbench.ui.control_values import checked_choice
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
 from workbench.ui.look_through import LookThrough

@@ -19,8 +19,7 @@ import viser
 from workbench.session.session import Session
 from workbench.session.timeline import Scope
 from workbench.session.view import SessionView
-from workbench.ui.checked import checked_int
-from workbench.ui.control_values import name_control
+from workbench.ui.control_values import checked_int, name_control
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
 from workbench.ui.over_the_view import GAP, FitsTheView

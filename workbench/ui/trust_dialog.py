@@ -15,7 +15,7 @@ import viser
 
 from workbench.session.clearance import FOLLOWED, Answer, Question
 from workbench.ui.fragments import render
-from workbench.ui.library_forms import Question as Window
+from workbench.ui.library_edits import Question as Window
 from workbench.ui.review_page import Places
 
 TITLE = "Run this code?"

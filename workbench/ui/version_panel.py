@@ -17,7 +17,7 @@ from workbench.authoring.problem import Problem
 from workbench.session.messages import LoadLevel, ReloadReport
 from workbench.session.session import Session
 from workbench.session.view import SessionView
-from workbench.ui.checked import checked_choice
+from workbench.ui.control_values import checked_choice
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
 from workbench.ui.parts import Part
