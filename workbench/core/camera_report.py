@@ -9,7 +9,8 @@ one mark between 0 and 1 by which envs are put in order (worst first) and placem
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -200,6 +201,9 @@ class CameraReport:
         return tuple(thing for thing in self.objects if thing.name in wanted)
 
 
+_Part = TypeVar("_Part", ObjectSeen, DepthReport)
+
+
 def join_reports(reports: Sequence[CameraReport]) -> CameraReport:
     """One report over all envs of several: the steps of an episode, or several seeds, of one camera.
 
@@ -216,33 +220,24 @@ def join_reports(reports: Sequence[CameraReport]) -> CameraReport:
             )
         if [thing.name for thing in other.objects] != [thing.name for thing in first.objects]:
             raise ValueError("the reports are of different scenes: their objects are not the same")
-    objects = tuple(
-        replace(
-            same[0],
-            present=np.concatenate([thing.present for thing in same]),
-            pixels=np.concatenate([thing.pixels for thing in same]),
-            unhindered=np.concatenate([thing.unhindered for thing in same]),
-            alone=np.concatenate([thing.alone for thing in same]),
-            cut=np.concatenate([thing.cut for thing in same]),
-            margin=np.concatenate([thing.margin for thing in same]),
-        )
-        for same in zip(*[report.objects for report in reports], strict=True)
-    )
-    depths = [report.depth for report in reports]
     return replace(
         first,
         envs=tuple(env for report in reports for env in report.envs),
-        objects=objects,
-        depth=DepthReport(
-            counts=np.concatenate([depth.counts for depth in depths]),
-            background=np.concatenate([depth.background for depth in depths]),
-            beyond=np.concatenate([depth.beyond for depth in depths]),
-            nearest=np.concatenate([depth.nearest for depth in depths]),
-            farthest=np.concatenate([depth.farthest for depth in depths]),
-            farthest_object=np.concatenate([depth.farthest_object for depth in depths]),
+        objects=tuple(
+            _end_to_end(same) for same in zip(*(report.objects for report in reports), strict=True)
         ),
+        depth=_end_to_end([report.depth for report in reports]),
         pictures=sum(report.pictures for report in reports),
         milliseconds=sum(report.milliseconds for report in reports),
+    )
+
+
+def _end_to_end(parts: Sequence[_Part]) -> _Part:
+    """One of several, its arrays those of all of them one behind the other."""
+    first = parts[0]
+    arrays = [f.name for f in fields(first) if isinstance(getattr(first, f.name), np.ndarray)]
+    return replace(
+        first, **{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}
     )
 
 

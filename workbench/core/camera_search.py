@@ -14,7 +14,6 @@ since five neighbours are one suggestion. For a seed the search is the same ever
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -32,13 +31,12 @@ from workbench.core.camera_frames import (
     rotation_matrix,
     with_pose,
 )
-from workbench.core.camera_report import CameraReport
-from workbench.core.camera_settings import CameraSettings
+from workbench.core.camera_report import CameraReport, join_reports
+from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.scene_index import SceneIndex, read_poses, scene_index
 from workbench.core.temporary_camera import undrawn
 from workbench.core.visibility import (
-    Measured,
     Placement,
     SceneObject,
     entities_of,
@@ -46,7 +44,6 @@ from workbench.core.visibility import (
     measure,
     picture_of,
     placed_camera,
-    report_of,
     small_size,
 )
 
@@ -212,7 +209,6 @@ class _Search:
         near = 8 * space.best
         self.total = len(envs) * (space.candidates + self.keep + ROUNDS * (near + 2 * space.best))
         self.done = 0
-        self.began = time.perf_counter()
         self.best = float("nan")
         self.found: list[tuple[float, _Candidate, CameraReport]] = []
 
@@ -237,7 +233,7 @@ class _Search:
         A robot only hides, so the score without it is a bound: who cannot beat what is found is not looked at again.
         """
         bare = self._measure(candidates, stage)
-        scores = [score_of(self._report(row), self.space.objects) for row in bare]
+        scores = [score_of(join_reports(row), self.space.objects) for row in bare]
         order = np.argsort([-score for score in scores], kind="stable").tolist()
         waiting = [i for i in order if scores[i] > 0][:keep]
         while waiting and not self.cancelled():
@@ -264,7 +260,7 @@ class _Search:
                 [candidates[i] for i in now], "looking past the robot", [bare[i] for i in now]
             )
             for i, row in zip(now, whole, strict=False):
-                report = self._report(row)
+                report = join_reports(row)
                 score = score_of(report, self.space.objects)
                 self.found.append((score, candidates[i], report))
                 self.best = max(score, self.best) if np.isfinite(self.best) else score
@@ -273,14 +269,15 @@ class _Search:
         return bool(np.linalg.norm(a[0] - b[0]) < self.apart)
 
     def _measure(
-        self, candidates: list[_Candidate], stage: str, bare: list[list[Measured]] | None = None
-    ) -> list[list[Measured]]:
+        self, candidates: list[_Candidate], stage: str, bare: list[list[CameraReport]] | None = None
+    ) -> list[list[CameraReport]]:
         """Each candidate in each env: with the robot if `bare` is given, without it otherwise.
 
         None at all where the search is cancelled on the way.
         """
-        measured: list[list[Measured]] = [[] for _ in candidates]
+        measured: list[list[CameraReport]] = [[] for _ in candidates]
         placement = Placement(self.space.lens, self.space.kind)
+        key: CameraKey = (self.space.kind, "suggested")
         local = [self._pose(candidate) for candidate in candidates]
         for position, e in enumerate(self.envs):
             robots = [x for thing in self.objects if thing.robot for x in entities_of(thing, e, self.index)]
@@ -294,16 +291,11 @@ class _Search:
                         return []
                     known = None if bare is None else bare[i][position]
                     measured[i].append(
-                        measure(view, pose, e, self.objects, self.index, self.space.kind, known)
+                        measure(view, pose, e, self.objects, self.index, key, self.space.lens, known)
                     )
                     self.done += 1
                     self.progress(SearchProgress(stage, self.done, self.total, self.best))
         return measured
-
-    def _report(self, measured: list[Measured]) -> CameraReport:
-        milliseconds = 1000 * (time.perf_counter() - self.began)
-        key = (self.space.kind, "suggested")
-        return report_of(key, self.space.lens, self.size, self.envs, self.objects, measured, milliseconds)
 
     def _chosen(self) -> list[tuple[float, _Candidate, CameraReport]]:
         """The best that stand apart."""

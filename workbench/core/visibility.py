@@ -15,8 +15,8 @@ as never drawn, and one that is part of the scene counts like any object.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,7 +27,14 @@ from numpy.typing import NDArray
 
 from workbench.core import seams
 from workbench.core.camera_frames import compose, intrinsic_of, make_pose, matrix3, scaled_intrinsic
-from workbench.core.camera_report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen, ObjectToSee
+from workbench.core.camera_report import (
+    DEPTH_EDGES,
+    CameraReport,
+    DepthReport,
+    ObjectSeen,
+    ObjectToSee,
+    join_reports,
+)
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.scene_index import SceneIndex, read_poses, scene_index
@@ -242,25 +249,6 @@ def small_size(width: int, height: int, shorter: int = SMALL) -> tuple[int, int]
 # --- measuring ---------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Measured:
-    """One env's pictures, counted; objects as `list_objects` gives them, with pixels of the judged size."""
-
-    present: NDArray[np.bool_]
-    pixels: NDArray[np.float32]
-    unhindered: NDArray[np.float32]
-    alone: NDArray[np.float32]
-    cut: NDArray[np.bool_]
-    margin: NDArray[np.float32]
-    counts: NDArray[np.int64]
-    background: float
-    beyond: float
-    nearest: float
-    farthest: float
-    farthest_object: float
-    pictures: int
-
-
 def _judge(
     env: Any,
     camera: CameraKey,
@@ -277,52 +265,15 @@ def _judge(
         raise IndexError(f"envs {list(envs)} are out of range for {env.num_envs} envs")
     objects, index = list_objects(env), scene_index(env)
     bodies = read_poses(env) if poses is None else poses
-    measured: list[Measured] = []
-    judged: list[int] = []
-    shown: list[Placement] = []
+    measured: list[CameraReport] = []
     for e in envs:
         if measured and cancelled():
             break
         placement = placement_in(e)
         with placed_camera(env, e, placement, size, None if poses is None else poses[e]) as view:
             pose = pose_in_env(placement, bodies[e], index)
-            measured.append(measure(view, pose, e, objects, index, camera[0]))
-        judged.append(e)
-        shown.append(placement)
-    milliseconds = 1000 * (time.perf_counter() - began)
-    return report_of(camera, shown[0].settings, size, judged, objects, measured, milliseconds)
-
-
-def report_of(
-    camera: CameraKey,
-    settings: CameraSettings,
-    size: tuple[int, int] | None,
-    envs: Sequence[int],
-    objects: Sequence[SceneObject],
-    measured: Sequence[Measured],
-    milliseconds: float,
-) -> CameraReport:
-    """What was measured in each of `envs`, put together."""
-    own = (settings.width, settings.height)
-    judged_size = size or own
-    scale = own[0] * own[1] / (judged_size[0] * judged_size[1])
-    return CameraReport(
-        camera=camera,
-        size=own,
-        judged_size=judged_size,
-        envs=tuple(envs),
-        objects=tuple(_seen(objects, measured, camera[0], scale)),
-        depth=DepthReport(
-            counts=np.stack([m.counts for m in measured]),
-            background=np.array([m.background for m in measured], np.float32),
-            beyond=np.array([m.beyond for m in measured], np.float32),
-            nearest=np.array([m.nearest for m in measured], np.float32),
-            farthest=np.array([m.farthest for m in measured], np.float32),
-            farthest_object=np.array([m.farthest_object for m in measured], np.float32),
-        ),
-        pictures=sum(m.pictures for m in measured),
-        milliseconds=milliseconds,
-    )
+            measured.append(measure(view, pose, e, objects, index, camera, placement.settings))
+    return replace(join_reports(measured), milliseconds=1000 * (time.perf_counter() - began))
 
 
 def placed_camera(
@@ -354,67 +305,88 @@ def measure(
     e: int,
     objects: Sequence[SceneObject],
     index: SceneIndex,
-    kind: CameraKind,
-    bare: Measured | None = None,
-) -> Measured:
-    """Look; once more without the robot, if it is in view; and at each object alone; and count.
+    camera: CameraKey,
+    settings: CameraSettings,
+    bare: CameraReport | None = None,
+) -> CameraReport:
+    """Look; once more without the robot, if it is in view; and at each object alone; and count: a report of one env.
 
     Args:
+        settings: of the camera, in whose pixels things are counted; `view` may have fewer.
         bare: what was measured from this pose with the robot not drawn, if that was; then one look is enough.
     """
-    entities = [entities_of(thing, e, index) for thing in objects]
-    ids = [[entity.per_scene_id for entity in row] for row in entities]
+    began = time.perf_counter()
+    shown = [thing for thing in objects if not (thing.robot or thing.name == "ground")]
+    ids = [[entity.per_scene_id for entity in entities_of(thing, e, index)] for thing in shown]
     segmentation, depth = view.look(pose)
     pictures = 1
+    height, width = segmentation.shape
+    scale = np.float32(settings.width * settings.height / (width * height))
     # Comparing with few numbers is ten times faster than np.isin, and this is done for hundreds of pictures.
     here = set(np.unique(segmentation).tolist())
-    pixels = np.array([_mask(segmentation, here.intersection(row)).sum() for row in ids], np.float32)
-    if bare is None:
-        unhindered, alone, margin = (np.zeros(len(objects), np.float32) for _ in range(3))
-        without = segmentation
-        robot = [
-            entity for thing, row in zip(objects, entities, strict=True) if thing.robot for entity in row
+    pixels = [_mask(segmentation, here.intersection(row)).sum() for row in ids]
+    robot = [entity for thing in objects if thing.robot for entity in entities_of(thing, e, index)]
+    found: list[ObjectSeen] = []
+    if bare is not None:
+        found = [
+            replace(thing, pixels=_one(count) * scale)
+            for thing, count in zip(bare.objects, pixels, strict=True)
         ]
+    else:
+        without = segmentation
         if any(entity.per_scene_id in here for entity in robot):
             with undrawn(robot):
                 without, _ = view.look(pose)
             pictures += 1
         left = set(np.unique(without).tolist())
         every = [entity for entity in index.entities[e] if entity is not None]
-        for i, (thing, row) in enumerate(zip(objects, ids, strict=True)):
+        for thing, row, count in zip(shown, ids, pixels, strict=True):
+            never_drawn = thing.hidden and camera[0] == "sensor"
             mask = _mask(without, left.intersection(row))
-            unhindered[i] = mask.sum()
-            if not (thing.robot or thing.scenery or (thing.hidden and kind == "sensor")):
+            unhindered = mask.sum()
+            if not (thing.scenery or never_drawn):
                 own = set(row)
                 with undrawn([entity for entity in every if entity.per_scene_id not in own]):
                     mask = view.look(pose)[0] != 0
                 pictures += 1
-            alone[i] = mask.sum()
-            margin[i] = _margin(mask)
-    else:
-        unhindered, alone, margin = bare.unhindered, bare.alone, bare.margin
-    cut = (alone > 0) & (margin == 0)
-    counted = [number for thing, row in zip(objects, ids, strict=True) if not thing.scenery for number in row]
+            margin = _one(_margin(mask))
+            found.append(
+                ObjectSeen(
+                    name=thing.name,
+                    never_drawn=never_drawn,
+                    scenery=thing.scenery,
+                    present=np.array([bool(row)]),
+                    pixels=_one(count) * scale,
+                    unhindered=_one(unhindered) * scale,
+                    alone=_one(mask.sum()) * scale,
+                    cut=mask.any() & (margin == 0),
+                    margin=margin,
+                )
+            )
+    counted = [entity.per_scene_id for entity in robot]
+    counted += [number for thing, row in zip(shown, ids, strict=True) if not thing.scenery for number in row]
     something = segmentation != 0
     far = depth[something]
     of_objects = depth[_mask(segmentation, here.intersection(counted))]
     limit = float(of_objects.max()) if len(of_objects) else np.nan
     counts, _ = np.histogram(np.clip(far, DEPTH_EDGES[0], DEPTH_EDGES[-1]), DEPTH_EDGES)
-    return Measured(
-        present=np.array([bool(row) for row in ids]),
-        pixels=pixels,
-        unhindered=unhindered,
-        alone=alone,
-        cut=cut,
-        margin=margin,
-        counts=counts.astype(np.int64),
-        background=float(1 - something.mean()),
-        # Where nothing counts is in view, all of it is room.
-        beyond=float((far > np.nan_to_num(limit, nan=-1.0)).sum() / depth.size),
-        nearest=float(far.min()) if len(far) else np.nan,
-        farthest=float(far.max()) if len(far) else np.nan,
-        farthest_object=limit,
+    return CameraReport(
+        camera=camera,
+        size=(settings.width, settings.height),
+        judged_size=(width, height),
+        envs=(e,),
+        objects=tuple(found),
+        depth=DepthReport(
+            counts=counts.astype(np.int64)[None],
+            background=_one(1 - something.mean()),
+            # Where nothing counts is in view, all of it is room.
+            beyond=_one((far > np.nan_to_num(limit, nan=-1.0)).sum() / depth.size),
+            nearest=_one(far.min() if len(far) else np.nan),
+            farthest=_one(far.max() if len(far) else np.nan),
+            farthest_object=_one(limit),
+        ),
         pictures=pictures,
+        milliseconds=1000 * (time.perf_counter() - began),
     )
 
 
@@ -430,6 +402,10 @@ def _mask(segmentation: NDArray[np.int32], numbers: Collection[int]) -> NDArray[
     return mask
 
 
+def _one(number: Any) -> NDArray[np.float32]:
+    return np.array([number], np.float32)
+
+
 def _margin(mask: NDArray[np.bool_]) -> float:
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not len(rows):
@@ -437,25 +413,6 @@ def _margin(mask: NDArray[np.bool_]) -> float:
     height, width = mask.shape
     least = min(rows[0], height - 1 - rows[-1], columns[0], width - 1 - columns[-1])
     return float(least) / min(width, height)
-
-
-def _seen(
-    objects: Sequence[SceneObject], measured: Sequence[Measured], kind: CameraKind, scale: float
-) -> Iterator[ObjectSeen]:
-    for i, thing in enumerate(objects):
-        if thing.robot or thing.name == "ground":
-            continue
-        yield ObjectSeen(
-            name=thing.name,
-            never_drawn=thing.hidden and kind == "sensor",
-            scenery=thing.scenery,
-            present=np.array([m.present[i] for m in measured]),
-            pixels=np.array([m.pixels[i] for m in measured], np.float32) * np.float32(scale),
-            unhindered=np.array([m.unhindered[i] for m in measured], np.float32) * np.float32(scale),
-            alone=np.array([m.alone[i] for m in measured], np.float32) * np.float32(scale),
-            cut=np.array([m.cut[i] for m in measured]),
-            margin=np.array([m.margin[i] for m in measured], np.float32),
-        )
 
 
 def _built_by_scene_builders(env: Any) -> set[int]:
