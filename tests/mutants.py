@@ -47,6 +47,8 @@ PROTECTED = {
     "authoring/registry": "authoring/test_registry.py",
     "authoring/modules": "authoring/test_load.py authoring/test_task_content.py authoring/test_library_names.py"
     " authoring/test_named_modules.py",
+    "authoring/source/text": "authoring/camera_source/test_which_camera.py authoring/camera_source/test_members.py"
+    " authoring/camera_source/test_shapes.py",
     "core/snapshot": "core/test_snapshot.py",
     "core/partial_reset": "core/test_partial_reset.py",
     "core/task_env": "core/test_task_env.py",

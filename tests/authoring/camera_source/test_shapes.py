@@ -102,3 +102,20 @@ def test_what_cannot_be_edited_safely_is_refused_with_reason_and_snippet(name: s
     # What it gives to copy is the camera that was asked for.
     task = f"{source}\n\nclass Copied(Base):\n    _sensor_configs = [{plan.snippet}]\n"
     assert near_enough(real_settings({FILE: task}, "cam", class_name="Copied"), after)
+
+
+@pytest.mark.parametrize(
+    ("name", "edit", "text"),
+    [
+        ("an argument a line, with remarks", lens, "fov=48.6 * np.pi / 180,"),
+        ("euler angles in degrees", lens, "np.radians(48.6)"),
+        ("arithmetic with a height", moved, "eye = [0.3512, 0, TABLE + 0.7]"),
+    ],
+)
+def test_the_number_that_a_person_would_change_is_changed_and_the_rest_is_followed_on(
+    name: str, edit: Edit, text: str
+) -> None:
+    source = WRITTEN[name]
+    before = real_settings({FILE: source}, "cam")
+    plan = plan_edit({FILE: source}, key_of(source), before, edit(before), run_class)
+    assert isinstance(plan, SourceEdit) and text in plan.new_text
