@@ -132,18 +132,6 @@ def test_for_who_does_not_read_no_more_is_read(door: Door, file: tuple[str, Path
         assert 0 < at < LARGE, "all of it is in memory"
 
 
-def test_who_reads_slowly_gets_the_last_byte_too(door: Door, file: tuple[str, Path]) -> None:
-    size = LARGE + 30_000
-    address, path = file
-    path.touch()
-    os.truncate(path, size)
-    raw, got = begun(door, address)
-    while 0 <= position(path) < size:
-        got += raw.recv(1 << 16)
-    # The server has read all of it, and the kernel is still full: the end waits in the server.
-    assert rest(raw, got) == (size, size)
-
-
 def test_many_read_one_file_at_once(door: Door, file: tuple[str, Path]) -> None:
     address, path = file
     path.write_bytes(os.urandom(3 * BLOCK + 7))

@@ -104,7 +104,7 @@ async def _pour(connection: ServerConnection, file: BinaryIO, head: bytes, lengt
     transport = connection.transport
     transport.write(head)
     left = length
-    while left and not transport.is_closing():
+    while left:
         try:
             # Never more than was announced: a recording may grow while it is read.
             block = await asyncio.to_thread(file.read, min(BLOCK, left))
@@ -120,3 +120,5 @@ async def _pour(connection: ServerConnection, file: BinaryIO, head: bytes, lengt
             await connection.drain()
         except OSError:
             return  # the browser went away
+        if transport.is_closing():
+            return
