@@ -70,7 +70,7 @@ def main(options: Options) -> None:
             start = camera.info.settings
             assert start is not None
             session.set_clients(1)
-            session.watch_cameras((CameraRequest("base_camera", "sensor"),))
+            session.change(cameras=(CameraRequest("base_camera", "sensor"),))
             wait(session, start)
             single = []
             for k in range(options.placements):

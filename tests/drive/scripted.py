@@ -29,12 +29,12 @@ from workbench.session.messages import (
     Reset,
     Restore,
     Restored,
+    Settings,
     SingleStep,
     Status,
     Stepped,
     TaskDescription,
     WarmUp,
-    WatchCameras,
 )
 from workbench.session.process import Output
 
@@ -127,7 +127,7 @@ class ScriptedWorker:
             self._send(self._at(poses, elapsed), envs, seeds=np.arange(count))
         elif isinstance(request, Restore):
             self._restore(request)
-        elif isinstance(request, WatchCameras) and request.cameras:
+        elif isinstance(request, Settings) and request.cameras:
             self._draw(request)
 
     def _step(self) -> None:
@@ -153,10 +153,10 @@ class ScriptedWorker:
         number = len(self._lived)
         self._tell(Stepped(step, begins, snapshot=b"a moment", part_keys=(), number=number, **more))
 
-    def _draw(self, request: WatchCameras) -> None:
+    def _draw(self, request: Settings) -> None:
         grey = np.full((6, 8, 3), 128, np.uint8)
         pose = np.array([1, 0, 0.5, 1, 0, 0, 0], np.float32)
-        wanted = [Picture(one.name, one.kind, request.env, pose, grey) for one in request.cameras]
+        wanted = [Picture(one.name, one.kind, request.selected_env, pose, grey) for one in request.cameras]
         self._tell(Pictures(tuple(wanted), 1.0, (len(self._lived),) * len(wanted)))
 
 

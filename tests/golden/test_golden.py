@@ -196,10 +196,10 @@ def live(place: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sess
 @contextmanager
 def opened(task: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
     with live_session(task, tmp_path_factory.mktemp("recordings")) as session:
-        session.select_env(1)
-        session.set_action_source("sliders")
+        session.change(selected_env=1)
+        session.change(action_source="sliders")
         # The recorded episodes end with success: what is seen after their last step would at times be the next episode.
-        session.set_episode_end("continue")
+        session.change(episode_end="continue")
         yield session
 
 
@@ -215,7 +215,7 @@ def goes_on_as_recorded(session: Session, path: Path, state: int) -> None:
     assert_close(view.step.poses[1], episode.poses[state])
     for t in range(state, episode.length):
         last = view.timeline.last
-        session.set_sliders(tuple(float(x) for x in episode.action[t]))
+        session.change(sliders=tuple(float(x) for x in episode.action[t]))
         session.step()
         view = wait_until(session, lambda v, last=last: v.timeline.last > last, "a step")
         assert_close(view.step.poses[1], episode.poses[t + 1])

@@ -32,8 +32,8 @@ def session(simulation: Simulation, renderer: str, tmp_path: Path) -> Iterator[S
 def test_it_plays_with_pictures(session: Session, simulation: Simulation, told: Told) -> None:
     assert ("gpu" in session.view().task.backend) == (simulation == "gpu")
     session.set_clients(1)
-    session.watch_cameras((CameraRequest("base_camera", "sensor", ("rgb",)),))
-    session.set_speed(float("inf"))
+    session.change(cameras=(CameraRequest("base_camera", "sensor", ("rgb",)),))
+    session.change(speed=float("inf"))
     session.play()
     first = wait_until(
         session, lambda v: bool(v.pictures) and bool(v.step.elapsed_steps.any()), "a first picture"

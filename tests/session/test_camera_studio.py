@@ -69,9 +69,9 @@ def studio_session(opened: tuple[Session, Copied], task_file: Path) -> Session:
     task_file.write_text(text.replace("512", "64"))
     session.studio.back_to_file(BASE)
     session.set_clients(1)
-    session.open_file(task_file, "PushCubeEnv")
+    session.versions.open_file(task_file, "PushCubeEnv")
     wait_until(session, lambda view: view.task.file == str(task_file), "the example")
-    session.watch_cameras((CameraRequest("base_camera", "sensor"), CameraRequest("render_camera", "human")))
+    session.change(cameras=(CameraRequest("base_camera", "sensor"), CameraRequest("render_camera", "human")))
     return session
 
 
@@ -396,7 +396,7 @@ def test_placements_outlive_reloads_and_workers_until_the_file_says_otherwise(
     session.studio.undo()
     wait_until(session, seen_from(BASE, there), "the placement, taken back from the file")
     serial = view.task_serial
-    session.restart_worker()
+    session.versions.restart_worker()
     wait_until(session, lambda v: v.task_serial > serial, "another worker")
     wait_until(session, seen_from(BASE, there), "its camera where the last one's was")
     assert moved(session.view()) == {BASE, PEOPLE}

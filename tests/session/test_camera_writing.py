@@ -193,7 +193,7 @@ class Inherits(PushCubeEnv):
 """
     file.write_text(text)
     example = session.view().task
-    session.open_file(file, "Inherits")
+    session.versions.open_file(file, "Inherits")
     try:
         before = wait_until(session, lambda v: v.task.class_name == "Inherits", "the other task").task
         info = camera(session, BASE).info
@@ -229,7 +229,7 @@ class Inherits(PushCubeEnv):
     finally:
         session.studio.back_to_file(BASE)
         session.studio.file.drop_plan()
-        session.open_file(task_file, example.class_name)
+        session.versions.open_file(task_file, example.class_name)
         wait_until(session, lambda v: v.task.file == str(task_file), "the example again")
 
 

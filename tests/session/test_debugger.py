@@ -121,7 +121,7 @@ def test_a_debugger_holds_the_worker_as_long_as_it_likes(
     assert session.worker_pid == worker
 
     # Another worker listens at the same place, waits for nobody, and says so.
-    session.restart_worker()
+    session.versions.restart_worker()
     view = wait_until(session, lambda v: said(v, "worker listens for a debugger") == 1, "the port again")
     view = wait_until(session, lambda v: v.task is not None and v.busy is None, "the task again")
     wait_until(session, lambda v: session.worker_pid not in (None, worker), "another worker")

@@ -41,7 +41,7 @@ def test_the_pages_pictures_lack_a_cube_that_evaluate_hides(tmp_path: Path) -> N
         assert view.task is not None
         (cube,) = (number for number, name in view.task.segmentation.items() if name == "cube")
         column = view.task.geometry.body_names.index("cube")
-        session.watch_cameras((CameraRequest(CAMERA[1], "sensor", ("rgb", "segmentation")),))
+        session.change(cameras=(CameraRequest(CAMERA[1], "sensor", ("rgb", "segmentation")),))
         session.set_clients(1)
 
         def shows_cube(view: SessionView) -> bool:
@@ -53,7 +53,7 @@ def test_the_pages_pictures_lack_a_cube_that_evaluate_hides(tmp_path: Path) -> N
             return CAMERA in view.pictures and view.pictures[CAMERA].env == env
 
         for env, seen in ((0, True), (1, False), (0, True)):
-            session.select_env(env)
+            session.change(selected_env=env)
             step = session.view().step.elapsed_steps[0]
             session.step()
             wait_until(session, lambda v, n=step: v.step.elapsed_steps[0] > n, "a step")
@@ -61,7 +61,7 @@ def test_the_pages_pictures_lack_a_cube_that_evaluate_hides(tmp_path: Path) -> N
             assert shows_cube(view) == seen
             assert (view.step.poses[:, column, 2] > 25).tolist() == [False, True]
         # A moment of the past, and on from there.
-        session.select_env(1)
+        session.change(selected_env=1)
         past = session.view().timeline.first
         session.past.seek(past)
         session.past.draw()

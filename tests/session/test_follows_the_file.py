@@ -40,7 +40,7 @@ def good(task_file: Path, session: Session) -> str:
 
 
 def test_a_good_edit_replaces_the_running_version(session: Session, task_file: Path, good: str) -> None:
-    session.select_env(1)
+    session.change(selected_env=1)
     before = session.view()
     text, _ = edited(good, "evaluate", "import torch as _t; self.note = _t.ones(self.num_envs)")
     text = text.replace('"success":', '"edited": self.note, "success":').replace(
@@ -160,7 +160,7 @@ def test_a_worker_that_is_killed_comes_back_with_the_last_good_version(
     assert "SIGKILL" in view.problem.message
     view = wait_until(session, lambda v: v.task_serial > before.task_serial, "the version again")
     assert view.task.source_hash == before.task.source_hash
-    session.reload()
+    session.versions.reload()
     wait_until(session, lambda v: v.problem is None, "the banner's end")
 
 

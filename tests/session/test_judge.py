@@ -49,12 +49,12 @@ class Desk:
         session.pause()
         self.file.write_text(ORIGINAL)
         wait_until(session, lambda v: v.task.source[str(self.file)] == ORIGINAL, "the original")
-        session.reload("rebuilt")
+        session.versions.reload("rebuilt")
         first = session.view().timeline.last
         wait_until(session, lambda v: v.timeline.first > first and v.timeline.moments == 1, "a new history")
         session.stop_judging()
         wait_until(session, lambda v: v.judgement.state not in ("loading", "judging"), "its end")
-        session.set_speed(math.inf)
+        session.change(speed=math.inf)
         session.play()
         wait_until(session, lambda v: v.timeline.moments >= steps, "the steps")
         session.pause()
@@ -176,7 +176,7 @@ def test_the_next_save_takes_the_place_of_a_judgement_while_the_worker_plays_on(
     desk.edit(REWARD, f"{slow}\n        {REWARD} * 2")
     desk.judged("judging")
     session = desk.session
-    session.set_speed(1.0)
+    session.change(speed=1.0)
     session.play()
     last = session.view().timeline.last
     view = wait_until(session, lambda v: v.timeline.last > last + 10, "the worker that plays")

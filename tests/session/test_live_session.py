@@ -21,8 +21,8 @@ DRAWS = True
 
 
 def settle(session: Session) -> None:
-    session.set_action_source("random")
-    session.set_episode_end("reset")
+    session.change(action_source="random")
+    session.change(episode_end="reset")
     start_over(session, 0)
 
 
@@ -38,12 +38,12 @@ def test_a_single_step_moves_every_env_once(session: Session) -> None:
 
 def test_playing_goes_on_until_paused(session: Session) -> None:
     settle(session)
-    session.set_speed(4.0)
+    session.change(speed=4.0)
     session.play()
     wait_until(session, lambda v: v.step.elapsed_steps.max() >= 10 and v.state == "running", "ten steps")
     session.pause()
     view = wait_until(session, lambda v: v.state == "paused", "the pause")
-    session.set_speed(1.0)
+    session.change(speed=1.0)
     settled = view.step_serial
     session.reset((1,))
     after = wait_until(session, lambda v: v.step_serial > settled, "the reset")
@@ -78,8 +78,8 @@ def test_the_same_seed_gives_the_same_start(session: Session) -> None:
 def test_sliders_are_the_action_of_every_env_and_are_kept_in_bounds(session: Session) -> None:
     settle(session)
     count = len(session.view().task.actions)
-    session.set_action_source("sliders")
-    session.set_sliders((5.0,) + (0.25,) * (count - 1))
+    session.change(action_source="sliders")
+    session.change(sliders=(5.0,) + (0.25,) * (count - 1))
     session.step()
     view = wait_until(session, lambda v: v.step.elapsed_steps.any(), "a step")
     assert view.step.action.shape == (2, count)
@@ -89,7 +89,7 @@ def test_sliders_are_the_action_of_every_env_and_are_kept_in_bounds(session: Ses
 
 def test_holding_still_keeps_the_robot_where_it_is(session: Session) -> None:
     settle(session)
-    session.set_action_source("hold")
+    session.change(action_source="hold")
     names = session.view().task.geometry.body_names
     hand = next(i for i, name in enumerate(names) if name.endswith("panda_hand"))
     start = session.view().step.poses[:, hand, :3]
@@ -101,12 +101,16 @@ def test_holding_still_keeps_the_robot_where_it_is(session: Session) -> None:
 
 def test_a_policy_from_a_file_is_called_with_the_observation(session: Session, tmp_path) -> None:
     settle(session)
-    policy = tmp_path / "policy.py"
-    policy.write_text("def act(obs):\n    return obs[:, :8] * 0 + 0.5\n")
-    session.set_action_source("policy", f"{policy}:act")
+    policy, imports = tmp_path / "policy.py", tmp_path / "imports.txt"
+    counted = f"open({str(imports)!r}, 'a').write('x')\n"
+    policy.write_text(f"{counted}def act(obs):\n    return obs[:, :8] * 0 + 0.5\n")
+    session.change(action_source="policy", policy=f"{policy}:act")
+    session.change(speed=2.0)
     session.step()
     view = wait_until(session, lambda v: v.step.elapsed_steps.any(), "a step")
     assert np.allclose(view.step.action, 0.5)
+    session.change(speed=1.0)
+    assert imports.read_text() == "x", "another setting leaves the policy as it is"
 
 
 @pytest.mark.parametrize(
@@ -131,7 +135,7 @@ def test_a_policy_that_fails_says_so_and_the_session_goes_on(
     settle(session)
     policy = tmp_path / "policy.py"
     policy.write_text(text)
-    session.set_action_source("policy", f"{policy}:{reference}")
+    session.change(action_source="policy", policy=f"{policy}:{reference}")
     if reference == "act":
         session.step()
     view = wait_until(session, lambda v: v.problem is not None, "a problem")
@@ -147,7 +151,7 @@ def test_a_policy_that_fails_says_so_and_the_session_goes_on(
             session, lambda v, n=said: v.problem_serial > n and not v.playing, "the problem again"
         )
         assert says in view.problem.message and not view.step.elapsed_steps.any()
-    session.set_action_source("random")
+    session.change(action_source="random")
     session.step()
     wait_until(session, lambda v: v.problem is None, "the problem's end")
 
@@ -158,7 +162,7 @@ def test_a_policy_is_taken_when_its_file_is_saved_and_a_mended_one_plays_on(
     settle(session)
     policy, text = tmp_path / "policy.py", "def act(obs):\n    return obs[:, :8] * 0 + {}\n"
     policy.write_text(text.format("0.50"))
-    session.set_action_source("policy", f"{policy}:act")
+    session.change(action_source="policy", policy=f"{policy}:act")
     session.play()
     wait_until(session, lambda v: v.step.action is not None and np.allclose(v.step.action, 0.5), "its action")
     # Of the same length and in the same second as the one before.
@@ -188,12 +192,12 @@ def test_a_policy_is_taken_when_its_file_is_saved_and_a_mended_one_plays_on(
 
 def test_a_policy_that_is_not_named_does_not_step(session: Session) -> None:
     settle(session)
-    session.set_action_source("policy")
+    session.change(action_source="policy", policy=None)
     session.step()
     view = wait_until(session, lambda v: v.problem is not None, "a problem")
     assert "name a policy: module:function or file.py:function" in view.problem.message
     assert not view.step.elapsed_steps.any()
-    session.set_action_source("random")
+    session.change(action_source="random")
     session.step()
     wait_until(session, lambda v: v.problem is None, "the problem's end")
 
@@ -202,7 +206,7 @@ def test_a_policy_is_looked_for_beside_the_task_too_and_taken_when_it_is_mended(
     session: Session, task_file
 ) -> None:
     settle(session)
-    session.set_action_source("policy", "pol.py:act")
+    session.change(action_source="policy", policy="pol.py:act")
     view = wait_until(session, lambda v: v.problem is not None, "a problem")
     for folder in (Path.cwd(), task_file.parent):
         assert str(folder) in view.problem.message
@@ -216,12 +220,12 @@ def test_pictures_come_of_the_selected_env_and_only_while_somebody_looks(session
     settle(session)
     sensor = next(c for c in session.view().task.cameras if c.kind == "sensor")
     wanted = CameraRequest(sensor.name, "sensor", ("rgb", "depth", "segmentation"))
-    session.watch_cameras((wanted,))
+    session.change(cameras=(wanted,))
     session.step()
     wait_until(session, lambda v: v.step.elapsed_steps[0] == 1, "a step")
     assert not session.view().pictures, "nobody looks yet"
     session.set_clients(1)
-    session.select_env(1)
+    session.change(selected_env=1)
     view = wait_until(session, lambda v: bool(v.pictures), "a picture")
     picture = view.pictures["sensor", sensor.name]
     assert picture.env == 1
@@ -229,11 +233,11 @@ def test_pictures_come_of_the_selected_env_and_only_while_somebody_looks(session
     assert picture.depth.shape == (sensor.height, sensor.width) and picture.depth.max() > 0.1
     assert set(np.unique(picture.segmentation)) - {0} <= view.task.segmentation.keys()
     session.set_clients(0)
-    session.select_env(0)
+    session.change(selected_env=0)
     session.step()
     wait_until(session, lambda v: v.step.elapsed_steps[0] == 2, "another step")
     assert not session.view().pictures, "nobody looks any more"
-    session.watch_cameras(())
+    session.change(cameras=())
 
 
 def test_recording_writes_an_episode_that_rerun_verifies(session: Session) -> None:

@@ -10,8 +10,7 @@ import numpy as np
 from tests.ui.scenes import description, problem, step_of, table_scene
 from workbench.authoring.reference import RecordedTask
 from workbench.core.pictures import Picture
-from workbench.session.judge import JudgementView
-from workbench.session.kept_worker import Death, Vitals
+from workbench.session.kept_worker import Death
 from workbench.session.live_state import LiveState
 from workbench.session.messages import (
     CameraRequest,
@@ -24,19 +23,15 @@ from workbench.session.messages import (
     Stepped,
     TaskOptions,
 )
-from workbench.session.printed import NOTHING_PRINTED
 from workbench.session.recovery import Wanted
-from workbench.session.view import RecordingStatus, SessionView
+from workbench.session.view import SessionView
 
 N = 3
 DEATH = Death("was killed by SIGSEGV", False, False, "stepping", "", False)
 
 
 def view(state: LiveState) -> SessionView:
-    recording = RecordingStatus(folder="recordings")
-    return state.view(
-        recording=recording, printed=NOTHING_PRINTED, vitals=Vitals(), judgement=JudgementView()
-    )
+    return state.view()
 
 
 def loaded(report: ReloadReport | None = None, num_envs: int = N, source_hash: str = "a") -> Loaded:
@@ -89,7 +84,7 @@ def test_curves_are_copied_once_a_step_and_not_at_every_look() -> None:
 
 def test_a_version_on_the_same_scene_leaves_the_past_and_the_drawn_shapes() -> None:
     state = running()
-    state.select(2)
+    state.change(selected_env=2)
     before = view(state)
     state.loaded(loaded(report("patched"), source_hash="b"), restored=False, stale=False)
     after = view(state)
@@ -101,13 +96,13 @@ def test_a_version_on_the_same_scene_leaves_the_past_and_the_drawn_shapes() -> N
 
 def test_another_scene_begins_another_past_whose_moments_count_on() -> None:
     state = running()
-    state.select(2)
-    state.sliders = (1.0,)
+    state.change(selected_env=2)
+    state.change(sliders=(1.0,))
     state.loaded(loaded(report("rebuilt"), num_envs=2), restored=False, stale=False)
     state.stepped(stepped(0, jumped=True, num_envs=2))
     after = view(state)
     assert (after.scene_serial, after.cameras_serial) == (2, 2)
-    assert (after.selected_env, after.sliders) == (1, ())
+    assert (after.selected_env, after.settings.sliders) == (1, ())
     assert (after.timeline.first, after.timeline.moments) == (4, 1)
 
 
@@ -167,33 +162,32 @@ def test_pictures_are_those_of_the_env_that_is_looked_at() -> None:
         return Pictures((Picture("eye", "sensor", env, np.zeros(7, np.float32), rgb),), 12.0, (0,))
 
     state = running()
-    state.cameras = (CameraRequest("eye", "sensor"),)
+    state.change(cameras=(CameraRequest("eye", "sensor"),))
     state.take(pictures(0))
     assert set(view(state).pictures) == {("sensor", "eye")}
-    assert state.select(99) and view(state).selected_env == N - 1 and view(state).pictures == {}
+    assert state.change(selected_env=99) and view(state).selected_env == N - 1 and view(state).pictures == {}
     state.take(pictures(0))
     assert view(state).pictures == {}
-    assert not state.select(N - 1)
-    assert state.watch_request().cameras == ()
+    assert not state.change(selected_env=N - 1)
+    assert state.settings().cameras == (), "no page is open"
 
 
 def test_a_moment_of_the_past_is_shown_in_place_of_the_newest() -> None:
     state = running()
-    assert state.seek(lambda timeline: timeline.seek(1))
-    assert not state.seek(lambda timeline: timeline.seek(1))
+    assert state.timeline is not None
+    state.timeline.seek(1)
     shown = view(state)
     assert shown.step_serial == 1 and shown.step is not None and shown.step.elapsed_steps[0] == 1
-    assert state.stretch() == (0, 3)
 
 
 def test_a_load_asks_for_the_class_and_the_seed_that_the_page_chose() -> None:
     state = running()
     assert not state.choose_class("Other")
-    task = state.task
+    task = state.now.task
     assert task is not None
-    state.task, state.choices = replace(task, others=("Other",)), ("PushEnv", "Other")
+    state.set(task=replace(task, others=("Other",)), choices=("PushEnv", "Other"))
     assert state.choose_class("Other")
-    state.seed = 7
+    state.set(seed=7)
     load = state.load_request(Wanted(None, b"moment"), "rebuilt")
     assert str(load.task).endswith("push.py:Other") and load.options == TaskOptions(seed=7)
     assert (load.source, load.level, load.snapshot) == (None, "rebuilt", b"moment")
@@ -201,23 +195,27 @@ def test_a_load_asks_for_the_class_and_the_seed_that_the_page_chose() -> None:
 
 def test_the_version_that_ran_is_brought_back_although_another_class_is_asked_for() -> None:
     state = running()
-    assert state.task is not None and state.step is not None
+    assert state.now.task is not None and state.now.step is not None
     task = replace(
-        state.task, chosen="One", others=("Two",), file="/home/me/push.py", source_files=("/home/me/push.py",)
+        state.now.task,
+        chosen="One",
+        others=("Two",),
+        file="/home/me/push.py",
+        source_files=("/home/me/push.py",),
     )
     state.reference, state.own_file = "/home/me/push.py", Path("/home/me/push.py")
-    state.loaded(Loaded(task, state.step, {}), restored=False, stale=False)
-    assert state.choices == ("One", "Two")
-    assert state.choose_class("Two") and state.choices == ("Two", "One")
+    state.loaded(Loaded(task, state.now.step, {}), restored=False, stale=False)
+    assert state.now.choices == ("One", "Two")
+    assert state.choose_class("Two") and state.now.choices == ("Two", "One")
     assert state.load_request(Wanted(None, None)).task == "/home/me/push.py:Two"
     assert state.load_request(Wanted({"/home/me/push.py": "text"}, None)).task == "/home/me/push.py:One"
-    state.loaded(Loaded(task, state.step, {}), restored=True, stale=True)
-    assert state.choices == ("Two", "One"), "it is still what saves bring in"
+    state.loaded(Loaded(task, state.now.step, {}), restored=True, stale=True)
+    assert state.now.choices == ("Two", "One"), "it is still what saves bring in"
     assert state.choose_class("One")
 
     tried = replace(task, in_place_of="Two")
     state.reference = "/home/me/push.py"
-    state.loaded(Loaded(tried, state.step, {}), restored=False, stale=False)
+    state.loaded(Loaded(tried, state.now.step, {}), restored=False, stale=False)
     assert state.load_request(Wanted(None, None)).task == "/home/me/push.py:One"
 
 

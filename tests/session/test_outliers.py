@@ -88,7 +88,7 @@ def one_of_each(child_process: None, tmp_path_factory: pytest.TempPathFactory) -
     folder: Path = tmp_path_factory.mktemp("author")
     (folder / "one_of_each.py").write_text(BROKEN)
     with live_session(folder / "one_of_each.py", folder / "kept", num_envs=8) as session:
-        session.set_action_source("hold")
+        session.change(action_source="hold")
         for count in range(1, 13):
             session.step()
             view = wait_until(
@@ -120,7 +120,7 @@ def test_the_reason_says_what_and_when(one_of_each: Session) -> None:
     assert outliers[5][0].reason == "the reward is 1.5, above 1"
     assert (outliers[6][0].reason, outliers[6][0].step) == ("the reward is NaN", 1)
     assert (outliers[7][0].reason, outliers[7][0].step) == ("the observation is NaN or infinite", 2)
-    one_of_each.select_env(6)
+    one_of_each.change(selected_env=6)
     [odd] = [what for what in one_of_each.past.strip(0, 10**6).events if what[1] & NOT_A_NUMBER]
     assert odd[0] == one_of_each.view().timeline.first + 1
 
@@ -137,7 +137,7 @@ def test_outliers_of_an_episode_are_those_of_the_last_one_after_a_reset(one_of_e
 
 def test_a_healthy_task_played_hard_has_none(child_process: None, tmp_path: Path) -> None:
     with live_session(TASKS / "push_cube.py", tmp_path, num_envs=4) as session:
-        session.set_speed(math.inf)
+        session.change(speed=math.inf)
         session.play()
         wait_until(session, lambda v: session.env_rows().ended.sum() >= 8, "eight episodes")
         rows = session.env_rows()

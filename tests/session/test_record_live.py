@@ -98,7 +98,7 @@ def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> N
     for steps in (3, 1):
         session.reset()
         for made in range(steps):
-            session.set_action_source("random" if made == 0 else "hold")
+            session.change(action_source="random" if made == 0 else "hold")
             session.step()
         wait_until(session, lambda view, n=steps: elapsed(view) == n, "the steps")
     session.keep_past((0,), before=True)
@@ -115,7 +115,7 @@ def test_the_episode_before_the_one_that_runs_can_be_kept(session: Session) -> N
     ).recording.keeping.said
     assert "its start was drawn for several envs at once" in said
     assert kept.info.acted_by == ((0, "random"), (1, "hold still"))
-    session.set_action_source("random")
+    session.change(action_source="random")
 
 
 def test_the_next_episode_waits_for_its_reset_and_ends_with_it(session: Session) -> None:
@@ -127,11 +127,11 @@ def test_the_next_episode_waits_for_its_reset_and_ends_with_it(session: Session)
     session.reset((1,))
     wait_until(session, lambda view: view.recording.waiting == 0, "the reset")
     step(session, 1)
-    session.set_action_source("zero")
+    session.change(action_source="zero")
     step(session, 1)
     session.reset((1,))
     wait_until(session, lambda view: not view.recording.active, "its end")
-    session.set_action_source("random")
+    session.change(action_source="random")
     step(session, 1)
     (*_, episode) = written(session, before + 1)
     assert episode.length == 2 and episode.info.acted_by == ((0, "random"), (1, "zero"))

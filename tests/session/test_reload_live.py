@@ -56,7 +56,7 @@ def reward_plus(good: str, number: float) -> str:
 
 def played(session: Session, steps: int) -> SessionView:
     """The view after some steps of the player, paused."""
-    session.set_speed(8.0)
+    session.change(speed=8.0)
     session.play()
     count = session.view().curves.serial
     wait_until(session, lambda v: v.curves.serial >= count + steps, "some steps")
@@ -71,7 +71,7 @@ def played(session: Session, steps: int) -> SessionView:
 def test_a_patch_keeps_moment_past_and_selection_and_shows_new_numbers_while_paused(
     session: Session, task_file: Path, good: str
 ) -> None:
-    session.select_env(1)
+    session.change(selected_env=1)
     before = played(session, 5)
     task_file.write_text(reward_plus(good, 3))
     view = arrived(session, task_file.read_text())
@@ -120,10 +120,10 @@ def test_edited_cameras_come_in_without_a_new_scene(session: Session, task_file:
 
 def test_a_level_can_be_asked_for_without_a_change(session: Session, good: str) -> None:
     before = session.view()
-    session.reload("rebuilt")
+    session.versions.reload("rebuilt")
     view = wait_until(session, lambda v: v.task_serial > before.task_serial, "the load")
     assert view.reload.level == "rebuilt" and view.scene_serial == before.scene_serial + 1
-    session.reload()
+    session.versions.reload()
     view = wait_until(session, lambda v: v.task_serial > view.task_serial, "the load")
     assert (view.reload.level, view.reload.reason) == ("same", "nothing changed")
 
@@ -193,8 +193,8 @@ def test_of_two_tasks_in_a_file_one_can_be_chosen_and_stays_chosen(
     view = arrived(session, good + SECOND_TASK)
     assert (view.task.class_name, view.task.others) == ("PushTheOtherEnv", ("PushCubeEnv",))
     assert view.reload.level == "rebuilt" and "another task" in view.reload.reason
-    session.choose_class("NobodysEnv")
-    session.choose_class("PushCubeEnv")
+    session.versions.choose_class("NobodysEnv")
+    session.versions.choose_class("PushCubeEnv")
     view = wait_until(session, lambda v: v.task.class_name == "PushCubeEnv", "the other task")
     assert view.task.others == ("PushTheOtherEnv",) and view.task.max_episode_steps == 50
     edited = reward_plus(good, 31) + SECOND_TASK

@@ -83,19 +83,19 @@ def test_the_chooser_stays_while_the_one_that_was_tried_fails(
         view = wait_until(session, lambda v: v.problem is not None, "the failure")
         assert view.task is None and view.choices[0] == "TwoEnv" and "OneEnv" in view.choices
 
-        session.choose_class("OneEnv")
+        session.versions.choose_class("OneEnv")
         view = wait_until(session, lambda v: v.task is not None, "the one that works")
         assert view.task.chosen == view.choices[0] == "OneEnv" and view.problem is None
 
-        session.choose_class("TwoEnv")
+        session.versions.choose_class("TwoEnv")
         view = wait_until(session, lambda v: v.problem is not None, "the failure again")
         assert view.task.chosen == "OneEnv" and view.choices[0] == "TwoEnv"
 
-        session.choose_class("OneEnv")
+        session.versions.choose_class("OneEnv")
         view = wait_until(session, lambda v: v.problem is None, "the one that works again")
         assert view.task.chosen == view.choices[0] == "OneEnv"
 
-        session.choose_class("TwoEnv")
+        session.versions.choose_class("TwoEnv")
         wait_until(session, lambda v: v.problem is not None and v.choices[0] == "TwoEnv", "the failure")
         file.write_text(tasks("OneEnv", "TwoEnv", broken=()))
         view = wait_until(session, lambda v: v.task.chosen == "TwoEnv", "the mended one")

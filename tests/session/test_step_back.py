@@ -48,8 +48,8 @@ def live(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> Itera
     file = folder / "push_cube.py"
     file.write_text((TASKS / "push_cube.py").read_text())
     with live_session(file, folder / "recordings", num_envs=N) as session:
-        session.select_env(ENV)
-        session.set_action_source("sliders")
+        session.change(selected_env=ENV)
+        session.change(action_source="sliders")
         yield session
 
 
@@ -59,7 +59,7 @@ def into(session: Session, run: RecordedRun, everywhere: bool = False) -> Sessio
 
 
 def step_with(session: Session, action: np.ndarray) -> SessionView:
-    session.set_sliders(tuple(float(x) for x in action))
+    session.change(sliders=tuple(float(x) for x in action))
     return step(session)
 
 

@@ -28,9 +28,9 @@ def session(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> It
 def fresh(session: Session) -> int:
     """Paused at the first moment of episodes of seed 0, live; its serial."""
     session.pause()
-    session.set_episode_end("reset")
-    session.set_action_source("sliders")
-    session.set_sliders((0.3, -0.4, 0.2, 0.6, -0.1, 0.5, 0.2, -1.0))
+    session.change(episode_end="reset")
+    session.change(action_source="sliders")
+    session.change(sliders=(0.3, -0.4, 0.2, 0.6, -0.1, 0.5, 0.2, -1.0))
     return start_over(session, 0).timeline.last
 
 
@@ -108,27 +108,27 @@ def test_one_env_goes_back_alone(session: Session) -> None:
     start = fresh(session)
     step(session, 4)
     before = session.view().step
-    session.select_env(1)
+    session.change(selected_env=1)
     session.past.seek(start + 1)
     view = after(session, lambda: session.past.go_on("this"))
     assert view.step.elapsed_steps.tolist() == [4, 1, 4]
     assert is_close(view.step.poses[1], poses(session, start + 1)[1])
     assert is_close(view.step.poses[[0, 2]], before.poses[[0, 2]])
     assert session.past.strip(0, 10**6).branches[-1] == (view.timeline.last, start + 1)
-    session.select_env(0)
+    session.change(selected_env=0)
 
 
 def test_one_envs_moment_is_put_into_all(session: Session) -> None:
     start = fresh(session)
     step(session, 3)
-    session.select_env(2)
+    session.change(selected_env=2)
     session.past.seek(start + 2)
     view = after(session, lambda: session.past.go_on("into all"))
     assert view.step.elapsed_steps.tolist() == [2] * N
     was = poses(session, start + 2)[2]
     for env in range(N):
         assert is_close(view.step.poses[env], was)
-    session.select_env(0)
+    session.change(selected_env=0)
 
 
 def test_the_future_that_was_left_can_be_returned_to(session: Session) -> None:
@@ -170,7 +170,7 @@ def test_undo_leaves_alone_what_has_jumped_on_since(session: Session) -> None:
     assert view.timeline.undo == "reset of env 0"
     view = after(session, session.past.undo)
     assert view.step.elapsed_steps.tolist() == [3, 1, 6] and view.timeline.undo == "reset of 2 envs"
-    session.select_env(1)
+    session.change(selected_env=1)
     assert session.view().timeline.undo == "reset of env 1"
     assert after(session, session.past.undo).step.elapsed_steps.tolist() == [3, 2, 6]
     assert session.view().timeline.undo == "reset of env 1", (
@@ -178,7 +178,7 @@ def test_undo_leaves_alone_what_has_jumped_on_since(session: Session) -> None:
     )
     view = after(session, session.past.undo)
     assert view.step.elapsed_steps.tolist() == [3, 3, 6] and view.timeline.undo == "reset of all"
-    session.select_env(0)
+    session.change(selected_env=0)
 
 
 def test_a_moment_without_an_action_has_the_reward_of_its_record_or_none(session: Session) -> None:
@@ -227,7 +227,7 @@ def test_a_moment_without_a_picture_is_drawn_as_it_was(session: Session) -> None
     view = step(session, 12)
     human = next(c for c in view.task.cameras if c.kind == "human")
     wanted = CameraRequest(human.name, "human", ("rgb",))
-    session.watch_cameras((wanted,))
+    session.change(cameras=(wanted,))
     session.set_clients(1)
     key = ("human", human.name)
     now = wait_until(session, lambda v: key in v.pictures, "the live picture").pictures[key]
@@ -246,5 +246,5 @@ def test_a_moment_without_a_picture_is_drawn_as_it_was(session: Session) -> None
     serial = session.view().pictures_serial
     again = wait_until(session, lambda v: v.pictures_serial > serial and key in v.pictures, "its picture")
     assert np.abs(then.rgb.astype(int) - again.pictures[key].rgb).max() <= 2
-    session.watch_cameras(())
+    session.change(cameras=())
     session.set_clients(0)

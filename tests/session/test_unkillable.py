@@ -123,7 +123,7 @@ def test_a_loop_in_a_load_can_be_left_and_the_last_good_version_stays(
     calm(risky_file)
     session.step()
     wait_until(session, lambda v: v.step.elapsed_steps[0] == 4, "a step of the last good version")
-    session.reload()
+    session.versions.reload()
     wait_until(session, lambda v: v.problem is None and not v.stale, "the new version")
 
 
@@ -156,7 +156,7 @@ def test_what_cannot_be_interrupted_is_said_and_a_restart_brings_the_moment_back
         and 'hazard("evaluate")' in busy.traceback
     )
     calm(risky_file)
-    session.restart_worker()
+    session.versions.restart_worker()
     view = died_and_came_back(session, before)
     assert "ended by hand in evaluate" in view.problem.message
     assert view.problem.file == str(risky_file) and view.problem.code

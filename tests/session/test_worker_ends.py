@@ -84,7 +84,7 @@ def test_a_message_that_stops_in_the_middle_is_a_hang_like_others(session: Sessi
     busy = wait_until(session, lambda v: v.busy is not None and v.busy.file is not None, "busy").busy
     assert busy.doing == "in evaluate"
     calm(risky_file)
-    session.restart_worker()
+    session.versions.restart_worker()
     wait_until(session, lambda v: v.task_serial > before.task_serial, "the version again")
 
 
@@ -114,7 +114,7 @@ def test_what_is_no_ordinary_exception_is_named_with_its_line(
     assert view.problem.code == code
     calm(risky_file)
     if place == "import":
-        session.reload()
+        session.versions.reload()
         wait_until(session, lambda v: v.problem is None, "the mended version")
     assert session.worker_pid == worker
 
@@ -195,7 +195,7 @@ def test_a_task_that_goes_to_another_folder_is_reloaded_and_recorded_as_before(
         session.step()
         wait_until(session, lambda v: v.step.elapsed_steps[0] == 1, "a step")
         assert not provocation(file).exists()
-        session.set_action_source("policy", "act.py:zero")
+        session.change(action_source="policy", policy="act.py:zero")
         session.step()
         view = wait_until(session, lambda v: v.step.elapsed_steps[0] == 2 or v.problem is not None, "a step")
         assert view.problem is None, view.problem

@@ -11,8 +11,7 @@ from workbench.authoring.problem import Problem
 from workbench.core.geometry import BodyKind, Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo, CameraKind
 from workbench.core.step import StepResult
-from workbench.session.messages import ActionDimension, TaskDescription
-from workbench.session.printed import NOTHING_PRINTED
+from workbench.session.messages import ActionDimension, Settings, TaskDescription
 from workbench.session.view import RecordingStatus, SessionView
 
 
@@ -104,47 +103,18 @@ def description(geometry: SceneGeometry, cameras: tuple[CameraInfo, ...] = ()) -
     )
 
 
-EMPTY = SessionView(
-    state="starting",
-    activity="starting the worker",
-    stale=False,
-    task=None,
-    task_serial=0,
-    scene_serial=0,
-    cameras_serial=0,
-    load_milliseconds={},
-    reload=None,
-    step=None,
-    step_serial=0,
-    pictures={},
-    pictures_serial=0,
-    picture_milliseconds=0.0,
-    problem=None,
-    problem_serial=0,
-    curves=None,
-    selected_env=0,
-    playing=False,
-    speed=1.0,
-    seed=0,
-    episode_end="reset",
-    action_source="random",
-    policy=None,
-    sliders=(),
-    steps_per_second=0.0,
-    real_time_factor=0.0,
-    recording=RecordingStatus(folder="recordings"),
-    printed=NOTHING_PRINTED,
-)
+EMPTY = SessionView(activity="starting the worker", recording=RecordingStatus(folder="recordings"))
 """A session that has just begun."""
 
 
-def running(num_envs: int, **changes: object) -> SessionView:
+def running(num_envs: int, *, selected_env: int = 0, speed: float = 1.0, **changes: object) -> SessionView:
     """A session that plays the table scene."""
     geometry, poses = table_scene(num_envs)
     view = replace(
         EMPTY,
         state="running",
         activity="",
+        settings=Settings(speed, selected_env=selected_env),
         playing=True,
         task=description(geometry),
         task_serial=1,

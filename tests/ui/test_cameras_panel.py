@@ -22,7 +22,7 @@ class Asked:
     def __init__(self) -> None:
         self.cameras: tuple[CameraRequest, ...] = ()
 
-    def watch_cameras(self, cameras: tuple[CameraRequest, ...]) -> None:
+    def change(self, *, cameras: tuple[CameraRequest, ...]) -> None:
         self.cameras = cameras
 
 

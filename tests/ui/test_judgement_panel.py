@@ -57,8 +57,8 @@ class RecordedSession:
     def show(self, env: int, serial: int) -> None:
         self.asked.append(("show", env, serial))
 
-    def select_env(self, env: int) -> None:
-        self.asked.append(("select", env))
+    def change(self, *, selected_env: int) -> None:
+        self.asked.append(("select", selected_env))
 
     def stop_judging(self) -> None:
         self.asked.append(("stop",))

@@ -74,7 +74,7 @@ def test_says_what_it_waits_for_and_then_shows_the_scene(opened: Opened) -> None
     assert all(opened.panels.bodies(name) for name in ("cube", "panda_hand", "ground"))
     assert "3 envs" in opened.panels.html("wb-status")
     run.set("Source", "sliders")
-    wait_until(opened.session, lambda view: view.action_source == "sliders", "the sliders")
+    wait_until(opened.session, lambda view: view.settings.action_source == "sliders", "the sliders")
     opened.draw()
     assert view.task is not None and all(run.shows(action.name) for action in view.task.actions)
     run.set("Source", "hold still")
@@ -84,7 +84,7 @@ def test_a_step_moves_the_robots_and_fills_the_numbers(opened: Opened) -> None:
     opened.load()
     hand = opened.panels.bodies("panda_hand")[0]
     before = hand.batched_positions.copy()
-    opened.session.set_action_source("random")
+    opened.session.change(action_source="random")
     serial = opened.session.view().step_serial
     opened.session.step()
     wait_until(opened.session, lambda view: view.step_serial > serial, "a step")
@@ -96,7 +96,7 @@ def test_a_step_moves_the_robots_and_fills_the_numbers(opened: Opened) -> None:
 
 def test_selecting_an_env_moves_its_mark(opened: Opened) -> None:
     opened.load()
-    opened.session.select_env(2)
+    opened.session.change(selected_env=2)
     opened.draw()
     assert opened.panels.labels() == ["env 2"]
     assert opened.panels.control("Selected").value == 2
@@ -110,7 +110,7 @@ def test_what_a_press_changes_on_the_panels_comes_apart_from_the_view(
     # A browser applies a batch with anything of the view in it at its next frame of the view, which may take long.
     opened.load()
     monkeypatch.setattr("workbench.ui.redraw_loop.SENT_WITHIN", 10.0)
-    opened.session.select_env(0)
+    opened.session.change(selected_env=0)
     opened.draw()
     address, options = handshake(f"http://127.0.0.1:{opened.panels.server.get_port()}")
     with websockets.sync.client.connect(address, **options) as connection:
@@ -124,7 +124,7 @@ def test_what_a_press_changes_on_the_panels_comes_apart_from_the_view(
             return batches
 
         kinds_until("ReplayDoneMessage")
-        opened.session.select_env(1)
+        opened.session.change(selected_env=1)
         opened.draw()
         *panels, view = kinds_until("SceneNodeUpdateMessage")
     assert any("GuiUpdateMessage" in batch for batch in panels)

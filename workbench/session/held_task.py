@@ -46,7 +46,7 @@ class HeldTask:
         self.asked_for: Path | None = None
         """The file that is to be loaded, whether or not it ever was."""
 
-    def at_work(self, doing: Doing | None, work: Callable[[], None]) -> None:
+    def at_work(self, doing: Doing | None, work: Callable[[], object]) -> None:
         """Do `work`; if the author's code is at work in it, it can be left.
 
         An exception that is none of Python's ordinary ones (a KeyboardInterrupt, which nobody but the author's code

@@ -35,7 +35,7 @@ class Interrupts:
         """From now on the signal is heard; before, it would end the process."""
         signal.signal(INTERRUPT_SIGNAL, self._on_signal)
 
-    def run(self, work: Callable[[], None]) -> None:
+    def run(self, work: Callable[[], object]) -> None:
         """Do `work`, which a signal may leave.
 
         Raises:

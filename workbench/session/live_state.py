@@ -1,31 +1,29 @@
 """What a session knows: how the task stands, what its batch lived through, and what the page has chosen.
 
 Every event of the worker changes a little of this, and every snapshot that the page draws is made of it. What an
-event means for what is seen is one idea and worth reading alone, so there is no lock, no thread and no message
-in here: `Session` calls these methods under its lock, and sends whatever is to be sent.
+event means for what is seen is one idea and worth reading alone, so `LiveState` has no lock, no thread and no message:
+`Session` calls its methods under the lock of `SharedState`, and sends whatever is to be sent.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from workbench.authoring.problem import Problem
 from workbench.authoring.reference import RecordedTask, TaskName, class_beside, followed_folder, named_file
 from workbench.core.inspection import Inspection
-from workbench.core.pictures import CameraKind, Picture
 from workbench.core.snapshot_bytes import WholeSnapshot
 from workbench.core.step import StepResult
 from workbench.session.chronicle import Chronicle
-from workbench.session.judge import JudgementView
-from workbench.session.kept_worker import Death, Vitals
-from workbench.session.last_words import Busy, death_problem, own_files_of
+from workbench.session.kept_worker import Death
+from workbench.session.last_words import death_problem, own_files_of
 from workbench.session.messages import (
     SCENE_KEPT,
-    ActionSource,
-    CameraRequest,
-    EpisodeEnd,
     Event,
     Failed,
     Load,
@@ -36,24 +34,18 @@ from workbench.session.messages import (
     Pictures,
     PlaceCamera,
     Placed,
-    ReloadReport,
-    Request,
-    Restore,
+    ReadPolicyAgain,
     RulesBroken,
-    SetActionSource,
-    SetEpisodeEnd,
-    SetSpeed,
+    Settings,
     Status,
     Stepped,
     TaskDescription,
     TaskOptions,
-    WatchCameras,
 )
 from workbench.session.past_episodes import PastEpisode, WhatToKeep, episode_round, moments_of
-from workbench.session.printed import Printed
 from workbench.session.recovery import Wanted
-from workbench.session.timeline import Timeline, TimelineView
-from workbench.session.view import RecordingStatus, SessionView, State
+from workbench.session.timeline import Timeline
+from workbench.session.view import SessionView
 
 
 @dataclass
@@ -66,60 +58,30 @@ class LiveState:
     """How it is made, but for the seed."""
     history_bytes: int
     """What the past may take."""
-    # --- the worker and its task ---
-    state: State = "starting"
-    activity: str = "starting the worker"
-    stale: bool = False
-    task: TaskDescription | None = None
-    task_serial: int = 0
-    scene_serial: int = 0
-    cameras_serial: int = 0
-    reload: ReloadReport | None = None
-    load_milliseconds: dict[str, float] = field(default_factory=dict)
-    problem: Problem | None = None
-    problem_serial: int = 0
-    problem_at_run: bool = False
-    """It came while the task ran, not while a version was loaded."""
-    busy: Busy | None = None
-    rules: RulesBroken | None = None
-    """What the version that runs has broken of the rules; None while nothing."""
-    rules_serial: int = 0
-    choices: tuple[str, ...] = ()
-    """What can be chosen in the file, the one that was asked for first."""
-    # --- the batch ---
+    now: SessionView = SessionView(activity="starting the worker")
+    """What is live, but for what `view` adds."""
     chronicle: Chronicle | None = None
     """None before a task is loaded."""
-    step: StepResult | None = None
-    step_serial: int = 0
+    problem_at_run: bool = False
+    """It came while the task ran, not while a version was loaded."""
     first_due: bool = False
     """The next step is the one that a new scene begins with: it does not show that anything runs."""
-    pictures: dict[tuple[CameraKind, str], Picture] = field(default_factory=dict)
-    pictures_serial: int = 0
-    picture_milliseconds: float = 0.0
-    inspection: Inspection | None = None
-    playing: bool = False
-    steps_per_second: float = 0.0
-    real_time_factor: float = 0.0
-    # --- what the page has chosen ---
-    seed: int = field(init=False)
-    selected_env: int = 0
-    cameras: tuple[CameraRequest, ...] = ()
     clients: int = 0
+    """Pages that are open."""
     wants_play: bool = False
-    speed: float = 1.0
-    episode_end: EpisodeEnd = "reset"
-    action_source: ActionSource = "random"
-    policy: str | None = None
-    sliders: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        self.seed = self.options.seed
+        self.set(seed=self.options.seed)
         self.own_file = named_file(self.reference)
         """The file that was named, whether or not it ever loaded; None for an env id."""
         self.own_folder = followed_folder(self.reference)
         """Modules in or below it are followed with the file; None where nothing is."""
         self.running_reference = self.reference
         """The task that runs."""
+
+    def set(self, **changes: Any) -> None:
+        """Replace fields of `now`."""
+        self.now = replace(self.now, **changes)
 
     @property
     def timeline(self) -> Timeline | None:
@@ -135,27 +97,33 @@ class LiveState:
             restored: it is the last good one, brought back after a worker's death.
             stale: the files hold another by now.
         """
-        task, report = event.task, event.reload
-        if scene_kept(event) and self.task is not None:
+        task, report, before = event.task, event.reload, self.now.task
+        kept = scene_kept(event)
+        if kept and before is not None:
             # The same scene: who has drawn it can see that by its being the same object.
-            task = replace(task, geometry=self.task.geometry)
-        before, self.task = self.task, task
-        self.task_serial += 1
-        self.step, self.load_milliseconds, self.reload = event.first, event.milliseconds, report
-        self.first_due = not scene_kept(event)
-        if not scene_kept(event):
-            self.rules, self.rules_serial = None, self.rules_serial + 1  # those of this scene come after it
+            task = replace(task, geometry=before.geometry)
+        self.set(
+            task=task,
+            task_serial=self.now.task_serial + 1,
+            step=event.first,
+            load_milliseconds=event.milliseconds,
+            reload=report,
+            activity="",
+            stale=stale,
+        )
+        self.first_due = not kept
+        if not kept:
+            # What was broken of the rules in this scene comes after it.
+            self.set(rules=None, rules_serial=self.now.rules_serial + 1)
             same = restored and before is not None and before.source_hash == task.source_hash
             self._new_scene(task, event.first, its_past_stays=same)
         elif self.timeline is not None:
-            self.step = self.timeline.history.renew_last(event.first)
+            self.set(step=self.timeline.history.renew_last(event.first))
         if report is None or report.level not in ("same", "patched"):
-            self.cameras_serial += 1
-            self.pictures_serial += 1
-            if not scene_kept(event):
-                self.pictures = {}
-        if not (restored and self.choices):  # else another may have been asked for since
-            self.choices = (task.chosen, *task.others) if task.others else ()
+            self.set(cameras_serial=self.now.cameras_serial + 1)
+            self.new_pictures(**{} if kept else {"pictures": {}})
+        if not (restored and self.now.choices):  # else another may have been asked for since
+            self.set(choices=(task.chosen, *task.others) if task.others else ())
         if task.others and task.source_files and task.file is not None:
             self.running_reference = class_beside(self.reference, Path(task.file), task.chosen)
             if task.in_place_of is not None:
@@ -163,80 +131,86 @@ class LiveState:
                 self.reference = self.running_reference
         else:
             self.running_reference = self.reference
-        self.activity = ""
-        self.stale = stale
         if not restored:  # else what killed the worker still stands
             self.set_problem(None)
         self._runs()
 
     def _new_scene(self, task: TaskDescription, first: StepResult, its_past_stays: bool) -> None:
-        self.scene_serial += 1
-        self.sliders = ()
-        self.selected_env = min(self.selected_env, task.num_envs - 1)
-        self.inspection = None
+        settings = self.now.settings
+        selected = min(settings.selected_env, task.num_envs - 1)
+        self.set(
+            scene_serial=self.now.scene_serial + 1,
+            settings=replace(settings, sliders=(), selected_env=selected),
+            inspection=None,
+        )
         if self.timeline is None or not its_past_stays:
             next_serial = 0 if self.timeline is None else self.timeline.history.next_serial
             self.chronicle = Chronicle(task, first, self.history_bytes, next_serial)
 
     def stepped(self, event: Stepped) -> None:
-        self.step = event.step
-        if self.chronicle is not None:
-            self.step = self.chronicle.add(event)
-            self.step_serial = self.chronicle.timeline.history.last
+        if self.chronicle is None:
+            self.set(step=event.step)
+        else:
+            step = self.chronicle.add(event)
+            self.set(step=step, step_serial=self.chronicle.timeline.history.last)
         first, self.first_due = self.first_due, False
-        if self.problem is not None and self.problem_at_run and not first:
+        if self.now.problem is not None and self.problem_at_run and not first:
             # What failed while running runs again: the task was reset, or the policy changed.
             self.set_problem(None)
             self._runs()
 
     def take(self, event: Event) -> None:
         """Any other event."""
+        now = self.now
         if isinstance(event, Loading):
-            self.state, self.activity = "loading", event.activity
+            self.set(state="loading", activity=event.activity)
         elif isinstance(event, Failed):
-            self.activity = ""
             self.set_problem(event.problem)
-            self.problem_at_run = self.state != "loading"
-            self.choices = event.classes or self.choices
-            self.state = "error"
-            self.stale = self.stale or not self.problem_at_run
+            self.problem_at_run = now.state != "loading"
+            self.set(
+                state="error",
+                activity="",
+                choices=event.classes or now.choices,
+                stale=now.stale or not self.problem_at_run,
+            )
         elif isinstance(event, RulesBroken):
-            self.rules = event if event.rows else None
-            self.rules_serial += 1
+            self.set(rules=event if event.rows else None, rules_serial=now.rules_serial + 1)
         elif isinstance(event, PastPictures):
             if self.timeline is not None:
                 self.timeline.add_pictures(event)
-                self.pictures_serial += 1
+                self.new_pictures()
         elif isinstance(event, Pictures):
             if self.timeline is not None:
                 self.timeline.add_pictures(event)
-            if event.pictures and event.pictures[0].env == self.selected_env:
+            if event.pictures and event.pictures[0].env == now.settings.selected_env:
                 # They come a kind at a time; what nobody looks through any more is not to stay.
-                watched = {(camera.kind, camera.name) for camera in self.cameras}
+                watched = {(camera.kind, camera.name) for camera in now.settings.cameras}
                 made = {(picture.kind, picture.camera): picture for picture in event.pictures}
-                self.pictures = {k: p for k, p in {**self.pictures, **made}.items() if k in watched}
-                self.pictures_serial += 1
-                self.picture_milliseconds = event.milliseconds
+                shown = {key: p for key, p in {**now.pictures, **made}.items() if key in watched}
+                self.new_pictures(pictures=shown, picture_milliseconds=event.milliseconds)
         elif isinstance(event, Placed):
             self._placed(event)
         elif isinstance(event, Inspection):
-            self.inspection = event
+            self.set(inspection=event)
         elif isinstance(event, Status):
-            self.playing = event.playing
-            self.steps_per_second, self.real_time_factor = event.steps_per_second, event.real_time_factor
+            self.set(
+                playing=event.playing,
+                steps_per_second=event.steps_per_second,
+                real_time_factor=event.real_time_factor,
+            )
             if event.activity:
-                self.state, self.activity = "loading", event.activity
-            elif self.state in ("running", "paused", "loading"):
-                self.activity = ""
+                self.set(state="loading", activity=event.activity)
+            elif now.state in ("running", "paused", "loading"):
+                self.set(activity="")
                 self._runs()
 
     def _placed(self, event: Placed) -> None:
-        if event.info is None or self.task is None:
+        if event.info is None or self.now.task is None:
             return
-        infos = tuple(event.info if c.key == event.key else c for c in self.task.cameras)
-        self.task = replace(self.task, cameras=infos)
+        infos = tuple(event.info if c.key == event.key else c for c in self.now.task.cameras)
+        self.set(task=replace(self.now.task, cameras=infos))
         if event.reshaped:
-            self.cameras_serial += 1  # what it can show may be something else
+            self.set(cameras_serial=self.now.cameras_serial + 1)  # what it can show may be something else
         if self.timeline is not None:
             self.timeline.camera_moved(*event.key)
 
@@ -250,137 +224,123 @@ class LiveState:
         Returns:
             what is to be told of it; None where somebody asked for it.
         """
-        self.playing, self.steps_per_second, self.real_time_factor = False, 0.0, 0.0
         problem = None
         if not death.asked or death.stack:
-            source = {} if self.task is None or while_loading else self.task.source
+            task = self.now.task
+            source = {} if task is None or while_loading else task.source
             problem = death_problem(death.why, death.doing, death.stack, self.own_files(), printed, source)
             self.set_problem(problem)
             self.problem_at_run = not while_loading
         if not death.file_waits:
             self.wants_play = False
-        self.state = "stopped" if death.gives_up else "starting"
-        self.activity = "" if death.gives_up else "starting another worker"
+        self.set(
+            playing=False,
+            steps_per_second=0.0,
+            real_time_factor=0.0,
+            state="stopped" if death.gives_up else "starting",
+            activity="" if death.gives_up else "starting another worker",
+        )
         return problem
 
     def waits_for_the_file(self) -> None:
         """A worker is up and has nothing that it could load: the problem stands."""
-        if self.state == "starting":
-            self.state, self.activity = "error", ""
+        if self.now.state == "starting":
+            self.set(state="error", activity="")
 
     def set_problem(self, problem: Problem | None) -> None:
-        self.problem = problem
-        self.problem_serial += 1
+        self.set(problem=problem, problem_serial=self.now.problem_serial + 1)
 
     def _runs(self) -> None:
-        self.state = "running" if self.playing else "paused"
+        self.set(state="running" if self.now.playing else "paused")
 
-    def _drop_pictures(self) -> None:
-        self.pictures = {}
-        self.pictures_serial += 1
+    def new_pictures(self, **changes: Any) -> None:
+        """Others are shown now."""
+        self.set(pictures_serial=self.now.pictures_serial + 1, **changes)
 
     # --- what the page asks for --------------------------------------------------------------------
 
-    def select(self, env: int) -> bool:
-        """Choose the env (the nearest that there is) whose pictures and numbers are shown. False if it was."""
-        last = 0 if self.task is None else self.task.num_envs - 1
-        chosen = min(max(env, 0), last)
-        if chosen == self.selected_env:
+    def change(self, **settings: Any) -> bool:
+        """Choose other `Settings`; the env is the nearest that there is. False if they were chosen."""
+        before, task = self.now.settings, self.now.task
+        new = replace(before, **settings)
+        last = 0 if task is None else task.num_envs - 1
+        new = replace(new, selected_env=min(max(int(new.selected_env), 0), last))
+        if new == before:
             return False
-        self.selected_env = chosen
-        # The other env's picture must not stand beside this env's numbers until a new one comes.
-        self._drop_pictures()
+        self.set(settings=new)
+        if new.selected_env != before.selected_env:
+            # The other env's picture must not stand beside this env's numbers until a new one comes.
+            self.new_pictures(pictures={})
         return True
 
     def choose_class(self, name: str) -> bool:
         """Ask for another task class of the same file. False if the file has no such class."""
-        if self.own_file is None or name not in self.choices:
+        if self.own_file is None or name not in self.now.choices:
             return False
-        file = self.own_file if self.task is None or self.task.file is None else Path(self.task.file)
+        file = (
+            self.own_file if self.now.task is None or self.now.task.file is None else Path(self.now.task.file)
+        )
         self.reference = class_beside(self.reference, file, name)
-        self.choices = (name, *(other for other in self.choices if other != name))
+        self.set(choices=(name, *(other for other in self.now.choices if other != name)))
         return True
 
     def open_file(self, file: Path, class_name: str) -> None:
         """Ask for a class of another file."""
         self.reference, self.own_file, self.own_folder = f"{file}:{class_name}", file, file.parent
-        self.choices = ()
+        self.set(choices=())
 
     def file_is_edited(self) -> None:
         """A file that a recording named is open live and is saved: from now on it is what is on disk that is open."""
         if isinstance(self.reference, RecordedTask) and self.reference.approved is not None:
             self.reference = str(self.reference)
 
-    def seek(self, seek: Callable[[Timeline], None]) -> bool:
-        """Show another moment. False if it was shown."""
-        if self.timeline is None:
-            return False
-        before = self.timeline.shown
-        seek(self.timeline)
-        if self.timeline.shown is before:
-            return False
-        self.pictures_serial += 1
-        return True
-
-    def travel(self, ask: Callable[[Timeline, int], Restore | None]) -> Restore | None:
-        """What is to be asked of the worker to put envs back, if anything."""
-        self.pictures_serial += 1
-        return None if self.timeline is None else ask(self.timeline, self.selected_env)
-
     def load_request(self, wanted: Wanted, level: LoadLevel = "auto") -> Load:
-        options = replace(self.options, seed=self.seed)
+        options = replace(self.options, seed=self.now.seed)
         # The version that ran is brought back although another class of the file was asked for since.
         reference = self.reference if wanted.source is None else self.running_reference
-        any_task = self.task is None and isinstance(reference, str)
+        any_task = self.now.task is None and isinstance(reference, str)
         return Load(reference, options, wanted.source, level, wanted.snapshot, any_task)
 
-    def settings(self) -> list[Request]:
-        """What has been chosen, for a worker that knows nothing of it; the cameras are told last (`watch_request`)."""
-        return [
-            SetSpeed(self.speed),
-            SetEpisodeEnd(self.episode_end),
-            self.action_request(),
-        ]
+    def settings(self) -> Settings:
+        """What the worker is to know of what was chosen."""
+        chosen = self.now.settings
+        return replace(
+            chosen,
+            policy_folder=None if self.folder is None else str(self.folder),
+            cameras=chosen.cameras if self.clients > 0 else (),
+        )
 
     @property
     def folder(self) -> Path | None:
         """Of the task's own file, where a policy's may lie too."""
         return None if self.own_file is None else self.own_file.parent
 
-    def action_request(self) -> SetActionSource:
-        """Where the actions come from."""
-        beside = None if self.folder is None else str(self.folder)
-        return SetActionSource(self.action_source, self.policy, beside)
+    @property
+    def policy(self) -> str | None:
+        """The one that acts."""
+        chosen = self.now.settings
+        return chosen.policy if chosen.action_source == "policy" else None
 
-    def policy_saved(self) -> SetActionSource:
+    def policy_saved(self) -> ReadPolicyAgain:
         """What was wrong with it before is past; what it stopped goes on, if it is well now."""
-        mended = self.problem is not None and self.problem.stage == "policy"
+        problem = self.now.problem
+        mended = problem is not None and problem.stage == "policy"
         if mended:
             self.set_problem(None)
             self._runs()
-        return replace(self.action_request(), play=mended and self.wants_play)
-
-    def watch_request(self) -> WatchCameras:
-        """The pictures that somebody looks at; none while no page is open."""
-        return WatchCameras(self.selected_env, self.cameras if self.clients > 0 else ())
+        return ReadPolicyAgain(play=mended and self.wants_play)
 
     # --- what is read --------------------------------------------------------------------------------
 
     def own_files(self) -> list[str]:
         """The author's files, as far as they are known."""
-        return own_files_of(() if self.task is None else self.task.source_files, self.own_file)
+        return own_files_of(() if self.now.task is None else self.now.task.source_files, self.own_file)
 
     def newest_moment(self) -> bytes | None:
         """Pickled for `Load.snapshot`; None before a task is loaded."""
         return (
             None if self.timeline is None else self.timeline.history.snapshot_at(self.timeline.history.last)
         )
-
-    def stretch(self) -> tuple[int, int] | None:
-        """See `TimeTravel.stretch`."""
-        if self.timeline is None or not len(self.timeline.history):
-            return None
-        return self.timeline.history.stretch_at(self.selected_env, self.timeline.at)
 
     def what_to_keep(
         self,
@@ -390,10 +350,10 @@ class LiveState:
         before: bool = False,
     ) -> WhatToKeep | str:
         """See `Session.keep_past`; in a sentence why there is nothing to keep."""
-        if self.task is None or self.timeline is None or load is None:
+        if self.now.task is None or self.timeline is None or load is None:
             return "no task is loaded"
         history, shown = self.timeline.history, self.timeline.shown
-        envs = range(self.task.num_envs) if env_idx is None else env_idx
+        envs = range(self.now.task.num_envs) if env_idx is None else env_idx
         serial = None if shown is None else shown.serial
         found = {env: episode_round(history, env, serial, before) for env in envs}
         episodes = tuple(episode for episode in found.values() if isinstance(episode, PastEpisode))
@@ -405,59 +365,67 @@ class LiveState:
             whole = history.whole_at(moment.serial)
             assert whole is not None, "an episode of the past has a snapshot of every moment"
             snapshots[moment.serial] = whole
-        return WhatToKeep(self.task, load, placed, episodes, snapshots)
+        return WhatToKeep(self.now.task, load, placed, episodes, snapshots)
 
-    def view(
-        self, *, recording: RecordingStatus, printed: Printed, vitals: Vitals, judgement: JudgementView
-    ) -> SessionView:
-        """A snapshot, with what others know."""
-        timeline = self.timeline
-        shown = None if timeline is None else timeline.shown
-        past = TimelineView() if timeline is None else timeline.view(self.selected_env, self.cameras)
-        return SessionView(
-            state=self.state,
-            activity=self.activity,
-            stale=self.stale,
-            task=self.task,
-            task_serial=self.task_serial,
-            scene_serial=self.scene_serial,
-            cameras_serial=self.cameras_serial,
-            reload=self.reload,
-            load_milliseconds=self.load_milliseconds,
-            step=self.step if shown is None else shown.step,
-            step_serial=self.step_serial if shown is None else shown.serial,
-            pictures=self.pictures
-            if timeline is None or shown is None
-            else timeline.pictures(self.selected_env),
-            pictures_serial=self.pictures_serial,
-            picture_milliseconds=self.picture_milliseconds,
-            problem=self.problem,
-            problem_serial=self.problem_serial,
-            choices=self.choices,
-            refused=self.problem if self.stale and not self.problem_at_run else None,
-            curves=None if self.chronicle is None else self.chronicle.curves(),
-            selected_env=self.selected_env,
-            playing=self.playing,
-            speed=self.speed,
-            seed=self.seed,
-            episode_end=self.episode_end,
-            action_source=self.action_source,
-            policy=self.policy,
-            sliders=self.sliders,
-            steps_per_second=self.steps_per_second,
-            real_time_factor=self.real_time_factor,
-            recording=recording,
-            timeline=past,
-            printed=printed,
-            busy=self.busy,
-            rules=self.rules,
-            rules_serial=self.rules_serial,
-            vitals=vitals,
-            inspection=self.inspection,
-            judgement=judgement,
-        )
+    def view(self, **known: Any) -> SessionView:
+        """A snapshot of what is shown.
+
+        Args:
+            known: fields that others know.
+        """
+        now, timeline = self.now, self.timeline
+        refused = now.problem if now.stale and not self.problem_at_run else None
+        if self.chronicle is None or timeline is None:
+            return replace(now, refused=refused, **known)
+        env, moment = now.settings.selected_env, timeline.shown
+        past = timeline.view(env, now.settings.cameras)
+        view = replace(now, refused=refused, curves=self.chronicle.curves(), timeline=past, **known)
+        if moment is None:
+            return view
+        return replace(view, step=moment.step, step_serial=moment.serial, pictures=timeline.pictures(env))
 
 
 def scene_kept(event: Loaded) -> bool:
     """Whether the env, its episodes and its past are those that were there before."""
     return event.reload is not None and event.reload.level in SCENE_KEPT
+
+
+class SharedState:
+    """What a session knows, behind the one lock, and how a page hears that something of it is new.
+
+    Pages, the worker's thread, the file watcher and the recorder all change it. A page asks for everything at once
+    (`Session.view`), so it needs only be told *that* there is something: a counter, and a wait for its next value.
+    """
+
+    def __init__(self, state: LiveState) -> None:
+        self.lock = threading.Lock()
+        """Of `state`; to be held for moments only."""
+        self.state = state
+        self._changed = threading.Condition(self.lock)
+        self._count = 0
+        self._closing = False
+
+    @contextmanager
+    def changing(self) -> Iterator[LiveState]:
+        """The state, with the lock held, to set fields of it; then notes that they are new."""
+        with self.lock:
+            yield self.state
+        self.note()
+
+    def note(self) -> None:
+        """Something is new. Not to be called with the lock held."""
+        with self._changed:
+            self._count += 1
+            self._changed.notify_all()
+
+    def wait(self, seen: int, timeout: float) -> int:
+        """Block until something is new since the counter `seen`; returns the counter as it is now."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._count != seen or self._closing, timeout)
+            return self._count
+
+    def close(self) -> None:
+        """From now on nobody waits."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()

@@ -153,35 +153,6 @@ class Reset:
 
 
 @dataclass(frozen=True)
-class SetSpeed:
-    speed: float
-    """Simulated seconds per second; ``inf`` runs as fast as the machine can."""
-
-
-@dataclass(frozen=True)
-class SetEpisodeEnd:
-    rule: EpisodeEnd
-
-
-@dataclass(frozen=True)
-class SetActionSource:
-    source: ActionSource
-    policy: str | None = None
-    """``module:function`` or ``file.py:function`` when `source` is ``policy``; None while none is named."""
-    beside: str | None = None
-    """The folder in which a policy's file is looked for when it is not in the current one."""
-    play: bool = False
-    """Play on, once it can be taken."""
-
-
-@dataclass(frozen=True)
-class SetSliders:
-    """The action that every env is given while the source is ``sliders``."""
-
-    action: tuple[float, ...]
-
-
-@dataclass(frozen=True)
 class CameraRequest:
     name: str
     kind: CameraKind
@@ -189,11 +160,31 @@ class CameraRequest:
 
 
 @dataclass(frozen=True)
-class WatchCameras:
-    """Which pictures to keep making, of which env. Empty: none are made."""
+class Settings:
+    """What pages choose of how the batch runs and what of it is looked at: sent whole, and the worker applies what
+    differs from what it knew."""
 
-    env: int
-    cameras: tuple[CameraRequest, ...]
+    speed: float = 1.0
+    """Simulated seconds per second; ``inf`` runs as fast as the machine can."""
+    episode_end: EpisodeEnd = "reset"
+    action_source: ActionSource = "random"
+    policy: str | None = None
+    """``module:function`` or ``file.py:function`` when `action_source` is ``policy``; None while none is named."""
+    policy_folder: str | None = None
+    """In which a policy's file is looked for when it is not in the current folder."""
+    sliders: tuple[float, ...] = ()
+    """(A,) the action of every env while `action_source` is ``sliders``."""
+    selected_env: int = 0
+    cameras: tuple[CameraRequest, ...] = ()
+    """Whose pictures of the selected env are made; none while no page is open."""
+
+
+@dataclass(frozen=True)
+class ReadPolicyAgain:
+    """The file of the policy was saved."""
+
+    play: bool
+    """Play on, once it can be taken."""
 
 
 @dataclass(frozen=True)
@@ -312,11 +303,8 @@ Request = (
     | Play
     | SingleStep
     | Reset
-    | SetSpeed
-    | SetEpisodeEnd
-    | SetActionSource
-    | SetSliders
-    | WatchCameras
+    | Settings
+    | ReadPolicyAgain
     | PlaceCamera
     | CameraQuestion
     | SetCapture

@@ -15,6 +15,7 @@ class PolicyFile:
         """`on_save` is called on a thread of this object's own."""
         self._on_save = on_save
         self._watcher: SourceWatcher | None = None
+        self._files: list[Path] = []
 
     def follow(self, reference: str | None, beside: Path | None) -> None:
         """The file of a ``file.py:function`` from now on, wherever it may lie; of anything else, none.
@@ -27,10 +28,12 @@ class PolicyFile:
         if name.endswith(".py"):
             path = Path(name).expanduser()
             files = [path, *([] if beside is None else [beside / path])]
-        if self._watcher is None and files:
+        if files == self._files:
+            return
+        self._files = files
+        if self._watcher is None:
             self._watcher = SourceWatcher(lambda changed: self._on_save())
-        if self._watcher is not None:
-            self._watcher.follow(files)
+        self._watcher.follow(files)
 
     def close(self) -> None:
         if self._watcher is not None:

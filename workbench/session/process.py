@@ -38,16 +38,12 @@ from workbench.session.messages import (
     PlaceCamera,
     Quit,
     Request,
-    SetActionSource,
-    SetEpisodeEnd,
-    SetSliders,
-    SetSpeed,
-    WatchCameras,
+    Settings,
     is_a_step,
 )
 from workbench.session.pulse import Beat, PulseReader, make_pulse
 
-_SETTINGS = (Load, SetActionSource, SetEpisodeEnd, SetSliders, SetSpeed, WatchCameras)
+_WHOLE = (Load, Settings)
 """Of two of one kind that wait one behind the other only the second matters."""
 _MOST_WAITING = 1000
 """Requests for a worker that reads none; more are dropped (a key held down on Step)."""
@@ -282,7 +278,7 @@ class WorkerProcess:
 def _takes_the_place_of(request: Request, before: Request) -> bool:
     if isinstance(request, PlaceCamera):
         return isinstance(before, PlaceCamera) and before.key == request.key
-    return isinstance(request, _SETTINGS) and type(before) is type(request)
+    return isinstance(request, _WHOLE) and type(before) is type(request)
 
 
 def describe_exit(code: int | None) -> str:

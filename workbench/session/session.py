@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import get_args
+from typing import Any, get_args
 
 from workbench.authoring.reference import TaskName
 from workbench.core.inspection import Section
@@ -31,25 +31,18 @@ from workbench.session.judgement import JudgedCurve, Judgement
 from workbench.session.keep_past import PastKeeper
 from workbench.session.kept_worker import Death, KeptWorker, WorkerOptions
 from workbench.session.last_words import Busy
-from workbench.session.live_state import LiveState, scene_kept
+from workbench.session.live_state import LiveState, SharedState, scene_kept
 from workbench.session.messages import (
-    ActionSource,
-    CameraRequest,
     DebuggerListens,
-    EpisodeEnd,
     Event,
     Failed,
     Inspect,
     Loaded,
-    LoadLevel,
     Placed,
     Play,
     Request,
     Reset,
     SetCapture,
-    SetEpisodeEnd,
-    SetSliders,
-    SetSpeed,
     SingleStep,
     StepBack,
     Stepped,
@@ -60,7 +53,6 @@ from workbench.session.policy_file import PolicyFile
 from workbench.session.printed import PrintedLine, PrintedLog
 from workbench.session.record_live import LiveRecorder
 from workbench.session.reward_terms import TermCurves
-from workbench.session.shared_state import SharedState
 from workbench.session.time_travel import TimeTravel
 from workbench.session.versions import Versions
 from workbench.session.view import SessionView
@@ -106,17 +98,18 @@ class Session:
         """What is to be gone into as soon as a task is there."""
         self._step_backs = itertools.count(1)
         self._printed = PrintedLog(self._on_lines)
-        self._versions = Versions(
+        self.versions = Versions(
             self._shared, self._send, lambda: self._worker.replace(), on_save=self._on_save
         )
+        """Which version of the file runs, and what is loaded in its place."""
         self._worker = make_worker(
             worker or WorkerOptions(),
             WarmUp(options),
-            greet=self._versions.greeting,
+            greet=self.versions.greeting,
             on_event=self._handle,
             on_death=self._on_death,
             on_busy=self._on_busy,
-            own_files=self._versions.own_files,
+            own_files=self.versions.own_files,
             output=self._printed.feed,
         )
         self._recorder = LiveRecorder(
@@ -131,26 +124,28 @@ class Session:
             self._send,
             self._note,
             self.past.shown_moment,
-            self._versions.same_again,
+            self.versions.same_again,
             self.past.episode_moments,
-            self.open_file,
+            self.versions.open_file,
         )
         """Cameras placed by hand."""
         listen(self._say_failure)
-        self._versions.start()
+        self.versions.start()
         self._worker.start()
 
     # --- what the page reads -----------------------------------------------------------------------
 
     def view(self) -> SessionView:
         """A snapshot; cheap enough for every frame."""
-        recording = replace(self._recorder.status(), keeping=self._keeper.status())
-        printed, vitals = self._printed.view(), self._worker.vitals
+        known = {
+            "recording": replace(self._recorder.status(), keeping=self._keeper.status()),
+            "printed": self._printed.view(),
+            "vitals": self._worker.vitals,
+            "judgement": self._judge.view,
+        }
         with self._lock:
-            view = self._state.view(
-                recording=recording, printed=printed, vitals=vitals, judgement=self._judge.view
-            )
-        return replace(view, studio=self.studio.view(view.step, view.selected_env))
+            view = self._state.view(**known)
+        return replace(view, studio=self.studio.view(view.step, view.settings.selected_env))
 
     def env_rows(self) -> EnvRows | None:
         """The row of every env; None before a task is loaded. Copies some 100 kB for 256 envs: not for every frame."""
@@ -173,28 +168,9 @@ class Session:
 
     # --- what the page asks for --------------------------------------------------------------------
 
-    def reload(self, level: LoadLevel = "auto") -> None:
-        """Load the file again, by a level that is named whatever it may leave of the old version.
-
-        A worker that does not take it up (an endless loop) is interrupted or replaced.
-        """
-        self._versions.reload(level)
-
-    def choose_class(self, name: str) -> None:
-        """Another task class of the same file, one that `TaskDescription.others` names."""
-        self._versions.choose_class(name)
-
-    def open_file(self, file: Path, class_name: str) -> None:
-        """Open a task class of another file in place of the one that is open, and follow that file."""
-        self._versions.open_file(file, class_name)
-
     def interrupt(self) -> None:
         """Have the author's code left where it is, if it is at work; its traceback becomes the problem."""
         self._worker.interrupt()
-
-    def restart_worker(self) -> None:
-        """End the worker, whatever it is doing, and start another with the last good version where it was."""
-        self._versions.restart_worker()
 
     def clear_printed(self) -> None:
         """Forget what the author's code printed."""
@@ -203,14 +179,16 @@ class Session:
 
     def play(self) -> None:
         self.past.seek(None)
-        with self._shared.changing() as state:
-            state.playing = state.wants_play = True
-        self._send(Play(True))
+        self._set_playing(True)
 
     def pause(self) -> None:
+        self._set_playing(False)
+
+    def _set_playing(self, playing: bool) -> None:
         with self._shared.changing() as state:
-            state.playing = state.wants_play = False
-        self._send(Play(False))
+            state.set(playing=playing)
+            state.wants_play = playing
+        self._send(Play(playing))
 
     def step(self) -> None:
         """One control step; pauses first."""
@@ -221,30 +199,23 @@ class Session:
     def reset(self, env_idx: tuple[int, ...] | None = None) -> None:
         """All envs with the session's seed, or some with fresh seeds."""
         self.past.seek(None)
-        self._send(Reset(env_idx, self._state.seed if env_idx is None else None))
+        self._send(Reset(env_idx, self._state.now.seed if env_idx is None else None))
 
     def set_seed(self, seed: int) -> None:
         """Take another seed and reset all envs with it."""
         with self._lock:
-            self._state.seed = int(seed)
+            self._state.set(seed=int(seed))
         self.reset()
 
-    def set_speed(self, speed: float) -> None:
-        """Simulated seconds per wall second; ``math.inf`` for as fast as the machine can."""
-        with self._shared.changing() as state:
-            state.speed = speed
-        self._send(SetSpeed(speed))
-
-    def set_episode_end(self, rule: EpisodeEnd) -> None:
-        with self._shared.changing() as state:
-            state.episode_end = rule
-        self._send(SetEpisodeEnd(rule))
-
-    def set_action_source(self, source: ActionSource, policy: str | None = None) -> None:
-        with self._shared.changing() as state:
-            state.action_source, state.policy = source, policy
-        self._send(self._state.action_request())
-        self._policy_file.follow(policy if source == "policy" else None, self._state.folder)
+    def change(self, **settings: Any) -> None:
+        """Choose otherwise: fields of `Settings`."""
+        with self._lock:
+            if not self._state.change(**settings):
+                return
+            policy, folder = self._state.policy, self._state.folder
+        self._send_settings()
+        self._policy_file.follow(policy, folder)
+        self._note()
 
     def _on_policy_saved(self) -> None:
         with self._lock:
@@ -254,33 +225,10 @@ class Session:
         self._note()
         self._send(request)
 
-    def set_sliders(self, action: tuple[float, ...]) -> None:
-        """The action (A,) that every env gets while the action source is ``sliders``."""
-        with self._shared.changing() as state:
-            state.sliders = action
-        self._send(SetSliders(action))
-
-    def select_env(self, env: int) -> None:
-        """The env whose pictures and numbers are shown."""
-        with self._lock:
-            changed = self._state.select(int(env))
-        if not changed:
-            return
-        self._watch()
-        self._note()
-
-    def watch_cameras(self, cameras: tuple[CameraRequest, ...]) -> None:
-        """Which pictures of the selected env are on screen; no others are rendered."""
-        with self._lock:
-            if cameras == self._state.cameras:
-                return
-            self._state.cameras = cameras
-        self._watch()
-
     def inspect(self, sections: tuple[Section, ...]) -> None:
         """Read the selected env out, once; the answer becomes `SessionView.inspection`."""
         with self._lock:
-            env = self._state.selected_env
+            env = self._state.now.settings.selected_env
         self._send(Inspect(env, sections))
 
     def set_clients(self, count: int) -> None:
@@ -288,7 +236,7 @@ class Session:
         with self._lock:
             before, self._state.clients = self._state.clients, count
         if (before == 0) != (count == 0):
-            self._watch()
+            self._send_settings()
 
     def start_recording(self, env_idx: tuple[int, ...] | None = None, next_episode: bool = False) -> None:
         """Record these envs (all if None): from a reset on that is made now, until it is stopped.
@@ -297,7 +245,7 @@ class Session:
             next_episode: reset nothing, and record of each env only the episode that begins with its next reset.
         """
         with self._lock:
-            task = self._state.task
+            task = self._state.now.task
         if task is None:
             return
         envs = tuple(range(task.num_envs)) if env_idx is None else env_idx
@@ -322,7 +270,7 @@ class Session:
         Args:
             before: the episode before that one.
         """
-        load = self._versions.same_again()
+        load = self.versions.same_again()
         placed = self.studio.placed_cameras()
         with self._lock:
             what = self._state.what_to_keep(env_idx, load, placed, before)
@@ -366,7 +314,7 @@ class Session:
         self.past.seek(None)
         self.pause()
         with self._lock:
-            task, env = self._state.task, self._state.selected_env
+            task, env = self._state.now.task, self._state.now.settings.selected_env
             if task is None:
                 self._step_in = number, run, everywhere, source_file, source
                 return
@@ -386,14 +334,14 @@ class Session:
 
     def show(self, env: int, serial: int) -> None:
         """Select an env and show a moment of its past."""
-        self.select_env(env)
+        self.change(selected_env=env)
         self.past.seek(serial)
 
     def close(self) -> None:
         """End the worker and the watcher, and wait for episodes that are being written."""
         stop_listening(self._say_failure)
         self._shared.close()
-        self._versions.close()
+        self.versions.close()
         self._policy_file.close()
         self._worker.stop()
         self._judge.close()
@@ -406,16 +354,16 @@ class Session:
     def _on_death(self, death: Death) -> None:
         self._recorder.stop()
         self.studio.interrupted()
-        problem, kept = self._versions.died(death, self._printed.tail(20))
+        problem, kept = self.versions.died(death, self._printed.tail(20))
         self._note()
         if problem is not None:
             self._on_event(Failed(problem, kept))
 
     def _on_busy(self, busy: Busy | None) -> None:
         with self._lock:
-            if busy is None and self._state.busy is None:
+            if busy is None and self._state.now.busy is None:
                 return
-            self._state.busy = busy
+            self._state.set(busy=busy)
         self._note()
 
     def _handle(self, event: Event) -> None:
@@ -435,7 +383,7 @@ class Session:
             if isinstance(event, get_args(CameraAnswer)):
                 self.studio.answered(event)  # type: ignore[arg-type]
             if isinstance(event, Failed):
-                self._versions.failed(event)
+                self.versions.failed(event)
                 if not self._state.problem_at_run:
                     self.studio.failed_to_load()
         self._note()
@@ -449,8 +397,8 @@ class Session:
             self._recorder.stop()
         with self._lock:
             s = self._state
-            restored, stale = self._versions.came_in(event.task)
-            meaning = what_a_load_means(s.task, event, self._judge.view)
+            restored, stale = self.versions.came_in(event.task)
+            meaning = what_a_load_means(s.now.task, event, self._judge.view)
             judgement = None
             if meaning == "judge" and s.timeline is not None:
                 judgement = Judgement(s.timeline.history)
@@ -458,13 +406,13 @@ class Session:
             level = None if event.reload is None else event.reload.level
             placed = self.studio.loaded(event.task, level)
         if judgement is not None:
-            load = self._versions.same_again()
+            load = self.versions.same_again()
             assert load is not None
             self._judge.judge(load, judgement)
         elif meaning == "forget":
             self._judge.forget()
-        self._versions.follow(event.task, stale)
-        self._watch()
+        self.versions.follow(event.task, stale)
+        self._send_settings()
         self.studio.ask_for(placed)
         if recording:
             self._record_on(event, recording, one_each)
@@ -480,7 +428,7 @@ class Session:
         elif not self._recorder.recording:
             # The moment is not to be lost: recording goes on with each env's next episode.
             with self._lock:
-                task = self._state.task
+                task = self._state.now.task
             if task is not None:
                 self._recorder.start(task, env_idx, one_each)
 
@@ -509,10 +457,10 @@ class Session:
 
     # --- small things --------------------------------------------------------------------------------
 
-    def _watch(self) -> None:
+    def _send_settings(self) -> None:
         with self._lock:
-            request = self._state.watch_request()
-        self._send(request)
+            settings = self._state.settings()
+        self._send(settings)
 
     def _send(self, request: Request) -> None:
         self._worker.send(request)

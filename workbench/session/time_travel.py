@@ -12,8 +12,8 @@ from collections.abc import Callable
 
 from workbench.session.camera_judging import ShownMoment
 from workbench.session.episode_moments import EpisodeMoment, moments_of_episode
+from workbench.session.live_state import SharedState
 from workbench.session.messages import Request, Restore
-from workbench.session.shared_state import SharedState
 from workbench.session.timeline import Scope, Strip, Timeline
 
 
@@ -48,14 +48,14 @@ class TimeTravel:
 
     def seek_event(self, direction: int) -> None:
         """Show the next (1) or last (-1) event of the selected env: reset, success, fail, truncation, branch."""
-        env = self._state.selected_env
+        env = self._env
         self._seek(lambda timeline: timeline.seek_event(env, direction))
 
     def draw(self) -> None:
         """Ask for pictures of the moment that is shown, if it has none of the cameras looked through."""
         with self._lock:
             s = self._state
-            request = None if s.timeline is None else s.timeline.draw(s.selected_env, s.cameras)
+            request = None if s.timeline is None else s.timeline.draw(self._env, s.now.settings.cameras)
         if request is not None:
             self._send(request)
 
@@ -76,20 +76,23 @@ class TimeTravel:
         """The selected env's past between two moments; None before a task is loaded."""
         with self._lock:
             s = self._state
-            return None if s.timeline is None else s.timeline.strip(s.selected_env, low, high)
+            return None if s.timeline is None else s.timeline.strip(self._env, low, high)
 
     def stretch(self) -> tuple[int, int] | None:
         """First and last moment of what the selected env lived through round the shown moment, without a jump."""
         with self._lock:
-            return self._state.stretch()
+            timeline = self._state.timeline
+            if timeline is None or not len(timeline.history):
+                return None
+            return timeline.history.stretch_at(self._env, timeline.at)
 
     def shown_moment(self) -> ShownMoment:
         """Which env is looked at, and where its bodies are if that is not live."""
         with self._lock:
             s = self._state
             shown = None if s.timeline is None else s.timeline.shown
-            count = 0 if s.task is None else s.task.num_envs
-            return ShownMoment(s.selected_env, count, None if shown is None else shown.step.poses)
+            count = 0 if s.now.task is None else s.now.task.num_envs
+            return ShownMoment(self._env, count, None if shown is None else shown.step.poses)
 
     def episode_moments(self, most: int) -> tuple[EpisodeMoment, ...]:
         """Moments, at the most so many, of the selected env's episode round the one that is shown."""
@@ -97,17 +100,29 @@ class TimeTravel:
             s = self._state
             if s.timeline is None or not len(s.timeline.history):
                 return ()
-            return moments_of_episode(s.timeline.history, s.selected_env, s.timeline.at, most)
+            return moments_of_episode(s.timeline.history, self._env, s.timeline.at, most)
+
+    @property
+    def _env(self) -> int:
+        return self._state.now.settings.selected_env
 
     def _seek(self, seek: Callable[[Timeline], None]) -> None:
         with self._lock:
-            moved = self._state.seek(seek)
-        if moved:
-            self._note()
+            timeline = self._state.timeline
+            if timeline is None:
+                return
+            before = timeline.shown
+            seek(timeline)
+            if timeline.shown is before:
+                return
+            self._state.new_pictures()
+        self._note()
 
     def _travel(self, ask: Callable[[Timeline, int], Restore | None]) -> None:
         with self._lock:
-            request = self._state.travel(ask)
+            timeline = self._state.timeline
+            request = None if timeline is None else ask(timeline, self._env)
+            self._state.new_pictures()
         if request is not None:
             self._send(request)
         self._note()

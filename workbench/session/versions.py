@@ -12,9 +12,9 @@ from pathlib import Path
 from workbench.authoring.problem import Problem
 from workbench.authoring.watch import SourceWatcher
 from workbench.session.kept_worker import Death
+from workbench.session.live_state import SharedState
 from workbench.session.messages import Failed, Load, LoadLevel, Play, Request, TaskDescription
 from workbench.session.recovery import Recovery, Wanted, is_on_disk
-from workbench.session.shared_state import SharedState
 
 
 class Versions:
@@ -43,32 +43,35 @@ class Versions:
     # --- what is asked for ---------------------------------------------------------------------------
 
     def reload(self, level: LoadLevel = "auto") -> None:
-        """See `Session.reload`."""
+        """Load the file again, by a level that is named whatever it may leave of the old version.
+
+        A worker that does not take it up (an endless loop) is interrupted or replaced.
+        """
         with self._shared.lock:
             state = self._shared.state
             request = state.load_request(self._recovery.file_asked(), level)
-            stopped = state.state == "stopped"
+            stopped = state.now.state == "stopped"
         if stopped:
             self._replace_worker()  # it will be greeted with the file
         else:
             self._send(request)
 
     def choose_class(self, name: str) -> None:
-        """See `Session.choose_class`."""
+        """Another task class of the same file, one that `TaskDescription.others` names."""
         with self._shared.lock:
             chosen = self._shared.state.choose_class(name)
         if chosen:
             self.reload()
 
     def open_file(self, file: Path, class_name: str) -> None:
-        """See `Session.open_file`."""
+        """Open a task class of another file in place of the one that is open, and follow that file."""
         with self._shared.lock:
             self._shared.state.open_file(file, class_name)
         self.start()
         self.reload()
 
     def restart_worker(self) -> None:
-        """See `Session.restart_worker`."""
+        """End the worker, whatever it is doing, and start another with the last good version where it was."""
         with self._shared.lock:
             self._recovery.restart_asked()
         self._replace_worker()
@@ -76,7 +79,7 @@ class Versions:
     def _on_files_changed(self, paths: set[Path]) -> None:
         self._on_save()
         with self._shared.changing() as state:
-            state.stale = True
+            state.set(stale=True)
             state.file_is_edited()
         self.reload()
 
@@ -86,7 +89,7 @@ class Versions:
         """Everything that a worker before this one knew."""
         with self._shared.lock:
             state = self._shared.state
-            requests = state.settings()
+            requests: list[Request] = [state.settings()]
             wanted = self._recovery.wanted()
             if wanted is not None:
                 requests.append(state.load_request(wanted))
@@ -94,7 +97,7 @@ class Versions:
                 state.waits_for_the_file()
             if state.wants_play:
                 requests.append(Play(True))
-            return [*requests, state.watch_request()]
+            return requests
 
     def own_files(self) -> list[str]:
         """The author's files, as far as they are known."""
@@ -104,7 +107,7 @@ class Versions:
     def same_again(self) -> Load | None:
         """How another worker gets the version that runs."""
         with self._shared.lock:
-            task = self._shared.state.task
+            task = self._shared.state.now.task
             return None if task is None else self._shared.state.load_request(_as_it_is(task))
 
     # --- what came of it -----------------------------------------------------------------------------
@@ -128,7 +131,7 @@ class Versions:
         with self._shared.lock:
             wanted = self._recovery.wanted() if self._recovery.failed(failed.kept) else None
             request = None if wanted is None else self._shared.state.load_request(wanted)
-            task = self._shared.state.task
+            task = self._shared.state.now.task
         if request is not None:
             self._send(request)
         if failed.problem.file is not None:
@@ -148,7 +151,7 @@ class Versions:
             while_loading = self._recovery.loading
             self._recovery.died(death.file_waits)
             problem = self._shared.state.died(death, while_loading, printed)
-            return problem, self._shared.state.task is not None
+            return problem, self._shared.state.now.task is not None
 
     def close(self) -> None:
         """Follow nothing any more."""

@@ -20,8 +20,8 @@ from workbench.session.judge import JudgementView
 from workbench.session.keep_status import KeepStatus
 from workbench.session.kept_worker import Vitals
 from workbench.session.last_words import Busy
-from workbench.session.messages import ActionSource, EpisodeEnd, ReloadReport, RulesBroken, TaskDescription
-from workbench.session.printed import Printed
+from workbench.session.messages import ReloadReport, RulesBroken, Settings, TaskDescription
+from workbench.session.printed import NOTHING_PRINTED, Printed
 from workbench.session.studio_view import StudioView
 from workbench.session.timeline import TimelineView
 
@@ -71,44 +71,41 @@ class RecordingStatus:
 
 @dataclass(frozen=True)
 class SessionView:
-    state: State
-    activity: str
+    state: State = "starting"
+    activity: str = ""
     """What is being done while starting or loading, else empty."""
-    stale: bool
+    stale: bool = False
     """The file on disk is newer than (or failed to become) the version that is shown."""
-    task: TaskDescription | None
-    task_serial: int
+    task: TaskDescription | None = None
+    task_serial: int = 0
     """Grows with every load that succeeded."""
-    scene_serial: int
+    scene_serial: int = 0
     """Grows with every scene: not with a version that was put on the one that is there."""
-    cameras_serial: int
+    cameras_serial: int = 0
     """Grows with every set of cameras."""
-    load_milliseconds: dict[str, float]
-    reload: ReloadReport | None
+    load_milliseconds: dict[str, float] = field(default_factory=dict)
+    reload: ReloadReport | None = None
     """How the version that is shown came in; None for the first."""
-    step: StepResult | None
+    choices: tuple[str, ...] = ()
+    """What can be chosen in the file, where it has several tasks: the one that was asked for first."""
+    step: StepResult | None = None
     """What is shown: the newest step, or a moment of the past (`timeline`)."""
-    step_serial: int
+    step_serial: int = 0
     """Number of the moment that is shown."""
-    pictures: dict[tuple[CameraKind, str], Picture]
-    pictures_serial: int
-    picture_milliseconds: float
-    problem: Problem | None
-    problem_serial: int
-    curves: Curves | None
-    selected_env: int
-    playing: bool
-    speed: float
-    seed: int
-    episode_end: EpisodeEnd
-    action_source: ActionSource
-    policy: str | None
-    sliders: tuple[float, ...]
-    steps_per_second: float
-    real_time_factor: float
-    recording: RecordingStatus
-    printed: Printed
-    """The last lines that the author's code printed."""
+    pictures: dict[tuple[CameraKind, str], Picture] = field(default_factory=dict)
+    pictures_serial: int = 0
+    picture_milliseconds: float = 0.0
+    problem: Problem | None = None
+    problem_serial: int = 0
+    refused: Problem | None = None
+    """Why what the file holds does not run, while another version does or none."""
+    curves: Curves | None = None
+    settings: Settings = Settings()
+    """What pages chose."""
+    seed: int = 0
+    playing: bool = False
+    steps_per_second: float = 0.0
+    real_time_factor: float = 0.0
     timeline: TimelineView = TimelineView()
     """The past. While a moment of it is shown, `step` and `pictures` are of that moment."""
     busy: Busy | None = None
@@ -116,15 +113,19 @@ class SessionView:
     rules: RulesBroken | None = None
     """What the version that is shown has broken of the rules of GPU simulation; None while nothing."""
     rules_serial: int = 0
-    vitals: Vitals = field(default_factory=Vitals)
-    """What the processes hold."""
     inspection: Inspection | None = None
     """The newest answer to `Session.inspect`, of whichever env was selected then."""
+    recording: RecordingStatus = RecordingStatus()
+    printed: Printed = NOTHING_PRINTED
+    """The last lines that the author's code printed."""
+    vitals: Vitals = Vitals()
+    """What the processes hold."""
     judgement: JudgementView = JudgementView()
     """What the new code says of the episodes that were run with the old."""
-    refused: Problem | None = None
-    """Why what the file holds does not run, while another version does or none."""
-    choices: tuple[str, ...] = ()
-    """What can be chosen in the file, where it has several tasks: the one that was asked for first."""
     studio: StudioView = StudioView()
     """Cameras, as they are placed by hand."""
+
+    @property
+    def selected_env(self) -> int:
+        """Whose pictures and numbers are shown."""
+        return self.settings.selected_env

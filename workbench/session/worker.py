@@ -48,7 +48,6 @@ from workbench.session.messages import (
     SCENE_KEPT,
     DebuggerListens,
     DrawPast,
-    EpisodeEnd,
     Failed,
     Inspect,
     ListenForDebugger,
@@ -58,22 +57,19 @@ from workbench.session.messages import (
     PlaceCamera,
     Play,
     Quit,
+    ReadPolicyAgain,
     ReloadReport,
     Reset,
     Restore,
     Restored,
     RulesBroken,
-    SetActionSource,
     SetCapture,
-    SetEpisodeEnd,
-    SetSliders,
-    SetSpeed,
+    Settings,
     SingleStep,
     Status,
     StepBack,
     WarmedUp,
     WarmUp,
-    WatchCameras,
 )
 from workbench.session.moment_messages import CaptureMoments, JudgeMoments
 from workbench.session.open_task import OpenedTask, reset_checked, step_checked
@@ -109,7 +105,7 @@ class Worker:
         self._playing = False
         self._started_in = CurrentFolder()
         self._acting = Acting(self._started_in)
-        self._episode_end: EpisodeEnd = "reset"
+        self._settings = Settings()
         self._pacer = Pacer(0.05)
         self._rate = Rate()
         self._status_sent = 0.0
@@ -122,11 +118,8 @@ class Worker:
             Play: self._play,
             SingleStep: lambda request: self._control_step(),
             Reset: self._reset,
-            SetSpeed: self._set_speed,
-            SetEpisodeEnd: self._set_episode_end,
-            SetActionSource: self._set_action_source,
-            SetSliders: self._set_sliders,
-            WatchCameras: self._cameras.watch,
+            Settings: self._change,
+            ReadPolicyAgain: self._read_policy_again,
             PlaceCamera: self._cameras.place,
             DrawCamera: self._cameras.answer,
             JudgeCamera: self._cameras.answer,
@@ -219,6 +212,8 @@ class Worker:
         if report is None or not report.carried:
             self._acting.seed(request.options.seed)
         self._rate.clear()
+        # Those of the scene before; the server, which hears of the new one later, says the same.
+        self._settings = replace(self._settings, sliders=())
         self._acting.sliders = ()
         self._cameras.look_again()
         self._steps.new_scene()
@@ -260,28 +255,37 @@ class Worker:
         seed = self._acting.fresh_seeds(count) if request.seed is None and count else request.seed
         self._held.guarded(lambda opened: self._reset_envs(opened, request.env_idx, seed))
 
-    def _set_speed(self, request: SetSpeed) -> None:
-        self._pacer.speed = request.speed
-        self._pacer.start(time.monotonic())
+    def _change(self, new: Settings) -> None:
+        old, self._settings = self._settings, new
+        if new.speed != old.speed:
+            self._pacer.speed = new.speed
+            self._pacer.start(time.monotonic())
+        self._acting.sliders = new.sliders
+        self._cameras.watch(new.selected_env, new.cameras)
+        if (new.action_source, new.policy, new.policy_folder) != (
+            old.action_source,
+            old.policy,
+            old.policy_folder,
+        ):
+            self._held.at_work("importing the policy", self._take_actions)
 
-    def _set_episode_end(self, request: SetEpisodeEnd) -> None:
-        self._episode_end = request.rule
-
-    def _set_action_source(self, request: SetActionSource) -> None:
+    def _take_actions(self) -> bool:
+        """From where the settings say. Whether they can be had from there."""
+        s = self._settings
         try:
-            beside = None if request.beside is None else Path(request.beside)
-            self._acting.use(request.source, request.policy, beside)
+            beside = None if s.policy_folder is None else Path(s.policy_folder)
+            self._acting.use(s.action_source, s.policy, beside)
         except TaskError as error:
             self._held.drop_steps_if_left(error)
             # Before a task is loaded it would pass for a failure of the load; the first step says it.
             if self._held.opened is not None:
                 self._held.fail(error.problem)
-            return
-        if request.play and not self._playing:
-            self._play(Play(True))
+            return False
+        return True
 
-    def _set_sliders(self, request: SetSliders) -> None:
-        self._acting.sliders = request.action
+    def _read_policy_again(self, request: ReadPolicyAgain) -> None:
+        if self._take_actions() and request.play and not self._playing:
+            self._play(Play(True))
 
     def _set_capture(self, request: SetCapture) -> None:
         self._steps.capture(request.env_idx, request.from_reset)
@@ -325,9 +329,9 @@ class Worker:
         ended = np.flatnonzero(step.terminated | step.truncated)
         if len(ended) == 0:
             return
-        if self._episode_end == "reset":
+        if self._settings.episode_end == "reset":
             self._reset_envs(opened, tuple(int(i) for i in ended), self._acting.fresh_seeds(len(ended)))
-        elif self._episode_end == "pause":
+        elif self._settings.episode_end == "pause":
             self._pause()
 
     def _reset_envs(
@@ -466,7 +470,7 @@ _DOING: dict[type, Doing] = {
     Reset: "resetting",
     Restore: "resetting",
     StepBack: "resetting",
-    SetActionSource: "importing the policy",
+    ReadPolicyAgain: "importing the policy",
     WarmUp: "warming up",
     ListenForDebugger: "starting",
 }

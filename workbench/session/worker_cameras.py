@@ -22,12 +22,12 @@ from workbench.session.capture_moments import capture_moments
 from workbench.session.held_task import HeldTask
 from workbench.session.interrupts import Interrupts
 from workbench.session.messages import (
+    CameraRequest,
     DrawPast,
     PastPictures,
     Pictures,
     PlaceCamera,
     Placed,
-    WatchCameras,
 )
 from workbench.session.moment_messages import CaptureMoments
 from workbench.session.open_task import OpenedTask, blamed
@@ -56,7 +56,8 @@ class WorkerCameras:
         """
         self._held, self._line, self._interrupts = held, line, interrupts
         self._pulse, self._steps, self._on_first = pulse, steps, on_first
-        self._watch = WatchCameras(0, ())
+        self._watched: tuple[int, tuple[CameraRequest, ...]] = 0, ()
+        """The env, and its cameras, whose pictures are kept being made."""
         self._pictures = PictureMaker()
         self._placed = PlacedCameras()
         self._to_place: dict[CameraKey, PlaceCamera] = {}
@@ -64,10 +65,10 @@ class WorkerCameras:
 
     # --- what is asked -------------------------------------------------------------------------------
 
-    def watch(self, request: WatchCameras) -> None:
-        # The server says it again after every load, when the first picture is under way already.
-        if request != self._watch:
-            self._watch = request
+    def watch(self, env: int, cameras: tuple[CameraRequest, ...]) -> None:
+        # It is said with every setting, also when the first picture is under way already.
+        if (env, cameras) != self._watched:
+            self._watched = env, cameras
             self.look_again()
 
     def place(self, request: PlaceCamera) -> None:
@@ -114,10 +115,11 @@ class WorkerCameras:
         if opened is None:
             return
         known = {(camera.name, camera.kind) for camera in opened.description.cameras}
+        env, cameras = self._watched
         wanted: list[PictureRequest] = [
-            (c.name, c.kind, c.modalities) for c in self._watch.cameras if (c.name, c.kind) in known
+            (c.name, c.kind, c.modalities) for c in cameras if (c.name, c.kind) in known
         ]
-        self._pictures.watch(min(self._watch.env, opened.env.num_envs - 1), wanted)
+        self._pictures.watch(min(env, opened.env.num_envs - 1), wanted)
 
     def scene_changed(self) -> None:
         """What was drawn is old."""
@@ -171,8 +173,7 @@ class WorkerCameras:
         try:
             made = self._pictures.poll(opened.env, time.monotonic())
         except RuntimeError as error:
-            self._watch = WatchCameras(0, ())
-            self._pictures.watch(0, ())
+            self._pictures.watch(0, ())  # until others are asked for, or another version is loaded
             self._held.fail(problem_from_exception(error, "pictures", opened.loaded.source_files))
             return
         if made is None:

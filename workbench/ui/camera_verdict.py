@@ -209,7 +209,7 @@ class CameraVerdict:
     def _go(self, env: int) -> None:
         task = self._session.view().task
         if task is not None and env < task.num_envs:  # a version with fewer envs may have been loaded since
-            self._session.select_env(env)
+            self._session.change(selected_env=env)
 
 
 def report_html(

@@ -51,7 +51,7 @@ class _Camera:
 class MakesPictures(Protocol):
     """Who is asked for pictures: a session, which renders them, or a review, which decodes them."""
 
-    def watch_cameras(self, cameras: tuple[CameraRequest, ...]) -> None: ...
+    def change(self, *, cameras: tuple[CameraRequest, ...]) -> None: ...
 
 
 class CamerasPanel(Part[SessionView]):
@@ -184,7 +184,7 @@ class CamerasPanel(Part[SessionView]):
         )
         if wanted != self._asked:
             self._asked = wanted
-            self._session.watch_cameras(wanted)
+            self._session.change(cameras=wanted)
         for camera in self._cameras.values():
             for modality, tick in camera.ticks.items():
                 shown = tick.value is True

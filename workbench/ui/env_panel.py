@@ -306,7 +306,7 @@ class EnvPanel(Part[SessionView]):
         rows = self._session.env_rows()
         if rows is None or env >= rows.num_envs:
             return  # a version with fewer envs was loaded since the table was drawn
-        self._session.select_env(env)
+        self._session.change(selected_env=env)
         step = moment_of(rows, env)
         if step is not None:
             self._session.past.seek_step(env, step)

@@ -123,7 +123,7 @@ class JudgementPanel(Part[SessionView]):
         if episode.at >= self._session.view().timeline.first:
             self._session.show(episode.env, episode.at)
         else:
-            self._session.select_env(episode.env)
+            self._session.change(selected_env=episode.env)
 
     def go_to_difference(self, by: int) -> None:
         """Show the next (1) or last (-1) moment of the list, from the one that is shown; round the end."""

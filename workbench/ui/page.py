@@ -97,8 +97,8 @@ class Page:
         run_tab, in_tabs = self._add_tabs(dark)
         self._timeline = TimelinePanel(server, session, clock)
         self._add_table_of_envs()
-        banner = Banner(server, session.reload, session.restart_worker)
-        busy_banner = BusyBanner(server, session.interrupt, session.restart_worker)
+        banner = Banner(server, session.versions.reload, session.versions.restart_worker)
+        busy_banner = BusyBanner(server, session.interrupt, session.versions.restart_worker)
         floating = self._envs, self._timeline, banner, busy_banner
         self._parts = Parts((status, self._rules, *in_tabs, *floating), clock)
 
@@ -268,7 +268,7 @@ class Page:
             return
         env = env_under_ray(layout, *ray)
         if env is not None and env < view.task.num_envs:
-            self._session.select_env(env)
+            self._session.change(selected_env=env)
 
     # --- keys ------------------------------------------------------------------------------------
 
@@ -308,9 +308,9 @@ class Page:
             Command("Start or stop recording", self._record.toggle, "C"),
             Command("Keep what I just saw", self._record.keep, "C", "shift"),
             Command("Open or close the list of warnings", self._rules.toggle, "W"),
-            Command("Load the file again", session.reload, "L"),
+            Command("Load the file again", session.versions.reload, "L"),
             Command("Interrupt what the task is doing", session.interrupt, "I"),
-            Command("Restart the worker", session.restart_worker, "L", "shift"),
+            Command("Restart the worker", session.versions.restart_worker, "L", "shift"),
             Command("Dark or light", self._view_panel.toggle_dark, "D"),
             *self._studio.commands(),
         ]

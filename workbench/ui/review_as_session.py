@@ -15,10 +15,9 @@ from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.core.step import StepResult
 from workbench.recording.episode import Episode
-from workbench.session.messages import TaskDescription
-from workbench.session.printed import NOTHING_PRINTED
+from workbench.session.messages import Settings, TaskDescription
 from workbench.session.review_view import ReviewView
-from workbench.session.view import RecordingStatus, SessionView
+from workbench.session.view import SessionView
 
 NO_GEOMETRY = SceneGeometry(0, (), (), (), ())
 
@@ -40,35 +39,19 @@ def as_session_view(
     task = described(chosen.episode, len(view.opened), cameras)
     return SessionView(
         state="running" if view.playing else "paused",
-        activity="",
-        stale=False,
         task=task,
         task_serial=view.opened_serial,
         scene_serial=view.opened_serial,
         # Each recording brings its own cameras.
         cameras_serial=view.opened_serial * 1000 + view.selected,
-        load_milliseconds={},
-        reload=None,
         step=step_of(chosen.episode, view.states[view.selected]),
         step_serial=view.position,
         pictures=pictures,
         pictures_serial=pictures_serial,
         picture_milliseconds=math.nan,
-        problem=None,
-        problem_serial=0,
-        curves=None,
-        selected_env=view.selected,
-        playing=view.playing,
-        speed=view.speed,
+        settings=Settings(view.speed, selected_env=view.selected),
         seed=chosen.episode.info.seed,
-        episode_end="continue",
-        action_source="hold",
-        policy=None,
-        sliders=(),
-        steps_per_second=0.0,
-        real_time_factor=0.0,
-        recording=RecordingStatus(),
-        printed=NOTHING_PRINTED,
+        playing=view.playing,
     )
 
 

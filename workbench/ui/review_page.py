@@ -305,7 +305,7 @@ class ReviewPage:
 
     # --- cameras -----------------------------------------------------------------------------------
 
-    def watch_cameras(self, cameras: tuple[CameraRequest, ...]) -> None:
+    def change(self, *, cameras: tuple[CameraRequest, ...]) -> None:
         """Which pictures to decode: the Cameras tab asks as it asks the session."""
         self._requests = cameras
 

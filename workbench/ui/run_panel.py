@@ -76,10 +76,10 @@ class ActionSliders:
         for dimension, control in zip(self._dimensions, self._controls, strict=True):
             low, high = slider_bounds(dimension)
             values.append(checked_number(control.handle.value, low, high, dimension.name))
-        self._session.set_sliders(tuple(values))
+        self._session.change(sliders=tuple(values))
 
     def _send_centre(self) -> None:
-        self._session.set_sliders(tuple(sum(slider_bounds(d)) / 2 for d in self._dimensions))
+        self._session.change(sliders=tuple(sum(slider_bounds(d)) / 2 for d in self._dimensions))
 
 
 def slider_bounds(dimension: ActionDimension) -> tuple[float, float]:
@@ -131,7 +131,7 @@ class RunPanel(Part[SessionView]):
             self._env = Control(
                 gui.add_slider("Selected", min=0, max=1, step=1, initial_value=0),
                 read=lambda value: checked_int(value, 0, self._num_envs() - 1, "env"),
-                send=session.select_env,
+                send=lambda env: session.change(selected_env=env),
             )
             self._neighbours = gui.add_button_group("", (PREVIOUS, NEXT))
             self._neighbours.on_click(
@@ -144,7 +144,7 @@ class RunPanel(Part[SessionView]):
                     "Speed", tuple(SPEEDS), initial_value="1 ×", hint="Simulated seconds in one second."
                 ),
                 read=lambda value: SPEEDS[value],
-                send=session.set_speed,
+                send=lambda speed: session.change(speed=speed),
                 shown=self._speed_shown,
             )
             self._seed = Control(
@@ -158,7 +158,7 @@ class RunPanel(Part[SessionView]):
             self._end = Control(
                 gui.add_dropdown("At its end", tuple(EPISODE_ENDS), initial_value="reset that env"),
                 read=lambda value: EPISODE_ENDS[value],
-                send=session.set_episode_end,
+                send=lambda rule: session.change(episode_end=rule),
                 shown=lambda rule: _name_of(EPISODE_ENDS, rule),
             )
 
@@ -174,7 +174,7 @@ class RunPanel(Part[SessionView]):
                     "Policy", "", hint="module:function or file.py:function, given obs, returns the action."
                 ),
                 read=self._read_policy,
-                send=lambda policy: session.set_action_source("policy", policy or None),
+                send=lambda policy: session.change(action_source="policy", policy=policy or None),
                 settle=0.8,
             )
             self._policy_hint = gui.add_html(
@@ -197,7 +197,7 @@ class RunPanel(Part[SessionView]):
     def select_neighbour(self, step: int) -> None:
         """The next (1) or previous (-1) env, round the end."""
         count = self._num_envs()
-        self._session.select_env((self._session.view().selected_env + step) % count)
+        self._session.change(selected_env=(self._session.view().selected_env + step) % count)
 
     def _on_transport(self, event: viser.GuiEvent) -> None:
         actions = {
@@ -218,22 +218,22 @@ class RunPanel(Part[SessionView]):
             several = view.task.num_envs > 1
             self._env_folder.visible = several
             self._env.handle.max = max(1, view.task.num_envs - 1)
-            self._sliders.build(view.task.actions, view.sliders)
+            self._sliders.build(view.task.actions, view.settings.sliders)
         self._draw_play(view.playing, can_act)
         # viser cannot grey out a group of buttons; one that does nothing must not be there.
         self._transport.visible = can_act
         for control in (self._env, self._speed, self._seed, self._end, self._source, self._policy):
             control.enable(can_act)
         self._env.show(view.selected_env)
-        self._speed.show(view.speed)
+        self._speed.show(view.settings.speed)
         self._seed.show(view.seed)
-        self._end.show(view.episode_end)
-        self._source.show(view.action_source)
-        self._policy.show(view.policy or "")
-        policy_wanted = view.action_source == "policy"
+        self._end.show(view.settings.episode_end)
+        self._source.show(view.settings.action_source)
+        self._policy.show(view.settings.policy or "")
+        policy_wanted = view.settings.action_source == "policy"
         self._policy.handle.visible = policy_wanted
-        self._policy_hint.visible = policy_wanted and not view.policy
-        self._sliders.draw(view.action_source == "sliders", view.sliders)
+        self._policy_hint.visible = policy_wanted and not view.settings.policy
+        self._sliders.draw(view.settings.action_source == "sliders", view.settings.sliders)
 
     def _draw_play(self, playing: bool, can_act: bool) -> None:
         self._play.label = "Pause" if playing else "Play"
@@ -259,7 +259,7 @@ class RunPanel(Part[SessionView]):
     def _choose_source(self, source: ActionSource) -> None:
         # A policy that is not named yet is a source all the same: a step says what is missing.
         policy = self._policy.handle.value.strip() if source == "policy" else ""
-        self._session.set_action_source(source, policy or None)
+        self._session.change(action_source=source, policy=policy or None)
 
     def _read_policy(self, value: object) -> str:
         text = checked_text(value, 500, "policy").strip()

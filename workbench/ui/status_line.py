@@ -147,8 +147,10 @@ def status_values(view: SessionView, fresh: bool = False, marked: bool = False) 
         if task is None
         else f"{view.steps_per_second * task.num_envs:,.0f}".replace(",", " "),
         "real_time_factor": f"{view.real_time_factor:.2f}",
-        "behind": moving and view.speed != float("inf") and view.real_time_factor < 0.85 * view.speed,
-        "speed": f"{view.speed:g}",
+        "behind": moving
+        and view.settings.speed != float("inf")
+        and view.real_time_factor < 0.85 * view.settings.speed,
+        "speed": f"{view.settings.speed:g}",
         "marked": marked,
     }
 

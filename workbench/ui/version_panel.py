@@ -43,7 +43,7 @@ class VersionPanel(Part[SessionView]):
             self._task = Control(
                 add_dropdown("Task", self._names, visible=False, hint="The file has several tasks."),
                 read=lambda value: checked_choice(value, self._names, "task"),
-                send=session.choose_class,
+                send=session.versions.choose_class,
             )
             self._html = server.gui.add_html("")
             self._again = server.gui.add_button_group(
@@ -71,7 +71,7 @@ class VersionPanel(Part[SessionView]):
         self._html.content = version_html(view.reload, task is not None, refused, notices)
 
     def _load(self, value: str) -> None:
-        self._session.reload(LEVELS[value])
+        self._session.versions.reload(LEVELS[value])
 
 
 def version_html(
