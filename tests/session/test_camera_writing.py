@@ -295,8 +295,13 @@ def test_what_the_constructor_sets_is_edited_there_and_the_batch_stands_as_it_st
     text = text.replace("look_at(eye=[0.45, 0, 0.6],", "look_at(eye=self.eye,")
     assert text.count("self.eye") == 2
     task_file.write_text(text)
-    wait_until(session, lambda v: v.task.source[str(task_file)] == text, "the version with a constructor")
-    step = session.view().step
+    # The first moment of its scene comes behind it.
+    view = wait_until(
+        session,
+        lambda v: v.task.source[str(task_file)] == text and v.timeline.moments == 1,
+        "the version with a constructor",
+    )
+    step = view.step
     wanted = replace(there(session, BASE), position=(0.45, 0.1, 0.7))
     session.studio.place(BASE, wanted)
     session.studio.file.plan_write(BASE)
