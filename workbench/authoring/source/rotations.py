@@ -41,7 +41,9 @@ def look_at(
     eye: Sequence[float], target: Sequence[float], up: Sequence[float] = (0, 0, 1)
 ) -> Quaternion | None:
     """The orientation of ManiSkill's ``look_at``; None straight along `up`, where that gives none."""
-    forward, upward = np.subtract(target, eye), np.asarray(up, float)
+    # It takes floats of 32 bits: of an eye nearly above its target their rounding turns the picture.
+    seen = np.asarray(target, np.float32).astype(float), np.asarray(eye, np.float32).astype(float)
+    forward, upward = np.subtract(*seen), np.asarray(up, float)
     left = np.cross(upward, forward)
     if np.linalg.norm(left) < 1e-6 * max(1e-6, float(np.linalg.norm(forward) * np.linalg.norm(upward))):
         return None
