@@ -49,7 +49,6 @@ PLANTED = (
         "workbench",
         "sitecustomize",
         "usercustomize",
-        "libcst",
         "pyarrow",
         "PIL",
         "select",

@@ -23,13 +23,7 @@ def desk(example_without_pictures: At, browser: Browser) -> Iterator[Desk]:
     with example_without_pictures(browser, height=1000) as desk:
         page = desk.page
         page.get_by_role("button", name="Play", exact=True).click()
-        strip = page.locator(".wb-timeline")
-
-        def kept() -> int:
-            found = re.search(r"MB, (\d+) steps", strip.inner_text())
-            return 0 if found is None else int(found.group(1))
-
-        until(lambda: kept() > STEPS, "some steps")
+        until(lambda: desk.moments_kept() > STEPS, "some steps")
         page.get_by_role("button", name="Pause", exact=True).click()
         expect(page.get_by_text("paused", exact=True)).to_be_visible()
         page.get_by_role("button", name="Reset all", exact=True).click()

@@ -37,9 +37,13 @@ def desk(opened: Desk) -> Desk:
         opened.press("s")
         opened.comes_to(step)
     opened.timeline_says("live")
-    # The slider's range follows a moment later, and would go over a hand that is there already.
-    time.sleep(RANGE_EVERY)
+    wait_for_the_range()
     return opened
+
+
+def wait_for_the_range() -> None:
+    """The slider's range follows a moment later, and would go over a hand that is there already."""
+    time.sleep(RANGE_EVERY)
 
 
 def test_arrow_keys_walk_through_the_past_and_end_is_live(desk: Desk) -> None:
@@ -160,9 +164,12 @@ def test_a_number_is_taken_when_it_has_been_typed_and_else_what_holds_is_shown_a
     page.keyboard.press("ArrowUp")
     expect(seed).to_have_value("101")
     empty(seed)
+    kept = desk.moments_kept()
     page.keyboard.type("0")
     page.get_by_role("tab", name="Reward").click()
     desk.leave_inputs()
+    until(lambda: desk.moments_kept() > kept, "the reset with seed 0, for which a seed waits a moment")
+    wait_for_the_range()
     page.get_by_role("tab", name="Run").click()
     expect(seed).to_have_value("0")
 

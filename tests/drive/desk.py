@@ -55,6 +55,11 @@ class Desk:
     def timeline_says(self, text: str) -> None:
         expect(self.page.locator(".wb-timeline").get_by_text(re.compile(text)).first).to_be_visible()
 
+    def moments_kept(self) -> int:
+        """Steps and resets that the timeline says it has."""
+        found = re.search(r"MB, (\d+) steps", self.page.locator(".wb-timeline").inner_text())
+        return 0 if found is None else int(found[1])
+
     def box(self, what: str) -> FloatRect:
         """Where it lies on the page, in pixels."""
         place = self.page.locator(what).last

@@ -3,8 +3,6 @@
 To know what a save changed, two versions of a file are compared by what they define: functions, methods,
 constants, class attributes, imports. Each is kept as the dump of its syntax tree, so comments, docstrings,
 layout and place make no difference; and with the names that it mentions, which say whom it may reach.
-`ast` and not libcst: what makes libcst worth its price, that it keeps every blank and comment, is just what has
-to be forgotten here.
 
 Names are only names. ``x.reset`` may be anybody's ``reset``, so it is taken to be everybody's, in all files;
 and a string that could be a name is one (``getattr(self, "reset")``). Where not even that is enough, because a

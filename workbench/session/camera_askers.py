@@ -37,44 +37,46 @@ Kind = TypeVar("Kind", bound=Event)
 
 
 class LiveAsker:
-    """Asks the worker that plays."""
+    """Asks the worker that plays: any number of questions at a time, from any threads, each with its own answer."""
 
-    def __init__(self, send: Callable[[Request], None], first: int = 1) -> None:
+    def __init__(self, send: Callable[[Request], None]) -> None:
+        self._send = send
+        self._numbers = count(1)
+        self._condition = threading.Condition()
+        self._answers: dict[int, CameraAnswer | None] = {}
+        """Of the questions under way, by number; None for those without one yet."""
+
+    def ask(self, question: CameraQuestion, check: Callable[[], None], kind: type[Kind]) -> Kind:
         """
         Args:
-            first: number of its first question.
-        """
-        self._send = send
-        self._numbers = count(first)
-        self._condition = threading.Condition()
-        self._answer: CameraAnswer | None = None
-        self._awaited = 0
+            check: called often meanwhile; what it raises ends the question, whose answer is then dropped.
 
-    def ask(self, question: CameraQuestion, job: Job, kind: type[Kind]) -> Kind:
-        """
         Raises:
-            Stopped: the job is to stop.
             JobFailed: it cannot be answered.
         """
         with self._condition:
-            self._awaited, self._answer = next(self._numbers), None
-            question = replace(question, number=self._awaited)
-        self._send(question)
-        while True:
-            job.check()
+            number = next(self._numbers)
+            self._answers[number] = None
+        try:
+            self._send(replace(question, number=number))
+            while True:
+                check()
+                with self._condition:
+                    self._condition.wait_for(lambda: self._answers[number] is not None, _LOOK)
+                    answer = self._answers[number]
+                if isinstance(answer, CameraQuestionFailed):
+                    raise JobFailed(answer.why)
+                if isinstance(answer, kind):
+                    return answer
+        finally:
             with self._condition:
-                self._condition.wait_for(lambda: self._answer is not None, _LOOK)
-                answer = self._answer
-            if isinstance(answer, CameraQuestionFailed):
-                raise JobFailed(answer.why)
-            if isinstance(answer, kind):
-                return answer
+                del self._answers[number]
 
     def take(self, answer: CameraAnswer) -> None:
         """What the worker said."""
         with self._condition:
-            if answer.number == self._awaited:
-                self._answer = answer
+            if answer.number in self._answers:
+                self._answers[answer.number] = answer
                 self._condition.notify_all()
 
 
@@ -113,7 +115,11 @@ class BackgroundAsker:
         kind: type[Kind],
         on_search: Callable[[Searching], None] = lambda at: None,
     ) -> Kind:
-        """Raises as `LiveAsker.ask`."""
+        """
+        Raises:
+            Stopped: the job is to stop.
+            JobFailed: it cannot be answered.
+        """
         return self._request(replace(question, number=next(self._numbers)), job, kind, on_search)
 
     def end(self) -> None:

@@ -22,7 +22,6 @@ from workbench.core.camera_suggestion import OfferedPlacement
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.session.camera_askers import BackgroundAsker, LiveAsker
 from workbench.session.camera_messages import (
-    CameraAnswer,
     CameraJudged,
     CameraPictures,
     DrawCamera,
@@ -32,7 +31,7 @@ from workbench.session.camera_messages import (
 )
 from workbench.session.episode_moments import EpisodeMoment
 from workbench.session.lane import Job, Lane
-from workbench.session.messages import Load, Request
+from workbench.session.messages import Load
 from workbench.session.studio_view import JudgedMoment, Picked, Progress
 
 FIRST_SEED = 10_000
@@ -78,16 +77,16 @@ class Looked:
 class CameraJudging:
     """Thread-safe; every method returns at once."""
 
-    def __init__(self, send: Callable[[Request], None], on_change: Callable[[], None]) -> None:
+    def __init__(self, asker: LiveAsker, on_change: Callable[[], None]) -> None:
         """
         Args:
-            send: to the worker that plays.
+            asker: asks the worker that plays.
             on_change: called, on any thread, when there is something new.
         """
         self._on_change = on_change
         self._lock = threading.Lock()
         self._looked = Looked()
-        self._live, self._background = LiveAsker(send), BackgroundAsker()
+        self._live, self._background = asker, BackgroundAsker()
         self._live_lane = Lane("studio-live", on_change, self._failed)
         self._background_lane = Lane(
             "studio-background", on_change, self._failed, _IDLE_SECONDS, self._background.end
@@ -104,10 +103,6 @@ class CameraJudging:
     def progress(self) -> Progress | None:
         return self._background_lane.progress or self._live_lane.progress
 
-    def take(self, answer: CameraAnswer) -> None:
-        """The worker that plays answered."""
-        self._live.take(answer)
-
     # --- jobs ------------------------------------------------------------------------------------------
 
     def judge(self, key: CameraKey, now: CameraSettings | None, moment: ShownMoment) -> None:
@@ -119,7 +114,7 @@ class CameraJudging:
                 for env in range(moment.num_envs):
                     job.tell(env, moment.num_envs)
                     question = JudgeCamera(0, key, None, (env,), moment.poses)
-                    reports.append(self._live.ask(question, job, CameraJudged).report)
+                    reports.append(self._live.ask(question, job.check, CameraJudged).report)
                 self._know_report(key, now, join_reports(reports), 0)
 
         self._live_lane.start(f"judging {key[1]} in all envs", work)
@@ -136,7 +131,7 @@ class CameraJudging:
                 for moment in moments:
                     job.tell(len(done), len(moments))
                     question = JudgeCamera(0, key, None, (moment.env,), moment.poses)
-                    reports.append(self._live.ask(question, job, CameraJudged).report)
+                    reports.append(self._live.ask(question, job.check, CameraJudged).report)
                     done.append(JudgedMoment(moment.serial, moment.env, moment.step))
                     if len(done) % _TELL_EVERY == 0 or len(done) == len(moments):
                         self._know_report(key, now, join_reports(reports), 0, tuple(done))
@@ -261,7 +256,7 @@ class CameraJudging:
         modalities: tuple[str, ...] = ("rgb",),
     ) -> Picture:
         question = DrawCamera(0, key, settings, (env,), modalities, moment.poses)
-        return self._live.ask(question, job, CameraPictures).pictures[0]
+        return self._live.ask(question, job.check, CameraPictures).pictures[0]
 
     def _know_report(
         self,

@@ -27,6 +27,7 @@ from workbench.core.camera_settings import (
 )
 from workbench.core.step import StepResult
 from workbench.session import camera_in_words
+from workbench.session.camera_askers import LiveAsker
 from workbench.session.camera_judging import CameraJudging, ShownMoment
 from workbench.session.camera_messages import CameraAnswer
 from workbench.session.episode_moments import EpisodeMoment
@@ -66,13 +67,14 @@ class CameraStudio:
         self._episode = episode
         self._cameras = StudioCameras()
         self._lock = self._cameras.lock
-        self.file = StudioFile(self._cameras, self._note, open_copy, send, load)
+        self._asker = LiveAsker(send)
+        self.file = StudioFile(self._cameras, self._note, open_copy, self._asker, load)
         self._asking = threading.Lock()
         """Held while placements are sent; taken before `_lock`."""
         self._serial = 0
-        self._judging = CameraJudging(send, self._note)
-        self._quick = QuickLook(send, self._note)
-        self._first = FirstSight(send, self._note)
+        self._judging = CameraJudging(self._asker, self._note)
+        self._quick = QuickLook(self._asker, self._note)
+        self._first = FirstSight(self._asker, self._note)
 
     # --- placing -------------------------------------------------------------------------------------
 
@@ -358,10 +360,7 @@ class CameraStudio:
 
     def answered(self, answer: CameraAnswer) -> None:
         """The worker that plays answered a question about a camera."""
-        self._judging.take(answer)
-        self._quick.take(answer)
-        self._first.take(answer)
-        self.file.take(answer)
+        self._asker.take(answer)
 
     def interrupted(self) -> None:
         """The file was saved, or the worker is gone: what is under way is about what there was before."""

@@ -4,7 +4,8 @@ What was written is believed only when it was seen: the reload builds the camera
 is compared number by number with what the edit was to say. A difference is told as the error that it is.
 
 Plans are made of the files as they are on disk at that moment, since that is what is edited; the worker runs them, and
-what comes of the plan, and if they say something else of the camera than the env has, the plan is refused. None of this runs on the page's thread, and nothing here is thread-safe.
+what comes of the plan, and if they say something else of the camera than the env has, the plan is refused. None of
+this runs on the page's thread, and nothing here is thread-safe.
 """
 
 from __future__ import annotations

@@ -13,12 +13,9 @@ from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.pictures import Picture
 from workbench.session.camera_askers import LiveAsker
 from workbench.session.camera_judging import ShownMoment
-from workbench.session.camera_messages import CameraAnswer, CameraPictures, DrawCamera
+from workbench.session.camera_messages import CameraPictures, DrawCamera
 from workbench.session.lane import Job, Lane
-from workbench.session.messages import Request
 
-_FIRST_NUMBER = 2_000_000_000
-"""Of the questions asked here: other askers count from lower ones, and all hear all answers."""
 _LARGEST = 256
 """Pixels of the picture's shorter side."""
 
@@ -26,10 +23,10 @@ _LARGEST = 256
 class FirstSight:
     """Thread-safe; every method returns at once."""
 
-    def __init__(self, send: Callable[[Request], None], on_change: Callable[[], None]) -> None:
+    def __init__(self, asker: LiveAsker, on_change: Callable[[], None]) -> None:
         self._on_change = on_change
         self._lock = threading.Lock()
-        self._asker = LiveAsker(send, _FIRST_NUMBER)
+        self._asker = asker
         self._lane = Lane("studio-first-sight", lambda: None, self._failed)
         self._picture: Picture | None = None
         self._problem = ""
@@ -54,16 +51,12 @@ class FirstSight:
 
         def work(job: Job) -> None:
             question = DrawCamera(0, key, settings, (moment.env,), ("rgb",), moment.poses, scale)
-            picture = self._asker.ask(question, job, CameraPictures).pictures[0]
+            picture = self._asker.ask(question, job.check, CameraPictures).pictures[0]
             with self._lock:
                 self._picture = picture
             self._on_change()
 
         self._lane.start("a first sight", work)
-
-    def take(self, answer: CameraAnswer) -> None:
-        """The worker that plays answered somebody."""
-        self._asker.take(answer)
 
     def stop(self) -> None:
         """The worker is gone, or another version runs: what is under way is not answered any more."""

@@ -18,14 +18,11 @@ from workbench.core.pictures import Picture
 from workbench.core.step import StepResult
 from workbench.session.camera_askers import LiveAsker
 from workbench.session.camera_judging import ShownMoment
-from workbench.session.camera_messages import CameraAnswer, CameraPictures, DrawCamera
+from workbench.session.camera_messages import CameraPictures, DrawCamera
 from workbench.session.lane import Job, Lane
-from workbench.session.messages import Request
 
 MODALITIES = ("rgb", "depth", "segmentation")
 """That a quick look has, whatever the camera's own shader gives."""
-_FIRST_NUMBER = 1_000_000_000
-"""Of the questions asked here: another asker counts from 1, and both hear all answers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +47,10 @@ class Sight:
 class QuickLook:
     """Thread-safe; every method returns at once."""
 
-    def __init__(self, send: Callable[[Request], None], on_change: Callable[[], None]) -> None:
+    def __init__(self, asker: LiveAsker, on_change: Callable[[], None]) -> None:
         self._on_change = on_change
         self._lock = threading.Lock()
-        self._asker = LiveAsker(send, _FIRST_NUMBER)
+        self._asker = asker
         self._lane = Lane("studio-look", lambda: None, self._failed)
         self._scale = 1.0
         self._asked: Sight | None = None
@@ -100,7 +97,7 @@ class QuickLook:
                 0, sight.key, sight.settings, (sight.env,), MODALITIES, moment.poses, sight.scale
             )
             try:
-                picture = self._asker.ask(question, job, CameraPictures).pictures[0]
+                picture = self._asker.ask(question, job.check, CameraPictures).pictures[0]
                 with self._lock:
                     self._picture = picture
             finally:
@@ -109,10 +106,6 @@ class QuickLook:
                 self._on_change()
 
         self._lane.start("a quick look", work)
-
-    def take(self, answer: CameraAnswer) -> None:
-        """The worker that plays answered somebody."""
-        self._asker.take(answer)
 
     def stop(self) -> None:
         """The worker is gone, or another version runs: what is under way is not answered any more."""

@@ -12,6 +12,7 @@ What is done here is to bring those together: who is asked, and who is told of w
 from __future__ import annotations
 
 import itertools
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -94,6 +95,8 @@ class Session:
         self._state = LiveState(task, options, history_bytes)
         self._shared = SharedState(self._state)
         self._lock, self._note = self._shared.lock, self._shared.note
+        self._sending_settings = threading.Lock()
+        """Taken before `_lock`."""
         self._step_in: tuple[int, RecordedRun, bool, str | None, Mapping[str, str]] | None = None
         """What is to be gone into as soon as a task is there."""
         self._step_backs = itertools.count(1)
@@ -458,9 +461,11 @@ class Session:
     # --- small things --------------------------------------------------------------------------------
 
     def _send_settings(self) -> None:
-        with self._lock:
-            settings = self._state.settings()
-        self._send(settings)
+        # Read and sent in one go, or of two threads the one that read first might send last.
+        with self._sending_settings:
+            with self._lock:
+                settings = self._state.settings()
+            self._send(settings)
 
     def _send(self, request: Request) -> None:
         self._worker.send(request)

@@ -1,11 +1,13 @@
 """What the page asks of the author's file: show what a change would be, make it, take it back.
 
-What takes long (the disk, the worker that runs the hooks) is done on a thread of its own, one thing after the other, and what came of it is in
-`view`. What a change means for the placements is settled when the version with it comes in: none is to be lost by it.
+What takes long (the disk, the worker that runs the hooks) is done on a thread of its own, one thing after the other;
+what came of it is in `view`. What a change means for the placements is settled when the version with it comes in: none
+is to be lost by it.
 """
 
 from __future__ import annotations
 
+import threading
 import time
 import traceback
 from collections.abc import Callable, Mapping
@@ -16,28 +18,15 @@ from workbench.authoring.camera_source.cameras import Ran
 from workbench.authoring.source.text import Refused
 from workbench.core.camera_settings import CameraKey, CameraKind, CameraSettings, differences
 from workbench.session.camera_askers import LiveAsker
-from workbench.session.camera_messages import CameraAnswer, CamerasRun, RunCameras
+from workbench.session.camera_messages import CamerasRun, RunCameras
 from workbench.session.camera_writing import CameraWriting, Wish, copy, plan
-from workbench.session.lane import Job, JobFailed, Stopped
-from workbench.session.messages import Load, Request, TaskDescription
+from workbench.session.lane import JobFailed, Stopped
+from workbench.session.messages import Load, TaskDescription
 from workbench.session.studio_cameras import StudioCameras
 from workbench.session.studio_view import Writing
 
-_FIRST_NUMBER = 3_000_000_000
-"""Of the questions asked here: other askers count from lower ones, and all hear all answers."""
 _PATIENCE = 60.0
 """Seconds in which the worker must have run the hooks: a question may be lost with a worker that ends."""
-
-
-class _Asking(Job):
-    """One question."""
-
-    def __init__(self) -> None:
-        self.stopped, self._began = False, time.monotonic()
-
-    def check(self) -> None:
-        if self.stopped or time.monotonic() - self._began > _PATIENCE:
-            raise Stopped
 
 
 class StudioFile:
@@ -46,7 +35,7 @@ class StudioFile:
     Args:
         on_change: called, on any thread, when there is something new.
         open_copy: open this class of this file, in a folder of the user's, in place of the task.
-        send: to the worker that plays.
+        asker: asks the worker that plays.
         load: how the version that runs was loaded; None before there is one.
     """
 
@@ -55,14 +44,15 @@ class StudioFile:
         cameras: StudioCameras,
         on_change: Callable[[], None],
         open_copy: Callable[[Path, str], None],
-        send: Callable[[Request], None],
+        asker: LiveAsker,
         load: Callable[[], Load | None],
     ) -> None:
         self._cameras, self._note, self._open_copy = cameras, on_change, open_copy
         self.folder = Path.cwd()
         """Where a copy of a task goes: where the program was started."""
-        self._asker, self._load = LiveAsker(send, _FIRST_NUMBER), load
-        self._asking = _Asking()
+        self._asker, self._load = asker, load
+        self._stopped = threading.Event()
+        """Nobody waits any more for what is being asked."""
         self._writing = CameraWriting()
         self._removed: dict[CameraKey, CameraSettings] = {}
         """Where cameras were placed, otherwise than the file said, that were taken out of it."""
@@ -119,23 +109,25 @@ class StudioFile:
         self._note()
 
     def _run(self, texts: Mapping[str, str]) -> Ran:
-        load, self._asking = self._load(), _Asking()
+        stopped = self._stopped = threading.Event()
+        load, deadline = self._load(), time.monotonic() + _PATIENCE
         if load is None or self._closing:
             raise Refused("no task is loaded")
+
+        def check() -> None:
+            if stopped.is_set() or time.monotonic() > deadline:
+                raise Stopped
+
         try:
-            return self._asker.ask(RunCameras(0, load.task, texts), self._asking, CamerasRun).ran
+            return self._asker.ask(RunCameras(0, load.task, texts), check, CamerasRun).ran
         except Stopped:
             raise Refused("the task did not answer, or another version came meanwhile; ask again") from None
         except JobFailed as failure:
             raise Refused(str(failure)) from failure
 
-    def take(self, answer: CameraAnswer) -> None:
-        """The worker that plays answered somebody."""
-        self._asker.take(answer)
-
     def stop(self) -> None:
         """The worker is gone, or another version comes: what is under way is not answered any more."""
-        self._asking.stopped = True
+        self._stopped.set()
 
     def write(self) -> None:
         """Make the planned edit; the file is reloaded, and the new camera compared with what was written."""

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from workbench.authoring.camera_source import Refusal, SourceEdit
 
 WritingStage = Literal["none", "planned", "refused", "written", "checked", "mismatch", "undone"]
-"""``planned``: shown, not made. ``written``: in the file, the reload is awaited. ``control_values``: the new env has what
+"""``planned``: shown, not made. ``written``: in the file, the reload is awaited. ``checked``: the new env has what
 was written. ``mismatch``: it has something else. ``undone``: taken back out of the file."""
 
 

@@ -1,19 +1,9 @@
-"""Where the chosen camera stands and looks, in numbers. Each can be typed.
+"""Where the chosen camera stands and looks, in numbers that can be typed, and the fields that hold them.
 
-A pose has several ways to be said, and an author knows theirs: the target is what they mean, roll, pitch and yaw is
-what their robot's drawing has, the quaternion what they copied from somewhere. All are shown of the same camera and
-each writes it; one of the three for the orientation at a time, since eleven fields are not read by anybody.
-
-Whoever types an eye may mean either of two things: the camera goes there as it is turned, or it goes there and still
-looks at its target. Which one it is follows the handles in the view, and is said under the fields: with one handle on
-the camera its position is typed, and the target goes with it; with an eye and a target each is typed alone.
-
-Numbers are those of the camera's config: of a mounted camera in the frame of its link.
-
-Fields of several numbers on one camera, each shown in so many digits, sent when they were left to settle.
-
-A field takes numbers between its bounds, or says why not; that they are numbers, and as many as it has, is known by then
-(`workbench.ui.control_values`).
+All ways to say a pose are shown of the same camera and each writes it; of the three for the orientation one at a time,
+since nobody reads eleven fields. What a typed eye means follows the handles in the view: with one handle on the camera
+the target goes with it, with an eye and a target each is typed alone. Of a mounted camera all is in the frame of its
+link.
 """
 
 from __future__ import annotations

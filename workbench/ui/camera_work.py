@@ -1,14 +1,8 @@
-"""How far work in the background is, shown where it was asked for, with a button that stops it.
+"""How far work in the background is, and the way into sight for what came of it.
 
-A bar above all folders would push the button that was just pressed away from under the pointer, and one at the end of
-the tab is not seen. So each folder has a bar of its own under its button, and the one whose button was pressed last
-shows what runs. What is done in a moment shows none: it would only flash.
-
-What was asked for has just come: then, and for a moment only, the page brings it into sight.
-
-A result opens under the button that asks for it, and at the lower end of a panel that is out of sight. HTML that is to
-be seen carries ``into_sight.html`` while it is new. Only a moment: a page that opens a tab again draws its HTML anew,
-and nobody wants to be taken there then.
+Each folder has a bar under its own button, and the one that was pressed last shows what runs: one bar above all would
+push the pressed button away, one at the end is not seen. A result is brought into sight for a moment only (HTML carries
+``into_sight.html`` while it is new): a tab that is opened again draws its HTML anew, and nobody wants to be taken there.
 """
 
 from __future__ import annotations

@@ -1,15 +1,8 @@
-"""A camera's way into the author's file: the change is shown, made, checked, and can be taken back.
+"""A camera's way into the author's file: the change is shown as a diff, made, checked, and can be taken back.
 
-Nothing is written that was not read first: one button shows what would change, as a diff, and only beside the diff
-is the button that makes it. What comes after (the reload, the comparison of the new env's camera with what was
-asked for) is said in the same place, so that "written" is never the last word of a change that did not work. A
-plan says where the camera stood when it was made; if the camera was moved since, the plan is asked for anew.
-
-A change of the author's file, shown where it was asked for: the diff, and the buttons that make it or leave it.
-
-A change is asked for in two places of the tab, at the top for the placement and at its end for adding and removing,
-and a diff that opens a screen away from the button is not seen. So each place has a box of its own, and when what was
-asked for comes into it, its last button is brought into sight.
+The button that makes a change is only beside its diff, and what comes after (the reload, the comparison of the new
+env's camera with what was asked for) is said in the same place. A plan is asked for anew if the camera was moved since.
+Changes are asked for at two places of the tab, so each has a box of its own, which is brought into sight.
 """
 
 from __future__ import annotations

@@ -1,18 +1,10 @@
-"""Checks what a page claims that a control holds, before viser stores it and sends it to every other page.
+"""Checks of what a page sends: before viser stores it, against its control; where it is used, against the session.
 
-viser forces the Python type and nothing else: it stores 99999 for a slider from 0 to 10, and an integer that
-msgpack cannot write ends the connection of every page, again at each reconnect. A control says itself what it
-can hold (its type, least and greatest value, options, number of components); that is checked here, once, for all
-controls. What only the session knows (does env 7 still exist, is that the name of a policy) is checked by the
-panel that reads the value, with `workbench.ui.control_values`.
-
-Checks of a value that a page sent, against what the session can do with it.
-
-`workbench.ui.control_values` has checked before viser stored it that the control can hold the value: type, range,
-options. What a control cannot say (is there still an env 7, how long may a name be) is asked here, where the value
-is used. A value that is refused is refused with a sentence for the person, not quietly bent into another one: the
-session keeps what it had, and the control goes back to showing that. Only the rounding of a browser's arithmetic
-at the ends of a slider is set right in silence.
+viser forces the Python type and nothing else: it stores 99999 for a slider from 0 to 10, and an integer that msgpack
+cannot write ends the connection of every page, again at each reconnect. What a control can hold (type, range, options,
+components) is checked once for all controls. What only the session knows (is there still an env 7) is checked by the
+panel that reads the value: it is refused with a sentence, not bent into another value, but for the rounding of a
+browser's arithmetic at the ends of a slider.
 """
 
 from __future__ import annotations

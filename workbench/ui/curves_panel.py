@@ -1,11 +1,7 @@
-"""Reward and success over time: the selected env against the mean of the batch.
+"""Reward, success and the reward's terms over time: the selected env, against the mean of the batch.
 
-The session keeps the past of every env, so selecting another env only takes another column of it:
-nothing is wiped. What is sent is bounded, and no more often than the eye follows.
-
-The reward's terms of the selected env, one line each, or how to get them.
-
-All in one chart: the question is which of them is stuck while the others grow.
+The session keeps the past of every env, so selecting another env takes another column of it and wipes nothing. What is
+sent is bounded, and no more often than the eye follows.
 """
 
 from __future__ import annotations

@@ -1,15 +1,8 @@
 """The batch, one row an env: sort it, filter it, press a row to select that env and go to its moment.
 
-What the rows say is in `env_panel`; how a row of HTML can be pressed, in `presses`. The table is drawn a few times
-a second, and at most `MOST_ROWS` rows of it: which those are is what sorting and filtering are for. Sorting and
-filter belong to the page's server, like the selected env, so two open pages show the same.
-
-What the rows of the batch say, and in which order: sorting, filtering, and the text of each cell.
-
-Pure functions of an `EnvRows`, so that what a person reads can be checked without a browser. Order matters more
-than it seems: ties keep the order of the envs (or rows would jump about while nothing changes), and an env that
-has no value in a column (never succeeded, episode not followed from its start) comes last whichever way it is
-sorted.
+At most `MOST_ROWS` rows are drawn. Sorting and filter belong to the page's server, like the selected env, so two open
+pages show the same. Ties keep the order of the envs, or rows would jump about while nothing changes; an env without a
+value in a column comes last whichever way it is sorted.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
-"""What a camera saw, one kind of it at a time, as a picture that a person can read and a line on what its colours mean.
+"""What a camera saw as a picture that a person can read, a line on what its colours mean, and pictures in our own HTML.
 
-Pictures inside of our own HTML, as ``data:`` addresses.
-
-viser's own pictures cannot be pressed, and stand one below the other. A table with a picture in each row, or a sheet
-of sixty-four small ones, has to carry them in its HTML. A picture of 128 x 128 is 3 to 6 kB so.
+viser's own pictures cannot be pressed, and stand one below the other; a table with a picture in each row carries them
+as ``data:`` addresses, 3 to 6 kB for 128 x 128.
 """
 
 from __future__ import annotations

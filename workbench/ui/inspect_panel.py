@@ -1,13 +1,8 @@
 """The Inspect tab: one env from inside, read from the worker only while somebody wants it.
 
-viser does not say which tab is looked at, so what is read is what is chosen here, and with no page open nothing
-is. A reading takes a millisecond or two of the worker's time, five times a second at most, and the next is asked
-for only when the last has come: a worker that is busy is not sent a queue. Poses are on the page already.
-
-The inspectors' cells: numbers as text, which of them changed, and where a joint stands between its limits.
-
-Pure functions of an `Inspection` and of poses. A number counts as changed when it differs from the reading before
-of the same env, however little: whether something moves at all is what one looks for.
+viser does not say which tab is looked at, so what is read is what is chosen here. The next reading is asked for when
+the last has come, five times a second at most: a worker that is busy is not sent a queue. A number counts as changed
+when it differs from the reading before of the same env, however little.
 """
 
 from __future__ import annotations

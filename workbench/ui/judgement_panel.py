@@ -1,13 +1,7 @@
-"""The past judged again, under the curves: progress, the new curve over the old, and the list of what differs.
+"""The past judged again: a line above the curves, and under them the new curve over the old and what differs.
 
-Nothing is here before there is something to say. The chart shows one number of the selected env, chosen from those
-that the task returns: the record thin and grey, what the new code says of the same moments over it. A row of the
-list selects its env and goes to the moment where it differs, in the timeline and so in the 3-D view.
-
-One line above the curves: that the past was judged again, and what came of it.
-
-What it is about, the new curve over the old one and the list, lies under the live curves, and on a small screen below
-the edge: who saved another reward and looks at the numbers would not learn of it. A press on the line scrolls there.
+Nothing is here before there is something to say. A row of the list selects its env and goes to the moment where it
+differs. On a small screen all that lies below the edge, so the line above says what came of it and scrolls there.
 """
 
 from __future__ import annotations

@@ -1,10 +1,7 @@
-"""Tags, notes and deleting, from the page: what is asked before, and what is said when it cannot be done.
+"""Tags, notes and deleting in the library: what is asked before, and what is said when it cannot be done.
 
-What the library asks before it does something: tags, a note, and whether it shall delete.
-
-A window over the page, since the table scrolls and a form in it would be out of sight. It is there for all open pages,
-as the selection is; whoever answers first has answered. What it was asked for (these recordings, not whatever is
-selected by then) is kept with the question.
+What is asked is asked in a window over the page, since a form in the scrolled table would be out of sight. It is there
+for all open pages, and keeps what it was asked for, not what is selected by the time of the answer.
 """
 
 from __future__ import annotations

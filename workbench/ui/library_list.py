@@ -1,14 +1,8 @@
-"""Which recordings the library lists, in which order, on which page, and which of them are selected.
+"""Which recordings the library lists, in which order, on which page, which are selected, and what is done with those.
 
 Selection works as in every list of files: a press selects a row alone, control adds it or takes it away, shift takes
-all from the last one on; arrows walk, and shift takes what they walk over along. What is not listed is not selected,
-or a filter would hide what a deletion then takes. The list lives in the server, so all pages show the same; its
-methods are called from any thread.
-
-What can be done with the table of recordings from the keyboard, and with those that are selected in it.
-
-What is done with recordings is a button over the table and a command with a key, made from one description, so that
-neither is without the other.
+all from the last one on. What is not listed is not selected, or a filter would hide what a deletion then takes. What is
+done is a button and a command with a key, of one description. Methods are called from any thread.
 """
 
 from __future__ import annotations

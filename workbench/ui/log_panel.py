@@ -1,12 +1,8 @@
-"""The Log tab: what the author's code printed, with a filter, and what the worker's processes hold.
+"""The Log tab: what the author's code printed, in its colours, with a filter, and what the worker's processes hold.
 
-Redrawn a few times a second and only the last lines of what fits the filter, so that a task that prints in every
-hook of every step costs the page no more than one that prints once.
-
-The colours of what an author's code printed, as the Log shows them: readable on the dark page and on the light one.
-
-Sixteen colours are the page's own (``page.css``). Others are what the author says, made lighter on the dark page and
-darker on the light one until they can be read; and with a background they are the author's on both.
+Only the last lines of what fits the filter are drawn, so that a task that prints in every hook costs no more than one
+that prints once. Colours beyond the page's sixteen are made lighter on the dark page and darker on the light one until
+they can be read; with a background they are the author's on both.
 """
 
 from __future__ import annotations

@@ -1,11 +1,8 @@
-"""The table of numbers in the Reward tab, redrawn no faster than it can be read.
+"""The numbers of the task in the Reward tab: one row an entry, the selected env beside the whole batch.
 
-The numbers of the task: one row an entry, the selected env beside the whole batch.
-
-What ``evaluate`` returns decides the rows. A bool is counted over the batch ("3 of 16"), a number is
-averaged, a vector is shortened; an entry that is a surprise (NaN, a string, None, a mean over the batch) is
-shown as it is rather than left out, because a surprise is what an author looks for. One that has no row for
-each env is marked as such.
+What ``evaluate`` returns decides the rows: a bool is counted over the batch, a number averaged, a vector shortened. A
+surprise (NaN, a string, None, an entry without a row for each env) is shown as it is and not left out, since it is what
+an author looks for.
 """
 
 from __future__ import annotations

@@ -1,12 +1,7 @@
-"""The Judge tab of the review: recorded episodes run again with today's code, and what is judged otherwise now.
+"""The Judge tab of the review: recorded episodes run again, with today's code or another, and what is judged otherwise.
 
-What to judge is chosen where recordings are chosen, in the library, or it is what is open. A row of the list opens its
-episode at the first state that differs; its reward, as it was recorded and as it is now, is drawn below.
-
-Which code recorded episodes can be judged with: what the server knows of, by name, and never a path from a page.
-
-Usually it is today's text of the file that each recording names. But that may be an installed package, or the author
-edits a copy: then the file that is open live is meant, or one that was named on the command line.
+A row of the list opens its episode at the first state that differs, with its reward as recorded and as it is now. Which
+code judges is chosen among what the server knows of, by name, and never by a path from a page.
 """
 
 from __future__ import annotations

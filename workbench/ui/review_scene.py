@@ -1,13 +1,8 @@
-"""Opened recordings as one scene: over each other, the later ones tinted and see-through, or side by side.
+"""Opened recordings as one scene in the 3-D view, over each other or side by side, with their marks and names.
 
-The view draws envs of one scene. Recordings are made into that: each is an env, their bodies go by name, and what
-looks the same in several is one shape with several wearers, so four recordings of a task cost what four envs do.
-
-Drawn over each other, the first keeps its looks and each other one is the same shapes in its colour, half
-see-through, for as long as they are elsewhere than the first one's. What stands at the same place in both for the whole time (the table, the floor) is drawn once: a tint
-over all of it would say nothing and hide the rest.
-
-Opened recordings in the 3-D view: their scene, marks and names, and where one looks from.
+Each recording is an env of one scene, and what looks the same in several is one shape with several wearers. Over each
+other, later ones are the same shapes, tinted and half see-through, for as long as they are elsewhere than the first
+one's; what stands at the same place in both for the whole time is drawn once.
 """
 
 from __future__ import annotations

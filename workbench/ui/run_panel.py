@@ -1,9 +1,7 @@
-"""The Run tab: play, step, reset, speed, seed, env, what happens at an episode's end, and actions.
+"""The Run tab: play, step, reset, speed, seed, env, what happens at an episode's end, and actions with their sliders.
 
-Nothing here touches an env. Every input asks the session and shows what the session says (see
-`controls`), so a key, a second page and this panel cannot disagree.
-
-A slider for every number of the action, given to every env while they are the action's source.
+Nothing here touches an env. Every input asks the session and shows what the session says (see `controls`), so a key, a
+second page and this panel cannot disagree.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
-"""The Share tab: choose what is to be made of the recordings, make it, save it.
+"""The Share tab: choose what is to be made of the recordings, make it, save it; and rerun beside it.
 
-Sharing and rerun on the review page: which recordings they are about, and what outlives the page.
-
-They are about the recordings that are selected in the library, and where none is, about those that are open; where both are
-there and differ, a person chooses.
+They are about the recordings that are selected in the library, and where none is, about those that are open; where
+both are there and differ, a person chooses.
 """
 
 from __future__ import annotations

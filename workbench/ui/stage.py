@@ -1,16 +1,8 @@
-"""The 3-D view, which outlives the pages that draw into it.
+"""The 3-D view, its light and where one looks from: what outlives the pages that draw into it.
 
-The live page and the review come and go (`pages`), and what they draw is mostly the same: the robot, the table, the
-cube. So the bodies stay in the browser while one page takes the other's place. What looks as before is not sent
-again, and the view is never empty in between: until a live env is there, one sees the recording that it begins from.
-Where one looks from stays as well, if the same is to be seen; everything else (labels, frustums, marks, handles) goes
-with its page.
-
-The light of the 3-D view: soft from above, with one lamp that gives shapes their form.
-
-viser's own lights are made for bare grey meshes; on the white plastic of a robot and the textures of a
-table they burn out. No environment map either: it doubles what a pixel costs, and a browser without a
-graphics card pays for every pixel. No shadows: each would draw the whole batch a second time.
+The bodies stay in the browser while one page takes the other's place, so what looks as before is not sent again and the
+view is never empty in between. Labels, frustums, marks and handles go with their page. viser's own lights burn white
+plastic and textures out; an environment map or shadows would make a browser without a graphics card pay for each pixel.
 """
 
 from __future__ import annotations

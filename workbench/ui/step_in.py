@@ -1,15 +1,9 @@
-"""From the review into the live env, and back: what "Go on live from here" opens, and in which code.
+"""From the review into the live env, and back: what "Go on live from here" opens, in which code, and the way there.
 
-Where the task of the recording is open already, its selected env (or all) is put into the recorded state. Where it is
-not, or where the recorded text is wanted, another session is opened for it beside the one that is open, which goes on as it
-is and can be gone back to. The review stays until the live env is there (`step_in`). Sessions that are opened here are closed here, with the folder of a recorded text.
-
-The way from a recording to the live env, while it takes: what is being done, and when one is there.
-
-Opening a task takes seconds, and making recorded actions again does too. A live page has nothing to show until then,
-so the review stays, with the recorded scene in the view, and says what it waits for. The page changes when the env
-stands in the recorded state; and before that where only the live page can help, because the task's code failed, or has
-been at one thing for so long that one may want to interrupt it.
+Where the recording's task is open already, its env (or all) is put into the recorded state; else another session is
+opened for it beside the one that is open. The review stays, and says what it waits for, until the env stands in that
+state, or until only the live page can help: the task's code failed, or may have to be interrupted. Sessions that are
+opened here are closed here, with the folder of a recorded text.
 """
 
 from __future__ import annotations

@@ -1,13 +1,8 @@
-"""Where the page looks from when it first shows a scene.
+"""Where the page looks from when it first shows a scene; after that the view belongs to the person.
 
-The view must frame the whole grid (or the one env) on its own, whatever the size of the task, and
-must then belong to the person: a reload of the file, a new seed or another env never moves it. Only
-a scene of another size, or a choice that changes what is shown, frames it anew.
-
-Pointing the open pages at what is shown, and leaving them alone once a person has moved the view.
-
-A page says how wide and high its view is only some moments after it has come. So it is first framed for the usual
-shape, and again when its own is known, unless somebody moved it meanwhile.
+It frames the whole grid (or the one env) by itself, and again only for a scene of another size or a choice that
+changes what is shown. A page says how large its view is some moments after it has come: it is framed for the usual
+shape first, and again when its own is known, unless somebody moved it meanwhile.
 """
 
 from __future__ import annotations
