@@ -50,11 +50,11 @@ def test_twenty_swaps_leave_nothing_and_the_session_lives_on(
         with tabs_of(f"http://127.0.0.1:{server.get_port()}") as tabs:
             tab = tabs.open()
             until(lambda tab=tab: tab.open and panels.html("wb-status"), f"the {which} page, drawn")
-            seen[which].append(drawn_whole(server) if number < 4 else held_by(server))
+            if number < 4 or number >= SWAPS - 2:
+                seen[which].append(drawn_whole(server))
         threads.append(threading.active_count())
     for found in seen.values():
         for name, count in found[-1].items():
-            # What a part draws some moments later is there or not yet.
             assert count <= found[1][name] + (40 if name == "messages" else 0), (name, found)
     assert max(threads[4:]) <= max(threads[:4])
     before = session.view().step_serial
