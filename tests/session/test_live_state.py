@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from tests.drive.scripted import scripted
+from tests.drive.waiting import until
 from tests.ui.scenes import description, problem, step_of, table_scene
 from workbench.authoring.reference import RecordedTask
 from workbench.core.pictures import Picture
-from workbench.session.kept_worker import Death
+from workbench.session.kept_worker import Death, KeptWorker
 from workbench.session.live_state import LiveState
 from workbench.session.messages import (
     CameraRequest,
@@ -19,11 +23,14 @@ from workbench.session.messages import (
     Loading,
     Pictures,
     ReloadReport,
+    Request,
+    Settings,
     Status,
     Stepped,
     TaskOptions,
 )
 from workbench.session.recovery import Wanted
+from workbench.session.session import Session
 from workbench.session.view import SessionView
 
 N = 3
@@ -226,3 +233,31 @@ def test_a_file_that_a_recording_named_is_what_was_agreed_to_until_it_is_saved()
     assert state.load_request(Wanted(None, None)).task is agreed
     state.file_is_edited()
     assert state.load_request(Wanted(None, None)).task == "/home/me/push.py:Push"
+
+
+def test_of_two_who_choose_at_once_the_last_message_has_what_both_chose(tmp_path: Path) -> None:
+    sent: list[Settings] = []
+
+    def overtaken(*arguments: Any, **named: Any) -> KeptWorker:
+        worker = scripted(2)(*arguments, **named)
+        send = worker.send
+
+        def send_slowly(request: Request) -> None:
+            if isinstance(request, Settings):
+                if request.speed == 2.0 and not other.ident:
+                    other.start()
+                    other.join(timeout=0.3)  # as long as the other may take to come in between
+                sent.append(request)
+            send(request)
+
+        worker.send = send_slowly
+        return worker
+
+    session = Session("push.py", TaskOptions(), recordings=tmp_path, make_worker=overtaken)
+    other = threading.Thread(target=lambda: session.change(episode_end="continue"))
+    try:
+        session.change(speed=2.0)
+        until(lambda: other.ident is not None and not other.is_alive(), "the other's choice")
+        assert (sent[-1].speed, sent[-1].episode_end) == (2.0, "continue")
+    finally:
+        session.close()
