@@ -24,6 +24,8 @@ STOP, STOP_WAITING, STOP_KEEPING = "Stop recording", "Stop waiting", "Stop keepi
 
 
 class RecordPanel(Part[SessionView]):
+    every = 0.2
+
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
         self._selected_env = 0
@@ -76,6 +78,15 @@ class RecordPanel(Part[SessionView]):
             self._session.stop_keeping()
         else:
             self._session.keep_past(self._envs)
+
+    def key(self, view: SessionView) -> object:
+        return view.recording, view.timeline, view.step_serial
+
+    def urgent(self, view: SessionView) -> object:
+        recording = view.recording
+        shown = view.task_serial, view.state, view.selected_env, view.timeline.shown, self._which.value
+        stand = recording.active, recording.waiting, recording.keeping.active, view.timeline.moments == 0
+        return *shown, *stand
 
     def draw(self, view: SessionView) -> None:
         recording, keeping = view.recording, view.recording.keeping

@@ -82,6 +82,8 @@ class StudioPanel(Part[SessionView]):
         self._keys: tuple[CameraKey, ...] = ()
         self._names: dict[str, CameraKey | None] = {NOBODY: None}
         self._in_its_eye = False
+        self._is_empty = False
+        """All below the choice is hidden, since no camera is chosen."""
         self._look_at, self._own_axes, self._snap = False, False, Snap()
         gui = server.gui
         choices: tuple[str, ...] = (NOBODY,)
@@ -166,13 +168,16 @@ class StudioPanel(Part[SessionView]):
     def draw(self, view: SessionView) -> None:
         studio = view.studio
         self._draw_choice(view)
+        self._writing.draw(studio)
         chosen, camera = studio.chosen, self._shown(studio)
+        if chosen is None and self._is_empty:
+            return
+        self._is_empty = chosen is None
         self._facts.visible = chosen is not None
         self._tools.visible = camera is not None
         self._handles.visible = camera is not None
         self._numbers.draw(camera)
         self._lens.draw(camera)
-        self._writing.draw(studio)
         self._picture.draw(view)
         self._pick.draw(view, shown=self._picture.visible)
         self._judging.draw(view)
