@@ -12,6 +12,7 @@ The chart of one number as it was recorded, and as the new code has it: the reco
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import viser
@@ -34,6 +35,17 @@ CURSOR = uplot.Series(
 Span = tuple[float, float]
 YES_OR_NO: Span = (-0.05, 1.05)
 """The range of a curve that is 0 or 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """One curve, without its points."""
+
+    name: str
+    values: NDArray
+    """(K,) with a gap where it is not finite."""
+    colour: str = SELECTED_COLOUR
+    width: float = 1.8
 
 
 class LineChart:
@@ -63,18 +75,28 @@ class LineChart:
     def draw(
         self,
         title: str,
-        data: Sequence[NDArray[np.float64]],
-        series: Sequence[uplot.Series],
+        x: NDArray,
+        lines: Sequence[Line],
+        dot: NDArray | None = None,
         span: Span | None = None,
     ) -> None:
-        """
+        """Hide it where no line has a number, or there are no two places.
+
         Args:
             title: Over the chart.
-            data: Steps, then one array a line, each (K,); a line has a gap where it is not finite.
-            series: What each of them is.
+            x: (K,) steps.
+            lines: Each over all of `x`.
+            dot: (K,) a number where one dot is to be, none elsewhere.
             span: The range along y; None for that of the data.
         """
-        data, series = tuple(data), tuple(series)
+        if len(x) < 2 or not any(np.isfinite(line.values).any() for line in lines):
+            self.hide()
+            return
+        dots = () if dot is None else (dot,)
+        data = tuple(
+            np.asarray(values, np.float64) for values in (x, *(line.values for line in lines), *dots)
+        )
+        series = (STEP, *map(_series, lines), *(CURSOR for _ in dots))
         wanted = (title, series, span)
         # The data must fit the series in every state that the browser may see.
         with self._server.atomic():
@@ -121,9 +143,8 @@ class LineChart:
         self._charts.append(chart)
 
 
-def line(label: str, colour: str, width: float) -> uplot.Series:
-    """How a curve looks: a line without its points."""
-    return uplot.Series(label=label, stroke=colour, width=width, points={"show": False})
+def _series(line: Line) -> uplot.Series:
+    return uplot.Series(label=line.name, stroke=line.colour, width=line.width, points={"show": False})
 
 
 def with_gaps(values: NDArray[np.float64]) -> NDArray[np.float64] | list[float | None]:
@@ -136,12 +157,11 @@ def with_gaps(values: NDArray[np.float64]) -> NDArray[np.float64] | list[float |
 
 def span_of(lines: Sequence[NDArray[np.float64]]) -> Span | None:
     """The range of a chart: of a yes or no always the same one, whether it changes or not; else that of the data."""
-    values = np.concatenate(lines)
+    values = np.concatenate([[], *lines])
     return YES_OR_NO if np.isin(values[np.isfinite(values)], (0.0, 1.0)).all() else None
 
 
 RECORD_COLOUR = "#adb5bd"
-SERIES = (STEP, line("as recorded", RECORD_COLOUR, 1.2), line("judged again", SELECTED_COLOUR, 1.8))
 
 
 class ThenAndNow:
@@ -164,5 +184,6 @@ class ThenAndNow:
             title: Over the chart.
             data: Steps, the record, what is said now, each (K,); and a point at the moment that is shown, if one is.
         """
-        series = SERIES if len(data) == 3 else (*SERIES, CURSOR)
-        self._chart.draw(title, data, series, span_of(data[1:]))
+        x, old, new, *dot = data
+        lines = Line("as recorded", old, RECORD_COLOUR, 1.2), Line("judged again", new)
+        self._chart.draw(title, x, lines, dot[0] if dot else None, span_of(data[1:]))

@@ -22,7 +22,7 @@ from workbench.ui.busy_banner import BusyBanner
 from workbench.ui.camera_frustums import LARGE, SMALL, CameraFrustums, without_the_viewpoint
 from workbench.ui.cameras_panel import CamerasPanel
 from workbench.ui.commands import Command, register
-from workbench.ui.curves_panel import CurvesPanel, TermsPanel
+from workbench.ui.curves_panel import CurvesPanel
 from workbench.ui.env_layout import EnvLayout, acting_box, env_under_ray, lay_out
 from workbench.ui.env_panel import EnvPanel
 from workbench.ui.force_arrows import ForceArrows
@@ -130,8 +130,7 @@ class Page:
             reward = [
                 NumbersPanel(server),
                 JudgedAbove(server),
-                CurvesPanel(server),
-                TermsPanel(server, session),
+                CurvesPanel(server, session.term_curves),
             ]
             self._judgement = JudgementPanel(server, session)
         with tabs.add_tab("Inspect", viser.Icon.ZOOM_IN):

@@ -8,6 +8,7 @@ selected recording alone. A line at the position would have to be sent with ever
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from workbench.session.review_events import ACTION, REWARD, TERMS, curves
 from workbench.session.review_view import ReviewView, column_at
 from workbench.ui.curves_panel import COLOURS as LINE_COLOURS
 from workbench.ui.fragments import render
-from workbench.ui.line_chart import CURSOR, LONGEST, STEP, LineChart, line, span_of
+from workbench.ui.line_chart import LONGEST, Line, LineChart, span_of
 from workbench.ui.numbers_panel import NumberRow, number_rows
 from workbench.ui.parts import Part
 from workbench.ui.review_as_session import step_of
@@ -126,53 +127,45 @@ class ReviewCurves(Part[ReviewView]):
     def _draw_entry(self, chart: str, entry: str, view: ReviewView, shown: Sequence[int]) -> None:
         """One entry of all that are compared."""
         group, line = self._offered.get(entry, (entry, ""))
-        drawn: list[tuple[str, str, NDArray[np.float64]]] = []
-        axis = axis_of(view)
+        drawn: list[Line] = []
+        cursor = 0
         for index in shown:
             one = view.opened[index]
             lines = self._found[one.id].get(group)
             if not lines or (line and line not in lines):
                 continue
+            if index == view.selected:
+                cursor = len(drawn)
             states, values = lines[line] if line else next(iter(lines.values()))
-            name = f"{letter(index)}" if len(view.opened) > 1 else entry
-            drawn.append((name, COLOURS[index % 4], column_at(states, values, view.anchors[index], axis)))
-        cursor = next((i for i, index in enumerate(shown) if index == view.selected), 0)
-        self._put(chart, entry, axis, drawn, view.position, cursor if cursor < len(drawn) else 0)
+            name = letter(index) if len(view.opened) > 1 else entry
+            over = column_at(states, values, view.anchors[index], axis_of(view))
+            drawn.append(Line(name, over, COLOURS[index % 4], 1.7))
+        self._put(chart, entry, view, drawn, drawn[cursor] if drawn else None)
 
     def _draw_lines(self, chart: str, entry: str, view: ReviewView) -> None:
         """An entry with several lines, of the selected recording."""
         chosen, axis = view.chosen, axis_of(view)
         lines = {} if chosen is None else self._found[chosen.id].get(entry, {})
         drawn = [
-            (name, colour, column_at(states, values, view.anchors[view.selected], axis))
+            Line(name, column_at(states, values, view.anchors[view.selected], axis), colour, 1.7)
             for (name, (states, values)), colour in zip(lines.items(), LINE_COLOURS, strict=False)
         ]
         whose = f", {letter(view.selected)}" if len(view.opened) > 1 else ""
-        self._put(chart, f"{entry}{whose}", axis, drawn, None, 0)
+        self._put(chart, f"{entry}{whose}", view, drawn)
 
     def _put(
-        self,
-        chart: str,
-        title: str,
-        axis: NDArray[np.int64],
-        drawn: list[tuple[str, str, NDArray[np.float64]]],
-        position: int | None,
-        cursor: int,
+        self, chart: str, title: str, view: ReviewView, drawn: list[Line], dotted: Line | None = None
     ) -> None:
-        known = [d for d in drawn if np.isfinite(d[2]).any()]
-        if not known or len(axis) < 2:
-            self._charts[chart].hide()
-            return
-        stride = max(1, -(-len(axis) // LONGEST))
-        x = axis[::stride].astype(np.float64)
-        data: tuple[NDArray[np.float64], ...] = (x, *(d[2][::stride] for d in drawn))
-        series = [STEP, *(line(name, colour, 1.7) for name, colour, _ in drawn)]
-        if position is not None:
+        """Every so-many-th position, and the dot of one line at the position that is shown."""
+        axis = axis_of(view)
+        every = slice(None, None, max(1, -(-len(axis) // LONGEST)))
+        x, lines = axis[every], [replace(line, values=line.values[every]) for line in drawn]
+        dot = None
+        if dotted is not None:
+            at = view.position - view.first
             dot = np.full(len(x), np.nan)
-            at = min(int(round((position - axis[0]) / stride)), len(x) - 1)
-            dot[at] = drawn[cursor][2][position - int(axis[0])]
-            data, series = (*data, dot), [*series, CURSOR]
-        self._charts[chart].draw(title, data, series, span_of(data[1:]))
+            dot[min(round(at / every.step), len(x) - 1)] = dotted.values[at]
+        self._charts[chart].draw(title, x, lines, dot, span_of([line.values for line in lines]))
 
 
 def known(number: str, state: int) -> str:
