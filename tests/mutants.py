@@ -53,6 +53,7 @@ PROTECTED = {
     "core/partial_reset": "core/test_partial_reset.py",
     "core/task_env": "core/test_task_env.py",
     "core/contacts": "core/test_contact_queries.py",
+    "jobs/pool": "jobs/test_pool.py",
     "session/history": "session/test_history.py",
     "session/outliers": "session/test_outlier_watch.py",
     "session/kept_worker": "session/test_kept_worker.py",

@@ -10,8 +10,9 @@ import pytest
 
 PACKAGE = Path(__file__).parents[1] / "workbench"
 BELOW = {
-    "ui": {"session", "authoring", "recording", "core", "machine"},
-    "session": {"authoring", "recording", "core", "machine"},
+    "ui": {"session", "jobs", "authoring", "recording", "core", "machine"},
+    "session": {"jobs", "authoring", "recording", "core", "machine"},
+    "jobs": {"authoring", "recording", "core", "machine"},
     "authoring": {"core", "machine"},
     "recording": {"core", "machine"},
     "core": {"machine"},

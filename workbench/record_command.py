@@ -27,6 +27,7 @@ from workbench.authoring.problem import Problem, TaskError
 from workbench.authoring.reference import named_file
 from workbench.core.backends import gpu_left_alone
 from workbench.core.rules import Finding
+from workbench.jobs.pool import PoolError
 from workbench.recording.landing import try_folder
 from workbench.recording.mend import mend
 from workbench.session.record import Progress, Recorded, RecordOptions, record, with_given_actions
@@ -97,7 +98,7 @@ def record_in_terminal(
         say_problem(error.problem)
         _say_what_is_kept(what, before)
         return 1
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, PoolError) as error:
         _say_what_is_kept(what, before)
         return refuse(str(error))
     except KeyboardInterrupt:

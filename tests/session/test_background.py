@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import pickle
-from collections.abc import Iterator
-from multiprocessing import Pipe
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 import psutil
 import pytest
 
 from tests.session.hazards import provoke, write_task
-from workbench.authoring.problem import Problem
 from workbench.session.background import BackgroundProcess
 from workbench.session.lane import Job, JobFailed, Lane
-from workbench.session.message_reader import Unreadable
 from workbench.session.messages import Failed, Load, Loaded, TaskOptions
-from workbench.session.record_workers import _said
 
 
 @pytest.mark.parametrize("what", ["garbage", pytest.param("half", marks=pytest.mark.slow)])
@@ -40,36 +33,3 @@ def test_a_process_that_sends_garbage_ends_its_job_and_the_next_can_have_another
         with pytest.raises(JobFailed, match="the process that judges sent what cannot be read"):
             process.answer(job, Loaded, Failed)
     assert process.pid is None and pid is not None and not psutil.pid_exists(pid)
-
-
-@pytest.fixture
-def line() -> Iterator[tuple[Connection, Connection]]:
-    ours, theirs = Pipe()
-    yield ours, theirs
-    ours.close()
-    theirs.close()
-
-
-@pytest.mark.parametrize(
-    "sent",
-    [b"", b"hello", pickle.dumps("next"), pickle.dumps(("next", 3)), pickle.dumps(("written", {}))]
-    + [pickle.dumps(("nothing", None)), pickle.dumps((["next"], None)), pickle.dumps(("steps", "many"))],
-)
-def test_a_process_that_records_is_not_believed_either(
-    line: tuple[Connection, Connection], sent: bytes
-) -> None:
-    ours, theirs = line
-    theirs.send_bytes(sent)
-    with pytest.raises(Unreadable):
-        _said(ours)
-
-
-def test_what_a_process_that_records_says_is_heard(line: tuple[Connection, Connection]) -> None:
-    ours, theirs = line
-    problem = Problem("step", "it broke", None, None, None, "")
-    for said in (("next", None), ("ended", (3, True)), ("steps", 4), ("failed", problem)):
-        theirs.send(said)
-        assert _said(ours) == said
-    theirs.close()
-    with pytest.raises(EOFError):
-        _said(ours)

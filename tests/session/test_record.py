@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -16,17 +17,20 @@ import gymnasium as gym
 import mani_skill.envs  # noqa: F401  registers the ids
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from rich.console import Console
 
 from tests.drive.waiting import until
 from tests.recording.verify_rrd import verify_rrd
 from workbench.authoring.problem import Problem, TaskError
 from workbench.cli import main
+from workbench.jobs.pool import Deal, Executor, Processes, Work
 from workbench.record_command import record_in_terminal
 from workbench.recording.episode import Episode
 from workbench.recording.read_episode import read_episode
 from workbench.session.messages import TaskOptions
-from workbench.session.record import Progress, Recorded, RecordOptions, record
+from workbench.session.record import Progress, Recorded, RecordOptions, Written, record
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -93,16 +97,67 @@ def test_an_episode_starts_as_the_stock_env_starts_with_its_seed(recorded: Recor
     stock.close()
 
 
-@pytest.mark.parametrize(("num_envs", "workers"), [(1, 1), (3, 2)])
+@pytest.mark.parametrize(
+    ("num_envs", "workers", "executor"), [(1, 1, None), (1, 1, Processes()), (3, 3, None)]
+)
 def test_the_episodes_are_the_same_on_any_number_of_envs_and_processes(
-    recorded: Recorded, num_envs: int, workers: int, tmp_path: Path
+    recorded: Recorded, num_envs: int, workers: int, executor: Executor | None, tmp_path: Path
 ) -> None:
     options = TaskOptions(num_envs=num_envs, seed=10, env_kwargs=PLAIN)
     what = RecordOptions(
         "PushCube-v1", tmp_path, 3, pictures=False, max_steps=5, workers=workers, options=options
     )
-    for one, other in zip(read_all(recorded), read_all(record(what)), strict=True):
-        assert_same(one, other)
+    again = record(what, executor=executor)
+    for one, other in zip(recorded.written, again.written, strict=True):
+        assert_same(read_episode(one.path), read_episode(other.path))
+        assert one.path.with_suffix(".h5").read_bytes() == other.path.with_suffix(".h5").read_bytes()
+
+
+class InAnyOrder:
+    """Episodes that end in the order that the data draws, with files that are empty."""
+
+    def __init__(self, good: list[bool], slots: int, data: st.DataObject) -> None:
+        self.good, self.slots, self.data = good, slots, data
+
+    def run(self, work: Work, deal: Deal) -> None:
+        (what, *_) = work.setups
+        running: list[int] = []
+        while True:
+            running = [number for number in running if number < deal.limit()]
+            while len(running) < self.slots and (number := deal.next()) is not None:
+                running.append(number)
+            if not running:
+                return
+            number = running.pop(self.data.draw(st.integers(0, len(running) - 1)))
+            path = what.out / f"v1.{number}.rrd"
+            if self.good[number] or what.successes is None:
+                for suffix in (".rrd", ".h5", ".json"):
+                    path.with_suffix(suffix).touch()
+                deal.tell(number, Written(number, path, number, 1, 0.0, self.good[number]))
+            else:
+                deal.tell(number, None)
+
+
+@given(
+    wanted=st.integers(1, 5),
+    tries=st.integers(1, 40),
+    good=st.lists(st.booleans(), min_size=40, max_size=40),
+    slots=st.integers(1, 8),
+    data=st.data(),
+)
+def test_the_kept_successes_are_those_with_the_lowest_numbers(
+    wanted: int, tries: int, good: list[bool], slots: int, data: st.DataObject
+) -> None:
+    first = [index for index in range(tries) if good[index]][:wanted]
+    seen: list[Progress] = []
+    with tempfile.TemporaryDirectory() as folder:
+        what = RecordOptions("PushCube-v1", Path(folder), successes=wanted, tries=tries)
+        done = record(what, on_progress=seen.append, executor=InAnyOrder(good, slots, data))
+        left = sorted(path.name for path in Path(folder).iterdir())
+    assert [episode.index for episode in done.written] == first
+    assert left == sorted(f"v1.{number}{suffix}" for number in first for suffix in (".rrd", ".h5", ".json"))
+    assert done.tried == (first[-1] + 1 if len(first) == wanted else tries)
+    assert max(progress.kept for progress in seen) <= wanted
 
 
 def test_successes_are_kept_and_nothing_else(tmp_path: Path) -> None:

@@ -14,10 +14,11 @@ import time
 from collections.abc import Callable
 from typing import TypeVar
 
+from workbench.machine.family import describe_exit
 from workbench.session.lane import Job, JobFailed
 from workbench.session.message_reader import Unreadable
 from workbench.session.messages import Event, Request
-from workbench.session.process import WorkerProcess, describe_exit
+from workbench.session.process import WorkerProcess
 
 _LOOK = 0.05
 """Seconds between two looks at whether the job is to stop."""

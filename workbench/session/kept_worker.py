@@ -18,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from workbench.authoring.problem import shorten
+from workbench.machine.family import describe_exit
 from workbench.machine.watched_thread import say_failure
 from workbench.session.last_words import Busy, busy_at, fatal_error
 from workbench.session.memory_limit import in_words
@@ -32,7 +33,7 @@ from workbench.session.messages import (
     WarmedUp,
     WarmUp,
 )
-from workbench.session.process import Output, WorkerProcess, describe_exit
+from workbench.session.process import Output, WorkerProcess
 from workbench.session.pulse import Beat, Doing
 from workbench.session.spare import SpareWorker
 

@@ -13,7 +13,6 @@ import select
 import socket
 import struct
 import time
-from multiprocessing.connection import Connection
 from types import UnionType
 from typing import Any
 
@@ -42,24 +41,6 @@ def message_from(raw: bytes | bytearray | memoryview, kinds: type | UnionType) -
     if not isinstance(message, kinds):
         raise Unreadable(f"it was a {type(message).__name__}, which is no message")
     return message
-
-
-def receive_message(connection: Connection, kinds: type | UnionType) -> Any:
-    """The next message of a connection that has one, waiting for its end.
-
-    Raises:
-        Unreadable: it is no message of these kinds, or longer than any.
-        EOFError: the other end is gone.
-    """
-    try:
-        raw = connection.recv_bytes(MOST_BYTES)
-    except EOFError:
-        raise
-    except ConnectionError as error:
-        raise EOFError from error
-    except (OSError, MemoryError, ValueError, OverflowError) as error:
-        raise Unreadable(_line(error)) from error
-    return message_from(raw, kinds)
 
 
 class MessageReader:

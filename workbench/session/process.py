@@ -26,9 +26,9 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 
 from workbench.machine.child_python import child_environment, python_command
+from workbench.machine.family import end_family
 from workbench.machine.process_tree import main_thread_ended
 from workbench.machine.watched_thread import say_failure
-from workbench.session.family import end_family
 from workbench.session.interrupts import INTERRUPT_SIGNAL, STACK_SIGNAL
 from workbench.session.memory_limit import FamilyMemory
 from workbench.session.message_reader import MessageReader
@@ -279,15 +279,6 @@ def _takes_the_place_of(request: Request, before: Request) -> bool:
     if isinstance(request, PlaceCamera):
         return isinstance(before, PlaceCamera) and before.key == request.key
     return isinstance(request, _WHOLE) and type(before) is type(request)
-
-
-def describe_exit(code: int | None) -> str:
-    """In words: ``was killed by SIGSEGV``, ``ended with exit code 3``."""
-    if code is None:
-        return "stopped answering"
-    if code < 0:
-        return f"was killed by {signal.Signals(-code).name}"
-    return f"ended with exit code {code}"
 
 
 def signal_main_thread(pid: int, number: signal.Signals) -> None:

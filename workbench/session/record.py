@@ -2,9 +2,7 @@
 
 Each episode is started by a reset of its env alone with a seed of its own, so that episode k of a recording is the one
 that ``gym.make(...).reset(seed=seed + k)`` starts, whatever the number of envs and processes; and its actions are its
-own too (`record_acting`). Which episodes there are, and which are kept, is the `Dealer`'s matter: here, or in
-the process that started this one. What is here is what one process does: envs that are free take the next episode,
-all make a step, and what is over waits for the word that it is kept.
+own too (`record_acting`).
 """
 
 from __future__ import annotations
@@ -12,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -27,11 +25,11 @@ from workbench.core.state_columns import read_state_columns
 from workbench.core.state_names import states_of
 from workbench.core.step import StepResult
 from workbench.core.step_pictures import step_pictures
+from workbench.jobs.pool import Deal, Executor, Here, Processes, Share, Work, shares
 from workbench.machine.current_folder import CurrentFolder
 from workbench.recording.episode_writer import EpisodeFiles
 from workbench.recording.landing import RecordingError
 from workbench.session.acting import Acting
-from workbench.session.dealer import Dealer
 from workbench.session.episode_files import EpisodeFinisher
 from workbench.session.episodes import EpisodeGatherer, GatheredEpisode
 from workbench.session.given_actions import SUFFIXES, GivenEpisode, GivenEpisodes, read_given
@@ -81,6 +79,8 @@ class Written:
     steps: int
     total_reward: float
     success: bool | None
+    put_right: bool = False
+    """Its seed gives another start than the demonstration's, and it was put to its first state."""
 
 
 @dataclass(frozen=True)
@@ -102,26 +102,7 @@ class Recorded:
     stopped: bool
     """Somebody ended it before."""
     put_right: int = 0
-    """Episodes whose seed gives another start than the demonstration's, and that were put to its first state."""
-
-
-class Dealing(Protocol):
-    """Who says which episodes are made and kept; a `Dealer`, or one in another process."""
-
-    def next(self) -> int | None: ...
-
-    def ended(self, index: int, success: bool) -> None: ...
-
-    def decided(self) -> list[tuple[int, bool]]: ...
-
-    def wait(self) -> None:
-        """Until something may have been decided: nothing is under way here."""
-        ...
-
-
-class _OwnDealing(Dealer):
-    def wait(self) -> None:
-        raise AssertionError("an episode waits for others, and none is under way")
+    """Episodes that were."""
 
 
 def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, GivenEpisodes | None]:
@@ -159,111 +140,117 @@ def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, GivenEpisode
     return replace(what, tries=min(most, several) if several else most), given
 
 
-def dealer_of(what: RecordOptions) -> Dealer:
-    """Of options that went through `with_given_actions`."""
-    if what.successes is None:
-        assert what.episodes is not None
-        return _OwnDealing(what.episodes)
-    return _OwnDealing(what.successes, only_successes=True, most=what.tries)
-
-
 def record(
     what: RecordOptions,
     on_activity: Callable[[str], None] = lambda activity: None,
     on_progress: Callable[[Progress], None] = lambda progress: None,
     stop: Callable[[], bool] = lambda: False,
     on_finding: Callable[[Finding], None] = warn_of,
+    executor: Executor | None = None,
 ) -> Recorded:
-    """Record into ``what.out``, in this process or, with several workers, in processes of their own.
+    """Record into ``what.out``.
 
     Args:
         on_finding: called with each place where the task breaks a rule that does not stop it, once.
         stop: asked between steps; when it says yes, what is over is kept, the rest is not, and that is it.
+        executor: None for this process, or, with several workers, for processes of their own.
 
     Raises:
         TaskError: the task cannot be opened, or fails while it runs.
         RecordingError: a file cannot be written.
+        PoolError: a process that records failed or died.
         FileNotFoundError, ValueError: what is asked for makes no sense.
     """
     what, given = with_given_actions(what)
-    if what.workers > 1:
-        from workbench.session.record_workers import record_in_processes
-
-        return record_in_processes(what, dealer_of(what), on_activity, on_progress, stop, on_finding)
-    dealer = dealer_of(what)
-    written: list[Written] = []
-    steps = 0
-
-    def on_steps(count: int) -> None:
-        nonlocal steps
-        steps += count
-        on_progress(Progress(dealer.kept, steps))
-
-    put_right = run_episodes(
-        what,
-        given,
-        dealer,  # type: ignore[arg-type]
-        written.append,
-        on_activity,
-        on_steps,
-        stop,
-        on_finding,
-    )
-    written.sort(key=lambda episode: episode.index)
-    return Recorded(tuple(written), dealer.tried, stop(), put_right)
+    envs = shares(what.options.num_envs, what.workers)
+    setups = [replace(what, options=replace(what.options, num_envs=count)) for count in envs]
+    recording = _Recording(what, on_activity, on_progress, stop, on_finding)
+    run = _record_share
+    if executor is None and len(setups) == 1:
+        executor, run = Here(), partial(_record_share, given=given)
+    work = Work(run, setups, result=Written | None, news=str | int | Finding, name="that records")
+    (executor or Processes()).run(work, recording.deal)
+    return recording.so_far(stop())
 
 
-def run_episodes(
-    what: RecordOptions,
-    given: GivenEpisodes | None,
-    dealing: Dealing,
-    on_written: Callable[[Written], None],
-    on_activity: Callable[[str], None],
-    on_steps: Callable[[int], None],
-    stop: Callable[[], bool],
-    on_finding: Callable[[Finding], None],
-) -> int:
-    """One process's share; returns how many starts were put right. Raises as `record`.
+class _Recording:
+    """What is heard of the episodes, whoever makes them.
+
+    Who wants K successes gets those with the lowest numbers, and that is where order matters: with many envs, or several
+    processes, a later episode may succeed before an earlier one has ended. Its files go again when K others are before it.
+    """
+
+    def __init__(
+        self,
+        what: RecordOptions,
+        on_activity: Callable[[str], None],
+        on_progress: Callable[[Progress], None],
+        stop: Callable[[], bool],
+        on_finding: Callable[[Finding], None],
+    ) -> None:
+        self._folder, self._wanted = what.out.absolute(), what.successes
+        self._on_activity, self._on_progress, self._on_finding = on_activity, on_progress, on_finding
+        self._kept: dict[int, Written] = {}
+        self._ended = self._steps = 0
+        self._found: set[object] = set()
+        """Each process finds the same, and it is told once."""
+        most = what.episodes if what.successes is None else what.tries
+        assert most is not None
+        self.deal: Deal[Written | None, str | int | Finding] = Deal(range(most), self._over, self._news, stop)
+
+    def so_far(self, stopped: bool) -> Recorded:
+        enough = self._wanted is not None and len(self._kept) == self._wanted
+        written = tuple(self._kept[number] for number in sorted(self._kept))
+        put_right = sum(episode.put_right for episode in written)
+        return Recorded(written, written[-1].index + 1 if enough else self._ended, stopped, put_right)
+
+    def _over(self, number: int, written: Written | None) -> None:
+        self._ended += 1
+        if written is not None:
+            self._kept[number] = written
+        if self._wanted is not None and len(self._kept) >= self._wanted:
+            last = sorted(self._kept)[self._wanted - 1]
+            self.deal.lower(last + 1)
+            for surplus in [number for number in self._kept if number > last]:
+                self._remove(self._kept.pop(surplus))
+        self._on_progress(Progress(len(self._kept), self._steps))
+
+    def _news(self, news: str | int | Finding) -> None:
+        if isinstance(news, str):
+            self._on_activity(news)
+        elif isinstance(news, int):
+            self._steps += news
+            self._on_progress(Progress(len(self._kept), self._steps))
+        elif news.key not in self._found:
+            self._found.add(news.key)
+            self._on_finding(news)
+
+    def _remove(self, episode: Written) -> None:
+        for suffix in (".json", ".h5", ".rrd"):  # what has no .json is not there
+            (self._folder / episode.path.name).with_suffix(suffix).unlink(missing_ok=True)
+
+
+def _record_share(what: RecordOptions, share: Share, given: GivenEpisodes | None = None) -> None:
+    """What one process does. Raises as `record`.
 
     Args:
-        on_written: called with each episode that is kept when its files are there.
-        on_steps: called after each control step of the batch with the number of envs that had an episode.
+        given: what its file of actions holds, if that was read already.
     """
     torch.set_num_threads(1)  # see workbench.session.worker.work
+    if given is None:
+        what, given = with_given_actions(what)
     here = CurrentFolder()  # the task may go to another
     with here.again():
-        return _run_share(what, here, given, dealing, on_written, on_activity, on_steps, stop, on_finding)
-
-
-def _run_share(
-    what: RecordOptions,
-    here: CurrentFolder,
-    given: GivenEpisodes | None,
-    dealing: Dealing,
-    on_written: Callable[[Written], None],
-    on_activity: Callable[[str], None],
-    on_steps: Callable[[int], None],
-    stop: Callable[[], bool],
-    on_finding: Callable[[Finding], None],
-) -> int:
-    folder = what.out.absolute()
-    opened = open_task(what.task, what.options, on_activity=on_activity, on_finding=on_finding)
-    finisher = EpisodeFinisher()
-    share = _Share(opened, what, here, folder, given, dealing, finisher, on_written)
-    try:
-        share.run(on_steps, stop)
-    finally:
+        folder = what.out.absolute()
+        opened = open_task(what.task, what.options, on_activity=share.say, on_finding=share.say)
         try:
-            share.give_up()
-            finisher.close()
-            share.collect()
+            _Episodes(opened, what, here, folder, given, share).run()
         finally:
             opened.env.close()
-    return share.put_right
 
 
-class _Share:
-    """The episodes that one process makes."""
+class _Episodes:
+    """The episodes that one process makes: envs that are free take the next one, and all make a step."""
 
     def __init__(
         self,
@@ -272,12 +259,10 @@ class _Share:
         here: CurrentFolder,
         folder: Path,
         given: GivenEpisodes | None,
-        dealing: Dealing,
-        finisher: EpisodeFinisher,
-        on_written: Callable[[Written], None],
+        share: Share,
     ) -> None:
-        self._opened, self._what, self._given, self._dealing = opened, what, given, dealing
-        self._finisher, self._on_written = finisher, on_written
+        self._opened, self._what, self._given, self._share = opened, what, given, share
+        self._finisher = EpisodeFinisher()
         self._envs = list(range(opened.env.num_envs))
         self._gatherer = EpisodeGatherer(opened.description, self._envs, folder, self._over, ends="reset")
         plain = given is None and what.actions != "random"
@@ -286,66 +271,63 @@ class _Share:
         self._running: dict[int, int] = {}
         """Number of the episode in each env that has one."""
         self._steps: dict[int, int] = {}
-        self._undecided: dict[int, GatheredEpisode] = {}
-        self._made: list[tuple[int, GatheredEpisode, Future[EpisodeFiles | str]]] = []
-        self.put_right = 0
+        self._put_right: set[int] = set()
+        """Episodes whose seed gives another start than the demonstration's."""
+        self._made: dict[int, tuple[GatheredEpisode, Future[EpisodeFiles | str]]] = {}
 
-    def run(self, on_steps: Callable[[int], None], stop: Callable[[], bool]) -> None:
-        """Until there is nothing more to make, or somebody stops it."""
-        limit = self._what.max_steps or self._opened.description.max_episode_steps or _STEPS_WITHOUT_LIMIT
-        while not stop():
-            self._hear()
-            for env in self._envs:
-                if env not in self._running and (index := self._dealing.next()) is not None:
-                    self._begin(env, index)
-            if not self._running:
-                self._hear()
-                if not self._undecided:
-                    return
-                self._dealing.wait()
-                continue
-            step = self._step()
-            on_steps(len(self._running))
-            for env, index in list(self._running.items()):
-                self._steps[env] += 1
-                given = self._given_of(index)
-                if given is not None:
-                    over = self._steps[env] >= min(len(given.actions), self._what.max_steps or 10**9)
-                else:
-                    over = step.terminated[env] or step.truncated[env] or self._steps[env] >= limit
-                if over:
-                    self._gatherer.end(env)
-                    del self._running[env]
-                    self._acting.end(env)
-            self.collect()
+    def run(self) -> None:
+        """Until there is nothing more to make; what is under way after a failure is not kept."""
+        try:
+            while self._begin_free():
+                self._step()
+                self._collect()
+        finally:
+            self._drop_from(0)
+            self._finisher.close()
+            self._collect()
 
-    def give_up(self) -> None:
-        """What is under way is not kept. Of what is over and undecided, the successes are."""
-        for env in list(self._running):
+    def _begin_free(self) -> bool:
+        """Whether any env has an episode."""
+        self._drop_from(self._share.limit())
+        for env in self._envs:
+            if env not in self._running and (index := self._share.next()) is not None:
+                self._begin(env, index)
+        return bool(self._running)
+
+    def _drop_from(self, limit: int) -> None:
+        for env in [env for env, index in self._running.items() if index >= limit]:
             self._gatherer.drop(env)
-        self._running.clear()
-        for index in list(self._undecided):
-            self._decide(index, True)
+            self._free(env)
 
-    def collect(self) -> None:
+    def _free(self, env: int) -> None:
+        del self._running[env]
+        self._acting.end(env)
+
+    def _collect(self) -> None:
         """Tell of the episodes whose files are there.
 
         Raises:
             RecordingError: those of one cannot be written.
         """
-        waiting = []
-        for index, episode, future in self._made:
-            if not future.done():
-                waiting.append((index, episode, future))
-                continue
+        for index in [index for index, (_, future) in self._made.items() if future.done()]:
+            episode, future = self._made.pop(index)
             files = future.result()
             if isinstance(files, str):
                 raise RecordingError(files)
             shown = self._what.out / files.rrd.name  # as the person named the folder
-            self._on_written(
-                Written(index, shown, episode.seed, episode.steps, episode.total_reward, episode.success)
+            put_right = index in self._put_right
+            self._share.tell(
+                index,
+                Written(
+                    index,
+                    shown,
+                    episode.seed,
+                    episode.steps,
+                    episode.total_reward,
+                    episode.success,
+                    put_right,
+                ),
             )
-        self._made = waiting
 
     # --- one episode -----------------------------------------------------------------------------------
 
@@ -358,25 +340,26 @@ class _Share:
         if given is not None and given.seed is not None:
             seed = given.seed
         step = reset_checked(task, self._opened.loaded, seed, [env])
-        if given is not None and given.states:
-            step = self._put_right(env, given, step)
         self._running[env], self._steps[env] = index, 0
+        if given is not None and given.states:
+            step = self._put_right_start(env, given, step)
         self._gatherer.acted_by = self._acting.begin(env, seed, given)
         mask = np.zeros(task.num_envs, bool)
         mask[env] = True
         self._gatherer.take(self._stepped(step, mask, [env]))
 
-    def _put_right(self, env: int, given: GivenEpisode, step: StepResult) -> StepResult:
+    def _put_right_start(self, env: int, given: GivenEpisode, step: StepResult) -> StepResult:
         first = {name: values[0] for name, values in given.states.items()}
         task = self._opened.env
         if max(apart(states_of(read_state_columns(task), env), first)) <= _ELSEWHERE:
             return step
-        self.put_right += 1
+        self._put_right.add(self._running[env])
         with blamed("restore", self._opened.loaded, task):
             write_states(task.env, {env: first})
             return task.judge()
 
-    def _step(self) -> StepResult:
+    def _step(self) -> None:
+        """A control step of all envs, and the end of the episodes that are over with it."""
         task, loaded = self._opened.env, self._opened.loaded
         action = self._acting.next_action(task, {env: self._steps[env] for env in self._running})
         step = step_checked(task, loaded, action)
@@ -391,7 +374,19 @@ class _Share:
                 step = task.judge(action)
         none = np.zeros(task.num_envs, bool)
         self._gatherer.take(self._stepped(step, none, sorted(self._running)))
-        return step
+        self._share.say(len(self._running))
+        for env in list(self._running):
+            self._steps[env] += 1
+            if self._is_over(env, step):
+                self._gatherer.end(env)
+                self._free(env)
+
+    def _is_over(self, env: int, step: StepResult) -> bool:
+        given = self._given_of(self._running[env])
+        if given is not None:
+            return self._steps[env] >= min(len(given.actions), self._what.max_steps or 10**9)
+        limit = self._what.max_steps or self._opened.description.max_episode_steps or _STEPS_WITHOUT_LIMIT
+        return bool(step.terminated[env] or step.truncated[env] or self._steps[env] >= limit)
 
     def _stepped(self, step: StepResult, reset_mask: np.ndarray, pictured: list[int]) -> Stepped:
         task = self._opened.env
@@ -404,24 +399,11 @@ class _Share:
 
     def _over(self, episode: GatheredEpisode) -> None:
         index = self._running[episode.env]
-        self._undecided[index] = episode
-        self._dealing.ended(index, bool(episode.success))
-
-    def _hear(self) -> None:
-        for index, keep in self._dealing.decided():
-            self._decide(index, keep)
-
-    def _decide(self, index: int, keep: bool) -> None:
-        episode = self._undecided.pop(index, None)
-        if episode is None:
-            for env in [env for env, running in self._running.items() if running == index]:
-                self._gatherer.drop(env)
-                del self._running[env]
-                self._acting.end(env)
-        elif keep:
-            self._made.append((index, episode, self._finisher.finish(episode)))
-        else:
+        if self._what.successes is not None and not episode.success:
             episode.writer.discard()
+            self._share.tell(index, None)
+        else:
+            self._made[index] = episode, self._finisher.finish(episode)
 
 
 def _acting(what: RecordOptions, here: CurrentFolder) -> Acting:

@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 from workbench.core.geometry import SceneGeometry
 from workbench.machine.child_python import child_environment, python_command
+from workbench.machine.family import end_family
 from workbench.recording.episode import Episode
 from workbench.session.clearance import files_named
-from workbench.session.family import end_family
 from workbench.session.message_reader import MessageReader, Unreadable
 
 _LOOK = 0.1
@@ -109,7 +109,7 @@ class SceneProcess:
         with ours, theirs:
             worker = ("workbench.session.recorded_scene_worker", str(theirs.fileno()))
             process = subprocess.Popen(
-                python_command("-m", "workbench.session.family", str(os.getpid()), *worker),
+                python_command("-m", "workbench.machine.family", str(os.getpid()), *worker),
                 env=child_environment(),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,

@@ -18,8 +18,8 @@ import traceback
 from pathlib import Path
 from typing import NoReturn
 
+from workbench.machine.family import begin_family
 from workbench.machine.quick_imports import quick_imports
-from workbench.session.family import begin_family
 
 
 def main() -> None:
@@ -37,7 +37,7 @@ def main() -> None:
 
     pulse = PulseWriter(pulse_fd)
     pulse.begin("starting")
-    from workbench.session.breakpoints import OPEN_WITH_DEBUG, pass_breakpoints, refuse_breakpoints
+    from workbench.machine.breakpoints import OPEN_WITH_DEBUG, pass_breakpoints, refuse_breakpoints
 
     if niceness:  # it works in the background, with a version that is being debugged elsewhere
         pass_breakpoints()

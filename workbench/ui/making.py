@@ -24,8 +24,8 @@ from typing import Any
 import msgspec
 
 from workbench.machine.child_python import child_environment, python_command
+from workbench.machine.family import describe_exit
 from workbench.machine.watched_thread import say_failure
-from workbench.session.process import describe_exit
 from workbench.ui.make_shared import Made, Wanted
 
 END_SECONDS = 5.0

@@ -12,7 +12,7 @@ from workbench.machine.child_python import child_environment, python_command
 pytestmark = pytest.mark.usefixtures("child_process")
 
 BEGIN = (
-    "from workbench.session.breakpoints import refuse_breakpoints\nrefuse_breakpoints('remove this line')\n"
+    "from workbench.machine.breakpoints import refuse_breakpoints\nrefuse_breakpoints('remove this line')\n"
 )
 
 

@@ -14,6 +14,7 @@ import pytest
 
 from tests.drive.waiting import until
 from workbench.machine.child_python import child_environment, python_command
+from workbench.machine.family import end_family
 from workbench.machine.process_tree import (
     children,
     family,
@@ -21,7 +22,6 @@ from workbench.machine.process_tree import (
     proportional_memory,
     resident_memory,
 )
-from workbench.session.family import end_family
 from workbench.session.memory_limit import FamilyMemory
 
 _MEMBER = '''
@@ -74,7 +74,7 @@ def begin(child_process: None, tmp_path: Path) -> Iterator[Callable[..., subproc
 
     def begin(how: str) -> subprocess.Popen[bytes]:
         process = subprocess.Popen(
-            python_command("-m", "workbench.session.family", str(os.getpid()), "family_member", how),
+            python_command("-m", "workbench.machine.family", str(os.getpid()), "family_member", how),
             env=child_environment(PYTHONPATH=str(tmp_path)),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -137,7 +137,7 @@ def test_a_family_is_ended_when_asked_and_nobody_else(begin: Callable[..., subpr
 def test_a_keeper_that_was_stopped_is_not_waited_for(
     begin: Callable[..., subprocess.Popen[bytes]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("workbench.session.family._LONGEST_END", 0.1)
+    monkeypatch.setattr("workbench.machine.family._LONGEST_END", 0.1)
     keeper = begin("wait")
     all_of_it = members(keeper.pid)
     os.kill(keeper.pid, signal.SIGSTOP)
@@ -152,7 +152,7 @@ def test_a_server_that_is_killed_leaves_no_family(child_process: None, tmp_path:
     (tmp_path / "family_member.py").write_text(_MEMBER)
     (tmp_path / "server.py").write_text(
         "import os, subprocess, sys, time\n"
-        "command = [sys.executable, '-m', 'workbench.session.family', str(os.getpid()), 'family_member', 'wait']\n"
+        "command = [sys.executable, '-m', 'workbench.machine.family', str(os.getpid()), 'family_member', 'wait']\n"
         "subprocess.Popen(command, stdin=subprocess.DEVNULL)\n"
         "time.sleep(600)\n"
     )

@@ -8,9 +8,7 @@ import sys
 from typing import Any, NoReturn
 
 OPEN_WITH_DEBUG = "remove this line, or open with --debug and attach a debugger"
-ONE_PROCESS = (
-    "remove this line, or record with --workers 1 in a terminal, where Python's own debugger answers"
-)
+ONE_PROCESS = "remove this line, or use --workers 1 in a terminal, where Python's own debugger answers"
 
 
 class NoDebugger(RuntimeError):

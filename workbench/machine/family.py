@@ -30,7 +30,7 @@ _SIGNALS = {signal.SIGCHLD, signal.SIGTERM}
 
 
 def main() -> None:
-    """``python -m workbench.session.family SERVER MODULE ARGUMENT...``: the family of a process that is ``MODULE.main()``."""
+    """``python -m workbench.machine.family SERVER MODULE ARGUMENT...``: the family of a process that is ``MODULE.main()``."""
     begin_family(int(sys.argv.pop(1)))
     importlib.import_module(sys.argv[1]).main(*sys.argv[2:])
 
@@ -74,6 +74,15 @@ def end_family(keeper: subprocess.Popen[bytes]) -> None:
         # Somebody stopped it. The worker ends with it; what was detached does not.
         keeper.kill()
         keeper.wait()
+
+
+def describe_exit(code: int | None) -> str:
+    """In words: ``was killed by SIGSEGV``, ``ended with exit code 3``."""
+    if code is None:
+        return "stopped answering"
+    if code < 0:
+        return f"was killed by {signal.Signals(-code).name}"
+    return f"ended with exit code {code}"
 
 
 def _keep(worker: int) -> NoReturn:

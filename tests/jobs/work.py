@@ -1,0 +1,85 @@
+"""What the processes of a pool do in tests: no task, and each way to go wrong."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from workbench.authoring.problem import Problem, TaskError
+from workbench.jobs.pool import Share
+
+PROBLEM = Problem("step", "it broke", "task.py", 3, "1 / 0", "Traceback")
+
+
+@dataclass(frozen=True)
+class Setup:
+    how: str = ""
+    at: int = -1
+    """The item with which that happens."""
+    folder: Path = Path()
+
+
+@dataclass(frozen=True)
+class Squared:
+    number: int
+    square: float
+    path: Path
+    pid: int
+
+
+def square(setup: Setup, share: Share) -> None:
+    """Two items at a time, as an env that has two places."""
+    if setup.how == "cannot be loaded":
+        raise TaskError(PROBLEM)
+    share.say(f"opened in {os.getpid()} on {','.join(map(str, sorted(os.sched_getaffinity(0))))}")
+    running: list[int] = []
+    while True:
+        running = [number for number in running if number < share.limit()]
+        while len(running) < 2 and (number := share.next()) is not None:
+            (setup.folder / f"begun{number}").touch()
+            running.append(number)
+        if not running:
+            return
+        number = running.pop(0)
+        if number == setup.at:
+            go_wrong(setup, share)
+        share.say(1)
+        share.tell(number, Squared(number, number**2, setup.folder / str(number), os.getpid()))
+
+
+def go_wrong(setup: Setup, share: Share) -> None:
+    if setup.how == "killed":
+        os.kill(os.getpid(), signal.SIGKILL)
+    elif setup.how == "left":
+        os._exit(0)
+    elif setup.how == "task":
+        raise TaskError(PROBLEM)
+    elif setup.how == "value":
+        raise ValueError("not such a number")
+    elif setup.how == "bug":
+        raise KeyError("nobody expects it")
+    elif setup.how == "garbage":
+        os.write(int(sys.argv[2]), b"\x00\x00\x00\x05hello")
+    elif setup.how == "endless":
+        os.write(int(sys.argv[2]), b"\x7f\xff\xff\xff")
+    elif setup.how == "another type":
+        share.tell(setup.at, "a text")
+    elif setup.how == "another's":
+        share.tell(10**6, Squared(0, 0, Path(), 0))
+    elif setup.how == "hangs":
+        (setup.folder / "hangs").touch()
+        while True:
+            time.sleep(0.01)
+    elif setup.how == "waits":
+        (setup.folder / "waits").touch()
+        while share.limit() > setup.at:
+            time.sleep(0.01)
+
+
+def forget(setup: Setup, share: Share) -> None:
+    """Ends with an item that it says nothing of."""
+    share.next()

@@ -1,0 +1,1 @@
+"""Work that needs no page: cut into numbered items, done by several processes."""

@@ -1,0 +1,393 @@
+"""Work cut into numbered items, done in this process or by several, each of which keeps its env from item to item.
+
+`Work.run` is the same function everywhere. It asks its `Share` for items, and tells what came of each. Items are dealt
+in ascending order to whoever asks. From the limit on none is wanted any more: a caller that has enough lowers it, and
+stopping is a limit of 0. So what is done does not depend on how many processes do it, and a job that was stopped is
+resumed by dealing what is left.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any, Generic, Protocol, TypeVar
+
+import msgspec
+
+from workbench.authoring.problem import Problem, TaskError, nobody_presses_ctrl_c
+from workbench.machine.breakpoints import ONE_PROCESS, refuse_breakpoints
+from workbench.machine.child_python import child_environment, python_command
+from workbench.machine.family import describe_exit, end_family
+from workbench.machine.guarded_terminal import guard_terminal
+from workbench.machine.quick_imports import quick_imports
+
+_LOOK_SECONDS = 0.1
+_END_SECONDS = 120.0
+"""In which a process that was told to stop must have finished what is over."""
+_EXIT_SECONDS = 10.0
+_MOST_BYTES = 1 << 26
+"""Of one message."""
+_NO_LIMIT = 1 << 62
+
+Setup = TypeVar("Setup")
+Result = TypeVar("Result")
+News = TypeVar("News")
+
+
+class PoolError(RuntimeError):
+    """A process died or failed; what the others had under way was finished."""
+
+
+class Share(Protocol):
+    """The items of one process. Used on one thread."""
+
+    def next(self) -> int | None:
+        """The next item to begin; None when there is none any more."""
+        ...
+
+    def limit(self) -> int:
+        """Items from this number on are not wanted any more, also if they are under way. It only falls."""
+        ...
+
+    def tell(self, number: int, result: Any) -> None:
+        """What came of an item."""
+        ...
+
+    def say(self, news: Any) -> None:
+        """How it goes meanwhile."""
+        ...
+
+
+class Deal(Generic[Result, News]):
+    """The items of a job, and who hears what comes of them. Used on one thread."""
+
+    def __init__(
+        self,
+        numbers: Iterable[int],
+        on_result: Callable[[int, Result], None],
+        on_news: Callable[[News], None] = lambda news: None,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> None:
+        """
+        Args:
+            numbers: ascending, from 0 on.
+            stop: asked often; after a yes nothing more is wanted.
+        """
+        self._numbers = iter(numbers)
+        self._on_result, self._on_news, self._stop = on_result, on_news, stop
+        self._limit = _NO_LIMIT
+
+    def lower(self, limit: int) -> None:
+        """Items from `limit` on are not wanted any more."""
+        self._limit = min(limit, self._limit)
+
+    def limit(self) -> int:
+        if self._stop():
+            self.lower(0)
+        return self._limit
+
+    def next(self) -> int | None:
+        number = next(self._numbers, _NO_LIMIT)
+        return number if number < self.limit() else None
+
+    def tell(self, number: int, result: Result) -> None:
+        self._on_result(number, result)
+
+    def say(self, news: News) -> None:
+        self._on_news(news)
+
+
+@dataclass(frozen=True)
+class Work(Generic[Setup, Result, News]):
+    """What each process does."""
+
+    run: Callable[[Setup, Share], None]
+    """A function that can be imported by its name. It returns when its share has no next item and none is under way.
+
+    A TaskError, OSError, ValueError or RuntimeError that it raises ends the job.
+    """
+    setups: Sequence[Setup]
+    """Its first argument, one for each process; can be pickled."""
+    result: Any
+    news: Any
+    """Types of what it tells and says: plain data as msgspec encodes it. Another process's words are held against them."""
+    name: str
+    """As in "a process *that records* was killed by SIGKILL"."""
+
+
+class Executor(Protocol):
+    """Who does the work."""
+
+    def run(self, work: Work[Setup, Result, News], deal: Deal[Result, News]) -> None:
+        """Deal until nothing is left or wanted, and everything under way is finished.
+
+        Raises:
+            TaskError, PoolError: a share failed, or its process died; the others were stopped before.
+        """
+        ...
+
+
+class Here:
+    """This process does all of it; what `Work.run` raises is raised as it is."""
+
+    def run(self, work: Work[Setup, Result, News], deal: Deal[Result, News]) -> None:
+        (setup,) = work.setups
+        work.run(setup, deal)
+
+
+class Processes:
+    """Spawned processes, each with its share of the cores."""
+
+    def __init__(self, chunk: int = 1) -> None:
+        """
+        Args:
+            chunk: items that a process is given at once: more than one where an item takes milliseconds.
+        """
+        self._chunk = chunk
+
+    def run(self, work: Work[Setup, Result, News], deal: Deal[Result, News]) -> None:
+        pool = _Pool(work, deal, self._chunk)
+        try:
+            pool.start()
+            pool.serve()
+        finally:
+            pool.end()
+
+
+def shares(count: int, processes: int) -> list[int]:
+    """`count` envs, or whatever else there is, cut for so many processes; no process without one."""
+    processes = min(processes, count)
+    return [count // processes + (i < count % processes) for i in range(processes)]
+
+
+# --- what is said between the processes ----------------------------------------------------------------
+
+
+class _Said(msgspec.Struct, tag=True, array_like=True):
+    pass
+
+
+class _Next(_Said):
+    """More items, please."""
+
+
+class _Result(_Said):
+    number: int
+    result: msgspec.Raw
+
+
+class _News(_Said):
+    news: msgspec.Raw
+
+
+class _Failed(_Said):
+    why: str
+    problem: Problem | None
+
+
+class _Over(_Said):
+    """Nothing is under way any more, and nothing comes after this."""
+
+
+_encode = msgspec.msgpack.Encoder(enc_hook=str).encode
+_decode_said = msgspec.msgpack.Decoder(_Next | _Result | _News | _Failed | _Over).decode
+
+
+def _path(kind: type, value: Any) -> Any:
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    raise NotImplementedError(f"{kind} does not cross between processes")
+
+
+class _Pool:
+    """The processes, as the one that started them sees them."""
+
+    def __init__(self, work: Work, deal: Deal, chunk: int) -> None:
+        self._work, self._deal, self._chunk = work, deal, chunk
+        self._result = msgspec.msgpack.Decoder(work.result, dec_hook=_path).decode
+        self._news = msgspec.msgpack.Decoder(work.news, dec_hook=_path).decode
+        self._processes: dict[Connection, subprocess.Popen[bytes]] = {}
+        self._busy: list[Connection] = []
+        self._begun: dict[Connection, set[int]] = {}
+        """The items that each has and has told nothing of."""
+
+    def start(self) -> None:
+        cores = sorted(os.sched_getaffinity(0))
+        for i, setup in enumerate(self._work.setups):
+            ours, theirs = socket.socketpair()
+            connection = Connection(ours.detach())
+            with theirs:
+                module = ("workbench.jobs.pool", str(theirs.fileno()))
+                self._processes[connection] = subprocess.Popen(
+                    python_command("-m", "workbench.machine.family", str(os.getpid()), *module),
+                    stdin=subprocess.DEVNULL,
+                    pass_fds=[theirs.fileno()],
+                    start_new_session=True,  # Ctrl-C in the terminal is for this process, which tells them
+                    env=child_environment(),
+                )
+            self._busy.append(connection)
+            self._begun[connection] = set()
+            self._send(connection, cores[i :: len(self._work.setups)] or cores)
+            self._send(connection, (self._work.run, setup))
+
+    def serve(self) -> None:
+        told, stopped = self._deal.limit(), 0.0
+        failure: TaskError | PoolError | None = None
+        while self._busy:
+            if (limit := self._deal.limit()) != told:
+                told = limit
+                for connection in self._busy:
+                    self._send(connection, limit)
+            if limit == 0:
+                stopped = stopped or time.monotonic()
+                if time.monotonic() - stopped > _END_SECONDS:
+                    raise failure or PoolError(f"a process {self._work.name} did not end in time")
+            for connection in wait(self._busy, _LOOK_SECONDS):
+                assert isinstance(connection, Connection)
+                try:
+                    self._hear(connection)
+                except (TaskError, PoolError) as error:
+                    self._busy.remove(connection)
+                    end_family(self._processes[connection])
+                    failure = failure or error
+                    self._deal.lower(0)
+        if failure is not None:
+            raise failure
+
+    def end(self) -> None:
+        """Wait for those that are done; those that are not, as after a second Ctrl-C, may be where nothing reaches them."""
+        for connection, process in self._processes.items():
+            if connection not in self._busy:
+                self._exit_code(connection, _EXIT_SECONDS)
+            end_family(process)
+            connection.close()
+
+    def _hear(self, connection: Connection) -> None:
+        """The next message. Raises TaskError or PoolError where it is the last one of a process that failed."""
+        said, value = self._receive(connection)
+        begun = self._begun[connection]
+        if isinstance(said, _Next):
+            numbers = [n for n in (self._deal.next() for _ in range(self._chunk)) if n is not None]
+            begun.update(numbers)
+            self._send(connection, numbers)
+        elif isinstance(said, _Result):
+            if said.number not in begun:
+                raise PoolError(f"a process {self._work.name} told of an item that it does not have")
+            begun.remove(said.number)
+            self._deal.tell(said.number, value)
+        elif isinstance(said, _News):
+            self._deal.say(value)
+        elif isinstance(said, _Failed):
+            raise PoolError(said.why) if said.problem is None else TaskError(said.problem)
+        elif min(begun, default=_NO_LIMIT) < self._deal.limit():
+            raise PoolError(f"a process {self._work.name} ended before it was done")
+        else:
+            self._busy.remove(connection)
+
+    def _receive(self, connection: Connection) -> tuple[_Said, Any]:
+        """What a process says, and what belongs to it. The author's code runs there: it may write into any descriptor."""
+        try:
+            said = _decode_said(connection.recv_bytes(_MOST_BYTES))
+            if isinstance(said, _Result):
+                return said, self._result(said.result)
+            return said, self._news(said.news) if isinstance(said, _News) else None
+        except (EOFError, ConnectionError):
+            words = describe_exit(self._exit_code(connection, 2.0))
+        except (OSError, msgspec.MsgspecError) as error:
+            words = f"sent what cannot be read ({error})"
+        raise PoolError(f"a process {self._work.name} {words}")
+
+    def _exit_code(self, connection: Connection, patience: float) -> int | None:
+        try:
+            return self._processes[connection].wait(timeout=patience)
+        except subprocess.TimeoutExpired:
+            return None
+
+    def _send(self, connection: Connection, message: Any) -> None:
+        try:
+            connection.send(message)
+        except (BrokenPipeError, ConnectionResetError):
+            pass  # it is gone, and `_hear` says so
+
+
+# --- a process of the pool -----------------------------------------------------------------------------
+
+
+class _FarShare:
+    """Asks the process that started this one."""
+
+    def __init__(self, connection: Connection) -> None:
+        self._connection = connection
+        self._mine: deque[int] = deque()
+        self._limit = _NO_LIMIT
+        self._none_left = False
+
+    def next(self) -> int | None:
+        if not self._mine and not self._none_left:
+            self._send(_Next())
+            while not isinstance(heard := self._take(), list):
+                pass
+            self._none_left = not heard
+        if not self._mine or self._mine[0] >= self._limit:
+            return None
+        return self._mine.popleft()
+
+    def limit(self) -> int:
+        while self._connection.poll(0):
+            self._take()
+        return self._limit
+
+    def tell(self, number: int, result: Any) -> None:
+        self._send(_Result(number, msgspec.Raw(_encode(result))))
+
+    def say(self, news: Any) -> None:
+        self._send(_News(msgspec.Raw(_encode(news))))
+
+    def over(self) -> None:
+        self._send(_Over())
+
+    def failed(self, why: str, problem: Problem | None) -> None:
+        self._send(_Failed(why, problem))
+
+    def _take(self) -> list[int] | int:
+        heard: list[int] | int = self._connection.recv()
+        if isinstance(heard, list):
+            self._mine.extend(heard)
+        else:
+            self._limit = heard
+        return heard
+
+    def _send(self, said: _Said) -> None:
+        self._connection.send_bytes(_encode(said))
+
+
+def main(socket_fd: str) -> None:
+    """Entry of a process, which `machine.family` has started."""
+    guard_terminal()
+    refuse_breakpoints(ONE_PROCESS)
+    nobody_presses_ctrl_c()
+    connection = Connection(int(socket_fd))
+    share = _FarShare(connection)
+    try:
+        # PhysX and the software renderer take a thread for each core that the process may use.
+        os.sched_setaffinity(0, connection.recv())
+        with quick_imports():
+            run, setup = connection.recv()
+        try:
+            run(setup, share)
+            share.over()
+        except TaskError as error:
+            share.failed(str(error), error.problem)
+        except (EOFError, ConnectionError):
+            raise  # not a file that cannot be written: nobody is there to be told
+        except (OSError, ValueError, RuntimeError) as error:
+            share.failed(str(error), None)
+    except (EOFError, ConnectionError):
+        return  # the process that started this one is gone
