@@ -17,6 +17,7 @@ import types
 from typing import Any
 
 from workbench.authoring.problem import Interrupted
+from workbench.session.calls import Answer, Call
 from workbench.session.interrupts import INTERRUPT_SIGNAL, Interrupts
 from workbench.session.messages import (
     DebuggerListens,
@@ -26,8 +27,6 @@ from workbench.session.messages import (
     Loaded,
     Loading,
     Quit,
-    WarmedUp,
-    WarmUp,
 )
 from workbench.session.pulse import PulseWriter
 from workbench.session.worker_start import main
@@ -50,8 +49,8 @@ class SmallWorker:
                 return
             if isinstance(request, ListenForDebugger):
                 self.line.send(DebuggerListens(request.port, request.wait))
-            if isinstance(request, WarmUp):
-                self.line.send(WarmedUp(0.0))
+            if isinstance(request, Call):
+                self.line.send(Answer(request.number))
             if isinstance(request, Load):
                 self.pulse.begin("loading")
                 self.line.send(Loading(str(request.task)))

@@ -6,7 +6,9 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from workbench.authoring.problem import TaskError
+import numpy as np
+
+from workbench.core.camera_report import CameraReport
 from workbench.core.camera_search import SearchProgress, SearchSpace, suggest_cameras
 from workbench.core.camera_suggestion import OfferedPlacement, in_words
 from workbench.core.pictures import Picture
@@ -14,18 +16,11 @@ from workbench.core.place_camera import PlacedCameras
 from workbench.core.take_pictures import take_pictures
 from workbench.core.visibility import Placement, judge_camera, picture_of, small_size
 from workbench.session.camera_messages import (
-    CameraAnswer,
-    CameraJudged,
-    CameraPictures,
     CameraQuestion,
-    CameraQuestionFailed,
-    CamerasRun,
     DrawCamera,
     JudgeCamera,
     RunCameras,
-    Searching,
     SuggestCameras,
-    Suggested,
 )
 from workbench.session.open_task import OpenedTask
 from workbench.session.run_cameras import run_cameras
@@ -41,28 +36,28 @@ def answer(
     opened: OpenedTask,
     placed: PlacedCameras,
     question: CameraQuestion,
-    tell: Callable[[Searching], None],
+    tell: Callable[[int, int], None],
     cancelled: Callable[[], bool],
-) -> CameraAnswer:
+) -> object:
     """No picture may be under way.
 
     Args:
-        tell: of a long search.
+        tell: how far a long search is, of how much.
         cancelled: whether nobody waits for it any more.
+
+    Raises:
+        ValueError, IndexError, RuntimeError, TaskError: it cannot be answered.
     """
-    try:
-        if isinstance(question, DrawCamera):
-            return CameraPictures(question.number, _drawn(opened, placed, question))
-        if isinstance(question, JudgeCamera):
-            return _judged(opened, question)
-        if isinstance(question, RunCameras):
-            return CamerasRun(question.number, run_cameras(opened, question))
-        return _suggested(opened, question, tell, cancelled)
-    except (ValueError, IndexError, RuntimeError, TaskError) as error:
-        return CameraQuestionFailed(question.number, str(error))
+    if isinstance(question, DrawCamera):
+        return _drawn(opened, placed, question)
+    if isinstance(question, JudgeCamera):
+        return _judged(opened, question)
+    if isinstance(question, RunCameras):
+        return run_cameras(opened, question)
+    return _suggested(opened, question, tell, cancelled)
 
 
-def _looked_at(opened: OpenedTask, question: DrawCamera) -> tuple[Picture, ...]:
+def _looked_at(opened: OpenedTask, question: DrawCamera) -> Picture:
     """In another size than the env's camera has, which is left alone; or by a camera that the env has not."""
     settings, scale = question.settings, question.scale
     if settings is None or not 0 < scale <= LARGEST_SCALE:
@@ -70,23 +65,17 @@ def _looked_at(opened: OpenedTask, question: DrawCamera) -> tuple[Picture, ...]:
     size = (max(1, round(settings.width * scale)), max(1, round(settings.height * scale)))
     info = next((info for info in opened.description.cameras if info.key == question.key), None)
     placement = Placement(settings, question.key[0], None if info is None else info.mount)
-    made = []
-    for e in question.envs:
-        moment = None if question.poses is None else question.poses[e]
-        picture = picture_of(opened.env.env, e, placement, moment, size)
-        wanted = question.modalities
-        made.append(
-            replace(
-                picture,
-                camera=question.key[1],
-                depth=picture.depth if "depth" in wanted else None,
-                segmentation=picture.segmentation if "segmentation" in wanted else None,
-            )
-        )
-    return tuple(made)
+    picture = picture_of(opened.env.env, question.env, placement, question.poses, size)
+    wanted = question.modalities
+    return replace(
+        picture,
+        camera=question.key[1],
+        depth=picture.depth if "depth" in wanted else None,
+        segmentation=picture.segmentation if "segmentation" in wanted else None,
+    )
 
 
-def _drawn(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> tuple[Picture, ...]:
+def _drawn(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> Picture:
     env, key = opened.env.env, question.key
     if question.scale != 1.0 or all(info.key != key for info in opened.description.cameras):
         return _looked_at(opened, question)
@@ -97,42 +86,34 @@ def _drawn(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> t
         info = next((info for info in opened.description.cameras if info.key == key), None)
         gives = question.modalities if info is None else info.modalities
         wanted = tuple(m for m in question.modalities if m in gives)
-        return tuple(
-            take_pictures(
-                env,
-                e,
-                [(key[1], key[0], wanted)],
-                None if question.poses is None else question.poses[e],
-            )[0]
-            for e in question.envs
-        )
+        return take_pictures(env, question.env, [(key[1], key[0], wanted)], question.poses)[0]
     finally:
         if question.settings is not None:
             placed.place(env, key, before)
 
 
-def _judged(opened: OpenedTask, question: JudgeCamera) -> CameraJudged:
+def _judged(opened: OpenedTask, question: JudgeCamera) -> CameraReport:
     info = next((info for info in opened.description.cameras if info.key == question.key), None)
     width, height = (128, 128) if info is None else (info.width, info.height)
     if question.settings is not None:
         width, height = question.settings.width, question.settings.height
-    report = judge_camera(
+    poses = question.poses
+    return judge_camera(
         opened.env.env,
         question.key,
-        question.envs,
+        (question.env,),
         settings=question.settings,
         size=small_size(width, height, JUDGED_SIDE),
-        poses=question.poses,
+        poses=None if poses is None else np.broadcast_to(poses, (question.env + 1, *poses.shape)),
     )
-    return CameraJudged(question.number, report)
 
 
 def _suggested(
     opened: OpenedTask,
     question: SuggestCameras,
-    tell: Callable[[Searching], None],
+    tell: Callable[[int, int], None],
     cancelled: Callable[[], bool],
-) -> Suggested:
+) -> tuple[OfferedPlacement, ...]:
     told = 0.0
     info = next((info for info in opened.description.cameras if info.key == question.key), None)
 
@@ -140,7 +121,7 @@ def _suggested(
         nonlocal told
         if time.monotonic() - told > _TELL_EVERY:
             told = time.monotonic()
-            tell(Searching(question.number, at.done, at.total))
+            tell(at.done, at.total)
 
     found = suggest_cameras(
         opened.env.env,
@@ -156,10 +137,9 @@ def _suggested(
         progress=progress,
         cancelled=cancelled,
     )
-    offered = tuple(
+    return tuple(
         OfferedPlacement(
             s.settings, s.target, s.score, in_words(s.report, question.objects), s.report, s.picture
         )
         for s in found
     )
-    return Suggested(question.number, offered)

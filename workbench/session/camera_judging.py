@@ -20,22 +20,17 @@ from workbench.core.camera_report import CameraReport, join_reports
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.camera_suggestion import OfferedPlacement
 from workbench.core.pictures import CameraInfo, Picture
-from workbench.session.camera_askers import BackgroundAsker, LiveAsker
-from workbench.session.camera_messages import (
-    CameraJudged,
-    CameraPictures,
-    DrawCamera,
-    JudgeCamera,
-    SuggestCameras,
-    Suggested,
-)
+from workbench.session.askers import Asker, Background
+from workbench.session.camera_messages import DrawCamera, JudgeCamera, SuggestCameras
 from workbench.session.episode_moments import EpisodeMoment
 from workbench.session.lane import Job, Lane
-from workbench.session.messages import Load
+from workbench.session.messages import Load, Reset
 from workbench.session.studio_view import JudgedMoment, Picked, Progress
 
 FIRST_SEED = 10_000
 """The same seeds for every judgement, so that two can be compared; others than people begin with."""
+MOST_ENVS = 16
+"""In the background: more are made of these by resetting them again."""
 _IDLE_SECONDS = 300.0
 _TELL_EVERY = 8
 """Steps after which what is known so far is shown."""
@@ -50,6 +45,10 @@ class ShownMoment:
     num_envs: int
     poses: NDArray[np.float32] | None
     """(N, B, 7) of a moment of the past; None for now."""
+
+    def of(self, env: int) -> NDArray[np.float32] | None:
+        """(B, 7) of one env."""
+        return None if self.poses is None else self.poses[env]
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,7 @@ class Looked:
 class CameraJudging:
     """Thread-safe; every method returns at once."""
 
-    def __init__(self, asker: LiveAsker, on_change: Callable[[], None]) -> None:
+    def __init__(self, asker: Asker, on_change: Callable[[], None]) -> None:
         """
         Args:
             asker: asks the worker that plays.
@@ -86,7 +85,7 @@ class CameraJudging:
         self._on_change = on_change
         self._lock = threading.Lock()
         self._looked = Looked()
-        self._live, self._background = asker, BackgroundAsker()
+        self._live, self._background = asker, Background("that looks at the cameras", "to look with")
         self._live_lane = Lane("studio-live", on_change, self._failed)
         self._background_lane = Lane(
             "studio-background", on_change, self._failed, _IDLE_SECONDS, self._background.end
@@ -113,8 +112,7 @@ class CameraJudging:
             with self._judging_anew():
                 for env in range(moment.num_envs):
                     job.tell(env, moment.num_envs)
-                    question = JudgeCamera(0, key, None, (env,), moment.poses)
-                    reports.append(self._live.ask(question, job.check, CameraJudged).report)
+                    reports.append(self._live.ask(job.check, JudgeCamera(key, None, env, moment.of(env))))
                 self._know_report(key, now, join_reports(reports), 0)
 
         self._live_lane.start(f"judging {key[1]} in all envs", work)
@@ -130,8 +128,8 @@ class CameraJudging:
             with self._judging_anew():
                 for moment in moments:
                     job.tell(len(done), len(moments))
-                    question = JudgeCamera(0, key, None, (moment.env,), moment.poses)
-                    reports.append(self._live.ask(question, job.check, CameraJudged).report)
+                    question = JudgeCamera(key, None, moment.env, moment.poses[moment.env])
+                    reports.append(self._live.ask(job.check, question))
                     done.append(JudgedMoment(moment.serial, moment.env, moment.step))
                     if len(done) % _TELL_EVERY == 0 or len(done) == len(moments):
                         self._know_report(key, now, join_reports(reports), 0, tuple(done))
@@ -146,14 +144,14 @@ class CameraJudging:
         def work(job: Job) -> None:
             reports: list[CameraReport] = []
             done = 0
-            with self._judging_anew():
-                self._background.load(load, job)
+            with self._judging_anew(), self._background.turn(job):
+                num_envs = self._background.ensure(job, _for_judging(load))
                 while done < seeds:
-                    self._background.reset(FIRST_SEED + done, job)
-                    for env in range(min(self._background.num_envs, seeds - done)):
+                    self._background.ask(job.check, Reset(None, FIRST_SEED + done))
+                    for env in range(min(num_envs, seeds - done)):
                         job.tell(done, seeds)
-                        question = JudgeCamera(0, key, now if moved else None, (env,))
-                        reports.append(self._background.ask(question, job, CameraJudged).report)
+                        question = JudgeCamera(key, now if moved else None, env)
+                        reports.append(self._background.ask(job.check, question))
                         done += 1
                     self._know_report(key, now, join_reports(reports), done)
 
@@ -173,19 +171,18 @@ class CameraJudging:
 
         def work(job: Job) -> None:
             self._know(suggestions=(), suggestions_of=key)
-            self._background.load(load, job)
-            self._background.reset(FIRST_SEED, job)
-            envs = tuple(range(min(max(1, seeds), self._background.num_envs)))
-            what = f"searching places for {key[1]}"
-            job.tell(0, 0, what)
-            question = SuggestCameras(0, key, lens, objects, low, high, envs)
-            found = self._background.ask(
-                question, job, Suggested, lambda at: job.tell(at.done, at.total, what)
-            )
-            problem = (
-                "" if found.offered else f"no place in that box sees {' and '.join(objects)} in any env."
-            )
-            self._know(suggestions=found.offered, problem=problem)
+            with self._background.turn(job):
+                num_envs = self._background.ensure(job, _for_judging(load))
+                self._background.ask(job.check, Reset(None, FIRST_SEED))
+                envs = tuple(range(min(max(1, seeds), num_envs)))
+                what = f"searching places for {key[1]}"
+                job.tell(0, 0, what)
+                question = SuggestCameras(key, lens, objects, low, high, envs)
+                found = self._background.ask(
+                    job.check, question, lambda at: job.tell(at.done, at.total, what)
+                )
+            problem = "" if found else f"no place in that box sees {' and '.join(objects)} in any env."
+            self._know(suggestions=found, problem=problem)
 
         self._background_lane.start(f"searching places for {key[1]}", work)
 
@@ -255,8 +252,7 @@ class CameraJudging:
         moment: ShownMoment,
         modalities: tuple[str, ...] = ("rgb",),
     ) -> Picture:
-        question = DrawCamera(0, key, settings, (env,), modalities, moment.poses)
-        return self._live.ask(question, job.check, CameraPictures).pictures[0]
+        return self._live.ask(job.check, DrawCamera(key, settings, env, modalities, moment.of(env)))
 
     def _know_report(
         self,
@@ -292,6 +288,15 @@ class CameraJudging:
 
     def _failed(self, why: str) -> None:
         self._know(problem=f"{why[:1].upper()}{why[1:]}" + ("" if why.endswith(".") else "."))
+
+
+def _for_judging(load: Load) -> Load:
+    options = load.options
+    kwargs = dict(options.env_kwargs)
+    if kwargs.get("obs_mode", "state") not in ("state", "state_dict", "none"):
+        kwargs["obs_mode"] = "state"  # else every reset draws all cameras of all envs
+    envs = min(options.num_envs, MOST_ENVS)
+    return replace(load, options=replace(options, num_envs=envs, env_kwargs=kwargs))
 
 
 def picked(info: CameraInfo, picture: Picture, u: float, v: float, names: dict[int, str]) -> Picked:

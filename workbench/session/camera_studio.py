@@ -27,9 +27,8 @@ from workbench.core.camera_settings import (
 )
 from workbench.core.step import StepResult
 from workbench.session import camera_in_words
-from workbench.session.camera_askers import LiveAsker
+from workbench.session.askers import Asker
 from workbench.session.camera_judging import CameraJudging, ShownMoment
-from workbench.session.camera_messages import CameraAnswer
 from workbench.session.episode_moments import EpisodeMoment
 from workbench.session.first_sight import FirstSight
 from workbench.session.messages import Load, PlaceCamera, Placed, ReloadLevel, Request, TaskDescription
@@ -48,6 +47,7 @@ class CameraStudio:
     def __init__(
         self,
         send: Callable[[Request], None],
+        asker: Asker,
         on_change: Callable[[], None],
         shown: Callable[[], ShownMoment],
         load: Callable[[], Load | None],
@@ -56,7 +56,7 @@ class CameraStudio:
     ) -> None:
         """
         Args:
-            send: to the worker that plays.
+            send, asker: tell and ask the worker that plays.
             on_change: called, on any thread, when `view` has something new.
             shown: what the page shows now.
             load: how another worker gets the version that runs; None before there is one.
@@ -67,14 +67,13 @@ class CameraStudio:
         self._episode = episode
         self._cameras = StudioCameras()
         self._lock = self._cameras.lock
-        self._asker = LiveAsker(send)
-        self.file = StudioFile(self._cameras, self._note, open_copy, self._asker, load)
+        self.file = StudioFile(self._cameras, self._note, open_copy, asker, load)
         self._asking = threading.Lock()
         """Held while placements are sent; taken before `_lock`."""
         self._serial = 0
-        self._judging = CameraJudging(self._asker, self._note)
-        self._quick = QuickLook(self._asker, self._note)
-        self._first = FirstSight(self._asker, self._note)
+        self._judging = CameraJudging(asker, self._note)
+        self._quick = QuickLook(asker, self._note)
+        self._first = FirstSight(asker, self._note)
 
     # --- placing -------------------------------------------------------------------------------------
 
@@ -357,10 +356,6 @@ class CameraStudio:
             # were changed here: taken back, one stands as the file says, which a version that is the same does not tell.
             asked = (*self._cameras.placements.all_moved, *dropped, *(own & said.keys()))
             return tuple(dict.fromkeys(asked))
-
-    def answered(self, answer: CameraAnswer) -> None:
-        """The worker that plays answered a question about a camera."""
-        self._asker.take(answer)
 
     def interrupted(self) -> None:
         """The file was saved, or the worker is gone: what is under way is about what there was before."""

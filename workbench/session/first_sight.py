@@ -11,9 +11,9 @@ from collections.abc import Callable
 
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.pictures import Picture
-from workbench.session.camera_askers import LiveAsker
+from workbench.session.askers import Asker
 from workbench.session.camera_judging import ShownMoment
-from workbench.session.camera_messages import CameraPictures, DrawCamera
+from workbench.session.camera_messages import DrawCamera
 from workbench.session.lane import Job, Lane
 
 _LARGEST = 256
@@ -23,7 +23,7 @@ _LARGEST = 256
 class FirstSight:
     """Thread-safe; every method returns at once."""
 
-    def __init__(self, asker: LiveAsker, on_change: Callable[[], None]) -> None:
+    def __init__(self, asker: Asker, on_change: Callable[[], None]) -> None:
         self._on_change = on_change
         self._lock = threading.Lock()
         self._asker = asker
@@ -50,8 +50,8 @@ class FirstSight:
         scale = min(1.0, _LARGEST / min(settings.width, settings.height))
 
         def work(job: Job) -> None:
-            question = DrawCamera(0, key, settings, (moment.env,), ("rgb",), moment.poses, scale)
-            picture = self._asker.ask(question, job.check, CameraPictures).pictures[0]
+            question = DrawCamera(key, settings, moment.env, ("rgb",), moment.of(moment.env), scale)
+            picture = self._asker.ask(job.check, question)
             with self._lock:
                 self._picture = picture
             self._on_change()

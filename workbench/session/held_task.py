@@ -46,8 +46,8 @@ class HeldTask:
         self.asked_for: Path | None = None
         """The file that is to be loaded, whether or not it ever was."""
 
-    def at_work(self, doing: Doing | None, work: Callable[[], object]) -> None:
-        """Do `work`; if the author's code is at work in it, it can be left.
+    def at_work(self, doing: Doing | None, work: Callable[[], object]) -> Problem | None:
+        """Do `work`; if the author's code is at work in it, it can be left. What it failed with was told.
 
         An exception that is none of Python's ordinary ones (a KeyboardInterrupt, which nobody but the author's code
         raises here, or a class of theirs) is a failure like others; an ordinary one is the workbench's own, and ends
@@ -55,7 +55,7 @@ class HeldTask:
         """
         if doing is None:
             work()
-            return
+            return None
         self._pulse.begin(doing)
         try:
             self._interrupts.run(work)
@@ -65,10 +65,13 @@ class HeldTask:
             # Outside of what knows its task: between two hooks, or in the workbench's own code.
             if isinstance(error, Interrupted):
                 self._line.drop_steps()
-            self.fail(problem_from_exception(error, _STAGE.get(doing, "step"), self._own_files(error)))
+            problem = problem_from_exception(error, _STAGE.get(doing, "step"), self._own_files(error))
+            self.fail(problem)
             self.back_to_the_moment()
+            return problem
         finally:
             self._pulse.begin("idle")
+        return None
 
     def _own_files(self, error: BaseException) -> list[Path]:
         """The author's files, with those on the traceback that lie beside the task and were never loaded whole."""
@@ -78,7 +81,7 @@ class HeldTask:
             known += [Path(frame.filename) for frame in frames if is_own_file(frame.filename, beside)]
         return known
 
-    def guarded(self, do: Callable[[OpenedTask], None]) -> None:
+    def guarded(self, do: Callable[[OpenedTask], object]) -> None:
         """Do it with the task, if there is one; what raises a TaskError has failed."""
         if self.opened is None:
             return

@@ -21,16 +21,11 @@ from enum import Enum
 from typing import Literal
 
 from workbench.authoring.problem import Problem
-from workbench.session.background import BackgroundProcess
+from workbench.session.askers import Background
 from workbench.session.judgement import JudgedCurve, Judgement, Summary
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
-from workbench.session.messages import (
-    Failed,
-    Load,
-    Loaded,
-    TaskDescription,
-)
-from workbench.session.moment_messages import Judged, JudgeMoments, MomentToJudge
+from workbench.session.messages import Load, Loaded, TaskDescription
+from workbench.session.moment_messages import JudgeMoments, MomentToJudge
 
 IDLE_SECONDS = 300.0
 """How long the process is kept without a judgement."""
@@ -39,9 +34,6 @@ _CHUNK_SECONDS = 0.1
 _MOST_AT_ONCE = 64
 _SUMMARY_EVERY = 0.5
 """Seconds; making one takes some milliseconds for a long history."""
-_MOMENT_PATIENCE = 2.0
-_LOAD_PATIENCE = 10.0
-"""Seconds after which a process that was told to stop, and is still at a chunk or a load, is ended."""
 
 
 class StoppedBy(Enum):
@@ -122,8 +114,7 @@ class Judge:
         self._case: _Case | None = None
         """What is shown: what is being judged, or was last."""
         self._view = JudgementView()
-        self._closing = False
-        self._process = BackgroundProcess("that judges", "to judge with")
+        self._process = Background("that judges", "to judge with")
         # Changes and failures are told by `_tell`, with all that there is to them.
         self._lane = Lane("judge", lambda: None, lambda why: None, IDLE_SECONDS, self._process.end)
 
@@ -170,7 +161,6 @@ class Judge:
 
     def close(self) -> None:
         """End the process; returns when the thread has ended."""
-        self._closing = True
         self.stop(StoppedBy.CLOSING)
         self._lane.close()
 
@@ -185,54 +175,45 @@ class Judge:
         with self._lock:
             job.check()  # stopped before it began: what was judged before stays to be seen
             self._case, self._view = case, JudgementView(serial=self._view.serial)
-        try:
-            self._load(job, case)
-            for rows in case.judgement.runs():
-                self._live_through(job, case, rows)
-            self._tell(case, "done")
-        except Stopped:
-            self._tell(case, "stopped")
-            patience = _LOAD_PATIENCE if self._process.owes(Loaded) else _MOMENT_PATIENCE
-            self._process.settle(patience, lambda: self._closing)
-        except JobFailed as failure:
-            self._tell(case, "failed", str(failure), failure.problem)
-        except Exception as error:
-            self._tell(case, "failed", f"it failed within the workbench ({type(error).__name__}: {error})")
-            self._process.end()  # what it was asked for last belongs to nobody
-            raise
+        with self._process.turn(job):
+            try:
+                self._load(job, case)
+                for rows in case.judgement.runs():
+                    self._live_through(job, case, rows)
+                self._tell(case, "done")
+            except Stopped:
+                self._tell(case, "stopped")
+            except JobFailed as failure:
+                self._tell(case, "failed", str(failure), failure.problem)
+            except Exception as error:
+                why = f"it failed within the workbench ({type(error).__name__}: {error})"
+                self._tell(case, "failed", why)
+                raise
         with self._lock:
             case.judgement.let_go()
 
     def _load(self, job: Job, case: _Case) -> None:
         self._tell(case, "loading")
-        if not self._process.there:
-            self._process.start()
-        else:
+        if self._process.holds_task:
             # A version is tried at the moment at which the env stands, which is where the judgement before
             # ended: there the new code may raise or loop though it runs from the beginnings in the record.
             begin = _to_judge(case.judgement, case.judgement.runs()[0].start)
-            self._process.send(JudgeMoments((begin,)))
-            self._process.answer(job, Judged, Failed)
-        event = self._ask_to_load(job, case.load)
-        if isinstance(event, Failed):
-            event = self._ask_to_load(job, replace(case.load, level="rebuilt"))
-        if isinstance(event, Failed):
-            raise JobFailed("the new code could not be loaded to judge with", event.problem)
-
-    def _ask_to_load(self, job: Job, load: Load) -> Loaded | Failed:
-        self._process.send(load)
-        return self._process.answer(job, Loaded, Failed)
+            self._process.ask(job.check, JudgeMoments((begin,)))
+        try:
+            self._process.ensure(job, case.load, or_else=replace(case.load, level="rebuilt"))
+        except JobFailed as failure:
+            if failure.problem is None:
+                raise
+            raise JobFailed("the new code could not be loaded to judge with", failure.problem) from failure
 
     def _live_through(self, job: Job, case: _Case, rows: range) -> None:
         at, count = rows.start, 2
         while at < rows.stop:
             chunk = range(at, min(at + count, rows.stop))
             began = time.monotonic()
-            self._process.send(JudgeMoments(tuple(_to_judge(case.judgement, row) for row in chunk)))
-            answer = self._process.answer(job, Judged, Failed)
+            moments = tuple(_to_judge(case.judgement, row) for row in chunk)
+            answer = self._process.ask(job.check, JudgeMoments(moments))
             took = time.monotonic() - began
-            if isinstance(answer, Failed):
-                raise JobFailed("the episodes could not be run again", answer.problem)
             with self._lock:
                 for row, step in zip(chunk, answer.steps, strict=False):
                     try:

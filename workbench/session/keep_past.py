@@ -17,36 +17,25 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
 from workbench.recording.columns import BatchPacker
 from workbench.recording.episode_writer import EpisodeWriter
 from workbench.recording.landing import RecordingError
-from workbench.session.background import BackgroundProcess
+from workbench.session.askers import Background
 from workbench.session.episode_files import EpisodeFinisher
 from workbench.session.episodes import GatheredEpisode, episode_info
 from workbench.session.keep_status import KeepStatus
-from workbench.session.lane import Job, JobFailed, Lane, Stopped
-from workbench.session.messages import (
-    Failed,
-    Load,
-    Loaded,
-    PlaceCamera,
-    Placed,
-    Request,
-    Reset,
-    Stepped,
-)
-from workbench.session.moment_messages import Captured, CaptureMoments, MomentToCapture
+from workbench.session.lane import Job, JobFailed, Lane
+from workbench.session.messages import Reset
+from workbench.session.moment_messages import CaptureMoment
 from workbench.session.past_episodes import PastEpisode, WhatToKeep, moments_of
 
 _IDLE_SECONDS = 60.0
 """How long the process stays when nothing is kept: it holds some 0.75 GB."""
 _SAME_START = 1e-6
 """Metres and quaternion components."""
-_Answer = TypeVar("_Answer", Captured, Loaded, Placed, Stepped)
 
 
 class PastKeeper:
@@ -56,15 +45,13 @@ class PastKeeper:
         self._folder, self._finisher, self._on_change = folder, finisher, on_change
         self._lock = threading.Lock()
         self._said, self._failed = "", False
-        self._process = BackgroundProcess("that draws it", "to draw it with")
-        self._loaded: tuple[Load, tuple[PlaceCamera, ...]] | None = None
-        """By the process that is there."""
+        self._process = Background("that draws it", "to draw it with")
         self._lane = Lane("keep-past", on_change, self._fail, _IDLE_SECONDS, self._process.end)
 
     def keep(self, what: WhatToKeep) -> None:
         """Begin; what was under way is given up."""
         self._say("")
-        self._lane.start("starting a process to draw it with", lambda job: self._work(job, what))
+        self._lane.start("starting a process to draw it with", lambda job: self._keep(job, what))
 
     def stop(self) -> None:
         """Give up; nothing of it is kept."""
@@ -88,8 +75,19 @@ class PastKeeper:
 
     # --- on the lane's thread --------------------------------------------------------------------------
 
+    def _keep(self, job: Job, what: WhatToKeep) -> None:
+        try:
+            with self._process.turn(job):
+                self._work(job, what)
+        except JobFailed as failure:
+            problem = failure.problem
+            if problem is None:
+                raise
+            where = "" if problem.line is None else f" (line {problem.line})"
+            raise JobFailed(f"it could not be drawn again: {problem.message}{where}") from failure
+
     def _work(self, job: Job, what: WhatToKeep) -> None:
-        self._have_loaded(job, what)
+        self._process.ensure(job, what.load, what.placed)
         what, lost = self._with_sure_seeds(job, what)
         writers: dict[int, GatheredEpisode] = {}
         try:
@@ -127,18 +125,10 @@ class PastKeeper:
         if episode.seed < 0:
             return True
         first, env = episode.moments[0]
-        self._process.send(Reset((env,), episode.seed))
-        while True:
-            event = self._answer(job, Stepped)
-            # The one that the version began with may come before.
-            if event.reset_mask.sum() == 1 and event.seeds is not None and event.seeds[env] == episode.seed:
-                return np.allclose(
-                    event.step.poses[env],
-                    first.as_recorded.poses[env],
-                    rtol=0,
-                    atol=_SAME_START,
-                    equal_nan=True,
-                )
+        step = self._process.ask(job.check, Reset((env,), episode.seed))
+        return np.allclose(
+            step.poses[env], first.as_recorded.poses[env], rtol=0, atol=_SAME_START, equal_nan=True
+        )
 
     def _capture_all(self, job: Job, what: WhatToKeep, writers: dict[int, GatheredEpisode]) -> None:
         names = [dimension.name for dimension in what.task.actions]
@@ -150,10 +140,8 @@ class PastKeeper:
         for done, (moment, envs) in enumerate(moments):
             job.tell(done, len(moments), "drawing it again")
             snapshot = pickle.dumps(what.snapshots[moment.serial])
-            answer = self._ask(
-                job, CaptureMoments((MomentToCapture(snapshot, envs),), what.task.can_render), Captured
-            )
-            columns, pictures, step = answer.columns[0], answer.pictures[0], moment.as_recorded
+            captured = self._process.ask(job.check, CaptureMoment(snapshot, envs, what.task.can_render))
+            columns, pictures, step = captured.columns, captured.pictures, moment.as_recorded
             for env in envs:
                 for episode, is_first in rows[moment.serial][env]:
                     if is_first:
@@ -169,36 +157,6 @@ class PastKeeper:
                     else:
                         writers[episode.env].acts(moment.acted_by)
                     writers[episode.env].take(packer, step, env, columns, pictures)
-
-    def _have_loaded(self, job: Job, what: WhatToKeep) -> None:
-        if self._loaded is not None and self._loaded[1] != what.placed:
-            self._process.end()  # a camera that was put back to the file would stay where it was placed
-        if not self._process.there:
-            self._loaded = None
-            self._process.start()
-        if self._loaded == (what.load, what.placed):
-            return
-        job.tell(0, 0, "building the envs to draw it with")
-        self._loaded = None
-        self._ask(job, what.load, Loaded)
-        for request in what.placed:
-            self._ask(job, request, Placed)
-        self._loaded = what.load, what.placed
-
-    def _ask(self, job: Job, request: Request, kind: type[_Answer]) -> _Answer:
-        self._process.send(request)
-        return self._answer(job, kind)
-
-    def _answer(self, job: Job, kind: type[_Answer]) -> _Answer:
-        try:
-            event = self._process.answer(job, kind, Failed)
-        except Stopped:
-            self._process.end()  # what it was asked for last belongs to nobody
-            raise
-        if isinstance(event, Failed):
-            where = "" if event.problem.line is None else f" (line {event.problem.line})"
-            raise JobFailed(f"it could not be drawn again: {event.problem.message}{where}")
-        return event
 
     def _fail(self, why: str) -> None:
         with self._lock:

@@ -30,7 +30,6 @@ from workbench.session.messages import (
     Loaded,
     Loading,
     Request,
-    WarmedUp,
     WarmUp,
 )
 from workbench.session.process import Output, WorkerProcess
@@ -297,7 +296,7 @@ class KeptWorker:
                 self._load_sent = None
             if isinstance(event, Loaded) and self._spare is not None:
                 self._spare.begin_soon()
-            if event is not None and not isinstance(event, WarmedUp):
+            if event is not None:
                 self._on_event(event)
             if time.monotonic() - looked >= _LOOK:
                 looked = time.monotonic()

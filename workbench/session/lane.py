@@ -34,6 +34,11 @@ class Job:
         self.stopped = False
         self.progress = Progress(what, 0, 0)
 
+    @property
+    def closing(self) -> bool:
+        """There is to be no job after it."""
+        return self._lane.closing
+
     def check(self) -> None:
         """Raises Stopped where it is to stop."""
         if self.stopped:
@@ -67,7 +72,7 @@ class Lane:
         self._wake = threading.Condition()
         self._waiting: Job | None = None
         self._job: Job | None = None
-        self._closing = False
+        self.closing = False
         self._thread: threading.Thread | None = None
 
     @property
@@ -80,7 +85,7 @@ class Lane:
     def start(self, what: str, work: Callable[[Job], None]) -> None:
         """Do this in place of whatever was done before."""
         with self._wake:
-            if self._closing:
+            if self.closing:
                 return
             self._stop()
             self._waiting = Job(self, what, work)
@@ -98,7 +103,7 @@ class Lane:
     def close(self) -> None:
         """Stop, and wait for the thread's end."""
         with self._wake:
-            self._closing = True
+            self.closing = True
             self._stop()
             self._wake.notify_all()
             thread = self._thread
@@ -132,10 +137,10 @@ class Lane:
 
     def _next(self) -> Job | None:
         with self._wake:
-            while self._waiting is None and not self._closing:
+            while self._waiting is None and not self.closing:
                 if not self._wake.wait(self._idle_seconds):
                     self._on_idle()
-            if self._closing:
+            if self.closing:
                 return None
             self._job, self._waiting = self._waiting, None
             return self._job

@@ -24,13 +24,7 @@ from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.core.recorded_run import RecordedRun
 from workbench.core.rules import Degree, Finding
 from workbench.core.step import StepResult
-from workbench.session.camera_messages import (
-    CameraAnswer,
-    CameraQuestion,
-    Searching,
-)
-from workbench.session.moment_messages import Captured, CaptureMoments, Judged, JudgeMoments
-from workbench.session.rescore_messages import Rescore, Rescored
+from workbench.session.calls import Answer, Call, Cancel, Progress, Question
 
 Backend = Literal["auto", "cpu", "gpu"]
 ActionSource = Literal["hold", "zero", "random", "sliders", "policy"]
@@ -118,7 +112,7 @@ class TaskDescription:
 
 
 @dataclass(frozen=True)
-class Load:
+class Load(Question["Loaded"]):
     """Import and build the task, replacing the one that runs if (and only if) all goes well."""
 
     task: TaskName
@@ -145,7 +139,7 @@ class SingleStep:
 
 
 @dataclass(frozen=True)
-class Reset:
+class Reset(Question[StepResult]):
     env_idx: tuple[int, ...] | None = None
     """None resets all."""
     seed: int | None = None
@@ -188,7 +182,7 @@ class ReadPolicyAgain:
 
 
 @dataclass(frozen=True)
-class PlaceCamera:
+class PlaceCamera(Question["Placed"]):
     """Put a camera elsewhere in all envs, or give it another lens, size or shader; answered with `Placed`.
 
     Of several for one camera that wait, only the last is made.
@@ -270,7 +264,7 @@ class DrawPast:
 
 
 @dataclass(frozen=True)
-class WarmUp:
+class WarmUp(Question[None]):
     """Do what the first load and the first picture of a process take long over; see `warm_up`."""
 
     options: TaskOptions
@@ -306,17 +300,14 @@ Request = (
     | Settings
     | ReadPolicyAgain
     | PlaceCamera
-    | CameraQuestion
     | SetCapture
     | Restore
     | StepBack
     | DrawPast
-    | WarmUp
     | ListenForDebugger
     | Inspect
-    | JudgeMoments
-    | Rescore
-    | CaptureMoments
+    | Call
+    | Cancel
     | Quit
 )
 
@@ -481,13 +472,6 @@ class RulesBroken:
 
 
 @dataclass(frozen=True)
-class WarmedUp:
-    """The answer to `WarmUp`."""
-
-    seconds: float
-
-
-@dataclass(frozen=True)
 class DebuggerListens:
     """The answer to `ListenForDebugger`."""
 
@@ -505,15 +489,11 @@ Event = (
     | Stepped
     | Pictures
     | Placed
-    | CameraAnswer
-    | Searching
     | PastPictures
     | Inspection
-    | Judged
-    | Rescored
-    | Captured
+    | Answer
+    | Progress
     | Status
     | RulesBroken
-    | WarmedUp
     | DebuggerListens
 )

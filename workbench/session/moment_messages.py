@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from workbench.authoring.problem import Problem
 from workbench.core.pictures import Picture
 from workbench.core.step import StepResult
+from workbench.session.calls import Question
 
 
 @dataclass(frozen=True)
@@ -29,34 +30,8 @@ class MomentToJudge:
 
 
 @dataclass(frozen=True)
-class JudgeMoments:
-    """Live through these moments, in order; the answer is `Judged`. Only for a worker that does not play."""
-
-    moments: tuple[MomentToJudge, ...]
-
-
-@dataclass(frozen=True)
-class MomentToCapture:
-    """A moment of the past of which some envs are to be recorded after the fact."""
-
-    snapshot: bytes
-    """A pickled `core.snapshot.Snapshot` of the whole batch."""
-    env_idx: tuple[int, ...]
-    """Those whose pictures are wanted."""
-
-
-@dataclass(frozen=True)
-class CaptureMoments:
-    """Put the envs back to these moments, and say what a recording would have kept; the answer is `Captured`. Only for a
-    worker that does not play."""
-
-    moments: tuple[MomentToCapture, ...]
-    pictures: bool
-
-
-@dataclass(frozen=True)
 class Judged:
-    """The answer to `JudgeMoments`: what the task says of them now."""
+    """What the task says of some moments now."""
 
     steps: tuple[StepResult, ...]
     """One for each moment; fewer if one raised."""
@@ -67,11 +42,28 @@ class Judged:
 
 
 @dataclass(frozen=True)
-class Captured:
-    """The answer to `CaptureMoments`."""
+class JudgeMoments(Question[Judged]):
+    """Live through these moments, in order. Only for a worker that does not play."""
 
-    columns: tuple[dict[str, NDArray], ...]
-    """As `Stepped.columns`, one for each moment."""
-    pictures: tuple[tuple[Picture, ...], ...]
-    not_carried: dict[str, str]
-    """What could not be put back, and why."""
+    moments: tuple[MomentToJudge, ...]
+
+
+@dataclass(frozen=True)
+class Captured:
+    """What a recording would have kept of a moment."""
+
+    columns: dict[str, NDArray]
+    """As `Stepped.columns`."""
+    pictures: tuple[Picture, ...]
+
+
+@dataclass(frozen=True)
+class CaptureMoment(Question[Captured]):
+    """Put the envs back to a moment of the past that is to be recorded after the fact. Only for a worker that does not
+    play."""
+
+    snapshot: bytes
+    """A pickled `core.snapshot.Snapshot` of the whole batch."""
+    env_idx: tuple[int, ...]
+    """Those whose pictures are wanted, if any."""
+    pictures: bool

@@ -16,9 +16,9 @@ from dataclasses import dataclass
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.pictures import Picture
 from workbench.core.step import StepResult
-from workbench.session.camera_askers import LiveAsker
+from workbench.session.askers import Asker
 from workbench.session.camera_judging import ShownMoment
-from workbench.session.camera_messages import CameraPictures, DrawCamera
+from workbench.session.camera_messages import DrawCamera
 from workbench.session.lane import Job, Lane
 
 MODALITIES = ("rgb", "depth", "segmentation")
@@ -47,7 +47,7 @@ class Sight:
 class QuickLook:
     """Thread-safe; every method returns at once."""
 
-    def __init__(self, asker: LiveAsker, on_change: Callable[[], None]) -> None:
+    def __init__(self, asker: Asker, on_change: Callable[[], None]) -> None:
         self._on_change = on_change
         self._lock = threading.Lock()
         self._asker = asker
@@ -94,10 +94,10 @@ class QuickLook:
 
         def work(job: Job) -> None:
             question = DrawCamera(
-                0, sight.key, sight.settings, (sight.env,), MODALITIES, moment.poses, sight.scale
+                sight.key, sight.settings, sight.env, MODALITIES, moment.of(sight.env), sight.scale
             )
             try:
-                picture = self._asker.ask(question, job.check, CameraPictures).pictures[0]
+                picture = self._asker.ask(job.check, question)
                 with self._lock:
                     self._picture = picture
             finally:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from workbench.authoring.problem import Problem
 from workbench.recording.episode import Episode
+from workbench.session.calls import Question
 
 FAR_METRES = 1e-3
 """A body further than this from the record makes a comparison doubtful."""
@@ -81,21 +82,20 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class Rescore:
-    """Request to a worker with the task open: judge these episodes; the answers are `Rescored`."""
-
-    files: tuple[EpisodeFile, ...]
-    use_env_states: bool
-
-
-@dataclass(frozen=True)
 class Rescored:
-    """How far a `Rescore` is."""
+    """How far a `Rescore` is, or its end."""
 
     verdicts: tuple[Verdict, ...]
     """New ones."""
     steps: int
     """Control steps of all its episodes so far."""
-    finished: bool
     problem: Problem | None = None
     """What the task's code raised; then it goes no further."""
+
+
+@dataclass(frozen=True)
+class Rescore(Question[Rescored]):
+    """Have a worker with the task open judge these episodes; each `Progress.part` is a `Rescored`."""
+
+    files: tuple[EpisodeFile, ...]
+    use_env_states: bool

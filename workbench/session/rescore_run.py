@@ -103,26 +103,34 @@ def rescore(
             yield replace(verdict, begins_otherwise=seat.beginning.otherwise, missed=missed)
 
 
-def answer(opened: OpenedTask, request: Rescore, send: Callable[[Rescored], None]) -> None:
-    """Carry out `request` in a worker, telling how far it is a few times a second."""
+def answer(opened: OpenedTask, request: Rescore, tell: Callable[[int, int, Rescored], None]) -> Rescored:
+    """Carry out `request` in a worker.
+
+    Args:
+        tell: called a few times a second with the control steps so far and what is new.
+
+    Returns:
+        what is new since then.
+    """
     told, steps = time.monotonic(), 0
     ready: list[Verdict] = []
 
-    def tell(now: int) -> None:
+    def on_steps(now: int) -> None:
         nonlocal told, steps
         steps = now
         if time.monotonic() - told > _TELL_EVERY:
             told = time.monotonic()
-            send(Rescored(tuple(ready), steps, False))
+            tell(steps, 0, Rescored(tuple(ready), steps))
             ready.clear()
 
     try:
-        for verdict in rescore(opened, request.files, use_env_states=request.use_env_states, on_steps=tell):
+        for verdict in rescore(
+            opened, request.files, use_env_states=request.use_env_states, on_steps=on_steps
+        ):
             ready.append(verdict)
     except TaskError as error:
-        send(Rescored(tuple(ready), steps, True, error.problem))
-        return
-    send(Rescored(tuple(ready), steps, True))
+        return Rescored(tuple(ready), steps, error.problem)
+    return Rescored(tuple(ready), steps)
 
 
 def _ready(opened: OpenedTask, file: EpisodeFile, use_env_states: bool) -> _Ready | Verdict:

@@ -17,10 +17,11 @@ from typing import Literal
 
 from workbench.authoring.problem import Problem
 from workbench.authoring.reference import TaskName, named_file
-from workbench.session.background import BackgroundProcess
+from workbench.session.askers import Background
+from workbench.session.calls import Progress
 from workbench.session.clearance import Clearances, NotCleared
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
-from workbench.session.messages import Failed, Load, Loaded, TaskOptions
+from workbench.session.messages import Load, TaskOptions
 from workbench.session.rescore import Group, group_episodes, hidden_in_words, not_judged, with_renderer
 from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored, Verdict
 from workbench.session.step_back import CannotStepIn, write_source
@@ -85,7 +86,7 @@ class Rescorer:
         self._lock = threading.Lock()
         """Of `view`: what a job that was stopped still has to say is not heard."""
         self._view = RescoreView()
-        self._process = BackgroundProcess("that judges", "to judge with")
+        self._process = Background("that judges", "to judge with")
         # `_run` tells of failures itself, with what the code raised.
         self._lane = Lane("rescore", lambda: None, lambda why: None, IDLE_SECONDS, self._process.end)
 
@@ -169,12 +170,10 @@ class Rescorer:
             self._tell(
                 job, state="failed", why=f"it failed within the workbench ({type(error).__name__}: {error})"
             )
-            self._process.end()  # what it was asked for last belongs to nobody
             raise
 
     def _judge(self, job: Job, asked: _Asked, group: Group, reference: TaskName) -> None:
         process = self._process
-        process.start()
         folder: Path | None = None
         try:
             if asked.recorded_source:
@@ -182,30 +181,32 @@ class Rescorer:
             hidden = tuple(dict.fromkeys((*self._view.hidden, *hidden_in_words(reference))))
             self._tell(job, state="loading", task=_judged_with(group, asked), hidden=hidden)
             # Never patched into what the last episodes were judged in.
-            process.send(Load(reference, group.options, level="rebuilt"))
-            told = process.answer(job, Loaded, Failed)
-            if isinstance(told, Failed):
-                process.send(Load(reference, with_renderer(group.options), level="rebuilt"))
-                told = process.answer(job, Loaded, Failed)
-            if isinstance(told, Failed):
-                raise JobFailed(f"{group.info.task} could not be opened to judge with", told.problem)
+            load = Load(reference, group.options, level="rebuilt")
+            try:
+                process.ensure(job, load, or_else=replace(load, options=with_renderer(group.options)))
+            except JobFailed as failure:
+                if failure.problem is None:
+                    raise
+                why = f"{group.info.task} could not be opened to judge with"
+                raise JobFailed(why, failure.problem) from failure
             self._tell(job, state="judging")
-            process.send(Rescore(group.files, asked.use_env_states))
             began, before, steps = time.monotonic(), self._view.seconds, self._view.steps
-            while True:
-                told = process.answer(job, Rescored, Failed)
-                if isinstance(told, Failed):
-                    raise JobFailed("the episodes could not be run again", told.problem)
+
+            def on_progress(at: Progress) -> None:
+                told(at.part)
+
+            def told(now: Rescored) -> None:
                 self._tell(
                     job,
-                    verdicts=(*self._view.verdicts, *told.verdicts),
-                    steps=steps + told.steps,
+                    verdicts=(*self._view.verdicts, *now.verdicts),
+                    steps=steps + now.steps,
                     seconds=before + time.monotonic() - began,
                 )
-                if told.problem is not None:
-                    raise JobFailed(f"the code of {group.info.task} raised", told.problem)
-                if told.finished:
-                    return
+
+            last = process.ask(job.check, Rescore(group.files, asked.use_env_states), on_progress)
+            told(last)
+            if last.problem is not None:
+                raise JobFailed(f"the code of {group.info.task} raised", last.problem)
         except CannotStepIn as error:
             raise JobFailed(str(error)) from error
         finally:

@@ -17,13 +17,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, get_args
+from typing import Any
 
 from workbench.authoring.reference import TaskName
 from workbench.core.inspection import Section
 from workbench.core.recorded_run import RecordedRun
 from workbench.machine.watched_thread import listen, stop_listening
-from workbench.session.camera_messages import CameraAnswer
+from workbench.session.askers import Asker
+from workbench.session.calls import Answer, Progress
 from workbench.session.camera_studio import CameraStudio
 from workbench.session.debugger_words import listening_for_a_debugger
 from workbench.session.env_table import EnvRows
@@ -123,8 +124,10 @@ class Session:
         self._policy_file = PolicyFile(self._on_policy_saved)
         self.past = TimeTravel(self._shared, self._send, self.pause)
         """What the batch lived through."""
+        self._asker = Asker(self._send)
         self.studio = CameraStudio(
             self._send,
+            self._asker,
             self._note,
             self.past.shown_moment,
             self.versions.same_again,
@@ -376,6 +379,8 @@ class Session:
             self._on_loaded(event)
         elif isinstance(event, Stepped):
             self._on_stepped(event)
+        elif isinstance(event, Answer | Progress):
+            self._asker.take(event)
         elif isinstance(event, DebuggerListens):
             self._say(listening_for_a_debugger(event))
         else:
@@ -383,8 +388,6 @@ class Session:
                 self._state.take(event)
             if isinstance(event, Placed):
                 self.studio.placed(event)
-            if isinstance(event, get_args(CameraAnswer)):
-                self.studio.answered(event)  # type: ignore[arg-type]
             if isinstance(event, Failed):
                 self.versions.failed(event)
                 if not self._state.problem_at_run:

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import time
 
-from workbench.session.messages import WarmedUp, WarmUp
+from workbench.session.calls import Answer, Call
+from workbench.session.messages import WarmUp
 from workbench.session.process import WorkerProcess
 
 _DELAY = 5.0
@@ -41,11 +42,11 @@ class SpareWorker:
                 self._due = None
                 # What it prints is of ManiSkill's and the renderer's making, and was seen before.
                 self._process = WorkerProcess(lambda stream, piece: False)
-                self._process.send(self._warm_up)
+                self._process.send(Call(0, self._warm_up))
             return
         try:
             while (event := self._process.receive(timeout=0)) is not None:
-                self._ready = self._ready or isinstance(event, WarmedUp)
+                self._ready = self._ready or isinstance(event, Answer)
         except EOFError:
             self._failures += 1
             self.stop()

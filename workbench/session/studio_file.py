@@ -17,8 +17,8 @@ from pathlib import Path
 from workbench.authoring.camera_source.cameras import Ran
 from workbench.authoring.source.text import Refused
 from workbench.core.camera_settings import CameraKey, CameraKind, CameraSettings, differences
-from workbench.session.camera_askers import LiveAsker
-from workbench.session.camera_messages import CamerasRun, RunCameras
+from workbench.session.askers import Asker
+from workbench.session.camera_messages import RunCameras
 from workbench.session.camera_writing import CameraWriting, Wish, copy, plan
 from workbench.session.lane import JobFailed, Stopped
 from workbench.session.messages import Load, TaskDescription
@@ -44,7 +44,7 @@ class StudioFile:
         cameras: StudioCameras,
         on_change: Callable[[], None],
         open_copy: Callable[[Path, str], None],
-        asker: LiveAsker,
+        asker: Asker,
         load: Callable[[], Load | None],
     ) -> None:
         self._cameras, self._note, self._open_copy = cameras, on_change, open_copy
@@ -119,7 +119,7 @@ class StudioFile:
                 raise Stopped
 
         try:
-            return self._asker.ask(RunCameras(0, load.task, texts), check, CamerasRun).ran
+            return self._asker.ask(check, RunCameras(load.task, texts))
         except Stopped:
             raise Refused("the task did not answer, or another version came meanwhile; ask again") from None
         except JobFailed as failure:

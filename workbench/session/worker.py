@@ -33,12 +33,8 @@ from workbench.core.inspect_env import inspect_env
 from workbench.core.step import StepResult
 from workbench.machine.current_folder import CurrentFolder
 from workbench.session.acting import Acting
-from workbench.session.camera_messages import (
-    DrawCamera,
-    JudgeCamera,
-    RunCameras,
-    SuggestCameras,
-)
+from workbench.session.calls import Answer, Call, Cancel, Progress, Question
+from workbench.session.camera_messages import CameraQuestion, RunCameras
 from workbench.session.debugger import CannotDebug, listen_for_debugger, wait_for_debugger
 from workbench.session.go_back import go_back, going_back
 from workbench.session.held_task import HeldTask
@@ -68,10 +64,9 @@ from workbench.session.messages import (
     SingleStep,
     Status,
     StepBack,
-    WarmedUp,
     WarmUp,
 )
-from workbench.session.moment_messages import CaptureMoments, JudgeMoments
+from workbench.session.moment_messages import CaptureMoment, JudgeMoments
 from workbench.session.open_task import OpenedTask, reset_checked, step_checked
 from workbench.session.pacing import Pacer, Rate
 from workbench.session.pulse import Doing, PulseWriter
@@ -81,7 +76,7 @@ from workbench.session.server_line import ServerLine
 from workbench.session.step_back_run import going_there, step_back
 from workbench.session.step_events import StepEvents
 from workbench.session.warm_up import warm_up
-from workbench.session.worker_cameras import WorkerCameras
+from workbench.session.worker_cameras import CannotAnswer, WorkerCameras
 
 _STATUS_PERIOD = 0.25
 _IDLE = 0.5
@@ -121,20 +116,13 @@ class Worker:
             Settings: self._change,
             ReadPolicyAgain: self._read_policy_again,
             PlaceCamera: self._cameras.place,
-            DrawCamera: self._cameras.answer,
-            JudgeCamera: self._cameras.answer,
-            SuggestCameras: self._cameras.answer,
-            RunCameras: self._cameras.answer,
             SetCapture: self._set_capture,
             Restore: self._restore,
             StepBack: self._step_back,
             DrawPast: self._cameras.draw_past,
-            WarmUp: self._warm_up,
             ListenForDebugger: self._listen_for_debugger,
             Inspect: self._inspect,
-            JudgeMoments: self._judge_moments,
-            Rescore: self._rescore,
-            CaptureMoments: self._cameras.capture,
+            Cancel: lambda request: None,
             Quit: self._stop,
         }
 
@@ -145,6 +133,9 @@ class Worker:
             self._pulse.begin("idle")
             self._line.listen(self._sleep())
             while (request := self._line.next()) is not None:
+                if isinstance(request, Call):
+                    self._call(request)
+                    continue
                 work = partial(self._handlers[type(request)], request)
                 self._held.at_work(_DOING.get(type(request)), work)
             now = time.monotonic()
@@ -158,6 +149,56 @@ class Worker:
             if time.monotonic() - self._rules_sent > _STATUS_PERIOD:
                 self._tell_of_rules()
 
+    # --- questions ---------------------------------------------------------------------------------
+
+    def _call(self, call: Call) -> None:
+        """Answered whatever happens, or who asked would wait for ever."""
+        answers: list[Answer] = []
+        doing = _DOING.get(type(call.request))
+        problem = self._held.at_work(doing, lambda: answers.append(self._answer(call)))
+        if problem is not None:
+            answers = [Answer(call.number, why=problem.message, problem=problem)]
+        self._line.send(answers[0])
+
+    def _answer(self, call: Call) -> Answer:
+        def tell(done: int, total: int, part: object = None) -> None:
+            self._line.send(Progress(call.number, done, total, part))
+
+        try:
+            return Answer(call.number, self._value(call.request, tell))
+        except CannotAnswer as error:
+            return Answer(call.number, why=str(error))
+        except TaskError as error:
+            if self._held.drop_steps_if_left(error):
+                self._held.back_to_the_moment()
+            return Answer(call.number, why=str(error), problem=error.problem)
+
+    def _value(self, question: Question[Any], tell: Callable[..., None]) -> object:
+        if isinstance(question, WarmUp):
+            return warm_up(question.options, lambda: not self._line.waits())
+        if isinstance(question, Load):
+            loaded: list[Loaded] = []
+            self._load_version(question, loaded.append)
+            return loaded[0]
+        opened = self._held.opened
+        if opened is None:
+            raise CannotAnswer("no task is loaded")
+        if isinstance(question, CameraQuestion):
+            return self._cameras.answer(opened, question, tell)
+        if isinstance(question, PlaceCamera):
+            return self._cameras.place_now(opened, question)
+        if isinstance(question, Reset):
+            return self._reset_envs(opened, question.env_idx, self._seeds(question))
+        if isinstance(question, JudgeMoments):
+            return judge_moments(opened, question)
+        if isinstance(question, CaptureMoment):
+            return self._cameras.capture(opened, question)
+        assert isinstance(question, Rescore)
+        # Not for every worker: it brings rerun and what reads recordings, a third of a second.
+        from workbench.session import rescore_run
+
+        return rescore_run.answer(opened, question, tell)
+
     # --- requests ----------------------------------------------------------------------------------
 
     def _sleep(self) -> float:
@@ -170,6 +211,13 @@ class Worker:
         return min(waits)
 
     def _load(self, request: Load) -> None:
+        try:
+            self._load_version(request, self._line.send)
+        except TaskError as error:
+            self._held.drop_steps_if_left(error)
+            self._line.send(Failed(error.problem, self._held.opened is not None, error.classes))
+
+    def _load_version(self, request: Load, tell: Callable[[Loaded], None]) -> None:
         self._cameras.settle()
         with self._started_in.again():
             self._held.asked_for = named_file(request.task)
@@ -185,17 +233,17 @@ class Worker:
                     on_activity=lambda activity: self._line.send(Loading(activity)),
                     on_finding=lambda finding: None,  # see `_tell_of_rules`
                 )
-        except TaskError as error:
+        except TaskError:
             self._cameras.put_back()  # trying new cameras took the old ones away
-            self._held.drop_steps_if_left(error)
-            self._line.send(Failed(error.problem, self._held.opened is not None, error.classes))
-            return
+            raise
         # From here on it is one thing: an interrupt in the middle would leave the page with another task than ours.
         with self._interrupts.shielded():
-            self._take_over(opened, report, request)
+            self._take_over(opened, report, request, tell)
             self._tell_of_rules()
 
-    def _take_over(self, opened: OpenedTask, report: ReloadReport | None, request: Load) -> None:
+    def _take_over(
+        self, opened: OpenedTask, report: ReloadReport | None, request: Load, tell: Callable[[Loaded], None]
+    ) -> None:
         before, self._held.opened = self._held.opened, opened
         self._loaded_by, self._last = request, opened.first
         if report is None or report.level not in ("same", "patched"):
@@ -206,7 +254,7 @@ class Worker:
             # The meshes are 9 MB for a Panda, and the server has them: 0.2 s on a reload's way to the page.
             unchanged = replace(opened.description.geometry, visuals=())
             description = replace(opened.description, geometry=unchanged)
-            self._line.send(Loaded(description, opened.first, opened.milliseconds, report))
+            tell(Loaded(description, opened.first, opened.milliseconds, report))
             return
         self._pacer = Pacer(opened.env.control_dt, self._pacer.speed)
         if report is None or not report.carried:
@@ -217,16 +265,11 @@ class Worker:
         self._acting.sliders = ()
         self._cameras.look_again()
         self._steps.new_scene()
-        self._line.send(Loaded(opened.description, opened.first, opened.milliseconds, report))
+        tell(Loaded(opened.description, opened.first, opened.milliseconds, report))
         # The past begins with the reset, and what a first step is taken back to is this.
         self._send_step(opened.first, np.ones(opened.env.num_envs, bool), opened.env.episode_seeds)
         if before is not None:
             before.env.close()
-
-    def _warm_up(self, request: WarmUp) -> None:
-        began = time.monotonic()
-        warm_up(request.options, lambda: not self._line.waits())
-        self._line.send(WarmedUp(time.monotonic() - began))
 
     def _listen_for_debugger(self, request: ListenForDebugger) -> None:
         try:
@@ -246,14 +289,16 @@ class Worker:
         self._send_status(None)
 
     def _reset(self, request: Reset) -> None:
-        if self._held.opened is None:
-            return
+        if self._held.opened is not None:
+            seeds = self._seeds(request)
+            self._held.guarded(lambda opened: self._reset_envs(opened, request.env_idx, seeds))
+
+    def _seeds(self, request: Reset) -> int | list[int] | None:
         # The random actions start again with the seed, or "reset" would not repeat an episode.
         if request.seed is not None:
             self._acting.seed(request.seed)
         count = 0 if request.env_idx is None else len(request.env_idx)
-        seed = self._acting.fresh_seeds(count) if request.seed is None and count else request.seed
-        self._held.guarded(lambda opened: self._reset_envs(opened, request.env_idx, seed))
+        return self._acting.fresh_seeds(count) if request.seed is None and count else request.seed
 
     def _change(self, new: Settings) -> None:
         old, self._settings = self._settings, new
@@ -301,17 +346,6 @@ class Worker:
         if self._held.opened is not None and request.env < self._held.opened.env.num_envs:
             self._line.send(inspect_env(self._held.opened.env, request.env, request.sections))
 
-    def _judge_moments(self, request: JudgeMoments) -> None:
-        if self._held.opened is not None:
-            self._line.send(judge_moments(self._held.opened, request))
-
-    def _rescore(self, request: Rescore) -> None:
-        # Not for every worker: it brings rerun and what reads recordings, a third of a second.
-        from workbench.session import rescore_run
-
-        if self._held.opened is not None:
-            rescore_run.answer(self._held.opened, request, self._line.send)
-
     def _stop(self, request: Quit) -> None:
         self._quit = True
 
@@ -336,7 +370,7 @@ class Worker:
 
     def _reset_envs(
         self, opened: OpenedTask, env_idx: tuple[int, ...] | None, seed: int | list[int] | None
-    ) -> None:
+    ) -> StepResult:
         self._cameras.finish_picture()  # a reset may build the scene anew
         step = self._reset_with_seeds(opened, env_idx, seed)
         self._cameras.put_back()
@@ -345,6 +379,7 @@ class Worker:
             mask[:] = False
             mask[list(env_idx)] = True
         self._send_step(step, mask, seeds=opened.env.episode_seeds)
+        return step
 
     def _reset_with_seeds(
         self, opened: OpenedTask, env_idx: tuple[int, ...] | None, seed: int | list[int] | None
@@ -474,7 +509,7 @@ _DOING: dict[type, Doing] = {
     WarmUp: "warming up",
     ListenForDebugger: "starting",
 }
-"""The requests that may run the author's code, or take long for other reasons."""
+"""The requests and questions that may run the author's code, or take long for other reasons."""
 
 
 def work(connection: int, pulse: PulseWriter) -> None:

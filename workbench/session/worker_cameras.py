@@ -17,8 +17,8 @@ from workbench.core.place_camera import PlacedCameras
 from workbench.core.take_pictures import Request as PictureRequest
 from workbench.core.take_pictures import list_cameras, take_pictures
 from workbench.session.camera_answers import answer
-from workbench.session.camera_messages import CameraQuestion, CameraQuestionFailed
-from workbench.session.capture_moments import capture_moments
+from workbench.session.camera_messages import CameraQuestion
+from workbench.session.capture_moments import capture_moment
 from workbench.session.held_task import HeldTask
 from workbench.session.interrupts import Interrupts
 from workbench.session.messages import (
@@ -29,12 +29,16 @@ from workbench.session.messages import (
     PlaceCamera,
     Placed,
 )
-from workbench.session.moment_messages import CaptureMoments
+from workbench.session.moment_messages import Captured, CaptureMoment
 from workbench.session.open_task import OpenedTask, blamed
 from workbench.session.picture_maker import PictureMaker
 from workbench.session.pulse import PulseWriter
 from workbench.session.server_line import ServerLine
 from workbench.session.step_events import StepEvents
+
+
+class CannotAnswer(Exception):
+    """A question that is none for this task, or for this machine's renderer; a sentence."""
 
 
 class WorkerCameras:
@@ -76,15 +80,21 @@ class WorkerCameras:
         self._to_place.pop(request.key, None)
         self._to_place[request.key] = request
 
-    def answer(self, question: CameraQuestion) -> None:
-        if self._held.opened is None:
-            self._line.send(CameraQuestionFailed(question.number, "no task is loaded"))
-            return
+    def place_now(self, opened: OpenedTask, request: PlaceCamera) -> Placed:
+        self.settle()
+        return self._place(opened, request)
+
+    def answer(
+        self, opened: OpenedTask, question: CameraQuestion, tell: Callable[[int, int], None]
+    ) -> object:
         self.settle()
         self._pulse.begin("drawing")
-        told = answer(self._held.opened, self._placed, question, self._line.send, self._line.waits)
-        self._pulse.begin("idle")
-        self._line.send(told)
+        try:
+            return answer(opened, self._placed, question, tell, self._line.waits)
+        except (ValueError, IndexError, RuntimeError) as error:
+            raise CannotAnswer(str(error)) from error
+        finally:
+            self._pulse.begin("idle")
 
     def draw_past(self, request: DrawPast) -> None:
         opened = self._held.opened
@@ -99,12 +109,9 @@ class WorkerCameras:
             return
         self._line.send(PastPictures(request.origin, pictures))
 
-    def capture(self, request: CaptureMoments) -> None:
-        def capture(opened: OpenedTask) -> None:
-            self.settle()  # the same scene is about to be drawn
-            self._line.send(capture_moments(opened, request))
-
-        self._held.guarded(capture)
+    def capture(self, opened: OpenedTask, request: CaptureMoment) -> Captured:
+        self.settle()  # the same scene is about to be drawn
+        return capture_moment(opened, request)
 
     # --- what the worker does to the scene -----------------------------------------------------------
 

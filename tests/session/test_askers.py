@@ -1,0 +1,187 @@
+"""Who asks a worker: each question has its own answer, and what a process sends is believed as little as a task is."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from queue import Queue
+
+import psutil
+import pytest
+
+from tests.drive.waiting import until
+from tests.session.hazards import calm, provoke, provoked, write_task
+from workbench.authoring.problem import Problem
+from workbench.session.askers import Asker, Background
+from workbench.session.calls import Answer, Call, Progress
+from workbench.session.camera_messages import JudgeCamera
+from workbench.session.lane import Job, JobFailed, Lane, Stopped
+from workbench.session.messages import Load, PlaceCamera, Request, Reset, TaskOptions
+
+BASE = ("sensor", "base_camera")
+PROBLEM = Problem("step", "it broke", None, None, None, "")
+
+
+def go_on() -> None:
+    """Nobody stops it."""
+
+
+def question(env: int) -> JudgeCamera:
+    return JudgeCamera(BASE, None, env)
+
+
+class Line:
+    """What a worker was sent."""
+
+    def __init__(self) -> None:
+        self.calls: Queue[Call] = Queue()
+
+    def send(self, request: Request) -> None:
+        assert isinstance(request, Call)
+        self.calls.put(request)
+
+
+def test_two_that_ask_at_once_each_hear_their_own_whatever_comes_first() -> None:
+    line = Line()
+    asker = Asker(line.send)
+    with ThreadPoolExecutor(2) as threads:
+        asked = [threads.submit(asker.ask, go_on, Reset((env,), env)) for env in range(2)]
+        calls = [line.calls.get(timeout=10) for _ in range(2)]
+        asker.take(Answer(99, why="nobody's"))
+        for call in reversed(calls):
+            asker.take(Answer(call.number, why=f"env {call.request.env_idx[0]}"))  # type: ignore[attr-defined]
+        for env, future in enumerate(asked):
+            with pytest.raises(JobFailed, match=f"env {env}"):
+                future.result(timeout=10)
+
+
+def test_progress_comes_in_order_before_the_answer_and_an_answer_brings_its_problem() -> None:
+    line, heard = Line(), list[Progress]()
+    asker = Asker(line.send)
+    with ThreadPoolExecutor(1) as threads:
+        asked = threads.submit(asker.ask, go_on, question(0), heard.append)
+        number = line.calls.get(timeout=10).number
+        for done in range(3):
+            asker.take(Progress(number, done, 3))
+        asker.take(Answer(number, why="no such camera", problem=PROBLEM))
+        with pytest.raises(JobFailed, match="no such camera") as failed:
+            asked.result(timeout=10)
+    assert failed.value.problem is PROBLEM
+    assert [at.done for at in heard] == [0, 1, 2]
+
+
+def test_an_answer_of_another_kind_is_none() -> None:
+    line = Line()
+    asker = Asker(line.send)
+    with ThreadPoolExecutor(1) as threads:
+        asked = threads.submit(asker.ask, go_on, question(0))
+        asker.take(Answer(line.calls.get(timeout=10).number, ("no", "report")))
+        with pytest.raises(JobFailed, match="answered with a tuple"):
+            asked.result(timeout=10)
+
+
+def test_who_is_told_to_stop_waits_no_longer_and_a_late_answer_is_nobody_s() -> None:
+    line, stopped = Line(), threading.Event()
+    asker = Asker(line.send)
+
+    def check() -> None:
+        if stopped.is_set():
+            raise Stopped
+
+    with ThreadPoolExecutor(1) as threads:
+        asked = threads.submit(asker.ask, check, question(0))
+        number = line.calls.get(timeout=10).number
+        stopped.set()
+        with pytest.raises(Stopped):
+            asked.result(timeout=10)
+        asker.take(Answer(number, why="late"))
+        again = threads.submit(asker.ask, go_on, question(1))
+        assert (second := line.calls.get(timeout=10).number) != number
+        asker.take(Answer(second, why="mine"))
+        with pytest.raises(JobFailed, match="mine"):
+            again.result(timeout=10)
+
+
+def a_job() -> Job:
+    return Job(Lane("test", go_on, lambda why: None), "judging", lambda job: None)
+
+
+@pytest.fixture
+def background(child_process: None) -> Iterator[Background]:
+    process = Background("that judges", "to judge with")
+    yield process
+    process.end()
+
+
+@pytest.mark.parametrize("what", ["garbage", pytest.param("half", marks=pytest.mark.slow)])
+def test_a_process_that_sends_garbage_ends_its_job_and_the_next_can_have_another(
+    background: Background, tmp_path: Path, what: str
+) -> None:
+    file = write_task(tmp_path)
+    provoke(file, "import", what)
+    job, load = a_job(), Load(str(file), TaskOptions(num_envs=1))
+    pids = list[int | None]()
+
+    def ensure() -> None:
+        with background.turn(job):
+            background.ensure(job, load)
+
+    if what == "half":
+        # It hangs in the middle of a message: that is no end, and a job that is stopped must get out all the same.
+        with ThreadPoolExecutor(1) as threads:
+            asked = threads.submit(ensure)
+            until(lambda: provoked(file), "it hangs in the middle of a message")
+            pids.append(background.pid)
+            job.stopped = True
+            with pytest.raises(Stopped):
+                asked.result(timeout=30)
+    else:
+        with pytest.raises(JobFailed, match="the process that judges sent what cannot be read"):
+            ensure()
+    assert background.pid is None and not any(pid is not None and psutil.pid_exists(pid) for pid in pids)
+    calm(file)
+    job.stopped = False
+    ensure()
+    assert background.pid is not None
+
+
+def test_what_is_loaded_is_loaded_once_and_a_process_that_dies_ends_only_the_job_that_asked(
+    background: Background, tmp_path: Path
+) -> None:
+    (tmp_path / "other").mkdir()
+    file, job = write_task(tmp_path), a_job()
+    load = Load(str(file), TaskOptions(num_envs=2, env_kwargs={"render_backend": "none"}))
+    told = list[str]()
+    job.tell = lambda done, total, what="": told.append(what)  # type: ignore[method-assign]
+    with background.turn(job):
+        assert background.ensure(job, load) == 2
+        assert told == ["starting a process to judge with", "building envs to judge with"]
+        assert background.ensure(job, load) == 2 and len(told) == 2, "it is there already"
+        step = background.ask(job.check, Reset((1,), 7))
+        assert step.poses.shape[0] == 2
+        with pytest.raises(JobFailed, match="no human camera 'nothing'"):
+            background.ask(job.check, JudgeCamera(("human", "nothing"), None, 0))
+        first = background.pid
+        assert first is not None
+        os.kill(first, signal.SIGKILL)
+        with pytest.raises(JobFailed, match="the process that judges was killed by SIGKILL"):
+            background.ask(job.check, Reset((1,), 7))
+    with background.turn(job):
+        assert background.ensure(job, load) == 2 and background.pid not in (None, first)
+        # What fails to load leaves the version before open, and is tried otherwise if there is another way.
+        provoke(file, "build", "ctrl_c")
+        with pytest.raises(JobFailed, match="the task failed in the background") as failed:
+            background.ensure(job, replace(load, level="rebuilt"))
+        assert failed.value.problem is not None and background.holds_task
+        other = Load(
+            str(write_task(tmp_path / "other")), TaskOptions(1, env_kwargs={"render_backend": "none"})
+        )
+        assert background.ensure(job, replace(load, level="rebuilt"), or_else=other) == 1
+        # A camera that stands elsewhere cannot be put back to the file but in a new process.
+        second, placed = background.pid, (PlaceCamera(("human", "nothing"), None),)
+        assert background.ensure(job, other, placed) == 1 and background.pid != second

@@ -1,0 +1,233 @@
+"""Whoever asks a worker: the one that plays, between its steps, or one in the background.
+
+The worker that plays has the envs that are on the screen, at their present moment. Judging the past, drawing it again
+and looking at cameras over many seeds take seconds or minutes, and put the envs wherever they like. So that is asked of
+a process of its own with a lower priority, which costs some seconds to start and some 0.75 GB: it is kept between jobs
+and ended when there was none in a while (`Lane`).
+
+A worker answers in order. A job that is stopped leaves one answer owed, which is taken at the end of its turn, or the
+process is ended. One that dies ends the job that asked it, and the next starts another.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import count
+from typing import Any, TypeVar
+
+from workbench.machine.family import describe_exit
+from workbench.session.calls import Answer, Call, Cancel, Progress, Question, fits
+from workbench.session.lane import Job, JobFailed
+from workbench.session.message_reader import Unreadable
+from workbench.session.messages import Load, PlaceCamera, Request
+from workbench.session.process import WorkerProcess
+
+_LOOK = 0.05
+"""Seconds between two looks at whether the job is to stop."""
+_NICENESS = 10
+_PATIENCE = 3.0
+_LOAD_PATIENCE = 10.0
+"""Seconds in which a process must answer what nobody waits for any more, or is ended."""
+Value = TypeVar("Value")
+OnProgress = Callable[[Progress], None]
+
+
+def _ignore(at: Progress) -> None:
+    pass
+
+
+class Asker:
+    """Asks the worker that plays: any number of questions at a time, from any threads, each with its own answer."""
+
+    def __init__(self, send: Callable[[Request], None]) -> None:
+        self._send = send
+        self._numbers = count(1)
+        self._condition = threading.Condition()
+        self._heard: dict[int, deque[Answer | Progress]] = {}
+        """What came for each question that is under way, and was not taken."""
+
+    def ask(
+        self, check: Callable[[], None], question: Question[Value], on_progress: OnProgress = _ignore
+    ) -> Value:
+        """
+        Args:
+            check: called often meanwhile; what it raises ends the question, whose answer is then dropped.
+
+        Raises:
+            JobFailed: it cannot be answered.
+        """
+        with self._condition:
+            number = next(self._numbers)
+            self._heard[number] = deque()
+        try:
+            self._send(Call(number, question))
+            while True:
+                check()
+                event = self._next(number)
+                if isinstance(event, Progress):
+                    on_progress(event)
+                elif event is not None:
+                    return _value(event, question)
+        finally:
+            with self._condition:
+                del self._heard[number]
+
+    def take(self, event: Answer | Progress) -> None:
+        """What the worker said."""
+        with self._condition:
+            if event.number in self._heard:
+                self._heard[event.number].append(event)
+                self._condition.notify_all()
+
+    def _next(self, number: int) -> Answer | Progress | None:
+        with self._condition:
+            heard = self._heard[number]
+            self._condition.wait_for(lambda: heard, _LOOK)
+            return heard.popleft() if heard else None
+
+
+class Background(Asker):
+    """Asks a process in the background, one thing at a time. All but `pid` on one lane's thread, within a `turn`."""
+
+    def __init__(self, that: str, to: str) -> None:
+        """
+        Args:
+            that: what it does, as in "the process *that judges* was killed by SIGKILL".
+            to: what for, as in "no process could be started *to judge with*".
+        """
+        super().__init__(self._send_call)
+        self._that, self._to = that, to
+        self._process: WorkerProcess | None = None
+        self._owed: Call | None = None
+        self._has: tuple[Load, tuple[PlaceCamera, ...], int] | None = None
+        """What was loaded last, where its cameras were placed, and how many envs that made; None after a failure."""
+        self.holds_task = False
+        """Whether the process has any version open."""
+
+    @property
+    def pid(self) -> int | None:
+        """None while there is no process."""
+        process = self._process
+        return None if process is None else process.pid
+
+    @contextmanager
+    def turn(self, job: Job) -> Iterator[None]:
+        """What a job asks is asked within this."""
+        try:
+            yield
+        finally:
+            self._settle(job)
+
+    def ensure(
+        self, job: Job, load: Load, placed: tuple[PlaceCamera, ...] = (), or_else: Load | None = None
+    ) -> int:
+        """Have a process with that version, and cameras where they are placed; started, loaded and placed if need be.
+
+        Args:
+            load: a level that is named is always loaded.
+            or_else: what is loaded where `load` fails.
+
+        Returns:
+            how many envs it has.
+
+        Raises:
+            Stopped: the job is to stop.
+            JobFailed: it cannot be had; with the problem, if the author's code raised.
+        """
+        if self._has is not None and self._has[1] != placed:
+            self.end()  # a camera that was put back to the file would stay where it was placed
+        if self._process is None:
+            job.tell(0, 0, f"starting a process {self._to}")
+            try:
+                self._process = _start()
+            except OSError as error:
+                raise JobFailed(f"no process could be started {self._to}: {error}") from error
+        if self._has is not None and load.level == "auto" and self._has[0] == load:
+            return self._has[2]
+        self._has = None
+        job.tell(0, 0, f"building envs {self._to}")
+        try:
+            loaded = self.ask(job.check, load)
+        except JobFailed as failure:
+            if failure.problem is None:
+                raise
+            if or_else is None:
+                why = f"the task failed in the background: {failure.problem.message}"
+                raise JobFailed(why, failure.problem) from failure
+            loaded = self.ask(job.check, or_else)
+        self.holds_task = True
+        for request in placed:
+            self.ask(job.check, request)
+        self._has = load, placed, loaded.task.num_envs
+        return loaded.task.num_envs
+
+    def ask(
+        self, check: Callable[[], None], question: Question[Value], on_progress: OnProgress = _ignore
+    ) -> Value:
+        """As `Asker.ask`; JobFailed also where the process died."""
+        try:
+            return super().ask(check, question, on_progress)
+        except EOFError as error:
+            why = self._why_gone(error)
+            self.end()
+            check()
+            raise JobFailed(f"the process {self._that} {why}") from None
+
+    def end(self) -> None:
+        """End it, if there is one. `pid` is its own until it has ended."""
+        if self._process is not None:
+            self._process.stop(grace=0.0)
+        self._process, self._owed, self._has, self.holds_task = None, None, None, False
+
+    def _settle(self, job: Job) -> None:
+        """Take the answer that is still owed, or end the process that does not give it in time."""
+        if self._process is None or self._owed is None:
+            return
+        self._process.send(Cancel())
+        patience = _LOAD_PATIENCE if isinstance(self._owed.request, Load) else _PATIENCE
+        deadline = time.monotonic() + patience
+        try:
+            while self._owed is not None and not job.closing:
+                if time.monotonic() > deadline:
+                    self.end()
+                    return
+                self._next(self._owed.number)
+        except EOFError:
+            self.end()  # of what it was asked for last; the next job starts another
+
+    def _send_call(self, request: Request) -> None:
+        assert self._process is not None and isinstance(request, Call)
+        self._owed = request
+        self._process.send(request)
+
+    def _next(self, number: int) -> Answer | Progress | None:
+        assert self._process is not None
+        event: Any = self._process.receive(timeout=_LOOK)
+        if not isinstance(event, Answer | Progress) or event.number != number:
+            return None
+        if isinstance(event, Answer):
+            self._owed = None
+        return event
+
+    def _why_gone(self, error: EOFError) -> str:
+        if isinstance(error, Unreadable):
+            return f"sent what cannot be read ({error}) and was ended"
+        return describe_exit(None if self._process is None else self._process.exit_code())
+
+
+def _value(answer: Answer, question: Question[Value]) -> Value:
+    if answer.why:
+        raise JobFailed(answer.why, answer.problem)
+    if not fits(answer.value, question):
+        raise JobFailed(f"the worker answered with a {type(answer.value).__name__}")
+    return answer.value
+
+
+def _start() -> WorkerProcess:
+    # What the author's code prints in it is heard of the worker that plays, and not said twice.
+    # With a low priority: after the one that plays, where there are fewer cores than work.
+    return WorkerProcess(lambda stream, piece: False, _NICENESS)
