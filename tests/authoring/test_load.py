@@ -21,7 +21,7 @@ from mani_skill.utils.registration import REGISTERED_ENVS
 from tests.authoring.refusal import refused
 from tests.authoring.registered import registered
 from workbench.authoring import registry
-from workbench.authoring.load import LoadedTask, load_task, take_back, with_late_imports
+from workbench.authoring.load import LoadedTask, load_task, take_back, task_of_class, with_late_imports
 
 Write = Callable[..., Path]
 
@@ -70,6 +70,22 @@ def test_a_registered_id_gives_the_built_in_class_and_its_source() -> None:
     assert (task.class_name, task.max_episode_steps, task.followed) == ("PickCubeEnv", 50, False)
     assert task.file is not None and task.file.name == "pick_cube.py"
     assert "class PickCubeEnv" in task.source[str(task.file)]
+
+
+def test_a_class_that_a_task_file_imports_is_no_class_of_that_file(write: Write) -> None:
+    built_in = "from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv\n"
+    path = write("child.py", f"{built_in}{PUSH.replace('BaseEnv', 'PickCubeEnv')}", task=True)
+    load_task(str(path))
+    task = load_task("PickCube-v1")
+    assert task.file is not None and task.file.name == "pick_cube.py" and str(path) not in task.source
+
+
+def test_a_class_of_others_that_a_task_file_registers_comes_with_that_file(write: Write) -> None:
+    built_in = "from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv\n"
+    path = write("again.py", f'{built_in}\nregister_env("AuthorPick-v1")(PickCubeEnv)\n', task=True)
+    load_task(str(path))
+    task = task_of_class(REGISTERED_ENVS["AuthorPick-v1"].cls, "AuthorPick-v1")
+    assert (task.file, str(path) in task.source) == (path, True)
 
 
 @pytest.mark.parametrize(

@@ -426,7 +426,9 @@ def task_of_class(cls: type[BaseEnv], env_id: str) -> LoadedTask:
     spec = registry.environment(env_id)
     limit, kwargs = (None, {}) if spec is None else (spec.max_episode_steps, dict(spec.default_kwargs))
     for load in _loads.values():
-        if vars(sys.modules.get(load.finder.main, object)).get(cls.__name__) is cls:
+        # A class of others that the file only imports has its own file.
+        registered = any(made.cls is cls and made.name == env_id for made in load.registrations.made)
+        if registered or cls.__module__ in load.finder.names:
             fields = _source_fields(load.finder)
             return LoadedTask(
                 cls, env_id, cls.__name__, load.finder.file, **fields, max_episode_steps=limit,
