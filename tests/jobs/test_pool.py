@@ -77,9 +77,12 @@ def test_each_item_is_done_once_with_the_same_result_whoever_does_it(
     assert not any(map(psutil.pid_exists, pids - {os.getpid()}))
 
 
-def test_cores_and_envs_are_shared_out() -> None:
+def test_cores_and_envs_are_shared_out(tmp_path: Path) -> None:
     cores = sorted(os.sched_getaffinity(0))
-    given = [line.rpartition(" ")[2].split(",") for line in Run([Setup()] * 2, range(4)).by(Processes()).news]
+    given = [
+        line.rpartition(" ")[2].split(",")
+        for line in Run([Setup(folder=tmp_path)] * 2, range(4)).by(Processes()).news
+    ]
     together = sorted(int(core) for one in given for core in one)
     assert together == (cores if len(cores) > 1 else 2 * cores)
     assert [shares(5, 2), shares(2, 3), shares(6, 3)] == [[3, 2], [1, 1], [2, 2, 2]]
@@ -105,7 +108,7 @@ def test_an_item_that_waits_for_others_is_dropped_when_it_is_not_wanted(tmp_path
         if (tmp_path / "waits").exists():
             run.deal.lower(4)
 
-    setups = [Setup("waits", 4, tmp_path), Setup("waits", 4, tmp_path)]
+    setups = [Setup("waits", 4, folder=tmp_path), Setup("waits", 4, folder=tmp_path)]
     done = Run(setups, range(10**6), on_result=enough).by(Processes())
     assert set(range(4)) <= set(done.results)
 
@@ -148,7 +151,7 @@ def test_a_process_that_fails_ends_the_job_and_the_others_finish_what_they_have(
     how: str, says: str, error: type[Exception], tmp_path: Path
 ) -> None:
     # The last that is dealt, so that the other process has all that is before it.
-    run = Run([Setup(how, 7, tmp_path)] * 2, range(8))
+    run = Run([Setup(how, 7, folder=tmp_path)] * 2, range(8))
     with pytest.raises(error, match=says) as raised:
         run.by(Processes())
     if isinstance(raised.value, TaskError):
@@ -158,15 +161,15 @@ def test_a_process_that_fails_ends_the_job_and_the_others_finish_what_they_have(
 
 
 @pytest.mark.parametrize("processes", [1, 2])
-def test_a_task_that_cannot_be_loaded_is_said_once(processes: int) -> None:
-    run = Run([Setup("cannot be loaded")] * processes, range(8))
+def test_a_task_that_cannot_be_loaded_is_said_once(processes: int, tmp_path: Path) -> None:
+    run = Run([Setup("cannot be loaded", folder=tmp_path)] * processes, range(8))
     with pytest.raises(TaskError, match="it broke") as raised:
         run.by(Processes())
     assert raised.value.problem == PROBLEM and not run.results
 
 
-def test_a_process_that_forgets_an_item_is_a_failure() -> None:
-    run = Run([Setup()], range(8), run=work.forget)
+def test_a_process_that_forgets_an_item_is_a_failure(tmp_path: Path) -> None:
+    run = Run([Setup(folder=tmp_path)], range(8), run=work.forget)
     with pytest.raises(PoolError, match="ended before it was done"):
         run.by(Processes())
 
@@ -177,7 +180,7 @@ def test_who_does_not_want_to_wait_ends_processes_that_hang(tmp_path: Path) -> N
             raise KeyboardInterrupt  # as the second Ctrl-C does
         return False
 
-    run = Run([Setup("hangs", 3, tmp_path)] * 2, range(10**6), stop=twice)
+    run = Run([Setup("hangs", 3, folder=tmp_path)] * 2, range(10**6), stop=twice)
     with pytest.raises(KeyboardInterrupt):
         run.by(Processes())
     pids = {int(line.split()[2]) for line in run.news}
@@ -189,6 +192,6 @@ def test_a_process_that_does_not_stop_is_not_waited_for_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("workbench.jobs.pool._END_SECONDS", 0.2)
-    run = Run([Setup("hangs", 0, tmp_path)], range(8), stop=lambda: (tmp_path / "hangs").exists())
+    run = Run([Setup("hangs", 0, folder=tmp_path)], range(8), stop=lambda: (tmp_path / "hangs").exists())
     with pytest.raises(PoolError, match="that squares did not end in time"):
         run.by(Processes())

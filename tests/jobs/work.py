@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from workbench.authoring.problem import Problem, TaskError
@@ -20,7 +20,7 @@ class Setup:
     how: str = ""
     at: int = -1
     """The item with which that happens."""
-    folder: Path = Path()
+    folder: Path = field(kw_only=True)
 
 
 @dataclass(frozen=True)
