@@ -20,12 +20,13 @@ from mani_skill.utils.structs.pose import Pose
 
 from tests.core.single_env_judge import put_in_same_state
 from workbench.core.cpu_scene import batched_class
+from workbench.core.rules import Degree
 
 STATE_ONLY = {"obs_mode": "state", "render_backend": "none"}
 
 
-def batched(env_id: str, num_envs: int) -> BaseEnv:
-    return batched_class(REGISTERED_ENVS[env_id].cls)(num_envs=num_envs, **STATE_ONLY)
+def batched(env_id: str, num_envs: int, rules: Degree | None = None) -> BaseEnv:
+    return batched_class(REGISTERED_ENVS[env_id].cls, rules=rules)(num_envs=num_envs, **STATE_ONLY)
 
 
 @pytest.fixture(scope="module")
@@ -114,6 +115,29 @@ def test_link_velocities_are_those_of_the_links(pick_cubes: BaseEnv) -> None:
     for link in pick_cubes.agent.robot.links:
         expected = torch.tensor(np.array([body.linear_velocity for body in link._bodies]))
         assert torch.equal(link.linear_velocity, expected)
+
+
+@pytest.mark.filterwarnings("ignore:The pose of link")
+@pytest.mark.parametrize("rules", ["off", None])
+def test_a_root_that_was_set_stays_set_when_the_velocity_of_a_link_is_read_before_it_is_applied(
+    rules: Degree | None,
+) -> None:
+    env = batched("PickCube-v1", 2, rules)
+    env.reset(seed=[0, 1])
+    env.step(env.action_space.sample())
+    robot, wanted = env.agent.robot, env.agent.robot.pose.raw_pose.clone()
+    wanted[:, 0] -= 0.1
+    fast = torch.full((2, 3), 0.5)
+    robot.set_pose(Pose.create(wanted))
+    robot.set_root_linear_velocity(fast)
+    assert robot.links[3].linear_velocity.shape == (2, 3)
+    assert torch.equal(robot.root_linear_velocity, fast)
+    env.scene._gpu_apply_all()
+    assert np.allclose([a.root_pose.p for a in robot._objs], wanted[:, :3], atol=1e-6)
+    env.scene.px.gpu_update_articulation_kinematics()
+    env.scene._gpu_fetch_all()
+    assert torch.allclose(robot.pose.raw_pose, wanted, atol=1e-6)
+    env.close()
 
 
 def test_a_stock_env_in_the_same_process_is_left_as_it_was(pick_cubes: BaseEnv) -> None:

@@ -12,6 +12,7 @@ fewer joints than the widest, the padding reads a zero.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -25,6 +26,7 @@ BODY = 13
 """Floats of a body in ``pack()``: quaternion wxyz, position, linear and angular velocity."""
 _FROM_PACKEDBODY = np.array([4, 5, 6, 0, 1, 2, 3, 7, 8, 9, 10, 11, 12])
 """Where ManiSkill's row [p, q, v, w] finds its columns in a packed body [q, p, v, w]."""
+_IN_ENV = re.compile(r"^scene-\d+[-_]")
 _FROM_PACKED_POSE = np.array([4, 5, 6, 0, 1, 2, 3])
 
 
@@ -53,6 +55,10 @@ class Layout:
     pose_at: NDArray[np.int64]
     """(R, 7) of each row, within the packed poses of its own env."""
     env_of_row: NDArray[np.int64]
+    names: list[str]
+    """(R,) of the body in each row, the same in every env."""
+    articulation_names: list[str]
+    """(A,) likewise."""
     row_of: dict[int, int]
     index_of: dict[int, int]
     row_count: int
@@ -130,6 +136,8 @@ def lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Sce
         entities=row_entities,
         pose_at=stacked(pose_at, 7),
         env_of_row=np.array(env_of_row, dtype=np.int64),
+        names=[_IN_ENV.sub("", entity.name) for entity in row_entities],
+        articulation_names=[_IN_ENV.sub("", articulation.name) for articulation in articulations],
         row_of={id(b): r for b, r in zip(every_body, [*body_rows, *link_rows], strict=True)},
         index_of={id(a): i for i, a in enumerate(articulations)},
         row_count=row,

@@ -19,7 +19,7 @@ What makes it quick:
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -30,10 +30,10 @@ import torch
 from numpy.typing import NDArray
 
 from workbench.core.contacts import BodyImpulseQuery, ContactReader, CpuArray, PairImpulseQuery
-from workbench.core.cpu_layout import BODY, Layout, check_layout, lay_out
+from workbench.core.cpu_layout import Layout, check_layout, lay_out
 from workbench.core.drawn_poses import Places, TensorPoses
-from workbench.core.drive_targets import DriveTargets, Setters, refuse_nan
 from workbench.core.gpu_members import applies_everything, uncommon_member
+from workbench.core.mirrors import Group, Mirror, Mirrors, refuse_nan
 from workbench.core.stepping import Stepper
 
 _TOO_EARLY = (
@@ -55,6 +55,7 @@ class BatchedCpuSystem:
         self.stepper = Stepper(self.systems, self.scenes, threads)
         self.contacts = ContactReader(self.systems)
         self._layout: Layout | None = None
+        self._found: Mirrors | None = None
         self._packed: NDArray[np.float32] | None = None
         self._posed: NDArray[np.float32] | None = None
         self._pose_lengths: list[int] = []
@@ -117,13 +118,12 @@ class BatchedCpuSystem:
         Args:
             flags: `drive_flags` as they were before.
         """
-        env_of = {id(scene): env for env, scene in enumerate(self.scenes)}
-        chosen = set(envs)
-        for row, articulation in enumerate(self._laid_out.articulations):
-            if env_of[id(articulation.root.entity.scene)] in chosen:
-                for now, was in zip(self.drive_flags, flags, strict=True):
-                    now[row] = was[row]
-        self._fetch_targets()
+        rows = np.isin(self._mirrors.targets.envs, envs)
+        for now, was in zip(self.drive_flags, flags, strict=True):
+            now[rows] = was[rows]
+        for targets in (self._mirrors.targets, self._mirrors.velocity_targets):
+            targets.drop()
+        self._fetch("targets")
 
     @contextmanager
     def merging(self, substeps: int) -> Iterator[None]:
@@ -152,42 +152,29 @@ class BatchedCpuSystem:
     def gpu_init(self) -> None:
         """Lay out the tensors over the bodies that were built; called once a scene is complete."""
         layout = self._layout = lay_out(self.systems, self.scenes)
-        width = layout.qpos_at.shape[1]
-        self._data, self._data_seen = _twin((layout.row_count, BODY))
-        self._qpos, self._qpos_seen = _twin(layout.qpos_at.shape)
-        self._qvel, self._qvel_seen = _twin(layout.qpos_at.shape)
-        self._qf, self._qf_seen = _twin(layout.qpos_at.shape)
-        self._qacc = np.zeros((len(layout.articulations), width), dtype=np.float32)
+        found = self._found = Mirrors(
+            layout, self._pack, self._link_poses, self._setter, self.stepper.write_before_step
+        )
+        self._qacc = np.zeros_like(found.qpos.now)
         most_links = max((len(a.links) for a in layout.articulations), default=0)
         self._joint_forces = np.zeros((len(layout.articulations), most_links, 6), dtype=np.float32)
-        self._tensor_poses = TensorPoses(self.scenes, layout, self._data)
-        self._force = np.zeros((layout.row_count, 3), dtype=np.float32)
-        self._torque = np.zeros((layout.row_count, 3), dtype=np.float32)
-        env_of = {id(scene): env for env, scene in enumerate(self.scenes)}
-        articulations_of: list[list[int]] = [[] for _ in self.scenes]
-        for i, articulation in enumerate(layout.articulations):
-            articulations_of[env_of[id(articulation.root.entity.scene)]].append(i)
-        self._targets = DriveTargets(layout, self._setters("set_drive_target"), articulations_of)
-        self._velocity_targets = DriveTargets(
-            layout, self._setters("set_drive_velocity_target"), articulations_of
-        )
-        self.cuda_rigid_body_data = _array(self._data)
+        self._tensor_poses = TensorPoses(self.scenes, layout, found.bodies.now)
+        self._force, self._torque = np.zeros((2, layout.row_count, 3), dtype=np.float32)
+        self.cuda_rigid_body_data = _array(found.bodies.now)
         self.cuda_rigid_dynamic_data = self.cuda_rigid_body_data
         self.cuda_articulation_link_data = self.cuda_rigid_body_data
-        self.cuda_articulation_qpos = _array(self._qpos)
-        self.cuda_articulation_qvel = _array(self._qvel)
-        self.cuda_articulation_qf = _array(self._qf)
-        self.cuda_articulation_target_qpos = _array(self._targets.now)
-        self.cuda_articulation_target_qvel = _array(self._velocity_targets.now)
+        self.cuda_articulation_qpos = _array(found.qpos.now)
+        self.cuda_articulation_qvel = _array(found.qvel.now)
+        self.cuda_articulation_qf = _array(found.qf.now)
+        self.cuda_articulation_target_qpos = _array(found.targets.now)
+        self.cuda_articulation_target_qvel = _array(found.velocity_targets.now)
         self.cuda_rigid_body_force = _array(self._force)
         self.cuda_rigid_body_torque = _array(self._torque)
         self.cuda_rigid_dynamic_force = self.cuda_rigid_body_force
         self.cuda_rigid_dynamic_torque = self.cuda_rigid_body_torque
         check_layout(layout, self._pack(), self._link_poses)
-        self._fetch_bodies()
-        self._fetch_links()
-        self._fetch_joints()
-        self._fetch_targets()
+        for mirror in found.all:
+            mirror.fetch()
 
     def row_of(self, body: physx.PhysxRigidBodyComponent) -> int:
         """Row of a dynamic or kinematic body, or of a link, in the (R, 13) tensor."""
@@ -209,29 +196,40 @@ class BatchedCpuSystem:
             raise RuntimeError(_TOO_EARLY)
         return self._layout
 
+    @property
+    def _mirrors(self) -> Mirrors:
+        if self._found is None:
+            raise RuntimeError(_TOO_EARLY)
+        return self._found
+
     def __getattr__(self, name: str) -> Any:
         # The tensors exist from `gpu_init` on: a task that asks earlier is told what it did wrong.
         if name.startswith("cuda_") and self.__dict__.get("_layout") is None:
             raise RuntimeError(_TOO_EARLY)
         return uncommon_member(name)
 
-    def _setters(self, method: str) -> Setters:
-        """What sets one kind of drive target, of each active joint of each articulation."""
-        return [[getattr(joint, method) for joint in a.active_joints] for a in self._laid_out.articulations]
+    def _setter(self, joint: Any, method: str) -> Callable[[float], None]:
+        """What sets one kind of drive target of a joint."""
+        return getattr(joint, method)
 
     # --- reading: gpu_fetch_* ----------------------------------------------------------------------
 
+    def _fetch(self, group: Group) -> None:
+        """Read what `group` has from the simulation, over what tasks wrote and did not apply."""
+        for mirror in self._mirrors.of[group]:
+            mirror.fetch()
+
     def gpu_fetch_rigid_dynamic_data(self) -> None:
-        self._fetch_bodies()
+        self._fetch("bodies")
 
     def gpu_fetch_articulation_link_pose(self) -> None:
-        self._fetch_links()
+        self._fetch("links")
 
     def gpu_fetch_articulation_link_velocity(self) -> None:
         """The root's comes with `gpu_fetch_articulation_link_pose`; see `fetch_link_velocities`."""
 
     def gpu_fetch_articulation_qpos(self) -> None:
-        self._fetch_joints()
+        self._fetch("joints")
 
     def gpu_fetch_articulation_qvel(self) -> None:
         """Comes with `gpu_fetch_articulation_qpos`."""
@@ -240,7 +238,7 @@ class BatchedCpuSystem:
         """Fetched when `cuda_articulation_qacc` is read."""
 
     def gpu_fetch_articulation_target_qpos(self) -> None:
-        self._fetch_targets()
+        self._fetch("targets")
 
     def gpu_fetch_articulation_target_qvel(self) -> None:
         """Comes with `gpu_fetch_articulation_target_qpos`."""
@@ -275,10 +273,12 @@ class BatchedCpuSystem:
         layout = self._laid_out
         if self._links_fetched_at == self._version:
             return
+        # Those of roots came with the poses, and may have been written since, as any pose may.
+        now, seen = self._mirrors.links.now, self._mirrors.links.seen
         for row, link in zip(layout.link_rows, layout.links, strict=True):
-            self._data[row, 7:10] = link.linear_velocity
-            self._data[row, 10:13] = link.angular_velocity
-        self._data_seen[layout.link_rows] = self._data[layout.link_rows]
+            if not link.is_root:
+                now[row, 7:10] = seen[row, 7:10] = link.linear_velocity
+                now[row, 10:13] = seen[row, 10:13] = link.angular_velocity
         self._links_fetched_at = self._version
 
     def _pack(self) -> NDArray[np.float32]:
@@ -320,31 +320,6 @@ class BatchedCpuSystem:
         self._version += 1
         self.contacts.invalidate()
 
-    def _fetch_bodies(self) -> None:
-        layout = self._laid_out
-        rows = self._pack()[layout.body_at]
-        self._data[layout.body_rows] = rows
-        self._data_seen[layout.body_rows] = rows
-
-    def _fetch_links(self) -> None:
-        layout = self._laid_out
-        poses = self._link_poses()
-        self._data[layout.link_rows, :7] = poses
-        self._data_seen[layout.link_rows, :7] = poses
-        velocities = self._pack()[layout.root_at[:, 7:]]
-        self._data[layout.root_rows, 7:] = velocities
-        self._data_seen[layout.root_rows, 7:] = velocities
-
-    def _fetch_joints(self) -> None:
-        layout, packed = self._laid_out, self._pack()
-        self._qpos[:] = self._qpos_seen[:] = packed[layout.qpos_at]
-        self._qvel[:] = self._qvel_seen[:] = packed[layout.qvel_at]
-
-    def _fetch_targets(self) -> None:
-        layout, packed = self._laid_out, self._pack()
-        self._targets.fetched(packed[layout.target_qpos_at])
-        self._velocity_targets.fetched(packed[layout.target_qvel_at])
-
     def elsewhere(self, envs: Sequence[int]) -> dict[int, Places]:
         """By env: bodies that the tensor has elsewhere than SAPIEN, and where it has them; see `drawn_poses`."""
         self._catch_up()
@@ -367,10 +342,18 @@ class BatchedCpuSystem:
 
     @property
     def drive_flags(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """(A,), (A,) whether position, velocity targets were ever set; see `drive_targets`."""
-        return self._targets.driven, self._velocity_targets.driven
+        """(A,), (A,) whether position, velocity targets were ever set; see `mirrors.DriveTargets`."""
+        return self._mirrors.targets.driven, self._mirrors.velocity_targets.driven
 
     # --- writing: gpu_apply_* ----------------------------------------------------------------------
+
+    def _apply(self, mirror: Mirror, keep_awake: bool = False) -> None:
+        """Set in the simulation what tasks wrote and what differs from the last fetch."""
+        changed = mirror.differs().any()
+        if changed:
+            self.note_change()
+        if changed or keep_awake:
+            mirror.apply(keep_awake)
 
     def apply_changes(self) -> None:
         """Everything that ``ManiSkillScene._gpu_apply_all`` applies, but only what differs."""
@@ -380,65 +363,40 @@ class BatchedCpuSystem:
         self.gpu_apply_articulation_qf()
         self.gpu_apply_articulation_root_pose()
         self.gpu_apply_articulation_root_velocity()
-        self._apply_targets(self._targets, keep_awake=False)
-        self._apply_targets(self._velocity_targets, keep_awake=False)
+        self._apply(self._mirrors.targets)
+        self._apply(self._mirrors.velocity_targets)
 
     @applies_everything
     def gpu_apply_rigid_dynamic_data(self) -> None:
-        layout = self._laid_out
-        now, seen = self._data[layout.body_rows], self._data_seen[layout.body_rows]
-        differs = now != seen
-        for i in np.flatnonzero(differs.any(axis=1)):
-            body, row = layout.bodies[i], now[i]
-            refuse_nan(row, body.entity.name)
-            if differs[i, :7].any():
-                body.entity.pose = _pose(row)
-            if differs[i, 7:].any() and not body.kinematic:
-                body.linear_velocity = row[7:10]
-                body.angular_velocity = row[10:13]
-            self.note_change()
-        self._data_seen[layout.body_rows] = now
+        self._apply(self._mirrors.bodies)
 
     @applies_everything
     def gpu_apply_articulation_root_pose(self) -> None:
-        layout = self._laid_out
-        now, seen = self._data[layout.root_rows, :7], self._data_seen[layout.root_rows, :7]
-        for i in np.flatnonzero((now != seen).any(axis=1)):
-            refuse_nan(now[i], layout.articulations[i].name)
-            layout.articulations[i].links[0].pose = _pose(now[i])
-            self.note_change()
-        self._data_seen[layout.root_rows, :7] = now
+        self._apply(self._mirrors.roots)
 
     @applies_everything
     def gpu_apply_articulation_root_velocity(self) -> None:
-        layout = self._laid_out
-        now, seen = self._data[layout.root_rows, 7:], self._data_seen[layout.root_rows, 7:]
-        for i in np.flatnonzero((now != seen).any(axis=1)):
-            refuse_nan(now[i], layout.articulations[i].name)
-            layout.articulations[i].set_root_linear_velocity(now[i, :3])
-            layout.articulations[i].set_root_angular_velocity(now[i, 3:])
-            self.note_change()
-        self._data_seen[layout.root_rows, 7:] = now
+        self._apply(self._mirrors.root_velocities)
 
     @applies_everything
     def gpu_apply_articulation_qpos(self) -> None:
-        self._apply_joints(self._qpos, self._qpos_seen, "set_qpos")
+        self._apply(self._mirrors.qpos)
 
     @applies_everything
     def gpu_apply_articulation_qvel(self) -> None:
-        self._apply_joints(self._qvel, self._qvel_seen, "set_qvel")
+        self._apply(self._mirrors.qvel)
 
     @applies_everything
     def gpu_apply_articulation_qf(self) -> None:
-        self._apply_joints(self._qf, self._qf_seen, "set_qf")
+        self._apply(self._mirrors.qf)
 
     @applies_everything
     def gpu_apply_articulation_target_position(self) -> None:
-        self._apply_targets(self._targets, keep_awake=True)
+        self._apply(self._mirrors.targets, keep_awake=True)
 
     @applies_everything
     def gpu_apply_articulation_target_velocity(self) -> None:
-        self._apply_targets(self._velocity_targets, keep_awake=True)
+        self._apply(self._mirrors.velocity_targets, keep_awake=True)
 
     def gpu_apply_rigid_dynamic_force(self) -> None:
         self._apply_forces(self._force, "force")
@@ -448,33 +406,15 @@ class BatchedCpuSystem:
 
     def drop_writes(self) -> None:
         """Forget what was written to the tensors and not applied."""
-        if self._layout is not None:
-            self._data[:], self._qf[:] = self._data_seen, self._qf_seen
-            self._qpos[:], self._qvel[:] = self._qpos_seen, self._qvel_seen
-            self._targets.drop_writes()
-            self._velocity_targets.drop_writes()
-
-    def _apply_joints(self, now: NDArray[np.float32], seen: NDArray[np.float32], setter: str) -> None:
-        for i in np.flatnonzero((now != seen).any(axis=1)):
-            articulation = self._laid_out.articulations[i]
-            refuse_nan(now[i], articulation.name)
-            getattr(articulation, setter)(now[i, : articulation.dof])
-            self.note_change()
-        seen[:] = now
-
-    def _apply_targets(self, targets: DriveTargets, keep_awake: bool) -> None:
-        changed, write = targets.apply(keep_awake)
-        if changed:
-            self.note_change()
-        self.stepper.write_before_step(write)
+        for mirror in () if self._found is None else self._found.all:
+            mirror.drop()
 
     def _apply_forces(self, values: NDArray[np.float32], kind: str) -> None:
         layout, zero = self._laid_out, np.zeros(3, dtype=np.float32)
-        every = [*zip(layout.body_rows, layout.bodies, strict=True)]
-        every += [*zip(layout.link_rows, layout.links, strict=True)]
-        for row, body in every:
+        rows = np.concatenate([layout.body_rows, layout.link_rows]).tolist()
+        for row, body in zip(rows, [*layout.bodies, *layout.links], strict=True):
             if values[row].any():
-                refuse_nan(values[row], body.entity.name)
+                refuse_nan(values[row], layout.names[row], int(layout.env_of_row[row]))
                 if kind == "force":
                     body.add_force_torque(values[row], zero)
                 else:
@@ -499,13 +439,5 @@ class BatchedCpuSystem:
         self.contacts.query_pairs(query)
 
 
-def _twin(shape: tuple[int, ...]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    return np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
-
-
 def _array(values: NDArray[np.float32]) -> CpuArray:
     return CpuArray(torch.from_numpy(values))
-
-
-def _pose(row: NDArray[np.float32]) -> sapien.Pose:
-    return sapien.Pose(row[:3], row[3:7])  # type: ignore[arg-type]  # the stubs want a literal shape

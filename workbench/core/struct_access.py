@@ -24,9 +24,9 @@ from mani_skill.utils.structs.base import PhysxRigidBodyComponentStruct, PhysxRi
 from mani_skill.utils.structs.link import Link
 from mani_skill.utils.structs.pose import vectorize_pose
 
+from workbench.core.mirrors import Group
 from workbench.core.seams import batched_system
 from workbench.core.strict_system import StrictCpuSystem
-from workbench.core.who_wrote import Group
 
 Index = Callable[[Any], torch.Tensor]
 

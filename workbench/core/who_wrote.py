@@ -9,15 +9,12 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.broken_rule import Frame, frames_of_the_task
-
-Group = Literal["bodies", "links", "joints", "targets", "forces"]
-"""What one ``gpu_fetch_*`` and its ``gpu_apply_*`` carry together."""
+from workbench.core.mirrors import Group
 
 TENSORS: dict[str, tuple[Group, ...]] = {
     "cuda_rigid_body_data": ("bodies", "links"),
