@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -78,3 +79,14 @@ def test_nothing_is_imported_from_a_test() -> None:
         if name and set(name.split(".")) & names
     ]
     assert wrong == []
+
+
+def test_nothing_that_a_run_wrote_lies_at_the_top(child_process: None) -> None:
+    top = PACKAGE.parent
+    if not (top / ".git").exists():
+        pytest.skip("not a checkout")
+    listed = subprocess.run(["git", "ls-files"], cwd=top, check=True, capture_output=True, text=True).stdout
+    assert {path.split("/")[0] for path in listed.splitlines()} == {
+        ".ci", ".gitignore", "Makefile", "README.md", "constraints.txt", "pyproject.toml", "tasks", "tests",
+        "web_assets", "workbench",
+    }  # fmt: skip
