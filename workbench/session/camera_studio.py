@@ -30,15 +30,16 @@ from workbench.session import camera_in_words
 from workbench.session.askers import Asker
 from workbench.session.camera_judging import CameraJudging, ShownMoment
 from workbench.session.episode_moments import EpisodeMoment
-from workbench.session.first_sight import FirstSight
 from workbench.session.messages import Load, PlaceCamera, Placed, ReloadLevel, Request, TaskDescription
-from workbench.session.quick_look import QuickLook, Sight
+from workbench.session.preview import Preview, Sight
 from workbench.session.studio_cameras import StudioCameras
 from workbench.session.studio_file import StudioFile
 from workbench.session.studio_view import StudioView
 
 MOST_SEEDS = 1000
 MOST_STEPS = 1000
+_LARGEST = 256
+"""Pixels of the shorter side of a new camera's picture, before it is written."""
 
 
 class CameraStudio:
@@ -72,8 +73,9 @@ class CameraStudio:
         """Held while placements are sent; taken before `_lock`."""
         self._serial = 0
         self._judging = CameraJudging(asker, self._note)
-        self._quick = QuickLook(asker, self._note)
-        self._first = FirstSight(asker, self._note)
+        self._quick = Preview(asker, self._note, "The quick look failed")
+        self._quick_scale = 1.0
+        self._first = Preview(asker, self._note, "There is no picture of the new camera")
 
     # --- placing -------------------------------------------------------------------------------------
 
@@ -129,7 +131,9 @@ class CameraStudio:
     ) -> None:
         """Find the edit that adds a camera which looks at `target`, and see what it would see: `first_sight`."""
         self.file.plan_add(kind, name, settings, target)
-        self._first.look((kind, name), settings, self._shown())
+        moment, scale = self._shown(), min(1.0, _LARGEST / min(settings.width, settings.height))
+        self._first.forget()
+        self._first.look(Sight((kind, name), settings, moment.env, None, scale), moment.of(moment.env))
 
     # --- judged ----------------------------------------------------------------------------------------
 
@@ -218,7 +222,9 @@ class CameraStudio:
 
     def set_quick_scale(self, scale: float) -> None:
         """Look through the chosen camera in a picture of so much of its own size; 1 for that itself. Never written."""
-        self._quick.set_scale(scale)
+        with self._lock:
+            self._quick_scale = scale
+        self._quick.forget()
         self._note()
 
     def look(self) -> None:
@@ -226,15 +232,15 @@ class CameraStudio:
         with self._lock:
             sight = self._sight()
         if sight is not None and self._quick.wants(sight):
-            self._quick.look(sight, self._shown())
+            self._quick.look(sight, self._shown().of(sight.env))
 
     def _sight(self) -> Sight | None:
         key = self._cameras.selected
         now = None if key is None else self._cameras.placements.now(key)
-        if key is None or now is None or self._cameras.refusal(key) is not None:
+        if self._quick_scale == 1.0 or key is None or now is None or self._cameras.refusal(key) is not None:
             return None
         step, env = self._cameras.drawn
-        return Sight(key, now, env, step, self._quick.scale)
+        return Sight(key, now, env, step, self._quick_scale)
 
     def pick(self, key: CameraKey, u: float, v: float) -> None:
         """What is seen at a place of the picture: 0, 0 is its upper left corner, 1, 1 its lower right one."""
@@ -309,7 +315,7 @@ class CameraStudio:
                 compared=looked.compared,
                 picked=looked.picked,
                 sheet=looked.sheet,
-                quick_scale=self._quick.scale,
+                quick_scale=self._quick_scale,
                 quick=self._quick.picture(self._cameras.selected, env),
                 wants_quick=sight is not None and self._quick.wants(sight),
                 progress=progress,

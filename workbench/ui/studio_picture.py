@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from workbench.core.camera_settings import CameraKey
 from workbench.core.pictures import Picture
-from workbench.session.quick_look import MODALITIES as IN_A_QUICK_LOOK
+from workbench.session.preview import MODALITIES as IN_A_QUICK_LOOK
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.cameras_panel import FASTEST, modalities_of
