@@ -26,10 +26,10 @@ from workbench.cli import main
 from workbench.exit_codes import Exit
 from workbench.recording.library import Library
 from workbench.session.clearance import Answer, Clearances, NotTrusted, Question
+from workbench.session.make_scene import MakeScene, make
 from workbench.session.messages import TaskOptions
 from workbench.session.record import RecordOptions, record
-from workbench.session.recorded_scene import SceneProcess, SceneWanted
-from workbench.session.recorded_scene_worker import make
+from workbench.session.recorded_scene import SceneProcess
 from workbench.session.rescore import find_episodes
 from workbench.session.rescore_all import RescoreOptions, rescore_all
 from workbench.session.rescorer import Rescorer
@@ -132,7 +132,7 @@ def test_no_form_of_a_name_in_a_recording_is_a_file(
     (tmp_path / "evil.py").write_text(f"open({str(mark)!r}, 'w').write('ran')\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path))
-    wanted = SceneWanted(named.format(file=tmp_path / "evil.py"), (), {}, 0, {}, {})
+    wanted = MakeScene(named.format(file=tmp_path / "evil.py"), (), {}, 0, {}, {})
     with pytest.raises(Exception, match="There is no env"):
         make(wanted)
     assert not mark.exists()

@@ -29,6 +29,7 @@ from workbench.session.process import WorkerProcess
 _LOOK = 0.05
 """Seconds between two looks at whether the job is to stop."""
 _NICENESS = 10
+"""After the one that plays, where there are fewer cores than work."""
 _PATIENCE = 3.0
 _LOAD_PATIENCE = 10.0
 """Seconds in which a process must answer what nobody waits for any more, or is ended."""
@@ -93,14 +94,15 @@ class Asker:
 class Background(Asker):
     """Asks a process in the background, one thing at a time. All but `pid` on one lane's thread, within a `turn`."""
 
-    def __init__(self, that: str, to: str) -> None:
+    def __init__(self, that: str, to: str, niceness: int = _NICENESS) -> None:
         """
         Args:
             that: what it does, as in "the process *that judges* was killed by SIGKILL".
             to: what for, as in "no process could be started *to judge with*".
+            niceness: by how much other processes come first.
         """
         super().__init__(self._send_call)
-        self._that, self._to = that, to
+        self._that, self._to, self._niceness = that, to, niceness
         self._process: WorkerProcess | None = None
         self._owed: Call | None = None
         self._has: tuple[Load, tuple[PlaceCamera, ...], int] | None = None
@@ -122,6 +124,20 @@ class Background(Asker):
         finally:
             self._settle(job)
 
+    def start(self) -> None:
+        """Have a process.
+
+        Raises:
+            JobFailed: none could be started.
+        """
+        if self._process is not None:
+            return
+        try:
+            # What the author's code prints in it is heard of the worker that plays, and not said twice.
+            self._process = WorkerProcess(lambda stream, piece: False, self._niceness)
+        except OSError as error:
+            raise JobFailed(f"no process could be started {self._to}: {error}") from error
+
     def ensure(
         self, job: Job, load: Load, placed: tuple[PlaceCamera, ...] = (), or_else: Load | None = None
     ) -> int:
@@ -142,10 +158,7 @@ class Background(Asker):
             self.end()  # a camera that was put back to the file would stay where it was placed
         if self._process is None:
             job.tell(0, 0, f"starting a process {self._to}")
-            try:
-                self._process = _start()
-            except OSError as error:
-                raise JobFailed(f"no process could be started {self._to}: {error}") from error
+            self.start()
         if self._has is not None and load.level == "auto" and self._has[0] == load:
             return self._has[2]
         self._has = None
@@ -225,9 +238,3 @@ def _value(answer: Answer, question: Question[Value]) -> Value:
     if not fits(answer.value, question):
         raise JobFailed(f"the worker answered with a {type(answer.value).__name__}")
     return answer.value
-
-
-def _start() -> WorkerProcess:
-    # What the author's code prints in it is heard of the worker that plays, and not said twice.
-    # With a low priority: after the one that plays, where there are fewer cores than work.
-    return WorkerProcess(lambda stream, piece: False, _NICENESS)

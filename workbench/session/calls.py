@@ -51,6 +51,10 @@ class Answer:
     """What the author's code raised, if that is why."""
 
 
+class CannotAnswer(Exception):
+    """In a worker: a question has no answer here; a sentence."""
+
+
 def fits(value: object, question: Question[Any]) -> bool:
     """Whether it can be the answer: the author's code runs where it comes from."""
     (base,) = type(question).__orig_bases__  # type: ignore[attr-defined]

@@ -33,13 +33,14 @@ from workbench.core.inspect_env import inspect_env
 from workbench.core.step import StepResult
 from workbench.machine.current_folder import CurrentFolder
 from workbench.session.acting import Acting
-from workbench.session.calls import Answer, Call, Cancel, Progress, Question
+from workbench.session.calls import Answer, Call, Cancel, CannotAnswer, Progress, Question
 from workbench.session.camera_messages import CameraQuestion, RunCameras
 from workbench.session.debugger import CannotDebug, listen_for_debugger, wait_for_debugger
 from workbench.session.go_back import go_back, going_back
 from workbench.session.held_task import HeldTask
 from workbench.session.interrupts import Interrupts
 from workbench.session.judge_moments import judge_moments
+from workbench.session.make_scene import MakeScene, SceneEnv
 from workbench.session.messages import (
     SCENE_KEPT,
     DebuggerListens,
@@ -76,7 +77,7 @@ from workbench.session.server_line import ServerLine
 from workbench.session.step_back_run import going_there, step_back
 from workbench.session.step_events import StepEvents
 from workbench.session.warm_up import warm_up
-from workbench.session.worker_cameras import CannotAnswer, WorkerCameras
+from workbench.session.worker_cameras import WorkerCameras
 
 _STATUS_PERIOD = 0.25
 _IDLE = 0.5
@@ -99,6 +100,7 @@ class Worker:
         self._last: StepResult | None = None
         self._playing = False
         self._started_in = CurrentFolder()
+        self._scene = SceneEnv()
         self._acting = Acting(self._started_in)
         self._settings = Settings()
         self._pacer = Pacer(0.05)
@@ -180,6 +182,8 @@ class Worker:
             loaded: list[Loaded] = []
             self._load_version(question, loaded.append)
             return loaded[0]
+        if isinstance(question, MakeScene):
+            return self._scene.scene(question, tell)
         opened = self._held.opened
         if opened is None:
             raise CannotAnswer("no task is loaded")

@@ -16,6 +16,7 @@ from workbench.core.exchange import keep_observation_space
 from workbench.core.place_camera import PlacedCameras
 from workbench.core.take_pictures import Request as PictureRequest
 from workbench.core.take_pictures import list_cameras, take_pictures
+from workbench.session.calls import CannotAnswer
 from workbench.session.camera_answers import answer
 from workbench.session.camera_messages import CameraQuestion
 from workbench.session.capture_moments import capture_moment
@@ -35,10 +36,6 @@ from workbench.session.picture_maker import PictureMaker
 from workbench.session.pulse import PulseWriter
 from workbench.session.server_line import ServerLine
 from workbench.session.step_events import StepEvents
-
-
-class CannotAnswer(Exception):
-    """A question that is none for this task, or for this machine's renderer; a sentence."""
 
 
 class WorkerCameras:

@@ -1,20 +1,21 @@
-"""The process that makes scenes of recordings that hold none; see `recorded_scene`.
+"""In a worker: the scenes of recordings that hold none; see `recorded_scene`.
 
-It is started by `family` with its end of a socket pair, and ends with its server, or when nobody listens any more. An
-env is kept for the next episode as long as that was made in the same way.
+An env is kept for the next episode as long as that was made in the same way.
 """
 
 from __future__ import annotations
 
 import traceback
-from multiprocessing.connection import Connection
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from workbench.machine.quick_imports import quick_imports
-from workbench.session.recorded_scene import Said, SceneFailed, SceneMade, SceneWanted
+from workbench.core.geometry import SceneGeometry
+from workbench.session.calls import CannotAnswer, Question
 
 if TYPE_CHECKING:
     from workbench.core.task_env import TaskEnv
@@ -23,57 +24,76 @@ _SAY_EVERY = 50
 """States between two words on how far it is."""
 
 
-class _CannotMake(Exception):
-    """A sentence for a person."""
+@dataclass(frozen=True)
+class SceneMade:
+    geometry: SceneGeometry
+    poses: NDArray[np.float32]
+    """(T + 1, B, 7)"""
+    missed: tuple[str, ...]
+    """What of the states could not be put into the env, each with its reason."""
 
 
-def main(socket: str) -> None:
-    """Entry of the process; `socket` is a file descriptor."""
-    from workbench.authoring.problem import nobody_presses_ctrl_c
+@dataclass(frozen=True)
+class MakeScene(Question[SceneMade]):
+    """Have a worker that holds no task make a recording's env, and put it into each recorded state."""
 
-    nobody_presses_ctrl_c()
-    connection = Connection(int(socket))
-    made: tuple[object, TaskEnv] | None = None
-    while True:
+    task: str
+    """Registered id."""
+    files: tuple[str, ...]
+    """Task files in which it may be found before ManiSkill is asked."""
+    env_kwargs: dict[str, Any]
+    seed: int
+    reset_options: dict[str, Any]
+    env_states: dict[str, NDArray]
+    """(T + 1, D) by name."""
+    imports: tuple[str, ...] = ()
+    """As `TaskOptions.imports`."""
+
+
+class SceneEnv:
+    """The env that is kept."""
+
+    def __init__(self) -> None:
+        self._made: tuple[object, TaskEnv] | None = None
+
+    def scene(self, wanted: MakeScene, tell: Callable[[int, int, str], None]) -> SceneMade:
+        """
+        Args:
+            tell: what is being done.
+
+        Raises:
+            CannotAnswer: it cannot be made.
+        """
+        key = (wanted.task, wanted.files, repr(sorted(wanted.env_kwargs.items())))
         try:
-            wanted = connection.recv()
-        except EOFError:
-            return
-        try:
-            key = (wanted.task, wanted.files, repr(sorted(wanted.env_kwargs.items())))
-            if made is None or made[0] != key:
-                if made is not None:
-                    made[1].close()
-                    made = None
-                connection.send(Said(f"making {wanted.task}"))
-                made = (key, make(wanted))
-            connection.send(scene_of(made[1], wanted, connection))
-        except _CannotMake as error:
-            connection.send(SceneFailed(str(error)))
-        except BrokenPipeError:
-            return
+            if self._made is None or self._made[0] != key:
+                if self._made is not None:
+                    self._made[1].close()
+                    self._made = None
+                tell(0, 0, f"making {wanted.task}")
+                self._made = (key, make(wanted))
+            return scene_of(self._made[1], wanted, tell)
+        except CannotAnswer:
+            raise
         except Exception as error:
             traceback.print_exc()
-            connection.send(
-                SceneFailed(
-                    f"The scene of {wanted.task} could not be made ({type(error).__name__}: {_line(error)}), so there "
-                    "are numbers and curves only."
-                )
-            )
+            raise CannotAnswer(
+                f"The scene of {wanted.task} could not be made ({type(error).__name__}: {_line(error)}), so there "
+                "are numbers and curves only."
+            ) from error
 
 
-def make(wanted: SceneWanted) -> TaskEnv:
+def make(wanted: MakeScene) -> TaskEnv:
     """One env of the recorded task, as it was made for the recording."""
-    with quick_imports():
-        from workbench.authoring.load import import_modules, load_task
-        from workbench.authoring.problem import TaskError
-        from workbench.authoring.reference import RecordedTask
-        from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+    from workbench.authoring.load import import_modules, load_task
+    from workbench.authoring.problem import TaskError
+    from workbench.authoring.reference import RecordedTask
+    from workbench.core.task_env import EnvOptions, TaskEnv, make_env
 
     try:
         import_modules(wanted.imports)
     except TaskError as error:
-        raise _CannotMake(error.problem.message) from error
+        raise CannotAnswer(error.problem.message) from error
     loaded = None
     for file in wanted.files:
         try:
@@ -82,12 +102,12 @@ def make(wanted: SceneWanted) -> TaskEnv:
             if found.env_id != wanted.task and wanted.task in found.others:
                 loaded = load_task(f"{file}:{wanted.task}")
         except TaskError as error:
-            raise _CannotMake(f"{Path(file).name} cannot be loaded: {error.problem.message}") from error
+            raise CannotAnswer(f"{Path(file).name} cannot be loaded: {error.problem.message}") from error
     if loaded is None or loaded.env_id != wanted.task:
         try:
             loaded = load_task(RecordedTask(wanted.task))  # an id that is registered, never a path
         except TaskError as error:
-            raise _CannotMake(
+            raise CannotAnswer(
                 f"There is no env {wanted.task} here to make the scene with, so there are numbers and curves only. If it "
                 "is yours, say which file it is in (workbench review --task FILE), or which package registers it "
                 "(workbench review --import PACKAGE)."
@@ -102,14 +122,14 @@ def make(wanted: SceneWanted) -> TaskEnv:
         )
     except BaseException as error:  # a constructor may end the program (SystemExit)
         traceback.print_exc()
-        raise _CannotMake(
+        raise CannotAnswer(
             f"{wanted.task} cannot be made here ({type(error).__name__}: {_line(error)}), so there are numbers and "
             "curves only."
         ) from error
     return TaskEnv(env)
 
 
-def scene_of(env: TaskEnv, wanted: SceneWanted, connection: Connection) -> SceneMade:
+def scene_of(env: TaskEnv, wanted: MakeScene, tell: Callable[[int, int, str], None]) -> SceneMade:
     """Its geometry, and the poses of every body at each recorded state."""
     from workbench.core.recorded_state import misfits, write_states
     from workbench.core.scene_geometry import read_geometry
@@ -124,7 +144,7 @@ def scene_of(env: TaskEnv, wanted: SceneWanted, connection: Connection) -> Scene
     missed = misfits(env.env, 0, {name: values[0] for name, values in states.items()}) if count else {}
     for row in range(count):
         if row % _SAY_EVERY == 0:
-            connection.send(Said(f"putting it into state {row} of {count - 1}"))
+            tell(row, count, f"putting it into state {row} of {count - 1}")
         write_states(env.env, {0: {name: values[row] for name, values in states.items()}})
         poses.append(read_poses(env.env)[0])
     return SceneMade(geometry, np.stack(poses), tuple(f"{name}: {why}" for name, why in missed.items()))
