@@ -24,8 +24,10 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from mani_skill.envs.tasks.tabletop.pick_cube import PickCubeEnv
 
 from workbench.core import actions
+from workbench.core.scene_geometry import read_geometry
 from workbench.core.snapshot_parts import SnapshotPacker
 from workbench.core.task_env import EnvOptions, TaskEnv, make_env
+from workbench.session.env_table import EnvTable
 from workbench.session.history import History
 from workbench.session.messages import Stepped
 
@@ -40,8 +42,8 @@ class Options:
 def measure(num_envs: int, steps: int) -> str:
     task = TaskEnv(make_env(PickCubeEnv, EnvOptions(num_envs=num_envs, backend="cpu", render=False)), 50)
     rng = np.random.default_rng(0)
-    task.reset(seed=0)
-    packer, history = SnapshotPacker(), History(num_envs, 2**40)
+    table = EnvTable(read_geometry(task.env), task.reset(seed=0), task.control_dt, task.env.reward_mode)
+    packer, history = SnapshotPacker(), History(table, 2**40)
     laps: dict[str, list[float]] = {"step": [], "snapshot": [], "parts": [], "message": [], "keep": []}
     sizes: list[int] = []
     base, held = 0, 0
@@ -59,7 +61,7 @@ def measure(num_envs: int, steps: int) -> str:
         times.append(time.perf_counter())
         if number % 2:
             tracemalloc.start()  # the odd steps tell the bytes, the even ones the time
-        history.add(pickle.loads(message), number)
+        history.add(pickle.loads(message))
         times.append(time.perf_counter())
         if number % 2:
             held += tracemalloc.get_traced_memory()[0]

@@ -15,7 +15,7 @@ from tests.drive.page import page_at
 from tests.drive.panels import Clock
 from tests.drive.waiting import until
 from tests.ui.scenes import running
-from workbench.session.view import Curves
+from workbench.session.curves import Curves
 from workbench.ui.curves_panel import CurvesPanel
 
 pytestmark = pytest.mark.browser
@@ -35,7 +35,7 @@ def past(first: int, last: int, lost: tuple[int, int] = (0, 0)) -> Curves:
     reward = np.sin(tick / 7)[:, None] + np.arange(ENVS, dtype=np.float32)
     reward[(tick >= lost[0]) & (tick < lost[1]), 0] = np.nan
     flags = np.zeros_like(reward)
-    return Curves(last, tick, reward, flags, flags.astype(bool))
+    return Curves(last, tick, reward, flags)
 
 
 def widest_gap(columns: NDArray[np.float64]) -> float:

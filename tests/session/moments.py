@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from workbench.core.geometry import SceneGeometry
 from workbench.core.step import StepResult
+from workbench.session.env_table import EnvTable
 from workbench.session.messages import Restored, Stepped
 
 N, BODIES = 3, 4
@@ -30,6 +32,15 @@ def stepped(
     )
     mask = mask_of(jumped)
     return Stepped(step, mask, (), None, b"body %d" % number, keys, new or {}, number, restored)
+
+
+def table(first: StepResult | None = None) -> EnvTable:
+    """Of a scene in which nothing moves, and which begins with this state."""
+    first = stepped(0).step if first is None else first
+    count, bodies = first.poses.shape[:2]
+    names = tuple(f"body {k}" for k in range(bodies))
+    geometry = SceneGeometry(count, names, ("static",) * bodies, (False,) * bodies, ())
+    return EnvTable(geometry, first, 0.05, "dense")
 
 
 def mask_of(envs: tuple[int, ...]) -> np.ndarray:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.ui.scenes import description, step_of, table_scene
+from tests.ui.scenes import step_of, table_scene
 from workbench.core.step import StepResult
 from workbench.session.env_table import KEPT_REWARDS, EnvTable, Outcome
-from workbench.session.history import History
+from workbench.session.history import FAIL, SUCCESS, History
 from workbench.session.messages import Restored, Stepped
 
 N = 3
@@ -67,12 +67,12 @@ def result(
     )
 
 
-def table() -> EnvTable:
+def past() -> History:
+    """Of a scene that was just built: it keeps the table."""
     geometry, poses = table_scene(N)
     first = step_of(poses, success=np.zeros(N, bool), fail=np.zeros(N, bool))
-    return EnvTable(
-        description(geometry), StepResult(**{**first.__dict__, "elapsed_steps": np.zeros(N, np.int32)})
-    )
+    first = replace(first, elapsed_steps=np.zeros(N, np.int32))
+    return History(EnvTable(geometry, first, 0.05, "dense"), 10**9)
 
 
 NO = {"success": False, "fail": False, "near": False}
@@ -93,22 +93,21 @@ event = st.one_of(
 @settings(max_examples=60, deadline=None)
 @given(st.lists(event, max_size=40))
 def test_rows_are_what_following_each_env_by_itself_and_back_in_time_gives(events: list[tuple]) -> None:
-    ours, history = table(), History(N, 10**9)
+    history = past()
     begin = result([0] * N, [0] * N, [NO] * N, [False] * N)
-    history.add(Stepped(begin, np.ones(N, bool)), 0)
-    ours.add(Stepped(begin, np.ones(N, bool)), history)
+    history.add(Stepped(begin, np.ones(N, bool)))
     episodes = [Episode() for _ in range(N)]
     last: list[Episode | None] = [None] * N
-    past = [deepcopy((episodes, last))]
+    seen = [deepcopy((episodes, last))]
     ended, succeeded, ticks = [0] * N, [0] * N, 0
     for kind, first, entries, limits in events:
         restored = None
         if kind == "back":
-            origin, who = entries % len(past), limits
+            origin, who = entries % len(seen), limits
             for env in np.flatnonzero(first).tolist():
                 if episodes[env].end >= 0:
                     last[env] = episodes[env]
-                then, last_then = deepcopy(past[origin])
+                then, last_then = deepcopy(seen[origin])
                 episodes[env] = then[env if who is None else who]
                 if who is None or who == env:
                     last[env] = last_then[env]
@@ -134,13 +133,14 @@ def test_rows_are_what_following_each_env_by_itself_and_back_in_time_gives(event
                     succeeded[env] += episode.outcome == Outcome.SUCCESS
             mask = np.zeros(N, bool)
             step = result([e.steps for e in episodes], first, entries, limits)
-        stepped = Stepped(step, mask, restored=restored)
-        history.add(stepped, ticks)
-        ours.add(stepped, history)
-        past.append(deepcopy((episodes, last)))
+        moment = history.add(Stepped(step, mask, restored=restored))
+        for name, flag in (("success", SUCCESS), ("fail", FAIL)):
+            now = [kind == "step" and e.first.get(name) == e.steps for e in episodes]
+            assert ((moment.happened & flag) > 0).tolist() == now
+        seen.append(deepcopy((episodes, last)))
 
-    rows = ours.rows()
-    assert rows.tick == ticks and rows.serial == len(events) + 1
+    rows = history.env_rows()
+    assert history.steps.count == ticks
     assert rows.steps.tolist() == [e.steps for e in episodes]
     assert rows.outcome.tolist() == [e.outcome for e in episodes]
     assert rows.end.tolist() == [e.end for e in episodes]
@@ -160,42 +160,51 @@ def test_rows_are_what_following_each_env_by_itself_and_back_in_time_gives(event
 
 
 def test_only_the_newest_rewards_of_a_long_episode_are_kept() -> None:
-    ours = table()
+    history = past()
     for step in range(1, KEPT_REWARDS + 31):
-        ours.add(Stepped(result([step] * N, [step, 0, 0], [NO] * N, [False] * N), np.zeros(N, bool)))
-    assert ours.rows().rewards[0].tolist() == list(range(31, KEPT_REWARDS + 31))
+        history.add(Stepped(result([step] * N, [step, 0, 0], [NO] * N, [False] * N), np.zeros(N, bool)))
+    assert history.env_rows().rewards[0].tolist() == list(range(31, KEPT_REWARDS + 31))
 
 
 @pytest.mark.parametrize("said", [True, False], ids=["said to be a reset", "only seen in the steps"])
 def test_an_env_that_was_put_back_nobody_knows_where_from_does_not_claim_to_know_its_return(
     said: bool,
 ) -> None:
-    ours = table()
+    history = past()
     for step in (1, 2, 3):
-        ours.add(Stepped(result([step] * N, [1] * N, [NO] * N, [False] * N), np.zeros(N, bool)))
+        history.add(Stepped(result([step] * N, [1] * N, [NO] * N, [False] * N), np.zeros(N, bool)))
     back = result([1, 3, 3], [0] * N, [NO] * N, [False] * N)
     mask = np.array([True, False, False]) if said else np.array([False, False, False])
-    ours.add(Stepped(back if said else result([1, 4, 4], [1] * N, [NO] * N, [False] * N), mask))
-    rows = ours.rows()
+    history.add(Stepped(back if said else result([1, 4, 4], [1] * N, [NO] * N, [False] * N), mask))
+    rows = history.env_rows()
     assert np.isnan(rows.total[0]) and rows.steps[0] == 1
     assert rows.total[1:].tolist() == ([3, 3] if said else [4, 4])
 
 
 def test_rows_that_were_taken_do_not_change_with_later_steps() -> None:
-    ours = table()
-    rows = ours.rows()
+    history = past()
+    rows = history.env_rows()
     taken = [np.copy(values) for values in (rows.steps, rows.total, rows.rewards, rows.end)]
-    ours.add(Stepped(result([1] * N, [1] * N, [{**NO, "success": True}] * N, [False] * N), np.zeros(N, bool)))
+    history.add(
+        Stepped(result([1] * N, [1] * N, [{**NO, "success": True}] * N, [False] * N), np.zeros(N, bool))
+    )
     for before, after in zip(taken, (rows.steps, rows.total, rows.rewards, rows.end), strict=True):
         np.testing.assert_array_equal(before, after)
 
 
 def test_a_worker_that_comes_back_at_the_same_moment_begins_no_episode() -> None:
-    ours = table()
+    history = past()
     for step in (1, 2, 3):
-        ours.add(Stepped(result([step] * N, [1] * N, [NO] * N, [False] * N), np.zeros(N, bool)))
-    ours.add(Stepped(result([3] * N, [1] * N, [NO] * N, [False] * N), np.ones(N, bool)))
-    assert ours.rows().total.tolist() == [3] * N
+        history.add(Stepped(result([step] * N, [1] * N, [NO] * N, [False] * N), np.zeros(N, bool)))
+    again = Stepped(result([3] * N, [1] * N, [NO] * N, [False] * N), np.ones(N, bool), resumed=True)
+    history.add(again)
+    rows = history.env_rows()
+    assert rows.total.tolist() == [3] * N and rows.followed.all()
+    assert np.nanmax(rows.rewards) == 1 and np.isfinite(rows.rewards).sum() == 3 * N
+    history.add(replace(again, resumed=False))
+    assert np.isnan(history.env_rows().total).all(), (
+        "what was reset to a moment was not followed from its start"
+    )
 
 
 def odd(steps: list[int], envs: tuple[int, ...]) -> StepResult:
@@ -206,14 +215,13 @@ def odd(steps: list[int], envs: tuple[int, ...]) -> StepResult:
     return StepResult(**{**step.__dict__, "poses": poses})
 
 
-def followed(*steps: tuple[StepResult, tuple[int, ...], Restored | None]) -> tuple[EnvTable, History]:
-    """A table and its history, which were told of these: result, envs that jumped, and where to."""
-    ours, history = table(), History(N, 10**9)
+def followed(*steps: tuple[StepResult, tuple[int, ...], Restored | None]) -> History:
+    """What was told of these: result, envs that jumped, and where to."""
+    history = past()
     first = Stepped(result([0] * N, [0] * N, [NO] * N, [False] * N), np.ones(N, bool))
     for one in (first, *(told(*step) for step in steps)):
-        history.add(one, 0)
-        ours.add(one, history)
-    return ours, history
+        history.add(one)
+    return history
 
 
 def told(step: StepResult, jumped: tuple[int, ...], restored: Restored | None) -> Stepped:
@@ -224,39 +232,37 @@ def told(step: StepResult, jumped: tuple[int, ...], restored: Restored | None) -
     return Stepped(step, mask, restored=restored)
 
 
-def outlier_steps(ours: EnvTable) -> dict[int, list[int]]:
-    return {env: [o.step for o in seen] for env, seen in ours.rows().outliers.items()}
+def outlier_steps(history: History) -> dict[int, list[int]]:
+    return {env: [o.step for o in seen] for env, seen in history.env_rows().outliers.items()}
 
 
 def test_what_was_odd_goes_with_the_moment_that_an_env_is_put_to() -> None:
-    ours, history = followed(
+    history = followed(
         (odd([1, 1, 1], ()), (), None),
         (odd([2, 2, 2], (1,)), (), None),
         (odd([3, 3, 3], (1,)), (), None),
         # Env 0 goes on from env 1's second step, env 1 from its own first, which was well.
         (odd([2, 1, 3], (0,)), (0, 1), Restored((0, 1), (1, 1), 2, None, {})),
     )
-    assert outlier_steps(ours) == {0: [2], 1: [2]}
+    assert outlier_steps(history) == {0: [2], 1: [2]}
     put = Restored((1,), (1,), 1, None, {})
     back = told(odd([2, 1, 3], (0,)), (1,), put)
-    history.add(back, 0)
-    ours.add(back, history)
-    assert outlier_steps(ours) == {0: [2]}
+    history.add(back)
+    assert outlier_steps(history) == {0: [2]}
     more = told(odd([3, 2, 4], (0, 1)), (), None)
-    history.add(more, 0)
-    ours.add(more, history)
-    assert outlier_steps(ours) == {0: [2], 1: [2]}, "once for env 0, and anew for env 1"
-    assert ours.rows().total.tolist() == [3, 2, 4]
+    history.add(more)
+    assert outlier_steps(history) == {0: [2], 1: [2]}, "once for env 0, and anew for env 1"
+    assert history.env_rows().total.tolist() == [3, 2, 4]
 
 
 def test_an_episode_that_was_odd_and_is_left_while_it_runs_is_the_last_one_with_its_steps() -> None:
-    ours, _ = followed(
+    history = followed(
         (odd([1, 1, 1], ()), (), None),
         (odd([2, 2, 2], (1,)), (), None),
         (odd([3, 3, 3], (1,)), (), None),
         (odd([0, 0, 3], ()), (0, 1), None),
     )
-    rows = ours.rows()
+    rows = history.env_rows()
     assert rows.last.steps.tolist() == [-1, 3, -1] and rows.last.total.tolist() == [0, 3, 0]
     assert rows.last.outcome.tolist() == [Outcome.RUNNING] * N
     assert list(rows.last.outliers) == [1] and rows.outliers == {}
@@ -264,14 +270,41 @@ def test_an_episode_that_was_odd_and_is_left_while_it_runs_is_the_last_one_with_
 
 
 def test_the_episode_before_stays_an_envs_own_whoevers_moment_it_is_put_to() -> None:
-    ours, _ = followed(
+    history = followed(
         (odd([1, 1, 1], (0, 1)), (), None),
         (odd([0, 0, 1], ()), (0, 1), None),
         (odd([1, 1, 2], (0,)), (), None),
         (odd([0, 1, 2], ()), (0,), None),
         (odd([1, 1, 2], ()), (0, 1), Restored((0, 1), (0, 0), 3, None, {})),
     )
-    rows = ours.rows()
+    rows = history.env_rows()
     assert rows.last.steps.tolist() == [1, 1, -1]
     assert {env: [o.step for o in seen] for env, seen in rows.last.outliers.items()} == {0: [1], 1: [1]}
-    assert outlier_steps(ours) == {0: [1], 1: [1]}
+    assert outlier_steps(history) == {0: [1], 1: [1]}
+
+
+def test_the_rewards_of_a_long_episode_that_was_gone_back_in_are_its_newest() -> None:
+    history = past()
+    steps = [result([k] * N, [k, 0, 0], [NO] * N, [False] * N) for k in range(1, KEPT_REWARDS + 51)]
+    for step in steps:
+        history.add(told(step, (), None))
+    history.add(told(steps[118], (0,), Restored((0,), (0,), 118, None, {})))
+    history.add(told(steps[119], (), None))
+    assert history.env_rows().rewards[0].tolist() == [*range(21, 120), 120]
+
+
+def test_a_success_that_is_no_bool_counts_and_other_numbers_do_not() -> None:
+    history = past()
+    step = result([1] * N, [0] * N, [NO] * N, [False] * N)
+    values = {
+        "success": np.array([[0.0], [1.0], [0.0]]),
+        "distance": np.ones(N),
+        "each": np.ones((N, 2), bool),
+    }
+    moment = history.add(
+        told(replace(step, evaluate=values, terminated=values["success"][:, 0] > 0), (), None)
+    )
+    rows = history.env_rows()
+    assert rows.first_true["success"].tolist() == [-1, 1, -1] and not {"distance", "each"} & {*rows.first}
+    assert (moment.happened & SUCCESS > 0).tolist() == [False, True, False]
+    assert rows.outcome.tolist() == [Outcome.RUNNING, Outcome.SUCCESS, Outcome.RUNNING]

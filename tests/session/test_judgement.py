@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.session.moments import table
 from workbench.core.step import StepResult
 from workbench.session.history import History
 from workbench.session.judgement import Judgement, drift
@@ -32,11 +33,11 @@ def a_step(reward: np.ndarray, success: np.ndarray, elapsed: np.ndarray) -> Step
 
 
 def recorded(steps: list[StepResult], jumped: np.ndarray, snapshots: list[bytes] | None = None) -> History:
-    history = History(len(steps[0].reward), 10**9)
+    history = History(table(steps[0]), 10**9)
     for row, step in enumerate(steps):
         body = b"body" if snapshots is None else snapshots[row]
         keys, parts = ((1,), {1: b"part"}) if row == 0 else (None, {})
-        history.add(Stepped(step, jumped[row], (), None, body, keys, parts, row), row)
+        history.add(Stepped(step, jumped[row], (), None, body, keys, parts, row))
     return history
 
 

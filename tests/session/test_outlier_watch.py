@@ -7,24 +7,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.ui.scenes import description, step_of, table_scene
+from tests.ui.scenes import step_of, table_scene
 from workbench.session.env_table import EnvTable
+from workbench.session.history import History
 from workbench.session.messages import Stepped
 from workbench.session.outliers import FASTEST, Kind, OutlierWatch, lowest_still_point
 
 
 def test_a_body_that_a_reset_puts_elsewhere_has_not_moved() -> None:
     geometry, poses = table_scene(2)
-    table = EnvTable(description(geometry), step_of(poses))
+    table = History(EnvTable(geometry, step_of(poses), 0.05, "dense"), 10**9)
     there = poses.copy()
     there[0, 3, 0] += 100.0
     moved = replace(step_of(there), elapsed_steps=np.array([0, 7], np.int32))
     table.add(Stepped(moved, np.array([True, False])))
     table.add(Stepped(replace(moved, elapsed_steps=np.array([1, 8], np.int32)), np.zeros(2, bool)))
-    assert not table.rows().outliers
+    assert not table.env_rows().outliers
     back = replace(step_of(poses), elapsed_steps=np.array([2, 9], np.int32))
     table.add(Stepped(back, np.zeros(2, bool)))
-    assert [o.kind for o in table.rows().outliers[0]] == [Kind.FAST]
+    assert [o.kind for o in table.env_rows().outliers[0]] == [Kind.FAST]
 
 
 def watched(num_envs: int, reward_mode: str = "dense") -> tuple[OutlierWatch, np.ndarray]:

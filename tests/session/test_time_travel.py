@@ -248,3 +248,16 @@ def test_a_moment_without_a_picture_is_drawn_as_it_was(session: Session) -> None
     assert np.abs(then.rgb.astype(int) - again.pictures[key].rgb).max() <= 2
     session.change(cameras=())
     session.set_clients(0)
+
+
+def test_the_episodes_go_on_as_they_stand_with_a_worker_that_takes_over(session: Session) -> None:
+    fresh(session)
+    step(session, 4)
+    before, rows = session.view(), session.env_rows()
+    view = after(session, session.versions.restart_worker)
+    now = session.env_rows()
+    assert view.reload.level == "restarted" and view.timeline.first == before.timeline.first
+    assert np.array_equal(view.step.reward, before.step.reward)
+    assert now.followed.all() and now.steps.tolist() == [4] * N
+    assert now.total.tolist() == rows.total.tolist()
+    assert np.array_equal(now.rewards, rows.rewards, equal_nan=True)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.session.moments import N, stepped
+from tests.session.moments import N, stepped, table
 from workbench.core.pictures import CameraKind, Picture
 from workbench.session.history import RESET, SUCCESS
 from workbench.session.messages import CameraRequest, PastPictures, Restored, Stepped
@@ -28,10 +28,10 @@ def moment(number: int, jumped: tuple[int, ...] = (), **more: object) -> Stepped
 
 
 def played(steps: int, limit: int = 10**9, first_serial: int = 0) -> Timeline:
-    timeline = Timeline(N, limit, first_serial)
-    timeline.add(moment(0, (0, 1, 2), keys=(1,), new={1: b"part"}), 0)
+    timeline = Timeline(table(), limit, first_serial)
+    timeline.add(moment(0, (0, 1, 2), keys=(1,), new={1: b"part"}))
     for number in range(1, steps + 1):
-        timeline.add(moment(number), number)
+        timeline.add(moment(number))
     return timeline
 
 
@@ -86,7 +86,7 @@ def test_a_moment_is_pinned_and_left_for_live() -> None:
     assert (timeline.at, timeline.shown) == (45, None)
     timeline.seek_by(-2)
     assert timeline.at == 43 and timeline.shown.serial == 43
-    timeline.add(moment(6), 6)
+    timeline.add(moment(6))
     assert timeline.at == 43, "what comes does not move it"
     timeline.seek(0)
     assert timeline.at == 40
@@ -102,17 +102,17 @@ def test_a_pinned_moment_that_has_to_go_gives_way_to_the_oldest() -> None:
     timeline = played(2, limit=60_000)
     timeline.seek(1)
     for number in range(3, 100):
-        timeline.add(moment(number), number)
+        timeline.add(moment(number))
     assert timeline.history.first > 1 and timeline.at == timeline.history.first
     assert timeline.shown is not None
 
 
 def test_the_next_and_the_last_event_of_an_env() -> None:
     timeline = played(1)
-    timeline.add(moment(2, success=(1,)), 2)
-    timeline.add(moment(3), 3)
-    timeline.add(moment(0, (1,)), 3)
-    timeline.add(moment(5), 4)
+    timeline.add(moment(2, success=(1,)))
+    timeline.add(moment(3))
+    timeline.add(moment(0, (1,)))
+    timeline.add(moment(5))
     for env, expected in ((1, [4, 2, 0, 0]), (0, [0, 0])):
         timeline.seek(None)
         seen = []
@@ -129,9 +129,9 @@ def test_the_next_and_the_last_event_of_an_env() -> None:
 
 def test_a_step_of_the_episode_is_found_through_resets() -> None:
     timeline = played(3)
-    timeline.add(moment(0, (1,)), 3)
-    timeline.add(moment(1), 4)
-    timeline.add(moment(2), 5)
+    timeline.add(moment(0, (1,)))
+    timeline.add(moment(1))
+    timeline.add(moment(2))
     timeline.seek_step(1, 1)
     assert timeline.at == 5
     timeline.seek_step(1, 3)
@@ -142,9 +142,9 @@ def test_a_step_of_the_episode_is_found_through_resets() -> None:
 
 def test_a_strip_is_of_one_env_between_two_moments() -> None:
     timeline = played(2)
-    timeline.add(moment(3, success=(1,)), 3)
-    timeline.add(moment(0, (1,), restored=Restored((1,), (2,), 1, None, {})), 4)
-    timeline.add(moment(4), 5)
+    timeline.add(moment(3, success=(1,)))
+    timeline.add(moment(0, (1,), restored=Restored((1,), (2,), 1, None, {})))
+    timeline.add(moment(4))
     whole = timeline.strip(1, -10, 99)
     assert (whole.low, whole.high) == (0, 5)
     assert [serial for serial, _ in whole.events] == [0, 3, 4]
@@ -177,8 +177,8 @@ def test_who_goes_back_and_to_whose_moment(scope, envs: tuple[int, ...], source:
 def test_a_jump_is_taken_back_in_the_envs_that_it_brought_where_they_are() -> None:
     timeline = played(3)
     assert timeline.undo(0) is None
-    timeline.add(moment(0, (0, 1, 2)), 3)
-    timeline.add(moment(0, (1,)), 3)
+    timeline.add(moment(0, (0, 1, 2)))
+    timeline.add(moment(0, (1,)))
     words = {env: timeline.view(env, ()).undo for env in range(N)}
     assert words == {0: "reset of 2 envs", 1: "reset of env 1", 2: "reset of 2 envs"}
     timeline.seek(2)
@@ -191,18 +191,18 @@ def test_a_jump_is_taken_back_in_the_envs_that_it_brought_where_they_are() -> No
 def test_what_a_going_back_could_not_put_back_is_told_until_the_next_jump() -> None:
     timeline = played(3)
     put = Restored((1,), (1,), 2, None, {"actor ball": "the snapshot has none"}, how="put there")
-    timeline.add(moment(2, (1,), restored=put), 3)
-    timeline.add(moment(3), 4)
+    timeline.add(moment(2, (1,), restored=put))
+    timeline.add(moment(3))
     view = timeline.view(0, ())
     assert view.not_carried == ("actor ball: the snapshot has none",) and view.arrived == "put there"
-    timeline.add(moment(0, (0,)), 4)
+    timeline.add(moment(0, (0,)))
     assert timeline.view(0, ()).not_carried == () and timeline.view(0, ()).arrived == ""
 
 
 def test_the_view_is_of_the_moment_that_is_shown() -> None:
     timeline = played(4)
-    assert timeline.view(0, (EYE,)).tick == 4 and not timeline.view(0, (EYE,)).wants_pictures
+    assert timeline.view(0, (EYE,)).tick == 3 and not timeline.view(0, (EYE,)).wants_pictures
     timeline.seek(1)
     view = timeline.view(0, (EYE,))
-    assert (view.first, view.last, view.shown, view.tick, view.moments) == (0, 4, 1, 1, 5)
+    assert (view.first, view.last, view.shown, view.tick, view.moments) == (0, 4, 1, 0, 5)
     assert view.can_go_on and view.used == timeline.history.used and view.limit == 10**9

@@ -17,14 +17,12 @@ def rows_of(**changes: object) -> EnvRows:
     rewards = np.full((6, KEPT_REWARDS), np.nan, np.float32)
     rewards[:, -3:] = np.arange(18).reshape(6, 3)
     values: dict[str, object] = {
-        "serial": 1,
-        "tick": 100,
         "outcome": np.array([0, 1, 2, 3, 0, 0], np.int8),
         "steps": np.array([3, 34, 20, 50, 3, 30], np.int32),
         "end": np.array([-1, 33, 20, 50, -1, -1], np.int32),
         "total": np.array([1.0, 20.0, 5.0, math.nan, 0.5, 3.0]),
         "followed": np.array([True, True, True, False, True, True]),
-        "first_true": {
+        "first": {
             "success": np.array([-1, 33, -1, -1, -1, -1]),
             "near": np.array([1, 20, -1, 7, -1, 0]),
         },

@@ -7,9 +7,8 @@ import pytest
 
 from tests.drive.panels import Panels
 from tests.ui.scenes import running
-from workbench.session.reward_terms import TermCurves
+from workbench.session.curves import Curves, TermCurves
 from workbench.session.timeline import TimelineView
-from workbench.session.view import Curves
 from workbench.ui.curves_panel import CurvesPanel
 from workbench.ui.line_chart import LONGEST
 
@@ -17,7 +16,7 @@ from workbench.ui.line_chart import LONGEST
 def curves(length: int, num_envs: int, success: float | None = 0.0, serial: int = 1) -> Curves:
     reward = np.arange(length * num_envs, dtype=np.float32).reshape(length, num_envs)
     flags = np.full_like(reward, np.nan if success is None else success)
-    return Curves(serial, np.arange(length), reward, flags, np.zeros_like(reward, bool))
+    return Curves(serial, np.arange(length), reward, flags)
 
 
 @pytest.fixture

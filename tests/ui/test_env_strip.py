@@ -122,7 +122,7 @@ def test_a_reward_that_is_not_a_number_leaves_a_gap_and_no_reward_no_curve() -> 
 
 def test_a_task_with_many_entries_keeps_success_and_fail() -> None:
     names = [f"a{i}" for i in range(9)] + ["success", "fail"]
-    rows = rows_of(first_true={name: np.zeros(6, np.int32) for name in names})
+    rows = rows_of(first={name: np.zeros(6, np.int32) for name in names})
     assert entry_names(rows)[:2] == ("success", "fail") and len(entry_names(rows)) == MOST_ENTRIES
     assert Outcome.RUNNING == 0
 

@@ -22,7 +22,7 @@ from workbench.core.camera_suggestion import OfferedPlacement
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.session.askers import Asker, Background
 from workbench.session.camera_messages import DrawCamera, JudgeCamera, SuggestCameras
-from workbench.session.episode_moments import EpisodeMoment
+from workbench.session.history import Lived
 from workbench.session.lane import Job, Lane
 from workbench.session.messages import Load, Reset
 from workbench.session.studio_view import JudgedMoment, Picked, Progress
@@ -117,20 +117,18 @@ class CameraJudging:
 
         self._live_lane.start(f"judging {key[1]} in all envs", work)
 
-    def judge_steps(
-        self, key: CameraKey, now: CameraSettings | None, moments: Sequence[EpisodeMoment]
-    ) -> None:
+    def judge_steps(self, key: CameraKey, now: CameraSettings | None, moments: Sequence[Lived]) -> None:
         """Judge a camera as it stands at moments of the past; what is known so far can be seen all the while."""
 
         def work(job: Job) -> None:
             reports: list[CameraReport] = []
             done: list[JudgedMoment] = []
             with self._judging_anew():
-                for moment in moments:
+                for moment, env in moments:
                     job.tell(len(done), len(moments))
-                    question = JudgeCamera(key, None, moment.env, moment.poses[moment.env])
+                    question = JudgeCamera(key, None, env, moment.step.poses[env])
                     reports.append(self._live.ask(job.check, question))
-                    done.append(JudgedMoment(moment.serial, moment.env, moment.step))
+                    done.append(JudgedMoment(moment.serial, env, int(moment.step.elapsed_steps[env])))
                     if len(done) % _TELL_EVERY == 0 or len(done) == len(moments):
                         self._know_report(key, now, join_reports(reports), 0, tuple(done))
 

@@ -29,7 +29,7 @@ from workbench.core.step import StepResult
 from workbench.session import camera_in_words
 from workbench.session.askers import Asker
 from workbench.session.camera_judging import CameraJudging, ShownMoment
-from workbench.session.episode_moments import EpisodeMoment
+from workbench.session.history import Lived
 from workbench.session.messages import Load, PlaceCamera, Placed, ReloadLevel, Request, TaskDescription
 from workbench.session.preview import Preview, Sight
 from workbench.session.studio_cameras import StudioCameras
@@ -52,7 +52,7 @@ class CameraStudio:
         on_change: Callable[[], None],
         shown: Callable[[], ShownMoment],
         load: Callable[[], Load | None],
-        episode: Callable[[int], tuple[EpisodeMoment, ...]],
+        episode: Callable[[int], tuple[Lived, ...]],
         open_copy: Callable[[Path, str], None],
     ) -> None:
         """

@@ -1,35 +1,37 @@
 """One row an env: how its episode stands, what came of the one before, and what was odd about it.
 
 The page shows one env's numbers and the batch's mean; neither says which of sixty-four envs to look at. This
-does: it follows every reset and control step of the batch and keeps, for each env, the return so far, the
-rewards for a small curve, the first step at which each bool of ``evaluate`` turned true, whether and how the
-episode ended, and the outliers seen (`outliers`). A step costs array operations over the batch; sentences and
-rows are made when somebody asks, and only for what is out of the ordinary.
+does: it follows every reset and control step of the batch. A step costs array operations over the batch; sentences
+are made only for what is out of the ordinary.
 
 An episode *ends* with the first step that is terminated or truncated. What happens after it (the player may let
 it run on) does not change its outcome. With the usual rule the env is reset at once, and nobody would ever read
 "failed" in its row; so a row also has the outcome of the episode before.
 
-An env that is put back to a moment of the past has its row put back too: to what was said then (`Standing`), of the
+An env that is put back to a moment of the past has its row put back too: to what the rows were at that moment, of the
 env whose moment it is. Only the counts of episodes that ended go on, since those did end.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.core.geometry import SceneGeometry
 from workbench.core.step import StepResult
-from workbench.session.history import History
-from workbench.session.messages import Restored, Stepped, TaskDescription
+from workbench.session.messages import Restored, Stepped
 from workbench.session.outliers import Kind, Outlier, OutlierWatch
-from workbench.session.standing import LastEpisode, Standing
 
 KEPT_REWARDS = 100
 """Steps of an episode whose rewards a row has; the newest where there are more."""
+LOST_REWARD = (Kind.REWARD, Kind.NOT_A_NUMBER)
+"""What `EnvRows.first` calls a reward that is NaN or infinite."""
+Outliers = Mapping[int, tuple[Outlier, ...]]
+"""By env, oldest first; envs without any are not in it."""
 
 
 class Outcome(IntEnum):
@@ -40,237 +42,239 @@ class Outcome(IntEnum):
 
 
 @dataclass(frozen=True)
-class EnvRows:
-    """The whole table at one moment: copies, which later steps do not change."""
+class LastEpisode:
+    """The episode before the present one, of each env; only of those that ended or had outliers."""
 
-    serial: int
-    """Grows with every reset and step."""
-    tick: int
-    """Control steps of the batch since the task was loaded."""
     outcome: NDArray[np.int8]
-    """(N,) `Outcome` of the present episode, RUNNING until it ends."""
+    """(N,) `Outcome`; RUNNING where it was cut short, or there was none (then `steps` is -1)."""
+    steps: NDArray[np.int32]
+    """(N,) control steps until its end."""
+    total: NDArray[np.float64]
+    """(N,) its return until its end."""
+    outliers: Outliers
+
+    def with_those(self, envs: NDArray[np.bool_], other: LastEpisode) -> LastEpisode:
+        """The same, but of these envs (N,) what `other` says."""
+        return LastEpisode(
+            np.where(envs, other.outcome, self.outcome),
+            np.where(envs, other.steps, self.steps),
+            np.where(envs, other.total, self.total),
+            _of_those(envs, other.outliers, self.outliers),
+        )
+
+
+@dataclass(frozen=True)
+class EnvRows:
+    """The whole table at one moment. Its arrays are never written to, and what did not change since the moment before
+    is shared with that: what a step adds is one array of returns."""
+
     steps: NDArray[np.int32]
     """(N,) control steps of the present episode."""
+    outcome: NDArray[np.int8]
+    """(N,) `Outcome` of the present episode, RUNNING until it ends."""
     end: NDArray[np.int32]
     """(N,) the step at which it ended; -1 while it runs."""
     total: NDArray[np.float64]
     """(N,) undiscounted return so far; NaN after a reward that is."""
     followed: NDArray[np.bool_]
     """(N,) whether the episode was followed from its start; of another there is no return."""
-    first_true: dict[str, NDArray[np.int32]]
-    """By bool entry of ``evaluate``: (N,) the first step at which it was true (0: after the reset); -1: never."""
-    rewards: NDArray[np.float32]
-    """(N, `KEPT_REWARDS`) oldest first; NaN before the episode's start."""
-    outliers: dict[int, tuple[Outlier, ...]]
-    """By env, oldest first; envs without any are not in it."""
+    first: Mapping[Hashable, NDArray[np.int32]]
+    """(N,) the first step at which it was so (0: after the reset); -1: never. By bool entry of ``evaluate``, by `Kind`
+    of outlier, and of `LOST_REWARD`."""
+    outliers: Outliers
     last: LastEpisode
     ended: NDArray[np.int64]
     """(N,) episodes that ended since the task was loaded."""
     succeeded: NDArray[np.int64]
     """(N,) those of them that ended in success."""
+    rewards: NDArray[np.float32]
+    """(N, `KEPT_REWARDS`) oldest first; NaN before the episode's start. (N, 0) in what a moment of the past keeps."""
 
     @property
     def num_envs(self) -> int:
         return len(self.steps)
 
+    @property
+    def first_true(self) -> dict[str, NDArray[np.int32]]:
+        """`first` of the entries of ``evaluate``."""
+        return {what: steps for what, steps in self.first.items() if isinstance(what, str)}
+
+    @staticmethod
+    def bytes_a_step(num_envs: int) -> int:
+        """What one more of them takes, nearly always."""
+        return 8 * num_envs + 400
+
 
 class EnvTable:
     """Follows the batch; `add` every event in order, ask for `rows` when they are to be shown."""
 
-    def __init__(self, task: TaskDescription, first: StepResult) -> None:
+    def __init__(
+        self, geometry: SceneGeometry, first: StepResult, control_dt: float, reward_mode: str
+    ) -> None:
         """
         Args:
             first: the state that the task was loaded with (a reset of all envs).
         """
-        count = task.num_envs
-        self._watch = OutlierWatch(task.geometry, first, task.control_dt, task.reward_mode)
-        self._serial = 0
-        self._tick = 0
-        self._steps = first.elapsed_steps.copy()
-        self._outcome = np.zeros(count, np.int8)
-        self._end = np.full(count, -1, np.int32)
-        self._total = np.zeros(count)
-        self._followed = np.ones(count, bool)
-        self._first_true: dict[str, NDArray[np.int32]] = {}
+        count = len(first.reward)
+        never, nothing = np.full(count, -1, np.int32), np.zeros(count)
+        zero, none = np.zeros(count, np.int8), np.zeros(count, np.int64)
+        self._watch = OutlierWatch(geometry, first, control_dt, reward_mode)
         self._rewards = np.full((count, KEPT_REWARDS), np.nan, np.float32)
-        self._outliers: dict[int, tuple[Outlier, ...]] = {}
-        self._shown: dict[Kind, NDArray[np.bool_]] = {kind: np.zeros(count, bool) for kind in Kind}
-        self._last = LastEpisode(np.zeros(count, np.int8), np.full(count, -1, np.int32), np.zeros(count), {})
-        self._ended = np.zeros(count, np.int64)
-        self._succeeded = np.zeros(count, np.int64)
+        self._tick = 0
+        self._now = EnvRows(
+            steps=first.elapsed_steps,
+            outcome=zero,
+            end=never,
+            total=nothing,
+            followed=np.ones(count, bool),
+            first={},
+            outliers={},
+            last=LastEpisode(zero, never, nothing, {}),
+            ended=none,
+            succeeded=none,
+            rewards=self._rewards[:, :0].copy(),
+        )
         self._begin(np.ones(count, bool), first)
 
-    def add(self, stepped: Stepped, history: History | None = None) -> None:
+    def add(
+        self, stepped: Stepped, then: EnvRows | None, rewards_then: Callable[[int], NDArray[np.float32]]
+    ) -> EnvRows:
         """Take one event: a reset of some envs, a going back, or a control step of all.
 
         Args:
-            history: that has this event as its newest moment, which is given the rows' standing; without it the
-                rows of envs that go back begin anew, from where nobody can say what came before.
-        """
-        self._take(stepped, history)
-        moment = None if history is None else history.at(history.last)
-        if moment is not None:
-            moment.standing = Standing(
-                self._outcome,
-                self._end,
-                self._total,
-                self._followed,
-                self._first_true,
-                self._outliers,
-                self._last,
-            )
+            then: the rows at the moment that was gone back to. None for no going back, or one to a moment that is not
+                known: the rows of its envs begin anew, from where nobody can say what came before.
+            rewards_then: those of an env's episode until then, oldest first.
 
-    def _take(self, stepped: Stepped, history: History | None) -> None:
-        step, reset = stepped.step, stepped.reset_mask
-        self._serial += 1
-        if reset.any():
-            # A worker that came back with the very moment at which the one before it died resets nothing.
-            resumed = (step.elapsed_steps == self._steps) & (self._steps > 0) & (stepped.restored is None)
-            anew = (reset & ~resumed) | (step.elapsed_steps != self._steps)
-            self._begin(anew, step)
-            if stepped.restored is not None and history is not None:
-                self._put_back(stepped.restored, history)
-            return
-        moved = step.elapsed_steps != self._steps + 1
+        Returns:
+            the rows as a moment keeps them.
+        """
+        step, jumped = stepped.step, stepped.reset_mask
+        if jumped.any():
+            begun = step.elapsed_steps != self._now.steps
+            self._begin(begun if stepped.resumed else jumped | begun, step)
+            if stepped.restored is not None and then is not None:
+                self._put_back(stepped.restored, then, rewards_then)
+            return self._now
+        moved = step.elapsed_steps != self._now.steps + 1
         if moved.any():
             self._begin(moved, step)
+        self._rewards[:, self._tick % KEPT_REWARDS] = step.reward
         self._tick += 1
-        self._steps = step.elapsed_steps.copy()
-        self._total = self._total + np.where(self._end < 0, step.reward, 0.0)
-        column = (self._tick - 1) % KEPT_REWARDS
-        self._rewards[:, column] = step.reward
-        self._note_first_true(step, np.ones(len(moved), bool))
-        self._note_outliers(step)
-        self._note_ends(step)
+        self._step(step)
+        return self._now
 
     def rows(self) -> EnvRows:
         """The table as it is now."""
         oldest_first = np.arange(self._tick, self._tick + KEPT_REWARDS) % KEPT_REWARDS
-        return EnvRows(
-            serial=self._serial,
-            tick=self._tick,
-            outcome=self._outcome,
-            steps=self._steps.copy(),
-            end=self._end,
-            total=self._total,
-            followed=self._followed,
-            first_true=dict(self._first_true),
-            rewards=self._rewards[:, oldest_first],
-            outliers=dict(self._outliers),
-            last=self._last,
-            ended=self._ended.copy(),
-            succeeded=self._succeeded.copy(),
+        return replace(self._now, rewards=self._rewards[:, oldest_first])
+
+    def _step(self, step: StepResult) -> None:
+        now, first, outliers = self._now, dict(self._now.first), self._now.outliers
+        for name, so in _flags(step):
+            _note(first, name, so, step)
+        _note(first, LOST_REWARD, ~np.isfinite(step.reward), step)
+        for sight in self._watch.look(step):
+            for env in np.flatnonzero(_note(first, sight.kind, sight.envs, step)).tolist():
+                outlier = Outlier(sight.kind, int(step.elapsed_steps[env]), sight.reason(env))
+                outliers = {**outliers, env: (*outliers.get(env, ()), outlier)}
+        same = all(steps is now.first.get(what) for what, steps in first.items())
+        running = now.end < 0
+        self._now = replace(
+            now,
+            steps=step.elapsed_steps,
+            total=now.total + np.where(running, step.reward, 0.0),
+            first=now.first if same else first,
+            outliers=outliers,
         )
+        ends = (step.terminated | step.truncated) & running
+        if ends.any():
+            success = dict(_flags(step)).get("success", np.zeros(len(ends), bool))
+            # An env may be terminated by neither (a task with its own rule): that is no success.
+            lost = np.where(step.terminated, Outcome.FAIL, Outcome.TRUNCATED)
+            outcome = np.where(success, Outcome.SUCCESS, lost).astype(np.int8)
+            self._now = replace(
+                self._now,
+                outcome=np.where(ends, outcome, now.outcome),
+                end=np.where(ends, step.elapsed_steps, now.end),
+                ended=now.ended + ends,
+                succeeded=now.succeeded + (ends & success),
+            )
 
     def _begin(self, envs: NDArray[np.bool_], step: StepResult) -> None:
         """A new episode in these envs (N,): what was known of the one before becomes "last"."""
-        worth_keeping = envs & ((self._end >= 0) | np.isin(np.arange(len(envs)), list(self._outliers)))
-        if worth_keeping.any():
-            kept = set(np.flatnonzero(worth_keeping).tolist())
-            before = {env: seen for env, seen in self._last.outliers.items() if env not in kept}
-            now = {env: seen for env, seen in self._outliers.items() if env in kept}
-            self._last = LastEpisode(
-                np.where(worth_keeping, self._outcome, self._last.outcome),
-                np.where(worth_keeping, np.where(self._end < 0, self._steps, self._end), self._last.steps),
-                np.where(worth_keeping, self._total, self._last.total),
-                {**before, **now},
-            )
-            self._outliers = {env: seen for env, seen in self._outliers.items() if env not in kept}
-        self._steps = np.where(envs, step.elapsed_steps, self._steps)
-        self._outcome = np.where(envs, np.int8(Outcome.RUNNING), self._outcome)
-        self._end = np.where(envs, np.int32(-1), self._end)
-        self._total = np.where(envs, np.where(step.elapsed_steps == 0, 0.0, np.nan), self._total)
-        self._followed = np.where(envs, step.elapsed_steps == 0, self._followed)
+        now, from_start = self._now, step.elapsed_steps == 0
+        worth_keeping = envs & ((now.end >= 0) | np.isin(np.arange(len(envs)), list(now.outliers)))
+        until = np.where(now.end < 0, now.steps, now.end)
+        before = LastEpisode(now.outcome, until, now.total, now.outliers)
+        first = {what: np.where(envs, np.int32(-1), steps) for what, steps in now.first.items()}
+        for name, so in _flags(step):
+            _note(first, name, so & envs, step)
+        self._now = replace(
+            now,
+            steps=np.where(envs, step.elapsed_steps, now.steps),
+            outcome=np.where(envs, np.int8(Outcome.RUNNING), now.outcome),
+            end=np.where(envs, np.int32(-1), now.end),
+            total=np.where(envs, np.where(from_start, 0.0, np.nan), now.total),
+            followed=np.where(envs, from_start, now.followed),
+            first=first,
+            outliers=_of_those(envs, {}, now.outliers),
+            last=now.last.with_those(worth_keeping, before) if worth_keeping.any() else now.last,
+        )
         self._rewards[envs] = np.nan
-        for shown in self._shown.values():
-            shown[envs] = False
-        self._first_true = {
-            name: np.where(envs, np.int32(-1), steps) for name, steps in self._first_true.items()
-        }
-        self._note_first_true(step, envs)
         self._watch.begin(envs, step)
 
-    def _put_back(self, restored: Restored, history: History) -> None:
+    def _put_back(
+        self, restored: Restored, then: EnvRows, rewards_then: Callable[[int], NDArray[np.float32]]
+    ) -> None:
         """The rows of these envs as they stood at the moment that they went back to."""
-        origin = history.at(restored.origin)
-        then = None if origin is None else origin.standing
-        if then is None:
-            return  # it had to go from memory while the worker was at it
-        envs, source = np.array(restored.env_idx), np.array(restored.source)
-        self._outcome = _with(self._outcome, envs, then.outcome[source])
-        self._end = _with(self._end, envs, then.end[source])
-        self._total = _with(self._total, envs, then.total[source])
-        self._followed = _with(self._followed, envs, then.followed[source])
-        self._first_true = {
-            name: _with(steps, envs, then.first_true[name][source]) if name in then.first_true else steps
-            for name, steps in self._first_true.items()
-        }
-        gone = set(restored.env_idx)
-        self._outliers = {env: seen for env, seen in self._outliers.items() if env not in gone}
+        now, every = self._now, np.arange(self._now.num_envs)
+        source = every.copy()
+        source[list(restored.env_idx)] = restored.source
+        put = np.isin(every, restored.env_idx)
+
+        def taken(old: NDArray, new: NDArray | None) -> NDArray:
+            return old if new is None else np.where(put, new[source], old)
+
+        self._now = replace(
+            now,
+            outcome=taken(now.outcome, then.outcome),
+            end=taken(now.end, then.end),
+            total=taken(now.total, then.total),
+            followed=taken(now.followed, then.followed),
+            first={what: taken(steps, then.first.get(what)) for what, steps in now.first.items()},
+            outliers=_of_those(
+                put, {env: then.outliers.get(int(source[env]), ()) for env in restored.env_idx}, now.outliers
+            ),
+            # The episode before is an env's own, whoever's moment it goes on from.
+            last=now.last.with_those(put & (source == every), then.last),
+        )
         for env, of in zip(restored.env_idx, restored.source, strict=True):
-            if of in then.outliers:
-                self._outliers[env] = then.outliers[of]
-            for kind, shown in self._shown.items():
-                shown[env] = any(outlier.kind == kind for outlier in then.outliers.get(of, ()))
-            rewards = history.rewards_until(of, restored.origin, KEPT_REWARDS)
-            columns = np.arange(self._tick - len(rewards), self._tick) % KEPT_REWARDS
-            self._rewards[env, columns] = rewards
-        # The episode before is an env's own, whoever's moment it goes on from.
-        own = envs[envs == source]
-        mine, last = set(own.tolist()), self._last
-        self._last = LastEpisode(
-            _with(last.outcome, own, then.last.outcome[own]),
-            _with(last.steps, own, then.last.steps[own]),
-            _with(last.total, own, then.last.total[own]),
-            {
-                **{env: seen for env, seen in last.outliers.items() if env not in mine},
-                **{env: seen for env, seen in then.last.outliers.items() if env in mine},
-            },
-        )
-
-    def _note_first_true(self, step: StepResult, envs: NDArray[np.bool_]) -> None:
-        for name, values in step.evaluate.items():
-            if values.dtype != np.bool_ or values.ndim != 1:
-                continue
-            steps = self._first_true.get(name)
-            if steps is None:
-                steps = np.full(len(values), -1, np.int32)
-                self._first_true = {**self._first_true, name: steps}
-            now = values & (steps < 0) & envs
-            if now.any():
-                self._first_true = {**self._first_true, name: np.where(now, step.elapsed_steps, steps)}
-
-    def _note_outliers(self, step: StepResult) -> None:
-        for sight in self._watch.look(step):
-            shown = self._shown[sight.kind]
-            for env in np.flatnonzero(sight.envs & ~shown).tolist():
-                outlier = Outlier(sight.kind, int(step.elapsed_steps[env]), sight.reason(env))
-                self._outliers = {**self._outliers, env: (*self._outliers.get(env, ()), outlier)}
-            shown |= sight.envs
-
-    def _note_ends(self, step: StepResult) -> None:
-        ends = (step.terminated | step.truncated) & (self._end < 0)
-        if not ends.any():
-            return
-        success = _flag(step, "success")
-        # An env may be terminated by neither (a task with its own rule): that is no success.
-        outcome = np.where(
-            success, Outcome.SUCCESS, np.where(step.terminated, Outcome.FAIL, Outcome.TRUNCATED)
-        )
-        self._outcome = np.where(ends, outcome, self._outcome).astype(np.int8)
-        self._end = np.where(ends, step.elapsed_steps, self._end)
-        self._ended += ends
-        self._succeeded += ends & success
+            rewards = rewards_then(of)
+            self._rewards[env, np.arange(self._tick - len(rewards), self._tick) % KEPT_REWARDS] = rewards
 
 
-def _with(values: NDArray, envs: NDArray[np.int64], new: NDArray) -> NDArray:
-    """A copy with other values for these envs."""
-    changed = values.copy()
-    changed[envs] = new
-    return changed
+def _flags(step: StepResult) -> Iterator[tuple[str, NDArray[np.bool_]]]:
+    """The entries of ``evaluate`` that say yes or no of each env, success and fail of whatever type; (N,) each."""
+    for name, values in step.evaluate.items():
+        if name in ("success", "fail") or (values.dtype == np.bool_ and values.ndim == 1):
+            yield name, values.reshape(len(step.reward), -1)[:, 0].astype(bool)
 
 
-def _flag(step: StepResult, name: str) -> NDArray[np.bool_]:
-    values = step.evaluate.get(name)
-    count = len(step.reward)
-    return np.zeros(count, bool) if values is None else values.reshape(count, -1)[:, 0].astype(bool)
+def _note(
+    first: dict[Hashable, NDArray[np.int32]], what: Hashable, so: NDArray[np.bool_], step: StepResult
+) -> NDArray[np.bool_]:
+    """Note in `first` where it is so for the first time in an episode; returns where."""
+    known = first.get(what)
+    if known is None:
+        known = first[what] = np.full(len(so), -1, np.int32)
+    new = so & (known < 0)
+    if new.any():
+        first[what] = np.where(new, step.elapsed_steps, known)
+    return new
+
+
+def _of_those(envs: NDArray[np.bool_], new: Outliers, old: Outliers) -> Outliers:
+    """Of these envs (N,) the new ones, of the others the old."""
+    kept = {env: seen for env, seen in old.items() if not envs[env]}
+    return {**kept, **{env: seen for env, seen in new.items() if seen and envs[env]}}

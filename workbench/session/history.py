@@ -3,8 +3,9 @@
 The history is a log, not a tape: what arrives is put at its end and nothing in it is changed. A reset is a
 moment of its own. Going back to step 43 is one too: the envs *jump*, and what follows are new moments behind the
 jump. So the future that was left stays where it was, can be scrubbed through and returned to, and "undo" is
-nothing but going back to the moment before a jump. What one env lived through without a jump is a `Stretch`: it
-starts from a snapshot, and its actions, rewards and entries of ``evaluate`` are all here, so it can be run again.
+nothing but going back to the moment before a jump. What one env lived through without a jump is a *stretch*: it
+starts from a snapshot, and its actions, rewards and entries of ``evaluate`` are all here, so it can be run again. An
+*episode* goes from a reset on through the moments that the env was put back to.
 
 Memory is bounded, and what is oldest goes first. Pictures are by far the largest (a human camera's is 0.8 MB, a
 step of 16 PickCube envs without pictures 21 KB, of 64 envs 72 KB) and can be drawn again, so they may fill no more
@@ -27,10 +28,10 @@ from numpy.typing import NDArray
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.snapshot_bytes import WholeSnapshot
 from workbench.core.step import StepResult
+from workbench.session.curves import Columns, RecentSteps
+from workbench.session.env_table import KEPT_REWARDS, LOST_REWARD, EnvRows, EnvTable
 from workbench.session.messages import NO_MOMENT, PastPictures, Pictures, Restored, Stepped, WayBack
-from workbench.session.moment_rows import MomentRows
 from workbench.session.shared_parts import PartSet, SharedParts
-from workbench.session.standing import Standing
 
 RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, NOT_A_NUMBER = 1, 2, 4, 8, 16, 32
 """What may happen to an env at a moment. Success, failure and a reward that is none: the first in an episode."""
@@ -53,7 +54,7 @@ class Moment:
     """(N,) as `Stepped.reset_mask`."""
     seeds: NDArray[np.int64] | None
     tick: int
-    """Control steps of the session so far: where this is on the curves."""
+    """Where this is on the curves."""
     happened: NDArray[np.uint8]
     """(N,) of `RESET` ... `TRUNCATED`, added up."""
     restored: Restored | None
@@ -63,14 +64,14 @@ class Moment:
     parts: PartSet
     size: int
     """Bytes, without parts and pictures."""
+    rows: EnvRows
+    """What the table of envs said then."""
+    acted_by: str
+    """As `Stepped.acted_by`."""
     pictures: dict[tuple[int, CameraKind, str], Picture] = field(default_factory=dict)
     """By env, kind and name of the camera."""
     outdated: set[tuple[int, CameraKind, str]] = field(default_factory=set)
     """Which of the pictures are of a camera that was moved since."""
-    standing: Standing | None = None
-    """What the table of envs said then."""
-    acted_by: str = ""
-    """As `Stepped.acted_by`."""
     first_said: StepResult | None = None
     """`step` as it was when this happened, if a newer version has said otherwise since."""
 
@@ -80,27 +81,21 @@ class Moment:
         return self.step if self.first_said is None else self.first_said
 
 
-@dataclass(frozen=True)
-class Stretch:
-    """What one env lived through without a jump: its first moment is a snapshot, each other one a step."""
-
-    env: int
-    first: int
-    last: int
-    """Serials of its first and last moment, both kept; not all between are its steps where others jumped."""
-    whole: bool
-    """Whether its first moment is the one that it began with; else that was dropped for want of memory."""
+Lived = tuple[Moment, int]
+"""A moment of an episode, with the number that the env had then: another than now where it was given another env's."""
 
 
 class History:
     """The moments of one built task, oldest first. Not thread-safe: its owner locks."""
 
-    def __init__(self, num_envs: int, limit: int, first_serial: int = 0) -> None:
+    def __init__(self, table: EnvTable, limit: int, first_serial: int = 0) -> None:
         """
         Args:
+            table: of the envs, which has been told of nothing yet.
             limit: bytes that it may take; the newest moment is kept whatever it takes.
             first_serial: the number of the first moment.
         """
+        self._table, num_envs = table, table.rows().num_envs
         self._num_envs = num_envs
         self.limit = limit
         self._moments: deque[Moment] = deque()
@@ -109,40 +104,50 @@ class History:
         self._used = 0
         self._pictures_used = 0
         self._pictured: deque[int] = deque()
-        self._ever = {flag: np.zeros(num_envs, bool) for flag in (SUCCESS, FAIL, NOT_A_NUMBER)}
         self._jumps: deque[Moment] = deque()
-        self._rows = MomentRows(num_envs, first_serial)
+        self._columns = Columns(num_envs, first_serial)
+        self.steps = RecentSteps(num_envs)
 
     # --- what comes --------------------------------------------------------------------------------
 
-    def add(self, stepped: Stepped, tick: int) -> Moment:
+    def add(self, stepped: Stepped) -> Moment:
         """The next moment.
 
         A reward is for an action: where there was none (a reset, a going back) the worker says zero, and what is
         kept is NaN, or what was said of the moment that was gone back to, or in the other envs what stood before.
         """
+        restored, jumps = stepped.restored, bool(stepped.reset_mask.any())
+        origin = None if restored is None else self.at(restored.origin)
         parts = self._parts.take(stepped.part_keys, stepped.new_parts)
-        stepped = replace(stepped, step=self._with_rewards(stepped))
+        stepped = replace(stepped, step=self._with_rewards(stepped, origin))
+        rows = self._table.add(
+            stepped,
+            None if origin is None else origin.rows,
+            lambda env: self._rewards_until(env, origin, KEPT_REWARDS),
+        )
+        if not jumps:
+            self.steps.add(stepped.step)
         size = _OVERHEAD + len(stepped.snapshot) + _step_bytes(stepped.step)
-        size += Standing.bytes_a_step(self._num_envs)
+        size += EnvRows.bytes_a_step(self._num_envs)
         moment = Moment(
             serial=self._next_serial,
             step=stepped.step,
             jumped=stepped.reset_mask,
             seeds=stepped.seeds,
-            tick=tick,
-            happened=self._events(stepped),
-            restored=stepped.restored,
+            tick=max(0, self.steps.count - 1),
+            happened=self._events(stepped, rows),
+            restored=restored,
             number=stepped.number,
             snapshot=stepped.snapshot if parts.complete else b"",
             parts=parts,
             size=size,
+            rows=rows,
             acted_by=sys.intern(stepped.acted_by),
         )
-        self._rows.write(moment.serial, self.first, moment.happened, moment.step.reward)
+        self._write(moment)
         self._next_serial += 1
         self._moments.append(moment)
-        if moment.jumped.any():
+        if jumps:
             self._jumps.append(moment)
         self._used += size
         self._shrink()
@@ -162,7 +167,7 @@ class History:
             moment.size += _step_bytes(step)
             self._used += _step_bytes(step)
         moment.step = step if step.action is not None else replace(step, reward=moment.step.reward)
-        self._rows.write(moment.serial, self.first, moment.happened, moment.step.reward)
+        self._write(moment)
         return moment.step
 
     def add_pictures(self, event: Pictures | PastPictures) -> None:
@@ -244,13 +249,19 @@ class History:
         start = self.first
         return (self._moments[k - start] for k in range(max(low, start), min(high, self.last) + 1))
 
+    def env_rows(self) -> EnvRows:
+        """The table of the envs as it is now."""
+        return self._table.rows()
+
     def events(self, env: int, low: int, high: int) -> list[tuple[int, int]]:
         """What happened to this env between two moments, both included: serials and `RESET` ... added up."""
-        return self._rows.events(env, max(low, self.first), min(high, self.last))
+        low = max(low, self.first)
+        happened = self._columns.between("happened", low, min(high, self.last))[:, env]
+        return [(low + int(k), int(happened[k])) for k in np.flatnonzero(happened)]
 
     def rewards(self, env: int, low: int, high: int) -> NDArray[np.float32]:
         """(K,) of this env at the moments between two, both included; NaN where it was reset."""
-        return self._rows.rewards(env, max(low, self.first), min(high, self.last))
+        return self._columns.between("reward", max(low, self.first), min(high, self.last))[:, env]
 
     def jumps_back(self, env: int) -> list[tuple[int, int]]:
         """Serials of the kept moments at which this env went back, and of those that it went back to."""
@@ -260,33 +271,33 @@ class History:
             if moment.restored is not None and moment.restored.origin != NO_MOMENT and moment.jumped[env]
         ]
 
-    def stretch_at(self, env: int, serial: int) -> tuple[int, int]:
-        """First and last serial of what this env lived through without a jump round this moment."""
-        low, high = self.first, self.last
-        for moment in self._jumps:
-            if moment.jumped[env]:
-                if moment.serial > serial:
-                    high = moment.serial - 1
-                    break
-                low = moment.serial
-        return low, high
-
-    def stretches(self, env: int) -> list[Stretch]:
-        """What this env lived through, cut at its jumps; oldest first."""
+    def stretches(self, env: int) -> list[tuple[int, int]]:
+        """First and last serials of what this env lived through without a jump, as far as they are kept; oldest first.
+        Where others jumped, not all moments between are its steps."""
         if not self._moments:
             return []
-        begins = [moment.serial for moment in self._jumps if moment.jumped[env]]
-        if not begins or begins[0] > self.first:
-            begins.insert(0, self.first)
-        ends = [*(begin - 1 for begin in begins[1:]), self.last]
-        known = {moment.serial for moment in self._jumps if moment.jumped[env]}
-        return [Stretch(env, a, b, a in known) for a, b in zip(begins, ends, strict=True)]
+        jumps = [moment.serial for moment in self._jumps if moment.jumped[env] and moment.serial > self.first]
+        return list(zip([self.first, *jumps], [*(jump - 1 for jump in jumps), self.last], strict=True))
 
-    def lived(self, env: int, serial: int) -> Iterator[tuple[Moment, int]]:
+    def stretch_at(self, env: int, serial: int) -> tuple[int, int]:
+        """The one of these that this moment is in."""
+        return next(stretch for stretch in reversed(self.stretches(env)) if stretch[0] <= serial)
+
+    def episode(self, env: int, serial: int, most: int | None = None) -> tuple[Lived, ...]:
+        """The episode that this env is in at a moment, as far as it went; oldest first, see `lived`.
+
+        Args:
+            most: so many moments at most, evenly spread, the first and the last among them; None for all.
+        """
+        lived = [*self.lived(env, self.stretch_at(env, serial)[1])][::-1]
+        count = len(lived) if most is None else min(most, len(lived))
+        chosen = np.unique(np.linspace(0, len(lived) - 1, count).round().astype(int))
+        return tuple(lived[k] for k in chosen)
+
+    def lived(self, env: int, serial: int) -> Iterator[Lived]:
         """The episode of this env up to a moment, newest first, through the moments that it was put back to.
 
-        Each control step and, at the end, the reset that it began with, as far as they are kept; with the number
-        that the env had then, which is another where it was given another env's moment.
+        Each control step and, at the end, the reset that it began with, as far as they are kept.
         """
         moment = self.at(serial)
         while moment is not None:
@@ -324,13 +335,6 @@ class History:
                 at, env = jump.origin, jump.source[jump.env_idx.index(env)]
             moment = self.at(at)
         return None
-
-    def rewards_until(self, env: int, serial: int, most: int) -> NDArray[np.float32]:
-        """(K,) rewards of the episode of this env up to a moment, oldest first; at most so many, the newest."""
-        rewards = (
-            moment.step.reward[of] for moment, of in self.lived(env, serial) if not moment.jumped.any()
-        )
-        return np.array(list(islice(rewards, most))[::-1], np.float32)
 
     def last_jump(self, env: int) -> Moment | None:
         """The jump that brought this env where it is, if it can be taken back.
@@ -375,42 +379,38 @@ class History:
         self._pictures_used -= size
         self._used -= size
 
-    def _with_rewards(self, stepped: Stepped) -> StepResult:
+    def _write(self, moment: Moment) -> None:
+        values = {"happened": moment.happened, "reward": moment.step.reward}
+        self._columns.write(moment.serial, self.first, values)
+
+    def _rewards_until(self, env: int, moment: Moment | None, most: int) -> NDArray[np.float32]:
+        """(K,) rewards of the episode of this env up to a moment, oldest first; at most so many, the newest."""
+        lived = () if moment is None else self.lived(env, moment.serial)
+        rewards = (one.step.reward[of] for one, of in lived if not one.jumped.any())
+        return np.array(list(islice(rewards, most))[::-1], np.float32)
+
+    def _with_rewards(self, stepped: Stepped, origin: Moment | None) -> StepResult:
         step, jumped, restored = stepped.step, stepped.reset_mask, stepped.restored
         if step.action is not None or not jumped.any():
             return step
-        reward, gone = np.full(self._num_envs, np.nan, np.float32), jumped
+        reward = np.full(self._num_envs, np.nan, np.float32)
         if self._moments:
-            before = self._moments[-1].step
-            reward[:] = before.reward
-            if restored is None:
-                # A worker that came back with the very moment at which the one before it died.
-                gone = jumped & ((step.elapsed_steps != before.elapsed_steps) | (step.elapsed_steps == 0))
-        reward[gone] = np.nan
-        origin = None if restored is None else self.at(restored.origin)
+            reward[:] = self._moments[-1].step.reward
+        if not stepped.resumed:
+            reward[jumped] = np.nan
         if restored is not None and origin is not None:
             reward[list(restored.env_idx)] = origin.step.reward[list(restored.source)]
         return replace(step, reward=reward)
 
-    def _events(self, stepped: Stepped) -> NDArray[np.uint8]:
+    def _events(self, stepped: Stepped, rows: EnvRows) -> NDArray[np.uint8]:
         step, jumped = stepped.step, stepped.reset_mask
-        happened = np.zeros(self._num_envs, np.uint8)
-        happened[jumped] |= RESET if stepped.restored is None else WENT_BACK
-        for flag, name in ((SUCCESS, "success"), (FAIL, "fail")):
-            now = step.evaluate.get(name)
-            if now is None:
-                continue
-            is_so = np.asarray(now).reshape(self._num_envs, -1)[:, 0].astype(bool)
-            # A moment that was gone back to is no event: its success was reached where it came from.
-            happened[is_so & ~self._ever[flag] & ~jumped] |= flag
-            self._ever[flag] = np.where(jumped, is_so, self._ever[flag] | is_so)
-        happened[step.truncated & ~jumped] |= TRUNCATED
-        ever, none = self._ever[NOT_A_NUMBER], ~np.isfinite(step.reward)
-        if not jumped.any():
-            happened[none & ~ever] |= NOT_A_NUMBER
-            ever |= none
-        else:
-            ever[jumped] = none[jumped] & (stepped.restored is not None)
+        if jumped.any():
+            # What is so at a moment that was gone back to is no event: it came about where that moment is.
+            return np.where(jumped, RESET if stepped.restored is None else WENT_BACK, 0).astype(np.uint8)
+        happened = np.where(step.truncated, TRUNCATED, 0).astype(np.uint8)
+        for flag, what in ((SUCCESS, "success"), (FAIL, "fail"), (NOT_A_NUMBER, LOST_REWARD)):
+            if what in rows.first:
+                happened[rows.first[what] == step.elapsed_steps] |= flag
         return happened
 
 

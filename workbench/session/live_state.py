@@ -19,7 +19,7 @@ from workbench.authoring.reference import RecordedTask, TaskName, class_beside, 
 from workbench.core.inspection import Inspection
 from workbench.core.snapshot_bytes import WholeSnapshot
 from workbench.core.step import StepResult
-from workbench.session.chronicle import Chronicle
+from workbench.session.env_table import EnvTable
 from workbench.session.kept_worker import Death
 from workbench.session.last_words import death_problem, own_files_of
 from workbench.session.messages import (
@@ -60,7 +60,7 @@ class LiveState:
     """What the past may take."""
     now: SessionView = SessionView(activity="starting the worker")
     """What is live, but for what `view` adds."""
-    chronicle: Chronicle | None = None
+    timeline: Timeline | None = None
     """None before a task is loaded."""
     problem_at_run: bool = False
     """It came while the task ran, not while a version was loaded."""
@@ -82,11 +82,6 @@ class LiveState:
     def set(self, **changes: Any) -> None:
         """Replace fields of `now`."""
         self.now = replace(self.now, **changes)
-
-    @property
-    def timeline(self) -> Timeline | None:
-        """None before a task is loaded."""
-        return None if self.chronicle is None else self.chronicle.timeline
 
     # --- what the worker says ----------------------------------------------------------------------
 
@@ -145,14 +140,15 @@ class LiveState:
         )
         if self.timeline is None or not its_past_stays:
             next_serial = 0 if self.timeline is None else self.timeline.history.next_serial
-            self.chronicle = Chronicle(task, first, self.history_bytes, next_serial)
+            table = EnvTable(task.geometry, first, task.control_dt, task.reward_mode)
+            self.timeline = Timeline(table, self.history_bytes, next_serial)
 
     def stepped(self, event: Stepped) -> None:
-        if self.chronicle is None:
+        if self.timeline is None:
             self.set(step=event.step)
         else:
-            step = self.chronicle.add(event)
-            self.set(step=step, step_serial=self.chronicle.timeline.history.last)
+            moment = self.timeline.add(event)
+            self.set(step=moment.step, step_serial=moment.serial)
         first, self.first_due = self.first_due, False
         if self.now.problem is not None and self.problem_at_run and not first:
             # What failed while running runs again: the task was reset, or the policy changed.
@@ -375,11 +371,11 @@ class LiveState:
         """
         now, timeline = self.now, self.timeline
         refused = now.problem if now.stale and not self.problem_at_run else None
-        if self.chronicle is None or timeline is None:
+        if timeline is None:
             return replace(now, refused=refused, **known)
         env, moment = now.settings.selected_env, timeline.shown
         past = timeline.view(env, now.settings.cameras)
-        view = replace(now, refused=refused, curves=self.chronicle.curves(), timeline=past, **known)
+        view = replace(now, refused=refused, curves=timeline.history.steps.curves(), timeline=past, **known)
         if moment is None:
             return view
         return replace(view, step=moment.step, step_serial=moment.serial, pictures=timeline.pictures(env))

@@ -414,6 +414,9 @@ class Stepped:
     capturing."""
     acted_by: str = ""
     """What chose the action of this step, as a recording is to say it; empty where it is known beforehand."""
+    resumed: bool = False
+    """The envs stand where the worker before this one left them: the result does not follow from one of this worker's,
+    but nothing was reset."""
 
 
 @dataclass(frozen=True)

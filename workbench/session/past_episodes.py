@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from workbench.core.snapshot_bytes import WholeSnapshot
-from workbench.session.history import History, Moment
+from workbench.session.history import History, Lived, Moment
 from workbench.session.messages import Load, PlaceCamera, TaskDescription
 
 
@@ -23,8 +23,7 @@ class PastEpisode:
     """The moments of one env's episode, oldest first; the first is its reset."""
 
     env: int
-    moments: tuple[tuple[Moment, int], ...]
-    """With the number that the env had then: another where it was given another env's moment."""
+    moments: tuple[Lived, ...]
     seed: int
     """Below 0 where it is not known."""
 
@@ -70,7 +69,7 @@ def episode_round(history: History, env: int, serial: int | None, before: bool =
     """
     if not len(history):
         return "nothing was seen yet"
-    found = _until(history, env, history.stretch_at(env, history.last if serial is None else serial)[1])
+    found = _of(history, env, history.last if serial is None else serial)
     if isinstance(found, PastEpisode) and found.steps == 0 and serial is None:
         found = _before(history, env, found) or found
     if before and isinstance(found, PastEpisode):
@@ -83,11 +82,11 @@ def episode_round(history: History, env: int, serial: int | None, before: bool =
 def _before(history: History, env: int, episode: PastEpisode) -> PastEpisode | str | None:
     """The one before; None where that is not in memory any more."""
     begin = episode.moments[0][0].serial
-    return _until(history, env, begin - 1) if begin > history.first else None
+    return _of(history, env, begin - 1) if begin > history.first else None
 
 
-def _until(history: History, env: int, last: int) -> PastEpisode | str:
-    lived = list(history.lived(env, last))[::-1]
+def _of(history: History, env: int, serial: int) -> PastEpisode | str:
+    lived = history.episode(env, serial)
     if not lived:
         return "nothing was seen yet"
     first, of = lived[0]
@@ -101,7 +100,7 @@ def _until(history: History, env: int, last: int) -> PastEpisode | str:
             lived = lived[: count + 1]
             break
     seed = -1 if first.seeds is None else int(first.seeds[of])
-    return PastEpisode(env, tuple(lived), seed)
+    return PastEpisode(env, lived, seed)
 
 
 def moments_of(episodes: Sequence[PastEpisode]) -> list[tuple[Moment, tuple[int, ...]]]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.recording.episode import Episode
-from workbench.session.reward_terms import PREFIX
+from workbench.session.curves import PREFIX
 
 Style = Literal["reset", "success", "fail", "limit", "odd", "other"]
 """As the strip under the slider draws it."""

@@ -26,6 +26,7 @@ from workbench.machine.watched_thread import listen, stop_listening
 from workbench.session.askers import Asker
 from workbench.session.calls import Answer, Progress
 from workbench.session.camera_studio import CameraStudio
+from workbench.session.curves import TermCurves
 from workbench.session.debugger_words import listening_for_a_debugger
 from workbench.session.env_table import EnvRows
 from workbench.session.judge import Judge, StoppedBy, what_a_load_means
@@ -54,7 +55,6 @@ from workbench.session.messages import (
 from workbench.session.policy_file import PolicyFile
 from workbench.session.printed import PrintedLine, PrintedLog
 from workbench.session.record_live import LiveRecorder
-from workbench.session.reward_terms import TermCurves
 from workbench.session.time_travel import TimeTravel
 from workbench.session.versions import Versions
 from workbench.session.view import SessionView
@@ -156,12 +156,12 @@ class Session:
     def env_rows(self) -> EnvRows | None:
         """The row of every env; None before a task is loaded. Copies some 100 kB for 256 envs: not for every frame."""
         with self._lock:
-            return None if self._state.chronicle is None else self._state.chronicle.table.rows()
+            return None if self._state.timeline is None else self._state.timeline.history.env_rows()
 
     def term_curves(self) -> TermCurves | None:
         """The reward's terms over time; None before a task is loaded. Copies: not for every frame."""
         with self._lock:
-            return None if self._state.chronicle is None else self._state.chronicle.terms.curves()
+            return None if self._state.timeline is None else self._state.timeline.history.steps.terms()
 
     def wait(self, seen: int, timeout: float) -> int:
         """Block until something changed since the counter `seen`; returns the counter as it is now."""

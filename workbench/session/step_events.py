@@ -66,6 +66,7 @@ class StepEvents:
         seeds: NDArray[np.int64] | None,
         restored: Restored | None,
         acted_by: str,
+        resumed: bool,
     ) -> Stepped:
         """See `Stepped` for what the arguments become."""
         self.number += 1
@@ -89,6 +90,7 @@ class StepEvents:
             restored,
             columns,
             acted_by,
+            resumed,
         )
 
     def _state_columns(self, opened: OpenedTask) -> dict[str, NDArray]:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from workbench.session.camera_judging import ShownMoment
-from workbench.session.episode_moments import EpisodeMoment, moments_of_episode
+from workbench.session.history import Lived
 from workbench.session.live_state import SharedState
 from workbench.session.messages import Request, Restore
 from workbench.session.timeline import Scope, Strip, Timeline
@@ -94,13 +94,13 @@ class TimeTravel:
             count = 0 if s.now.task is None else s.now.task.num_envs
             return ShownMoment(self._env, count, None if shown is None else shown.step.poses)
 
-    def episode_moments(self, most: int) -> tuple[EpisodeMoment, ...]:
+    def episode_moments(self, most: int) -> tuple[Lived, ...]:
         """Moments, at the most so many, of the selected env's episode round the one that is shown."""
         with self._lock:
             s = self._state
             if s.timeline is None or not len(s.timeline.history):
                 return ()
-            return moments_of_episode(s.timeline.history, self._env, s.timeline.at, most)
+            return s.timeline.history.episode(self._env, s.timeline.at, most)
 
     @property
     def _env(self) -> int:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.pictures import CameraKind, Picture
+from workbench.session.env_table import EnvTable
 from workbench.session.history import History, Moment
 from workbench.session.messages import CameraRequest, DrawPast, PastPictures, Pictures, Restore, Stepped
 
@@ -74,9 +75,10 @@ class Strip:
 class Timeline:
     """The history of the present task and the moment that is shown. Not thread-safe: the session locks."""
 
-    def __init__(self, num_envs: int, limit: int, first_serial: int = 0) -> None:
-        self.history = History(num_envs, limit, first_serial)
-        self._num_envs = num_envs
+    def __init__(self, table: EnvTable, limit: int, first_serial: int = 0) -> None:
+        """See `History`."""
+        self.history = History(table, limit, first_serial)
+        self._num_envs = table.rows().num_envs
         self._shown: int | None = None
         self._not_carried: tuple[str, ...] = ()
         self._arrived = ""
@@ -85,8 +87,8 @@ class Timeline:
 
     # --- what comes ----------------------------------------------------------------------------------
 
-    def add(self, stepped: Stepped, tick: int) -> Moment:
-        moment = self.history.add(stepped, tick)
+    def add(self, stepped: Stepped) -> Moment:
+        moment = self.history.add(stepped)
         if stepped.reset_mask.any():
             missed = {} if stepped.restored is None else stepped.restored.not_carried
             self._not_carried = tuple(f"{what}: {why}" for what, why in missed.items())
@@ -183,9 +185,9 @@ class Timeline:
             history.rewards(env, low, high),
             tuple(pair for pair in history.jumps_back(env) if low <= pair[0] <= high),
             tuple(
-                (max(s.first, low), min(s.last, high))
-                for s in history.stretches(env)
-                if s.last >= low and s.first <= high
+                (max(first, low), min(last, high))
+                for first, last in history.stretches(env)
+                if last >= low and first <= high
             ),
         )
 

@@ -9,13 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from workbench.authoring.problem import Problem
 from workbench.core.inspection import Inspection
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.step import StepResult
+from workbench.session.curves import Curves
 from workbench.session.judge import JudgementView
 from workbench.session.keep_status import KeepStatus
 from workbench.session.kept_worker import Vitals
@@ -28,21 +26,6 @@ from workbench.session.timeline import TimelineView
 State = Literal["starting", "loading", "running", "paused", "error", "stopped"]
 """``starting``: the worker process is coming up. ``loading``: a task is being imported or built.
 ``error``: a problem stands (see `SessionView.problem`); ``stopped``: the worker is gone."""
-
-
-@dataclass(frozen=True)
-class Curves:
-    """The past of the batch, oldest first, bounded in length; kept over env selection."""
-
-    serial: int
-    tick: NDArray[np.int64]
-    """(T,) control steps of the session, counting up."""
-    reward: NDArray[np.float32]
-    """(T, N)"""
-    success: NDArray[np.float32]
-    """(T, N) 0 or 1; NaN for a task that has no ``success``."""
-    started: NDArray[np.bool_]
-    """(T, N) True where an env began a new episode."""
 
 
 @dataclass(frozen=True)

@@ -271,7 +271,9 @@ class Worker:
         self._steps.new_scene()
         tell(Loaded(opened.description, opened.first, opened.milliseconds, report))
         # The past begins with the reset, and what a first step is taken back to is this.
-        self._send_step(opened.first, np.ones(opened.env.num_envs, bool), opened.env.episode_seeds)
+        resumed = report is not None and report.level == "restarted" and bool(report.carried)
+        mask = np.ones(opened.env.num_envs, bool)
+        self._send_step(opened.first, mask, opened.env.episode_seeds, resumed=resumed)
         if before is not None:
             before.env.close()
 
@@ -453,13 +455,14 @@ class Worker:
         reset_mask: np.ndarray,
         seeds: np.ndarray | None = None,
         restored: Restored | None = None,
+        resumed: bool = False,
     ) -> None:
         assert self._held.opened is not None
         self._last = step
         if self._steps.pictures_due(step, reset_mask):
             self._cameras.settle()  # the same scene is about to be drawn
         acted_by = "" if restored else self._acting.name
-        event = self._steps.event(self._held.opened, step, reset_mask, seeds, restored, acted_by)
+        event = self._steps.event(self._held.opened, step, reset_mask, seeds, restored, acted_by, resumed)
         self._cameras.scene_changed()
         self._line.send(event)
 

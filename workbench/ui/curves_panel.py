@@ -12,8 +12,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.session.curves import MOST, TermCurves
 from workbench.session.number_text import lost_text, number_text
-from workbench.session.reward_terms import MOST, TermCurves
 from workbench.session.view import SessionView
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import LONGEST, YES_OR_NO, Line, LineChart

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import viser
 
+from workbench.session.curves import PREFIX
 from workbench.session.lengths import length
 from workbench.session.review import Review
 from workbench.session.review_compare import (
@@ -17,7 +18,6 @@ from workbench.session.review_compare import (
     difference,
 )
 from workbench.session.review_view import Opened, ReviewView
-from workbench.session.reward_terms import PREFIX
 from workbench.ui.fragments import render
 from workbench.ui.parts import Part
 from workbench.ui.presses import Presses

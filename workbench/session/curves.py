@@ -1,0 +1,156 @@
+"""The past of the batch as rows of numbers: what the curves are, and what is drawn under the time slider.
+
+Both are drawn several times a second, and going through some thousand moments one by one for it would take longer than a
+step. They are kept of all envs, so that choosing another env shows its past and not an empty plot.
+
+A dense reward is a sum, and its total does not say which part is stuck. ManiSkill has no place for the parts, so the
+workbench names one: ``info["reward_terms"]``, a dict of tensors (N,), put there by ``compute_dense_reward``, which is
+given ``info``. ManiSkill hands ``info`` on as it is, nested dicts included, so the same file runs everywhere. In a
+`StepResult` a term is the entry ``reward_terms/<name>``. A term that is no number for each env is shown among the numbers,
+and has no curve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from workbench.core.step import StepResult
+
+PREFIX = "reward_terms/"
+MOST = 12
+"""Terms that are followed; more cannot be told apart."""
+_LENGTH = 1000
+"""Steps of a curve."""
+_FIRST_ROWS = 1024
+
+
+class Columns:
+    """Columns of numbers by name, each of shape (rows, N). Rows have numbers that count up; the oldest are dropped when
+    there is no room."""
+
+    def __init__(self, num_envs: int, first: int = 0) -> None:
+        """
+        Args:
+            first: the number of the first row.
+        """
+        self._num_envs, self._base, self._room = num_envs, first, _FIRST_ROWS
+        self._columns: dict[str, NDArray[np.float32]] = {}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self._columns)
+
+    def write(self, number: int, oldest: int, values: Mapping[str, ArrayLike]) -> None:
+        """
+        Args:
+            number: of the newest row, or the one after it.
+            oldest: number of the oldest row that is still wanted.
+            values: (N,) by name of the column; what is not in it is NaN in this row.
+        """
+        if number - self._base == self._room:
+            kept = slice(oldest - self._base, self._room)
+            self._base, self._room = oldest, max(_FIRST_ROWS, 2 * (number - oldest))
+            before, self._columns = self._columns, {}
+            for name, column in before.items():
+                if not np.isnan(column[kept]).all():
+                    self._new(name)[: number - oldest] = column[kept]
+        for name in values:
+            if name not in self._columns:
+                self._new(name)
+        for name, column in self._columns.items():
+            column[number - self._base] = values.get(name, np.nan)
+
+    def between(self, name: str, low: int, high: int) -> NDArray[np.float32]:
+        """(K, N) of the rows from `low` to `high`, both of rows that are wanted; NaN in a column that is not there."""
+        rows = slice(low - self._base, max(low, high + 1) - self._base)
+        column = self._columns.get(name)
+        if column is None:
+            return np.full((rows.stop - rows.start, self._num_envs), np.nan, np.float32)
+        return column[rows].copy()
+
+    def _new(self, name: str) -> NDArray[np.float32]:
+        column = self._columns[name] = np.full((self._room, self._num_envs), np.nan, np.float32)
+        return column
+
+
+@dataclass(frozen=True)
+class Curves:
+    """The past of the batch, oldest first, bounded in length; kept over env selection."""
+
+    serial: int
+    """Control steps so far, which is one past the tick of the newest row."""
+    tick: NDArray[np.int64]
+    """(T,) control steps since the task was loaded, counting up."""
+    reward: NDArray[np.float32]
+    """(T, N)"""
+    success: NDArray[np.float32]
+    """(T, N) 0 or 1; NaN for a task that has no ``success``."""
+
+
+@dataclass(frozen=True)
+class TermCurves:
+    """Oldest first."""
+
+    tick: NDArray[np.int64]
+    """(T,) as `Curves.tick`."""
+    terms: dict[str, NDArray[np.float32]]
+    """By name: (T, N); NaN where a step did not have that term."""
+    no_curve: tuple[str, ...] = ()
+    """Names of what the last step put there that is no number for each env."""
+
+
+class RecentSteps:
+    """Reward, success and the reward's terms of the newest control steps."""
+
+    def __init__(self, num_envs: int) -> None:
+        self._num_envs, self._columns = num_envs, Columns(num_envs)
+        self._curves: Curves | None = None
+        self._no_curve: tuple[str, ...] = ()
+        self.count = 0
+        """Control steps so far."""
+
+    def add(self, step: StepResult) -> None:
+        """The next control step. A reset has no reward, so it is none."""
+        of_each_env = {
+            name: values.reshape(self._num_envs, -1)[:, 0]
+            for name, values in step.evaluate.items()
+            if name == "success" or (name.startswith(PREFIX) and values.size == self._num_envs)
+        }
+        self._no_curve = tuple(
+            name.removeprefix(PREFIX)
+            for name in [*step.evaluate, *step.others]
+            if (name.startswith(PREFIX) or name == PREFIX[:-1]) and name not in of_each_env
+        )
+        known = self._columns.names
+        new = [name for name in of_each_env if name.startswith(PREFIX) and name not in known]
+        room = MOST - sum(name.startswith(PREFIX) for name in known)
+        for name in new[max(0, room) :]:
+            del of_each_env[name]
+        # A reload may drop a term, and the old one's values do not stand for the new steps: they are NaN there.
+        self._columns.write(self.count, max(0, self.count - _LENGTH), {"reward": step.reward, **of_each_env})
+        self.count += 1
+
+    def curves(self) -> Curves:
+        """Copied once for every control step, however often they are asked for."""
+        if self._curves is None or self._curves.serial != self.count:
+            self._curves = Curves(self.count, self._ticks, self._newest("reward"), self._newest("success"))
+        return self._curves
+
+    def terms(self) -> TermCurves:
+        kept = {
+            name.removeprefix(PREFIX): self._newest(name) for name in self._columns.names if PREFIX in name
+        }
+        # A term that is gone for as long as a curve is long has no curve any more.
+        drawn = {name: values for name, values in kept.items() if not np.isnan(values).all()}
+        return TermCurves(self._ticks, drawn, self._no_curve)
+
+    @property
+    def _ticks(self) -> NDArray[np.int64]:
+        return np.arange(max(0, self.count - _LENGTH), self.count)
+
+    def _newest(self, name: str) -> NDArray[np.float32]:
+        return self._columns.between(name, max(0, self.count - _LENGTH), self.count - 1)
