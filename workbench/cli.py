@@ -412,6 +412,7 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="workbench",
             description="Workbench: write ManiSkill tasks in front of a live, batched view of them.",
             args=args,
+            config=(tyro.conf.DisallowNone,),
         )
     except KeyboardInterrupt:  # in the seconds before a command listens for it: importing torch takes some
         code = refuse("interrupted")

@@ -20,7 +20,7 @@ from workbench.authoring.reference import TaskName, named_file
 from workbench.machine.software_vulkan import use_private_driver
 from workbench.recording.reading import start_reading
 from workbench.session.kept_worker import WorkerOptions
-from workbench.session.messages import Event, Failed, Loaded, TaskOptions
+from workbench.session.messages import Event, Failed, Loaded, Loading, TaskOptions
 from workbench.session.session import Session
 from workbench.terminal import out, print_event, print_line, refuse, say, say_addresses, warn
 from workbench.ui.commands import Command
@@ -50,12 +50,21 @@ def open_in_terminal(
         return door
     end = _End()
     waits_for_a_file = named_file(task) is not None
+    begun = 0
+    if waits_for_a_file:
+        end.show_address()
 
     def on_event(event: Event) -> None:
+        nonlocal begun
         print_event(event)
-        # A broken file is mended and saved; an env id that cannot be opened has nothing to wait for.
-        if isinstance(event, Failed) and not event.kept and not waits_for_a_file:
-            end.now(1)
+        # A broken file is mended and saved; an env id that cannot be opened has nothing to wait for, and no page to go to.
+        if not waits_for_a_file:
+            if isinstance(event, Failed) and not event.kept:
+                end.now(1)
+            elif isinstance(event, Loading):
+                begun += 1
+                if begun == 2:  # what is done first finds out whether the id is there
+                    end.show_address()
         if isinstance(event, Loaded):
             # Not before: the task is what is waited for.
             start_reading()
@@ -95,9 +104,9 @@ def review_in_terminal(
     if isinstance(door, int):
         return door
     place = Workplace(door.server, folder, tasks=tasks, imports=base.imports, on_notice=warn)
-    _serve(
-        door, place, "review", f"recordings in {folder}", folder, worker, base, _End(), lambda: None, trust
-    )
+    end = _End()
+    end.show_address()
+    _serve(door, place, "review", f"recordings in {folder}", folder, worker, base, end, lambda: None, trust)
 
 
 def _opened(at: DoorOptions, label: str) -> Door | int:
@@ -144,7 +153,7 @@ def _serve(
     end.at_signals()
     try:
         place.pages.start(first)
-        _announce(door, what)
+        out.print(f"[bold]Workbench[/] {workbench.__version__}: {escape(what)}", soft_wrap=True)
         end.wait(door)
     finally:
         out.print("closing")
@@ -156,13 +165,16 @@ def _serve(
     _leave(end.code)
 
 
+_Asked = Literal["end", "renew", "show"]
+
+
 class _End:
     """The end of a page: it comes from a signal or from an event, and with it the exit code."""
 
     def __init__(self) -> None:
         self.code = 0
         # A signal's handler may not take a lock that the main thread holds; putting into this queue takes none.
-        self._asked: queue.SimpleQueue[Literal["end", "renew"]] = queue.SimpleQueue()
+        self._asked: queue.SimpleQueue[_Asked] = queue.SimpleQueue()
 
     def now(self, code: int) -> None:
         self.code = code
@@ -178,15 +190,21 @@ class _End:
         """Ask for another token. Returns at once."""
         self._asked.put("renew")
 
+    def show_address(self) -> None:
+        """Say where the page is. Returns at once."""
+        self._asked.put("show")
+
     def wait(self, door: Door) -> None:
-        """Return at the end; until then renew the token as often as that is asked for."""
+        """Return at the end; until then renew the token and say where the page is as often as that is asked for."""
         while (asked := self._next()) != "end":
+            if asked == "show":
+                _say_where(door)
             if asked == "renew" and door.options.token:
                 door.renew_token()
                 say("  the token was renewed, and every page was closed; open the new address:")
                 say_addresses(door.addresses())
 
-    def _next(self) -> Literal["end", "renew"] | None:
+    def _next(self) -> _Asked | None:
         """What is asked for, or None after a while."""
         try:
             # Not for ever: the kernel may hand the signal to another thread, and the main one, which alone runs its
@@ -196,8 +214,7 @@ class _End:
             return None
 
 
-def _announce(door: Door, what: str) -> None:
-    out.print(f"[bold]Workbench[/] {workbench.__version__}: {escape(what)}", soft_wrap=True)
+def _say_where(door: Door) -> None:
     # Not through rich, which would break the address in a narrow terminal.
     if door.options.socket is not None:
         say(f"  socket  {door.options.socket}")

@@ -7,14 +7,28 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+
+import tyro
+
+from workbench.core.rules import DEGREES, Degree
 
 if TYPE_CHECKING:
     from workbench.session.messages import TaskOptions
 
 Backend = Literal["auto", "cpu", "gpu"]
-Rules = Literal["stop", "warn", "off"] | None
-"""None is each rule's own degree."""
+Rules = Annotated[
+    Degree | None,
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=f"{{{','.join(DEGREES)}}}",
+        instance_from_str=lambda given: cast(Degree, given[0]),
+        is_instance=lambda value: value is None or value in DEGREES,
+        str_from_instance=lambda value: [str(value)],
+        choices=DEGREES,
+    ),
+]
+"""None is each rule's own degree, and no word for the command line."""
 
 
 def task_options(

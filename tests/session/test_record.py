@@ -21,6 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
+from tests.drive.page import open_workbench
 from tests.drive.waiting import until
 from tests.recording.verify_rrd import verify_rrd
 from workbench.authoring.problem import Problem, TaskError
@@ -448,6 +449,10 @@ def test_arguments_are_refused_with_a_sentence(
         (["record", "PickCub-v1"], "PickCube-v1"),
         (["record", "PickCube-v1", "--num-envs", "0"], "num-envs"),
         (["record", "PickCube-v1", "--actions", "demo.h5"], "demo.h5"),
+        (["record", "PickCube-v1", "--actions", "gone.py:act"], "there is no file"),
+        (["record", "PickCube-v1", "--actions", "randomly"], "module:function"),
+        (["record", "PickCube-v1", "--num-envs", "1", "--actions", "gone:act"], "no module gone"),
+        (["record", "PickCube-v1", "--num-envs", "1", "--actions", "json:act"], "json has no function act"),
         (["record", "PickCube-v1", "--out", sys.executable], "is not a folder"),
     ],
 )
@@ -477,4 +482,13 @@ def test_a_page_that_cannot_be_opened_ends_with_a_sentence(tmp_path: Path) -> No
         stdin=subprocess.DEVNULL,
     )
     assert done.returncode != 0 and "PickCube-v1" in done.stderr
+    assert "PickCub-v1" in done.stdout and "http" not in done.stdout
     assert not any(tmp_path.iterdir())
+
+
+def test_a_page_of_an_id_says_where_it_is_once() -> None:
+    with open_workbench(
+        "PickCube-v1", "--num-envs", "1", "--no-spare", "--env", "render_backend=none"
+    ) as opened:
+        opened.wait_for_line("loaded PickCube-v1")
+        assert sum("page  " in line for line in opened.lines) == 1

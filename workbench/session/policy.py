@@ -34,27 +34,44 @@ _told: set[Path] = set()
 """Files beside policies of which it was said that a library has their name."""
 
 
-def load_policy(reference: str, beside: Path | None = None) -> Policy:
-    """Import the function that `reference` names.
+class NoPolicy(ValueError):
+    """What was named is no policy; the message says why. Nothing of the author's raised it."""
+
+
+def find_policy(reference: str, beside: Path | None = None) -> tuple[str | Path, str]:
+    """The module or file, and the function, that `reference` names. Imports nothing.
 
     Args:
         beside: a folder in which a relative file is looked for when it is not in the current one.
 
     Raises:
-        ValueError: the reference is not of that form, or names nothing callable.
-        Exception: whatever the policy's module raises while it is imported.
+        NoPolicy: it is not of that form, or the file is not there.
     """
     if not reference.strip():
-        raise ValueError("name a policy: module:function or file.py:function")
+        raise NoPolicy("name a policy: module:function or file.py:function")
     name, separator, attribute = reference.rpartition(":")
     if not separator or not name or not attribute:
-        raise ValueError(f"'{reference}' is not of the form module:function or file.py:function")
-    if name.endswith(".py"):
-        path = _find(name, beside)
-        name = f"workbench_policy_{path.stem}"
+        raise NoPolicy(f"'{reference}' is not of the form module:function or file.py:function")
+    return (_find(name, beside) if name.endswith(".py") else name), attribute
+
+
+def load_policy(reference: str, beside: Path | None = None) -> Policy:
+    """Import the function that `reference` names.
+
+    Args:
+        beside: as for `find_policy`.
+
+    Raises:
+        NoPolicy: the reference is not of that form, or names nothing callable.
+        Exception: whatever the policy's module raises while it is imported.
+    """
+    named, attribute = find_policy(reference, beside)
+    name = str(named)
+    if isinstance(named, Path):
+        path, name = named, f"workbench_policy_{named.stem}"
         spec = importlib.util.spec_from_file_location(name, path, loader=_Loader(name, str(path)))
         if spec is None or spec.loader is None:
-            raise ValueError(f"{path} cannot be imported")
+            raise NoPolicy(f"{path} cannot be imported")
         module = importlib.util.module_from_spec(spec)
         for file in files_named_like_libraries(path.parent):
             if file not in (path, *_told):
@@ -62,15 +79,17 @@ def load_policy(reference: str, beside: Path | None = None) -> Policy:
                 print(named_like_library(file), file=sys.stderr)
         with searched_first(path.parent):
             spec.loader.exec_module(module)
-    elif importlib.util.find_spec(name.partition(".")[0]) is None:
+    elif importlib.util.find_spec(package := name.partition(".")[0]) is None:
         # Whoever names a module in words means the one that they see where they are.
         with searched_first(Path.cwd()):
+            if importlib.util.find_spec(package) is None:
+                raise NoPolicy(f"there is no module {package}: it is neither installed nor in {Path.cwd()}")
             module = importlib.import_module(name)
     else:
         module = importlib.import_module(name)
     function = getattr(module, attribute, None)
     if not callable(function):
-        raise ValueError(f"{name} has no function {attribute}{_hint(name, attribute, beside)}")
+        raise NoPolicy(f"{name} has no function {attribute}{_hint(name, attribute, beside)}")
     return function
 
 
@@ -104,6 +123,8 @@ def problem_of(
         policy: what `load_policy` gave, if it got so far: its ``def`` is the place where no line on the traceback
             is the author's, because it is what it returned that is wrong.
     """
+    if isinstance(error, NoPolicy):
+        return Problem("policy", str(error), None, None, None, "")
     linecache.checkcache()  # it may have been mended, and be wrong elsewhere, since a line of it was last shown
     files = [Path(frame.filename) for frame in traceback.extract_tb(error.__traceback__)]
     if isinstance(error, SyntaxError) and error.filename is not None:
@@ -137,10 +158,10 @@ def _find(name: str, beside: Path | None) -> Path:
     if here.is_file():
         return here
     if path.is_absolute() or beside is None or (beside / path).resolve() == here:
-        raise ValueError(f"there is no file {here}")
+        raise NoPolicy(f"there is no file {here}")
     there = (beside / path).resolve()
     if not there.is_file():
-        raise ValueError(
+        raise NoPolicy(
             f"there is no {name} in {Path.cwd()}, where the command was started, nor beside the task in {beside}"
         )
     return there

@@ -35,12 +35,14 @@ from workbench.session.episodes import EpisodeGatherer, GatheredEpisode
 from workbench.session.given_actions import SUFFIXES, GivenEpisode, GivenEpisodes, read_given
 from workbench.session.messages import Stepped, TaskOptions
 from workbench.session.open_task import OpenedTask, blamed, open_task, reset_checked, step_checked
+from workbench.session.policy import find_policy
 from workbench.session.record_acting import RecordActing
 from workbench.session.recorded_pictures import recorded_pictures
 
 _STEPS_WITHOUT_LIMIT = 200
 _TRIES = 100
 """For each success that is wanted."""
+_KINDS = ("random", "zero", "hold")
 _ELSEWHERE = 1e-4
 """Metres, or radians: a start that is further from the demonstration's is another start."""
 
@@ -117,6 +119,8 @@ def with_given_actions(what: RecordOptions) -> tuple[RecordOptions, GivenEpisode
         options = what.options
         options = replace(options, env_kwargs={**given.env_kwargs, **options.env_kwargs})
         what = replace(what, options=options)
+    elif what.actions not in _KINDS:
+        find_policy(what.actions, _beside(what))
     if what.use_env_states and (given is None or not all(episode.states for episode in given.episodes)):
         raise ValueError("--use-env-states needs --actions FILE.h5 with env states in it")
     if what.episodes is not None and what.successes is not None:
@@ -413,6 +417,12 @@ def _acting(what: RecordOptions, here: CurrentFolder) -> Acting:
         acting.use(what.actions, None)
     else:
         with here.again():
-            file = named_file(what.task)
-        acting.use("policy", what.actions, None if file is None else file.parent)
+            beside = _beside(what)
+        acting.use("policy", what.actions, beside)
     return acting
+
+
+def _beside(what: RecordOptions) -> Path | None:
+    """Where a policy may be too."""
+    file = named_file(what.task)
+    return None if file is None else file.parent
