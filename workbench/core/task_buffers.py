@@ -30,7 +30,7 @@ import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 
-from workbench.core.task_members import PLAIN, Found, Walk, forget_look, look_over
+from workbench.core.task_members import PLAIN, Found, Walk, look_over
 
 _LARGEST_OF_BATCH = 1 << 16
 """Elements of a tensor that holds for the whole batch; more than that is data, which nobody rewinds."""
@@ -93,7 +93,6 @@ _scenes: WeakKeyDictionary[Any, _Scene] = WeakKeyDictionary()
 
 
 def _scene_of(env: BaseEnv) -> _Scene:
-    # Kept, also where nothing was noted: `look_over` knows its last look by the object.
     return _scenes.setdefault(env.scene, _Scene())
 
 
@@ -101,7 +100,6 @@ def note_scene(env: BaseEnv) -> None:
     """Remember what the task holds now, right after its scene was built, as belonging to the scene."""
     _scenes[env.scene] = scene = _Scene()
     scene.add(look_over_env(env).leaves)
-    forget_look(env)
 
 
 def note_constructed(env: BaseEnv) -> None:
@@ -111,7 +109,6 @@ def note_constructed(env: BaseEnv) -> None:
     """
     scene = _scene_of(env)
     scene.add([leaf for leaf in look_over_env(env).leaves if isinstance(leaf.value, (*PLAIN, tuple))])
-    forget_look(env)
 
 
 def read_task_state(env: BaseEnv, env_idx: list[int]) -> TaskState:

@@ -4,11 +4,6 @@ Nobody declares state, so it is looked for: on the env, its agents and their con
 tuples, dataclasses, ManiSkill's Poses and objects of classes that the author wrote beside the task. What
 belongs to ManiSkill, SAPIEN, gymnasium or torch (scenes, actors, sensors, spaces) is not entered, and neither are
 BaseEnv's own members. `task_buffers` says what of it is state, and keeps that.
-
-A look costs as much as two envs' physics, and the session looks after every step. Nearly always the last look's
-tree still stands and some tensors at its ends are others. So the objects that were met are kept with what was in
-them; if every one holds the same objects, but for values of the same type at its ends, the last look is the answer
-with those values put in (`_still_stands`), in a third of the time. Anything else, and everything is looked over again.
 """
 
 from __future__ import annotations
@@ -16,7 +11,6 @@ from __future__ import annotations
 import ast
 import dataclasses
 import inspect
-import operator
 import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -44,7 +38,6 @@ _NOT_ENTERED = (
 )
 """Packages whose objects belong to the simulation or hold no state of an episode."""
 _DEEPEST = 8
-_LAST_LOOK = "_workbench_last_look"
 _SIMULATION_TENSORS = (
     "cuda_rigid_body_data",
     "cuda_articulation_qpos",
@@ -65,24 +58,6 @@ class Found:
 
 
 @dataclass
-class _Met:
-    """A container that was looked into."""
-
-    members: dict[Any, Any] | list[Any]
-    """The container itself, or an object's ``vars``."""
-    skipped: frozenset[str]
-    """Keys that are not looked at."""
-    keys: list[Any]
-    """Of a dict; empty for a list."""
-    values: list[Any]
-    """What was in it; held, or an id could be another object's."""
-    ends: dict[int, Found] = field(default_factory=dict)
-    """What ended there, by position among `values`."""
-    owner: Any = None
-    """The object, of which `members` are the ``vars``."""
-
-
-@dataclass
 class Walk:
     """One look over everything that a task remembers."""
 
@@ -99,9 +74,6 @@ class Walk:
     """Plain attributes that need no look if they are still the same, by the path of their owner."""
     simulation: frozenset[int] = frozenset()
     """Where the simulation's own tensors lie: an attribute that is a view of one is no memory."""
-    met: list[_Met] = field(default_factory=list)
-    scene: Any = None
-    """The one that the env had: a new one has other tensors."""
 
 
 def look_over(env: BaseEnv, built: dict[str, dict[str, Any]]) -> Walk:
@@ -111,11 +83,7 @@ def look_over(env: BaseEnv, built: dict[str, dict[str, Any]]) -> Walk:
         built: plain attributes that need no look if they are still the same, by the path of their owner.
     """
     task: Any = getattr(env, "_workbench_task", type(env))
-    last: Walk | None = vars(env).get(_LAST_LOOK)
-    if last is not None and last.author == task.__module__ and last.scene is env.scene:
-        if last.built is built and _still_stands(last):
-            return last
-    walk = Walk(env, task.__module__, built=built, scene=env.scene)
+    walk = Walk(env, task.__module__, built=built)
     walk.entered[id(env)] = env
     walk.simulation = frozenset(
         array.torch().untyped_storage().data_ptr()
@@ -123,60 +91,7 @@ def look_over(env: BaseEnv, built: dict[str, dict[str, Any]]) -> Walk:
         if array is not None
     )
     _enter_members(walk, env, "", base_env_members(), 0)
-    # On the env, so that it goes when the env goes: it holds the env.
-    vars(env)[_LAST_LOOK] = walk
     return walk
-
-
-def forget_look(env: BaseEnv) -> None:
-    """What counts as built has changed: look over everything the next time."""
-    vars(env).pop(_LAST_LOOK, None)
-
-
-def _still_stands(walk: Walk) -> bool:
-    """Whether the tree is as it was; the values at its ends are then made those of now."""
-    for met in walk.met:
-        if met.owner is not None and vars(met.owner) is not met.members:
-            return False
-        if isinstance(met.members, list):
-            values = list(met.members)
-        elif met.skipped:
-            kept = [item for item in met.members.items() if item[0] not in met.skipped]
-            if [key for key, _ in kept] != met.keys:
-                return False
-            values = [value for _, value in kept]
-        else:
-            if list(met.members) != met.keys:
-                return False
-            values = list(met.members.values())
-        if len(values) != len(met.values):
-            return False
-        if all(map(operator.is_, values, met.values)):
-            continue
-        for position, (new, old) in enumerate(zip(values, met.values, strict=True)):
-            if new is old:
-                continue
-            end = met.ends.get(position)
-            if end is None or type(new) is not type(old) or not _is_end(walk, new):
-                return False
-            end.value = new
-        met.values = values
-    return True
-
-
-def _is_end(walk: Walk, value: Any) -> bool:
-    if isinstance(value, torch.Tensor):
-        return value.untyped_storage().data_ptr() not in walk.simulation
-    return isinstance(value, PLAIN) or (isinstance(value, np.ndarray) and value.dtype != object)
-
-
-def _meet(walk: Walk, members: dict[Any, Any] | list[Any]) -> _Met:
-    if isinstance(members, list):
-        met = _Met(members, frozenset(), [], list(members))
-    else:
-        met = _Met(members, frozenset(), list(members), list(members.values()))
-    walk.met.append(met)
-    return met
 
 
 def _enter(walk: Walk, value: Any, path: str, put: Callable[[Any], None], depth: int) -> None:
@@ -204,18 +119,16 @@ def _enter(walk: Walk, value: Any, path: str, put: Callable[[Any], None], depth:
         # A Pose is frozen, so another takes its place; torch may hold on to the old one.
         _enter(walk, value.raw_pose, f"{path}.raw_pose", lambda raw: put(Pose(raw)), depth + 1)
     elif isinstance(value, dict):
-        met = _meet(walk, value)
-        for i, (key, item) in enumerate(zip(met.keys, met.values, strict=True)):
+        for key, item in list(value.items()):
             if not _is_ignored(type(item), walk.author):
-                _enter_item(walk, met, i, item, f"{path}[{key!r}]", _putter(value, key), depth)
+                _enter(walk, item, f"{path}[{key!r}]", _putter(value, key), depth + 1)
     elif isinstance(value, list):
-        met = _meet(walk, value)
         if all(isinstance(item, PLAIN) for item in value):
             walk.leaves.append(Found(path, value, put))
         else:
-            for i, item in enumerate(met.values):
+            for i, item in enumerate(value):
                 if not _is_ignored(type(item), walk.author):
-                    _enter_item(walk, met, i, item, f"{path}[{i}]", _putter(value, i), depth)
+                    _enter(walk, item, f"{path}[{i}]", _putter(value, i), depth + 1)
     elif isinstance(value, tuple):
         _enter_tuple(walk, value, path, put, depth)
     elif _has_members(type(value), walk.author):
@@ -227,24 +140,14 @@ def _enter(walk: Walk, value: Any, path: str, put: Callable[[Any], None], depth:
 def _enter_members(walk: Walk, owner: Any, path: str, skipped: frozenset[str], depth: int) -> None:
     walk.owners[path] = owner
     built = walk.built.get(path, {})
-    kept = {name: value for name, value in vars(owner).items() if name not in skipped}
-    met = _Met(vars(owner), skipped, list(kept), list(kept.values()), owner=owner)
-    walk.met.append(met)
-    for i, (name, value) in enumerate(zip(met.keys, met.values, strict=True)):
+    for name, value in list(vars(owner).items()):
+        if name in skipped:
+            continue
         # Most members are options and links to the simulation; a path and a way to put cost more than a look.
         if (name in built and built[name] is value) or _is_ignored(type(value), walk.author):
             continue
         where = f"{path}.{name}" if path else name
-        _enter_item(walk, met, i, value, where, lambda new, n=name: object.__setattr__(owner, n, new), depth)
-
-
-def _enter_item(
-    walk: Walk, met: _Met, position: int, item: Any, path: str, put: Callable[[Any], None], depth: int
-) -> None:
-    before = len(walk.leaves)
-    _enter(walk, item, path, put, depth + 1)
-    if len(walk.leaves) == before + 1 and walk.leaves[before].value is item:
-        met.ends[position] = walk.leaves[before]
+        _enter(walk, value, where, lambda new, n=name: object.__setattr__(owner, n, new), depth + 1)
 
 
 def _enter_tuple(walk: Walk, value: tuple, path: str, put: Callable[[Any], None], depth: int) -> None:
@@ -302,7 +205,6 @@ def base_env_members() -> frozenset[str]:
         "_kept_controllers",
         "_to_begin",
         "begins_anew",
-        _LAST_LOOK,
         "observation_space",
         "single_observation_space",
         "segmentation_id_map",
