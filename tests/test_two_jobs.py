@@ -98,7 +98,7 @@ class Filming:
         assert self._making.start(self._wanted)
 
     def pids(self) -> list[int]:
-        return [process.pid for process in running("workbench.ui.making_process")]
+        return [process.pid for process in running("workbench.ui.making")]
 
     def ended(self) -> bool:
         return not self._making.view().running

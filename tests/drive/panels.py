@@ -20,7 +20,7 @@ from typing import Any, Literal
 import viser
 from viser._messages import CommandTriggerMessage, GuiSetPanelCollapsedMessage, GuiUpdateMessage
 
-from workbench.ui.control_values import name_of
+from workbench.ui.control_values import check_value, name_of
 from workbench.ui.viser_seam import element_id
 
 Kind = Literal["button", "field"]
@@ -256,6 +256,12 @@ class Panels:
     # --- viser's own -------------------------------------------------------------------------------
 
     def _say(self, control: Any, value: object) -> None:
+        try:
+            # The door's own, before viser hears of it (`workbench.ui.page_guard`).
+            check_value(control, list(value) if isinstance(value, tuple) else value)
+        except ValueError as error:
+            self.client.notices.append(str(error))
+            return
         update = GuiUpdateMessage(control._impl.uuid, {"value": value})
         self._handled(self.server.gui._handle_gui_updates, update)
 

@@ -24,7 +24,7 @@ from workbench.session.kept_worker import WorkerOptions
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
 from workbench.session.view import SessionView
-from workbench.ui.busy_banner import is_shown
+from workbench.ui.banner import is_busy_for_long
 from workbench.ui.status_line import status_values
 
 HANGS = 0.3
@@ -99,7 +99,7 @@ def test_a_debugger_holds_the_worker_as_long_as_it_likes(
     held_since = time.monotonic()
     view = wait_until(session, lambda v: bool(v.busy and v.busy.seconds > 6 * HANGS), "a long time")
     session.interrupt()
-    assert view.stale and not is_shown(view) and view.problem is None
+    assert view.stale and not is_busy_for_long(view) and view.problem is None
     assert session.worker_pid == worker and time.monotonic() - held_since > 4 * HANGS
     client.stop_at(task_file)
     client.ask("continue", threadId=thread)

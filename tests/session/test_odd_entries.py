@@ -25,7 +25,7 @@ from workbench.session.rescore_all import RescoreOptions, rescore_all
 from workbench.session.review_events import curves
 from workbench.session.session import Session
 from workbench.session.step_back import run_of
-from workbench.ui.review_as_session import step_of
+from workbench.ui.review_curves import step_of
 
 pytestmark = pytest.mark.usefixtures("child_process")
 

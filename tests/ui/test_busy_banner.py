@@ -5,8 +5,7 @@ from dataclasses import replace
 from tests.drive.panels import Panels
 from tests.ui.scenes import EMPTY, problem, running
 from workbench.session.last_words import Busy, busy_at
-from workbench.ui.banner import Banner, banner_html
-from workbench.ui.busy_banner import SHOWN_AFTER, BusyBanner, busy_html
+from workbench.ui.banner import SHOWN_AFTER, Banner, BusyBanner, banner_html, busy_html
 from workbench.ui.fragments import render
 from workbench.ui.status_line import status_values
 

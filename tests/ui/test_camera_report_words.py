@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from workbench.core.camera_report import DEPTH_EDGES, CameraReport, DepthReport, ObjectSeen
-from workbench.ui.camera_report_words import env_words, headline, histogram, object_rows, percent
+from workbench.ui.camera_verdict import env_words, headline, histogram, object_rows, percent
 
 
 def seen(

@@ -10,7 +10,7 @@ from tests.drive.panels import Clock, Panels
 from tests.ui.scenes import camera, description, running, table_scene
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.session.messages import CameraRequest
-from workbench.session.view import SessionView
+from workbench.session.view import Seen
 from workbench.ui.cameras_panel import CamerasPanel
 
 POSE = np.array([0, 0, 1, 1, 0, 0, 0], np.float32)
@@ -22,24 +22,25 @@ class Asked:
     def __init__(self) -> None:
         self.cameras: tuple[CameraRequest, ...] = ()
 
-    def change(self, *, cameras: tuple[CameraRequest, ...]) -> None:
+    def __call__(self, cameras: tuple[CameraRequest, ...]) -> None:
         self.cameras = cameras
 
 
 BASE, TOP = "base · sensor", "top · sensor"
 
 
-def seen(serial: int, cameras: tuple[CameraInfo, ...], pictured: bool = True) -> SessionView:
+def seen(serial: int, cameras: tuple[CameraInfo, ...], pictured: bool = True) -> Seen | None:
     pictures = {
         (c.kind, c.name): Picture(c.name, c.kind, 0, POSE, np.zeros((6, 8, 3), np.uint8)) for c in cameras
     }
-    return running(
+    view = running(
         1,
         task=description(table_scene(1)[0], cameras),
         cameras_serial=serial,
         pictures=pictures if pictured else {},
         pictures_serial=serial,
     )
+    return view.seen
 
 
 def test_a_camera_that_stays_keeps_its_place_its_ticks_and_its_picture(panels: Panels, clock: Clock) -> None:

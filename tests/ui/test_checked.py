@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from workbench.ui.control_values import (
     checked_choice,
     checked_int,
     checked_number,
-    checked_text,
+    limit_text,
     name_control,
 )
 
@@ -125,15 +125,36 @@ def test_true_is_not_the_option_one():
         checked_choice(True, (0, 1), "camera")
 
 
+@pytest.fixture(scope="module")
+def texts() -> Iterator[dict[bool, viser.GuiTextHandle]]:
+    """A short text of one line, and of several."""
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    made = {several: server.gui.add_text("policy", "", multiline=several) for several in (False, True)}
+    for text in made.values():
+        limit_text(text, 5)
+    yield made
+    server.stop()
+
+
 @unhurried
-@given(anything, st.integers(0, 20))
-def test_a_text_is_one_short_line_or_refused(value, longest):
-    got = outcome(lambda: checked_text(value, longest, "policy"))
-    if not isinstance(got, ValueError):
-        assert got == value
-        assert isinstance(got, str)
-        assert len(got) <= longest
-        assert not any(character in got for character in "\n\r\0\x1b\u202e")
+@given(anything)
+def test_a_limited_text_is_short_and_can_be_read_or_is_refused(texts, value):
+    for several, text in texts.items():
+        got = outcome(lambda text=text: check_value(text, value))
+        if isinstance(got, ValueError):
+            assert str(got).startswith("The policy ")
+        else:
+            assert isinstance(value, str)
+            assert len(value) <= 5 and "\0" not in value
+            assert several or value.isprintable()
+
+
+@pytest.mark.parametrize("value", ["abcdef", "a\nb", "a\0", "\x1b[m", "a\u202eb", "a\u2028b"])
+def test_a_limited_line_takes_nothing_that_is_not_seen(texts, value):
+    with pytest.raises(ValueError, match="^The policy (takes|has characters)"):
+        check_value(texts[False], value)
+    assert check_value(texts[False], "abcdé") is None
+    assert check_value(texts[True], "a\nb") is None
 
 
 def test_a_control_without_a_label_is_named_in_a_refusal(server: viser.ViserServer) -> None:

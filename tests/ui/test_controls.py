@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import pytest
 
 from tests.drive.panels import Clock, Panels
-from workbench.ui.control_values import checked_int
 from workbench.ui.controls import HANDS_OFF, Control
 
 SETTLES = 3600.0
@@ -28,9 +27,7 @@ class Slider:
 def make(panels: Panels, clock: Clock, settle: float) -> Slider:
     sent: list[int] = []
     slider = panels.server.gui.add_slider("env", min=0, max=15, step=1, initial_value=0)
-    control = Control(
-        slider, lambda value: checked_int(value, 0, 15, "env"), sent.append, settle=settle, clock=clock
-    )
+    control = Control(slider, sent.append, settle=settle, clock=clock)
     return Slider(control, panels, clock, sent)
 
 

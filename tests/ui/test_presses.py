@@ -8,8 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.drive.panels import Panels
 from workbench.ui.fragments import render
-from workbench.ui.presses import NUMBERS, PARTS, number_of, place_of
+from workbench.ui.presses import NUMBERS, PARTS, Presses, place_of
 
 
 def test_a_part_that_can_be_pressed_is_a_stop_of_the_tab_key_and_its_id_stays_an_id() -> None:
@@ -30,12 +31,21 @@ def test_a_place_comes_back_from_its_number_whatever_the_running_part(
     assert place == (column / (PARTS - 1), row / (PARTS - 1))
 
 
-@pytest.mark.parametrize("sent", [True, "12", None, -1, math.nan, math.inf, 2**60, 1e300, (1, 2)])
-def test_what_no_page_of_ours_sends_is_no_place(sent: object) -> None:
-    assert place_of(sent) is None
-    assert number_of(sent) is None
+@pytest.mark.parametrize("sent", [True, "12", None, -1, 0.5, math.nan, math.inf, 2**60, 1e300, (1, 2)])
+def test_what_no_page_of_ours_sends_is_no_press(panels: Panels, sent: object) -> None:
+    came: list[object] = []
+    presses = Presses(panels.server)
+    presses.place_id("place", lambda *place: came.append(place))
+    presses.number_id("number", lambda *number: came.append(number))
+    for name in ("place", "number"):
+        panels.claim(name, sent)
+    assert came == [] and len(panels.client.notices) == 2
 
 
-@given(st.integers(0, NUMBERS - 1), st.integers(0, 88))
-def test_a_number_comes_back_whatever_the_running_part(number: int, running: int) -> None:
-    assert number_of(float(running * NUMBERS + number)) == number
+@pytest.mark.parametrize("running", [0, 1, 88])
+@pytest.mark.parametrize("number", [1, 8 * 99 + 3, NUMBERS - 1])
+def test_a_number_comes_back_whatever_the_running_part(panels: Panels, number: int, running: int) -> None:
+    came: list[int] = []
+    Presses(panels.server).number_id("number", lambda sent, client: came.append(sent))
+    panels.claim("number", float(running * NUMBERS + number))
+    assert came == [number]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,10 +17,9 @@ from tests.drive.waiting import until
 from workbench.core.step import OtherEntry
 from workbench.recording.library import Library
 from workbench.session.review import Review
-from workbench.ui import ground_numbers
-from workbench.ui.env_layout import EnvLayout
 from workbench.ui.review_page import ReviewOffers, ReviewPage
 from workbench.ui.review_panel import GHOSTS, GO_LIVE
+from workbench.ui.review_scene import MOST_NAMED
 
 
 @pytest.fixture(scope="module")
@@ -111,19 +110,17 @@ def test_two_recordings_are_compared_and_aligned(shown: Shown, monkeypatch: pyte
     assert "They part at step 1" in shown.panels.part("Compare").html()
     assert "reward = 2" in shown.panels.part("Compare").html()
     assert len(shown.chart("reward").series) == 4, "step, two lines and the dot"
-    written: list[tuple[str, ...]] = []
-    real = ground_numbers.ground_glb
-
-    def noted(layout: EnvLayout, words: Sequence[str]) -> bytes:
-        written.append(tuple(words))
-        return real(layout, words)
-
-    monkeypatch.setattr(ground_numbers, "ground_glb", noted)
     shown.panels.command("Over each other or side by side")
     shown.draw()
     (cubes,) = shown.panels.bodies("cube")
-    assert len(cubes.batched_positions) == 2 and shown.panels.labels() == ["A, seed 1"]
-    assert written == [("", "B")] and shown.panels.nodes("/labels")
+    assert len(cubes.batched_positions) == 2 and sorted(shown.panels.labels()) == ["A, seed 1", "B"]
+    (name,) = shown.panels.nodes("/names")
+    away = np.linalg.norm(cubes.batched_positions - name.position, axis=1)
+    assert away[1] < away[0], "at its own place"
+    shown.review.select(1)
+    shown.draw()
+    assert sorted(shown.panels.labels()) == ["A", "B, seed 2"]
+    shown.review.select(0)
     shown.review.align("first success")
     shown.draw()
     assert "B has no success" in shown.panels.part("Review").html()
@@ -182,3 +179,16 @@ def test_many_recordings_stand_side_by_side(shown: Shown, folder: Path) -> None:
     assert not shown.panels.shows("Draw them")
     (cubes,) = shown.panels.bodies("cube")
     assert len(cubes.batched_positions) == 6
+    assert sorted(shown.panels.labels()) == ["5", "6", "A, seed 20", "B", "C", "D"]
+
+
+def test_of_too_many_recordings_only_the_selected_one_is_named(shown: Shown, folder: Path) -> None:
+    several = range(40, 40 + MOST_NAMED + 1)
+    for seed in several:
+        write(folder, made(1, seed=seed), pictures=False)
+    shown.library.refresh()
+    shown.open(*several)
+    assert shown.panels.labels() == ["A, seed 40"]
+    shown.review.close_one(MOST_NAMED)
+    shown.draw()
+    assert len(shown.panels.labels()) == MOST_NAMED

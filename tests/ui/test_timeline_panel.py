@@ -142,10 +142,20 @@ def test_an_arrow_that_a_slider_took_is_not_taken_twice(lived: Lived) -> None:
 def test_a_value_that_no_slider_has_is_refused(lived: Lived) -> None:
     lived.step(3)
     lived.panels.claim(SLIDER, 1)
-    assert lived.panels.client.notices == ["The step of the past goes from -1000000000 to 0."]
+    lived.panels.claim(SLIDER, -4)
+    assert lived.panels.client.notices == ["The step of the past goes from -3 to 0."] * 2
     assert lived.past.shown is None
-    lived.panels.claim(SLIDER, -(10**8))
+    lived.panels.claim(SLIDER, -3)
     assert lived.past.shown == lived.past.first
     lived.panels.claim("way to go on", "rm -rf")
     lived.panels.claim("step to take", "rm -rf")
+    assert len(lived.panels.client.notices) == 4
     assert lived.past.shown == lived.past.first and lived.past.last == 3
+
+
+def test_one_moment_alone_has_nothing_to_slide_along(lived: Lived) -> None:
+    lived.draw()
+    assert not lived.panels.shows(SLIDER)
+    assert "1 step<" in lived.strip()
+    lived.step(1)
+    assert lived.panels.shows(SLIDER) and lived.ends() == (-1, 0, 0)

@@ -7,7 +7,8 @@ from tests.ui.scenes import running
 from workbench.session.history import FAIL, RESET, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.session.timeline import Strip, TimelineView
 from workbench.ui.fragments import render
-from workbench.ui.timeline_strip import HEIGHT, POINTS, reward_lines, strip_values
+from workbench.ui.timeline_panel import LINE_HEIGHT as HEIGHT
+from workbench.ui.timeline_panel import POINTS, reward_lines, strip_values
 
 
 def strip(**changes: object) -> Strip:

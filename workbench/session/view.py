@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from workbench.authoring.problem import Problem
+from workbench.core.camera_settings import CameraKey
 from workbench.core.inspection import Inspection
-from workbench.core.pictures import CameraKind, Picture
+from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.core.step import StepResult
 from workbench.session.curves import Curves
 from workbench.session.judge import JudgementView
@@ -50,6 +51,27 @@ class RecordingStatus:
     problem: str | None = None
     """Why the recording ended, or the last file could not be written."""
     keeping: KeepStatus = field(default_factory=KeepStatus)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What cameras see of the env that is looked at: a session's at the moment that is shown, or a recording's."""
+
+    cameras: tuple[CameraInfo, ...]
+    cameras_serial: int
+    """Another one for another set of cameras."""
+    pictures: dict[CameraKey, Picture]
+    pictures_serial: int
+    segmentation: dict[int, str]
+    """Names of the ids in a segmentation."""
+    env: int = 0
+    milliseconds: float | None = None
+    """That the newest picture took; None for one that was recorded."""
+    can_render: bool = True
+    placed: CameraKey | None = None
+    """The camera that is placed by hand."""
+    quick: bool = False
+    """That one is looked through in another size than its own."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +129,23 @@ class SessionView:
     """What the new code says of the episodes that were run with the old."""
     studio: StudioView = StudioView()
     """Cameras, as they are placed by hand."""
+
+    @property
+    def seen(self) -> Seen | None:
+        """None while there is no task."""
+        task, studio = self.task, self.studio
+        return task and Seen(
+            task.cameras,
+            self.cameras_serial,
+            self.pictures,
+            self.pictures_serial,
+            task.segmentation,
+            self.selected_env,
+            self.picture_milliseconds,
+            task.can_render,
+            studio.selected,
+            studio.quick_scale != 1.0,
+        )
 
     @property
     def selected_env(self) -> int:

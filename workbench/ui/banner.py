@@ -1,8 +1,13 @@
-"""The banner over the top of the view: what is wrong in the author's file, until it is right again.
+"""The banners over the top of the view: what is wrong in the author's file, or what its code has been at for long.
 
-It floats over the view and never over the controls, because the last good version keeps running
-behind it and stays usable. First the sentence that is needed (what failed, where), then the line of
-code and the message; the whole traceback only on demand.
+They float over the view and never over the controls, because the last good version keeps running behind and stays
+usable. Of a problem the sentence that is needed comes first (what failed, where), then the line of code and the message;
+the whole traceback only on demand.
+
+Code that is at one thing for long may only be slow, so nothing is done unasked, and the page says what is known instead:
+the hook, the author's line, the seconds. *Interrupt* leaves the code there, with its traceback, and keeps the process and
+the envs. Where that does not help (native code, a loop that catches everything), *Restart* ends the process, and the last
+good version comes back in another, where it was.
 """
 
 from __future__ import annotations
@@ -10,15 +15,18 @@ from __future__ import annotations
 import viser
 
 from workbench.authoring.problem import Problem
+from workbench.session.last_words import Busy
 from workbench.session.view import SessionView
-from workbench.ui.busy_banner import is_shown as busy_is_shown
 from workbench.ui.fragments import render
-from workbench.ui.over_the_view import GAP, FitsTheView
 from workbench.ui.parts import Part
+from workbench.ui.timeline_panel import GAP
 
-WIDEST, NARROWEST = 520, 240
-"""Pixels. Between them it is as wide as the narrowest open view leaves room for: over the controls it
-would hide the very buttons that the last good version is still used with."""
+WIDEST, BUSY_WIDEST = 520, 460
+"""Pixels. The style sheet makes them as narrow as the view: over the controls they would hide the very buttons that the
+last good version is still used with."""
+
+SHOWN_AFTER = 4.0
+"""Seconds. The status line says it earlier; a banner is for what one may want to end."""
 
 DOING = {
     "syntax": "cannot be read",
@@ -40,6 +48,16 @@ INTERRUPTED = {
 }
 
 
+def is_busy_for_long(view: SessionView) -> bool:
+    """Whether the banner stands over the view; it goes before that of a problem.
+
+    Not for a worker that gets ready: nothing of the author's is at work then, and why the one before is gone
+    must stay in sight. Nor for one that a debugger holds, which the status line says.
+    """
+    busy = view.busy
+    return busy is not None and busy.seconds >= SHOWN_AFTER and not (busy.getting_ready or busy.held)
+
+
 class Banner(Part[SessionView]):
     """A floating panel that is there only while a problem stands.
 
@@ -59,20 +77,17 @@ class Banner(Part[SessionView]):
             )
         # From the right edge of the view: on the left are viser's own notices.
         self._panel.float(x=-GAP, y=GAP, width=WIDEST)
-        self._server = server
-        self._fits = FitsTheView(server, self._panel, WIDEST, NARROWEST)
         self._reload.on_click(lambda _: reload())
         self._restart.on_click(lambda _: restart())
         self._drawn: tuple[int, str] | None = None
 
     def draw(self, view: SessionView) -> None:
         problem = view.problem
-        if problem is None or busy_is_shown(view):
+        if problem is None or is_busy_for_long(view):
             if self._panel.visible:
                 self._panel.visible = False
             self._drawn = None
             return
-        self._fits.fit()
         stopped = view.state == "stopped"
         self._restart.visible = stopped
         # Written once a problem: a new text would close the traceback that someone has open.
@@ -109,3 +124,58 @@ def _kept(view: SessionView) -> str:
     if view.playing:
         return "The last good version keeps running."
     return "The last good version stays on the page."
+
+
+class BusyBanner(Part[SessionView]):
+    """A floating panel that is there only while the worker is busy for long.
+
+    Args:
+        server: The page.
+        interrupt: Asks the session to have the author's code left where it is.
+        restart: Asks the session for another worker process.
+    """
+
+    def __init__(self, server: viser.ViserServer, interrupt, restart) -> None:
+        self._panel = server.gui.add_panel(visible=False, order=-11.0)
+        with self._panel.add_tab("Busy", viser.Icon.HOURGLASS):
+            self._html = server.gui.add_html("")
+            self._traceback = server.gui.add_html("", visible=False)
+            self._interrupt = server.gui.add_button("Interrupt", icon=viser.Icon.HAND_STOP, color="orange")
+            self._restart = server.gui.add_button("Restart", icon=viser.Icon.POWER, color="gray")
+        self._panel.float(x=-GAP, y=GAP, width=BUSY_WIDEST)
+        self._interrupt.on_click(lambda _: interrupt())
+        self._restart.on_click(lambda _: restart())
+
+    def draw(self, view: SessionView) -> None:
+        busy = view.busy
+        if busy is None or not is_busy_for_long(view):
+            self._panel.visible = False
+            return
+        self._html.content = busy_html(busy, view)
+        # Apart from the seconds, which would close it each time that they change.
+        trace = render("traceback", traceback=busy.traceback) if busy.deaf and busy.traceback else ""
+        self._traceback.content = trace
+        self._traceback.visible = bool(trace)
+        can_interrupt = not busy.deaf and not busy.drawing
+        self._interrupt.visible = can_interrupt
+        if not self._panel.visible:
+            self._panel.visible = True
+            self._panel.expand()
+
+
+def busy_html(busy: Busy, view: SessionView) -> str:
+    """The banner's content; every value escaped."""
+    if busy.deaf:
+        advice = (
+            "It was interrupted and goes on: it is in native code, or it catches every exception. Restart ends the "
+            "process; the last good version comes back where it was."
+        )
+    elif busy.drawing:
+        advice = "The renderer is at work. The first picture may take long; Restart ends the process."
+    else:
+        advice = (
+            "It may only be slow. Interrupt stops it there and shows the traceback; Restart ends the process, and "
+            "the last good version comes back where it was. Saving a mended file does as much."
+        )
+    subject = "The task" if view.task is None else view.task.class_name or view.task.env_id
+    return render("busy", subject=subject, busy=busy, advice=advice)

@@ -17,6 +17,7 @@ from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera
 from workbench.session.view import SessionView
 from workbench.ui.camera_work import WorkBar
+from workbench.ui.controls import refusals_told
 from workbench.ui.fragments import render
 from workbench.ui.in_colours import data_address
 
@@ -74,19 +75,15 @@ class CameraCompare:
         if camera is None or camera.now is None or camera.info.settings is None:
             return
         choice = self._other.value
-        if choice == KEPT and camera.key not in self._kept:
-            if event.client is not None:
-                event.client.add_notification(
-                    "Not possible",
-                    "Nothing is kept of this camera yet: press Keep this placement as A, then move it.",
-                    color="orange",
-                    auto_close_seconds=6.0,
+        with refusals_told(event.client):
+            if choice == KEPT and camera.key not in self._kept:
+                raise ValueError(
+                    "Nothing is kept of this camera yet: press Keep this placement as A, then move it."
                 )
-            return
-        other = camera.info.settings if choice == FILE else self._kept[camera.key]
-        self._asked = (camera.key, camera.now, other, choice)
-        self._bar.asked()
-        self._session.studio.compare(camera.key, other)
+            other = camera.info.settings if choice == FILE else self._kept[camera.key]
+            self._asked = (camera.key, camera.now, other, choice)
+            self._bar.asked()
+            self._session.studio.compare(camera.key, other)
 
     def draw(self, view: SessionView) -> None:
         studio = view.studio

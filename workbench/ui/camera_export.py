@@ -18,6 +18,8 @@ from workbench.core.camera_frames import Convention, Direction
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera
 from workbench.session.view import SessionView
+from workbench.ui.control_values import limit_text
+from workbench.ui.controls import refusals_told
 from workbench.ui.fragments import render
 
 Form = Literal["json", "opencv", "ros"]
@@ -76,6 +78,7 @@ class CameraExport:
                 hint="Paste a matrix of 4 x 4 or 3 x 4 numbers, our JSON, or an OpenCV YAML. It is read in the "
                 "convention and direction chosen above.",
             )
+            limit_text(self._text, LONGEST)
             self._unit = server.gui.add_dropdown(
                 "Its lengths in",
                 tuple(UNITS),
@@ -95,27 +98,20 @@ class CameraExport:
         camera = view.studio.chosen
         if event.client is None or camera is None:
             return
-        try:
+        with refusals_told(event.client):
             form, suffix = FORMS[self._form.value]
             every = self._which.value == ALL
             keys = tuple(c.key for c in view.studio.cameras) if every else (camera.key,)
             text = self._session.studio.export(keys, form)
-        except ValueError as error:
-            event.client.add_notification("Not possible", str(error), color="orange", auto_close_seconds=8.0)
-            return
-        name = "cameras" if every else camera.key[1]
-        event.client.send_file_download(
-            file_name(name, form, suffix), text.encode("utf-8"), save_immediately=True
-        )
+            name = file_name("cameras" if every else camera.key[1], form, suffix)
+            event.client.send_file_download(name, text.encode("utf-8"), save_immediately=True)
 
     def _on_import(self, event: viser.GuiEvent) -> None:
         camera = self._session.view().studio.chosen
         if event.client is None or camera is None:
             return
-        try:
+        with refusals_told(event.client, "Not placed"):
             text = self._text.value
-            if not isinstance(text, str) or len(text) > LONGEST:
-                raise ValueError(f"The calibration is longer than {LONGEST} characters.")
             if not text.strip():
                 raise ValueError(
                     "Paste a calibration into the field first: a matrix, our JSON, or an OpenCV YAML."
@@ -123,25 +119,19 @@ class CameraExport:
             convention, direction = self._choices()
             metres = UNITS[self._unit.value]
             self._session.studio.import_pose(camera.key, text, direction, convention, metres)
-        except ValueError as error:
-            event.client.add_notification("Not placed", str(error), color="orange", auto_close_seconds=12.0)
-            return
-        event.client.add_notification(
-            "Placed",
-            "The pose was taken. A lens that the text may hold was not: its matrix goes into Lens and picture.",
-            color="green",
-            auto_close_seconds=8.0,
-        )
+            event.client.add_notification(
+                "Placed",
+                "The pose was taken. A lens that the text may hold was not: its matrix goes into Lens and picture.",
+                color="green",
+                auto_close_seconds=8.0,
+            )
 
     def draw(self, view: SessionView) -> None:
         camera = view.studio.chosen
         idle = camera is None or camera.now is None
         for button in (self._download, self._import):
             button.disabled = idle
-        try:
-            convention, direction = self._choices()
-        except ValueError:
-            return
+        convention, direction = self._choices()
         mount = None if camera is None or camera.mount_pose is None else camera.mount_pose.tobytes()
         wanted = (convention, direction, None if camera is None else (camera.key, camera.now), mount)
         if wanted != self._drawn:

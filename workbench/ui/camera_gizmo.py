@@ -10,7 +10,6 @@ While somebody holds it, it belongs to them: a pose that the server writes then 
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ import viser
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.session.studio_view import StudioCamera
 from workbench.ui.camera_moves import Floats, Frame, Snap, looking_at, snapped, turned_in_world
+from workbench.ui.controls import refusals_told
 from workbench.ui.placing import Placing
 from workbench.ui.selection_mark import LineSet
 
@@ -28,8 +28,7 @@ LEFT_ALONE = 60.0
 """Seconds without a movement after which a gizmo that was never let go (a page that went away) is free again."""
 PIXELS = 76.0
 TARGET_PIXELS = 44.0
-SIZES = (0.5, 32.0, PIXELS), (0.35, 24.0, TARGET_PIXELS)
-"""Of the eye's handle and the target's: its share of the distance between them on the screen, its least, its most."""
+"""Of the handles on the screen."""
 SIGHT_COLOUR = (34, 139, 230)
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -65,7 +64,7 @@ class CameraGizmo:
         own_axes: Callable[[], bool],
         look_at: Callable[[], bool],
     ) -> None:
-        self._server, self._placing = server, placing
+        self._placing = placing
         self._snap, self._own_axes, self._look_at = snap, own_axes, look_at
         scene = server.scene
         # A fixed size on the screen: in a grid of sixteen envs one of 10 cm would be a dot.
@@ -117,20 +116,6 @@ class CameraGizmo:
         target = self._placing.target_in_view(camera, camera.now)
         _move(self._eye, pose[:3], UNTURNED)
         _move(self._target, target, UNTURNED)
-        if two:
-            self._keep_apart(pose[:3], target)
-
-    def _keep_apart(self, eye: Floats, target: Floats) -> None:
-        """As large as they can be without lying over each other, in the page that looks from farthest away."""
-        apart = [
-            pixels_apart(page.camera.position, page.camera.fov, page.camera.image_height, eye, target)
-            for page in self._server.get_clients().values()
-        ]
-        for handle, pixels in zip((self._eye, self._target), sizes(min(apart, default=np.inf)), strict=True):
-            handle.scale = pixels
-            few = pixels < PIXELS / 2
-            # Its planes are what hides most, and can be done without.
-            handle.disable_sliders = few
 
     def _draw_line(self, camera: StudioCamera | None) -> None:
         """From the eye to the target, which otherwise would be any three arrows in the air."""
@@ -169,15 +154,13 @@ class CameraGizmo:
             return
         pose, frame = start.pose, start.frame
         position, wxyz = event.target.position, event.target.wxyz
-        try:
+        with refusals_told(event.client, then=self._let_go):
             if self._own_axes():
                 moved = np.concatenate([position, wxyz])
             else:
                 moved = turned_in_world(pose, position, wxyz)
             moved = snapped(pose, moved, self._snap(), self._own_axes(), frame.offset)
             self._place(start, moved, float(np.linalg.norm(start.target - pose[:3])))
-        except ValueError as error:
-            self._refuse(event, error)
 
     async def _on_eye(self, event: viser.TransformControlsEvent) -> None:
         self._look(event, moves_eye=True)
@@ -194,34 +177,17 @@ class CameraGizmo:
         at = np.concatenate([before, UNTURNED]), np.concatenate([event.target.position, UNTURNED])
         there = snapped(*at, Snap(metres=self._snap().metres), False, start.frame.offset)[:3]
         eye, target = (there, target) if moves_eye else (pose[:3], there)
-        try:
+        with refusals_told(event.client, then=self._let_go):
             self._place(start, looking_at(pose, eye, target), float(np.linalg.norm(target - eye)))
-        except ValueError as error:
-            self._refuse(event, error)
 
     def _place(self, start: _Taken, pose: Floats, distance: float) -> None:
         moved = start.frame.from_view(start.settings, pose)
         self._placing.set_distance(start.key, moved, distance)
         self._placing.place(start.key, moved, "gizmo", start.gesture)
 
-    def _refuse(self, event: viser.TransformControlsEvent, error: ValueError) -> None:
-        """Let go, so that it is put back to where the camera is."""
+    def _let_go(self) -> None:
+        """So that it is put back to where the camera is."""
         self._start = None
-        if event.client is not None:
-            event.client.add_notification("Not possible", str(error), color="orange", auto_close_seconds=6.0)
-
-
-def pixels_apart(viewer: Floats, fov: float, height: float, a: Floats, b: Floats) -> float:
-    """How far apart two points (3,) are on a screen of so many pixels, seen at an angle `fov` (radians) in all."""
-    to_a, to_b = a - viewer, b - viewer
-    angle = math.atan2(float(np.linalg.norm(np.cross(to_a, to_b))), float(to_a @ to_b))
-    return angle * height / fov
-
-
-def sizes(apart: float) -> tuple[float, float]:
-    """Pixels of the eye's handle and of the target's, for a distance of their middles on the screen."""
-    eye, target = (round(float(np.clip(share * apart, least, most)) / 4) * 4 for share, least, most in SIZES)
-    return eye, target
 
 
 def _move(handle: viser.TransformControlsHandle, position: Floats, wxyz: Floats) -> None:

@@ -22,8 +22,7 @@ from workbench.core.camera_frames import (
 from workbench.core.camera_settings import CameraSettings
 from workbench.session.studio_view import StudioCamera
 from workbench.ui.camera_moves import kept_where_equal
-from workbench.ui.camera_numbers import number_field, pair_field
-from workbench.ui.control_values import checked_int
+from workbench.ui.camera_numbers import numbers_field
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
 from workbench.ui.placing import Placing
@@ -32,11 +31,10 @@ FOV, INTRINSIC = "field of view", "intrinsic matrix"
 LENSES = (FOV, INTRINSIC)
 SHADERS: tuple[str, ...] = ("minimal", "default", "rt-fast", "rt-med", "rt")
 """Those that ManiSkill 3 brings."""
-METRES, DEGREES, RADIANS, PIXELS = 4, 2, 4, 2
+METRES, DEGREES, PIXELS = 4, 2, 2
 """Digits that are shown."""
 SMALLEST, LARGEST = 8, 4096
 """Pixels of a picture's side."""
-VERTICAL = "vertical field of view"
 
 Change = Callable[[CameraSettings], CameraSettings]
 
@@ -53,47 +51,55 @@ class CameraLens:
             self._build_picture(gui)
 
     def _build_lens(self, gui: viser.GuiApi) -> None:
-        self._lens = Control(
-            gui.add_dropdown("Lens as", LENSES, initial_value=FOV),
-            read=str,
-            send=self._set_lens,
-        )
-        self._degrees = number_field(
+        self._lens = Control(gui.add_dropdown("Lens as", LENSES, initial_value=FOV), self._set_lens)
+        vertical = "The vertical field of view."
+        self._degrees = numbers_field(
             gui,
             "Degrees high",
-            DEGREES,
-            1.0,
-            1.0,
-            175.0,
             lambda fov: self._set_fov(math.radians(fov)),
-            VERTICAL,
+            1,
+            digits=DEGREES,
+            step=1.0,
+            low=1.0,
+            high=175.0,
+            hint=vertical,
         )
-        self._radians = number_field(gui, "Radians", RADIANS, 0.01, 0.02, 3.05, self._set_fov, VERTICAL)
-        self._focal = pair_field(gui, "fx, fy", PIXELS, 1.0, 1.0, 1e5, self._set_focal, "Pixels.")
-        self._centre = pair_field(
+        self._radians = numbers_field(gui, "Radians", self._set_fov, 1, low=0.02, high=3.05, hint=vertical)
+        self._focal = numbers_field(
+            gui, "fx, fy", self._set_focal, 2, digits=PIXELS, step=1.0, low=1.0, high=1e5, hint="Pixels."
+        )
+        self._centre = numbers_field(
             gui,
             "cx, cy",
-            PIXELS,
-            1.0,
-            -1e5,
-            1e5,
             self._set_centre,
-            "Pixels from the picture's upper left corner to the optical axis.",
+            2,
+            digits=PIXELS,
+            step=1.0,
+            low=-1e5,
+            high=1e5,
+            hint="Pixels from the picture's upper left corner to the optical axis.",
         )
 
     def _build_picture(self, gui: viser.GuiApi) -> None:
-        self._size = pair_field(
-            gui, "Width, height", 0, 1.0, SMALLEST, LARGEST, self._set_size, "Pixels of the picture."
+        self._size = numbers_field(
+            gui,
+            "Width, height",
+            self._set_size,
+            2,
+            digits=0,
+            step=1.0,
+            low=SMALLEST,
+            high=LARGEST,
+            hint="Pixels of the picture.",
         )
-        self._range = pair_field(
+        self._range = numbers_field(
             gui,
             "Near, far",
-            METRES,
-            0.01,
-            1e-4,
-            1e4,
             self._set_range,
-            "Metres. What is nearer or farther is not drawn.",
+            2,
+            low=1e-4,
+            high=1e4,
+            hint="Metres. What is nearer or farther is not drawn.",
         )
         self._shader = Control(
             gui.add_dropdown(
@@ -102,7 +108,6 @@ class CameraLens:
                 initial_value="minimal",
                 hint="minimal is what ManiSkill trains with; the rt ones trace rays, slowly.",
             ),
-            read=str,
             send=lambda name: self._change("shader", lambda s: replace(s, shader_pack=name)),
         )
 
@@ -179,7 +184,9 @@ class CameraLens:
         self._change("intrinsic", change)
 
     def _set_size(self, typed: tuple[float, ...]) -> None:
-        width, height = (checked_int(n, SMALLEST, LARGEST, "number of pixels") for n in typed)
+        if any(n % 1 for n in typed):
+            raise ValueError("A number of pixels is a whole number.")
+        width, height = map(int, typed)
 
         def change(s: CameraSettings) -> CameraSettings:
             sized = replace(s, width=width, height=height)

@@ -27,7 +27,7 @@ from workbench.core.camera_frames import (
 from workbench.core.camera_settings import CameraSettings
 from workbench.session.studio_view import StudioCamera
 from workbench.ui.camera_moves import Floats, kept_where_equal, rounded
-from workbench.ui.control_values import checked_number, checked_text
+from workbench.ui.control_values import limit_text
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
 from workbench.ui.placing import FARTHEST, Placing
@@ -35,62 +35,32 @@ from workbench.ui.placing import FARTHEST, Placing
 TYPED = 0.3
 """Seconds without another number after which the last is taken: the arrows beside a field are held down."""
 
-Send = Callable[[tuple[float, ...]], None]
 
-
-def vector_field(
-    gui: viser.GuiApi, label: str, digits: int, step: float, hint: str, send: Send
-) -> Control[Any, Any]:
-    """Three numbers, metres or parts of a unit vector."""
-    handle = gui.add_vector3(label, (0.0, 0.0, 0.0), step=step, hint=hint)
-    return _field(handle, label, digits, -FARTHEST, FARTHEST, send)
-
-
-def pair_field(
+def numbers_field(
     gui: viser.GuiApi,
     label: str,
-    digits: int,
-    step: float,
-    low: float,
-    high: float,
-    send: Send,
+    send: Callable[[Any], None],
+    count: int = 3,
+    *,
+    digits: int = 4,
+    step: float = 0.01,
+    low: float = -FARTHEST,
+    high: float = FARTHEST,
     hint: str,
 ) -> Control[Any, Any]:
-    """Two numbers."""
-    handle = gui.add_vector2(label, (0.0, 0.0), step=step, hint=hint)
-    return _field(handle, label, digits, low, high, send)
+    """A field of one to three numbers; what is sent, and shown, is a number or a tuple of them."""
 
+    def each(number: float) -> Any:
+        return number if count == 1 else (number,) * count
 
-def number_field(
-    gui: viser.GuiApi,
-    label: str,
-    digits: int,
-    step: float,
-    low: float,
-    high: float,
-    send: Callable[[float], None],
-    name: str,
-) -> Control[Any, Any]:
-    """One number; `name` says in a sentence what it is."""
-    handle = gui.add_number(label, low, step=step, hint=f"The {name}.")
-    handle.precision = digits
-    return Control(
-        handle,
-        read=lambda value: checked_number(value, low, high, name),
-        send=send,
-        shown=lambda number: rounded([number], digits)[0],
-        settle=TYPED,
-    )
-
-
-def _field(handle: Any, label: str, digits: int, low: float, high: float, send: Send) -> Control[Any, Any]:
+    add: Any = (gui.add_number, gui.add_vector2, gui.add_vector3)[count - 1]
+    handle = add(label, each(max(low, 0.0)), min=each(low), max=each(high), step=step, hint=hint)
     # Digits that are shown and can be typed; viser takes them from the step.
     handle.precision = digits
     return Control(
         handle,
-        read=lambda value: tuple(checked_number(n, low, high, label) for n in value),
-        send=send,
-        shown=lambda numbers: rounded(numbers, digits),
+        send,
+        shown=lambda shown: rounded([shown], digits)[0] if count == 1 else rounded(shown, digits),
         settle=TYPED,
     )
 
@@ -122,21 +92,17 @@ class CameraNumbers:
             self._build_orientation(gui)
 
     def _build_points(self, gui: viser.GuiApi) -> None:
-        self._position = vector_field(
+        self._position = numbers_field(
             gui,
             "Position",
-            METRES,
-            0.01,
-            "Of the eye, in metres. The arrow keys up and down change the number by a centimetre.",
             self._set_position,
+            hint="Of the eye, in metres. The arrow keys up and down change the number by a centimetre.",
         )
-        self._target = vector_field(
+        self._target = numbers_field(
             gui,
             "Looks at",
-            METRES,
-            0.01,
-            "A point on the line of sight, in metres: the camera stays where it is and turns towards it.",
             self._set_target,
+            hint="A point on the line of sight, in metres: the camera stays where it is and turns towards it.",
         )
         self._about = gui.add_html("")
 
@@ -144,14 +110,14 @@ class CameraNumbers:
         self._orientation = gui.add_dropdown(
             "Turned", ORIENTATIONS, initial_value=RPY, hint="How its orientation is said below."
         )
-        self._rpy = vector_field(
+        self._rpy = numbers_field(
             gui,
             "Degrees",
-            DEGREES,
-            1.0,
-            "R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF and ROS. Yaw turns it to the left, a positive pitch "
-            "looks down, roll turns it clockwise.",
             self._set_rpy,
+            digits=DEGREES,
+            step=1.0,
+            hint="R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF and ROS. Yaw turns it to the left, a positive pitch "
+            "looks down, roll turns it clockwise.",
         )
         self._wxyz: Control[Any, Any] = Control(
             gui.add_text(
@@ -161,12 +127,11 @@ class CameraNumbers:
             send=lambda q: self._change("quaternion", lambda s: _turned(s, q)),
             settle=0.8,
         )
-        self._forward = vector_field(
-            gui, "Forward", UNIT, 0.1, "The line of sight: ManiSkill's x axis of a camera.", self._set_forward
-        )
-        self._up = vector_field(
-            gui, "Up", UNIT, 0.1, "The top of the picture: ManiSkill's z axis of a camera.", self._set_up
-        )
+        limit_text(self._wxyz.handle, 200)
+        about = "The line of sight: ManiSkill's x axis of a camera."
+        self._forward = numbers_field(gui, "Forward", self._set_forward, step=0.1, hint=about)
+        about = "The top of the picture: ManiSkill's z axis of a camera."
+        self._up = numbers_field(gui, "Up", self._set_up, step=0.1, hint=about)
         self._left = gui.add_html("")
 
     def draw(self, camera: StudioCamera | None) -> None:
@@ -254,8 +219,7 @@ class CameraNumbers:
         self._change("up", change)
 
 
-def _read_quaternion(value: object) -> Floats:
-    text = checked_text(value, 200, "quaternion")
+def _read_quaternion(text: str) -> Floats:
     words = re.findall(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", text)
     if len(words) != 4 or re.search(r"[^\d\s,;()\[\].eE+-]", text):
         raise ValueError("A quaternion is four numbers, w first: 1 0 0 0 turns nothing.")

@@ -19,7 +19,7 @@ from workbench.session.studio_view import Picked, StudioCamera
 from workbench.session.view import SessionView
 from workbench.ui.fragments import render
 from workbench.ui.presses import Presses
-from workbench.ui.selection_mark import LineSet
+from workbench.ui.selection_mark import LineSet, ViewLabel
 
 MARK_COLOUR = (230, 73, 128)
 MARK_SIZE = 0.05
@@ -106,30 +106,15 @@ class PointMark:
     """A cross and the body's name in the view, at a point of the selected env."""
 
     def __init__(self, server: viser.ViserServer) -> None:
-        self._server = server
         self._cross = LineSet(server, "/picked/cross", MARK_COLOUR, 3.0)
-        self._label: viser.LabelHandle | None = None
-        self._drawn: object = None
+        self._label = ViewLabel(server, "/picked/label", "bottom-left")
 
     def draw(self, picked: Picked | None, offset: NDArray[np.float32]) -> None:
-        point = None if picked is None else picked.point
-        wanted = None if point is None or picked is None else (point, offset.tobytes(), picked.body)
-        if wanted == self._drawn:
-            return
-        self._drawn = wanted
-        if point is None or picked is None:
+        if picked is None or picked.point is None:
             self._cross.draw(None)
-            if self._label is not None:
-                self._label.remove()
-                self._label = None
+            self._label.draw(None)
             return
-        place = np.asarray(point, np.float64) + offset
-        text = picked.body or ""
+        place = np.asarray(picked.point, np.float64) + offset
         ends = np.eye(3) * MARK_SIZE
         self._cross.draw(np.stack([place - ends, place + ends], axis=1))
-        if self._label is None:
-            self._label = self._server.scene.add_label(
-                "/picked/label", text, position=place, anchor="bottom-left"
-            )
-        else:
-            self._label.position, self._label.text = place, text
+        self._label.draw(picked.body or "", place)

@@ -12,7 +12,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.core.camera_frames import rotation_matrix
+from workbench.core.camera_frames import rotation_matrix, triple
 from workbench.core.camera_settings import CameraKey
 from workbench.core.camera_suggestion import OfferedPlacement
 from workbench.core.pictures import CameraKind
@@ -21,10 +21,11 @@ from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera
 from workbench.session.view import SessionView
 from workbench.ui.camera_work import Arrival, WorkBar
-from workbench.ui.control_values import checked_number
+from workbench.ui.controls import refusals_told
 from workbench.ui.env_layout import box_corners
 from workbench.ui.fragments import render
 from workbench.ui.in_colours import data_address
+from workbench.ui.placing import FARTHEST
 from workbench.ui.presses import Presses
 from workbench.ui.selection_mark import LineSet
 
@@ -34,8 +35,6 @@ MOST_LINKS = 12
 """An articulation with more offers none of them alone: a list that nobody reads."""
 OF_THE_ROBOT = 4
 """Links of a robot that are offered at once, its hand's; the others on demand."""
-FARTHEST = 1000.0
-"""Metres: bounds beyond are a slip of the finger."""
 MOST_RESETS = 256
 LARGEST = 160
 BOX_COLOUR = (230, 73, 128)
@@ -71,14 +70,19 @@ class CameraSuggest:
         with server.gui.add_folder("Suggest a placement", expand_by_default=False) as self.folder:
             self._mounted = server.gui.add_html("", visible=False)
             self._objects = server.gui.add_html("")
-            self._low = server.gui.add_vector3(
-                "Eye from",
-                (0.0, 0.0, 0.0),
-                step=0.05,
-                hint="Lowest corner of the box in which the eye may be, metres.",
-            )
-            self._high = server.gui.add_vector3(
-                "Eye to", (0.0, 0.0, 0.0), step=0.05, hint="Highest corner of that box, metres."
+            self._low, self._high = (
+                server.gui.add_vector3(
+                    label,
+                    np.zeros(3),
+                    min=np.full(3, -FARTHEST),
+                    max=np.full(3, FARTHEST),
+                    step=0.05,
+                    hint=hint,
+                )
+                for label, hint in (
+                    ("Eye from", "Lowest corner of the box in which the eye may be, metres."),
+                    ("Eye to", "Highest corner of that box, metres."),
+                )
             )
             self._show_box = server.gui.add_checkbox(
                 "Draw this box", False, hint="In the 3-D view, in the selected env."
@@ -117,32 +121,21 @@ class CameraSuggest:
         return {c.name for c in self._choices if c.first} if self._chosen is None else set(self._chosen)
 
     def _bounds(self) -> tuple[Corner, Corner]:
-        """Raises ValueError with a sentence."""
-        corners = []
-        for handle, name in ((self._low, "eye's first corner"), (self._high, "eye's second corner")):
-            corners.append([checked_number(number, -FARTHEST, FARTHEST, name) for number in handle.value])
-        low, high = np.minimum(*corners), np.maximum(*corners)
-        return (float(low[0]), float(low[1]), float(low[2])), (float(high[0]), float(high[1]), float(high[2]))
+        corners = self._low.value, self._high.value
+        return triple(np.minimum(*corners)), triple(np.maximum(*corners))
 
     def _ask(self, event: viser.GuiEvent) -> None:
         key = self._session.view().studio.selected
         if key is None:
             return
-        try:
-            chosen = self._now_chosen()
-            wanted = tuple(choice.name for choice in self._choices if choice.name in chosen)
+        chosen = self._now_chosen()
+        wanted = tuple(choice.name for choice in self._choices if choice.name in chosen)
+        with refusals_told(event.client):
             if not wanted:
                 raise ValueError("Choose at least one object that must be seen.")
-            low, high = self._bounds()
-        except ValueError as error:
-            if event.client is not None:
-                event.client.add_notification(
-                    "Not possible", str(error), color="orange", auto_close_seconds=6.0
-                )
-            return
-        self._bar.asked()
-        self._arrival.asked(self._session.view().studio.suggestions)
-        self._session.studio.suggest(key, wanted, low, high, self._resets.value)
+            self._bar.asked()
+            self._arrival.asked(self._session.view().studio.suggestions)
+            self._session.studio.suggest(key, wanted, *self._bounds(), self._resets.value)
 
     # --- drawn ---------------------------------------------------------------------------------------
 
@@ -237,15 +230,10 @@ class CameraSuggest:
         """
         camera = view.studio.chosen
         nowhere = camera is None or (camera.info.mount is not None and camera.mount_pose is None)
-        if self._show_box.value is not True or nowhere or camera is None:
+        if not self._show_box.value or nowhere or camera is None:
             self._box.draw(None)
             return
-        try:
-            low, high = self._bounds()
-        except ValueError:
-            self._box.draw(None)
-            return
-        edges = box_edges(low, high)
+        edges = box_edges(*self._bounds())
         if camera.mount_pose is not None:
             mount = camera.mount_pose.astype(np.float64)
             edges = (edges @ rotation_matrix(mount[3:]).T + mount[:3]).astype(np.float32)

@@ -20,7 +20,7 @@ from workbench.core.pictures import Picture
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioView, Writing
 from workbench.ui.camera_work import Arrival
-from workbench.ui.control_values import checked_text
+from workbench.ui.control_values import limit_text
 from workbench.ui.first_place import FirstPlace, aimed_at, first_place, objects_in
 from workbench.ui.fragments import render
 from workbench.ui.in_colours import data_address
@@ -185,6 +185,7 @@ class CameraWriting:
                 "",
                 hint="Letters, digits, - and _. A camera that is added without one is given one.",
             )
+            limit_text(self._name, LONGEST_NAME)
             self._with_chosen = gui.add_button_group("", (DUPLICATE, RENAME, REMOVE), visible=False)
             add = gui.add_button_group("", (ADD_SENSOR, ADD_HUMAN))
             self._why_not = gui.add_html("", visible=False)
@@ -256,7 +257,7 @@ class CameraWriting:
 
     def _checked_name(self, view: StudioView, kind: CameraKind, like: str) -> str:
         """The name that was typed, or a free one like another; `ValueError` where neither is there."""
-        name = checked_text("" if self._name is None else self._name.value, LONGEST_NAME, "name").strip()
+        name = "" if self._name is None else self._name.value.strip()
         if not name and like:
             return free_name(view, kind, like)
         if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_-]*", name):

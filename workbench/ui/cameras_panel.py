@@ -10,24 +10,52 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
 
 from workbench.core.camera_settings import CameraKey
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
-from workbench.session.messages import CameraRequest, TaskDescription
-from workbench.session.view import SessionView
+from workbench.session.messages import CameraRequest
+from workbench.session.view import Seen
 from workbench.ui.false_colour import DepthRange
 from workbench.ui.fragments import render
 from workbench.ui.in_colours import COLOUR, MODALITIES, depth_span, image_format, in_colours
-from workbench.ui.parts import Clock, DrawDue, Part
+from workbench.ui.parts import Clock, DrawDue
 
 FASTEST = 1 / 15
 """Seconds between two pictures of one camera."""
 KIND_NAMES: dict[CameraKind, str] = {"sensor": "sensor", "human": "for people"}
+
+
+class CameraImage:
+    """A picture of a camera in a container, from when there is one on."""
+
+    def __init__(
+        self, server: viser.ViserServer, container: viser.GuiFolderHandle, order: float | None = None
+    ) -> None:
+        self._server, self._container, self._order = server, container, order
+        self._handle: viser.GuiImageHandle | None = None
+
+    @property
+    def visible(self) -> bool:
+        return self._handle is not None and self._handle.visible
+
+    def show(self, shown: bool) -> None:
+        """Show the last picture, if there is one, or hide it."""
+        if self._handle is not None:
+            self._handle.visible = shown
+
+    def draw(self, kind: str, pixels: NDArray[np.uint8]) -> None:
+        if self._handle is None:
+            with self._container:
+                self._handle = self._server.gui.add_image(
+                    pixels, format=image_format(kind), jpeg_quality=80, order=self._order
+                )
+            return
+        self._handle.format, self._handle.image, self._handle.visible = image_format(kind), pixels, True
 
 
 @dataclass
@@ -37,7 +65,7 @@ class _Camera:
     captions: dict[str, viser.GuiHtmlHandle]
     folder: viser.GuiFolderHandle
     facts: viser.GuiHtmlHandle
-    images: dict[str, viser.GuiImageHandle] = field(default_factory=dict)
+    images: dict[str, CameraImage]
     depth_span: DepthRange | None = None
     drawn: tuple[Picture, tuple[str, ...]] | None = None
     """What its images show."""
@@ -45,19 +73,13 @@ class _Camera:
     """Whether its pictures are said to be of another moment."""
 
     def wanted(self) -> tuple[str, ...]:
-        return tuple(modality for modality, tick in self.ticks.items() if tick.value is True)
+        return tuple(modality for modality, tick in self.ticks.items() if tick.value)
 
 
-class MakesPictures(Protocol):
-    """Who is asked for pictures: a session, which renders them, or a review, which decodes them."""
-
-    def change(self, *, cameras: tuple[CameraRequest, ...]) -> None: ...
-
-
-class CamerasPanel(Part[SessionView]):
+class CamerasPanel:
     """
     Args:
-        session: Who is asked for pictures.
+        ask: Asks for exactly these pictures: a session renders them, a review decodes them.
         no_camera: What is said where there is none.
         studio_shows: Which kind of picture of the camera that is being placed is on the page beside its colours.
     """
@@ -65,22 +87,18 @@ class CamerasPanel(Part[SessionView]):
     def __init__(
         self,
         server: viser.ViserServer,
-        session: MakesPictures,
+        ask: Callable[[tuple[CameraRequest, ...]], None],
         no_camera: str = "This task has no camera.",
         studio_shows: Callable[[], str] = lambda: COLOUR,
         clock: Clock = time.monotonic,
     ) -> None:
         self._no_camera, self._studio_shows = no_camera, studio_shows
-        self._server = server
-        self._session = session
+        self._server, self._ask_for = server, ask
         self._cameras: dict[tuple[CameraKind, str], _Camera] = {}
         self._remembered: dict[tuple[CameraKind, str, str], bool] = {}
         self._cameras_serial = -1
         self._due = DrawDue(FASTEST, clock)
         self._asked: tuple[CameraRequest, ...] | None = None
-        self._quick = False
-        self._studio: CameraKey | None = None
-        """The camera that is being placed, whose picture is wanted whether or not it has a tick here."""
         self._note = server.gui.add_html(render("note", text="Pictures appear when the task is loaded."))
         self._frustums = server.gui.add_checkbox(
             "In the view",
@@ -92,52 +110,52 @@ class CamerasPanel(Part[SessionView]):
 
     @property
     def show_frustums(self) -> bool:
-        return self._frustums.value is True
+        return self._frustums.value
 
-    def draw(self, view: SessionView) -> None:
-        self._studio = view.studio.selected
-        self._quick = view.studio.quick_scale != 1.0
-        if view.task is not None and view.cameras_serial != self._cameras_serial:
-            self._cameras_serial = view.cameras_serial
-            self._build(view.task)
-        self._ask()
-        self._mark_stale(view)
-        if not self._due.is_due((view.pictures_serial, view.selected_env)):
+    def draw(self, seen: Seen | None) -> None:
+        if seen is None:
+            return
+        if seen.cameras_serial != self._cameras_serial:
+            self._cameras_serial = seen.cameras_serial
+            self._build(seen)
+        self._ask(seen)
+        self._mark_stale(seen)
+        if not self._due.is_due((seen.pictures_serial, seen.env)):
             return
         for key, camera in self._cameras.items():
-            picture = view.pictures.get(key)
-            if picture is None or picture.env != view.selected_env or view.task is None:
+            picture = seen.pictures.get(key)
+            if picture is None or picture.env != seen.env:
                 continue
             # Kinds come one after the other, and a picture that is sent again is decoded again.
             if camera.drawn is None or camera.drawn[0] is not picture or camera.drawn[1] != camera.wanted():
                 camera.drawn = (picture, camera.wanted())
-                self._draw_camera(camera, picture, view.task, view.picture_milliseconds)
+                self._draw_camera(camera, picture, seen)
 
-    def shown_pictures(self, view: SessionView) -> dict[tuple[CameraKind, str], Picture]:
+    def shown_pictures(self, seen: Seen) -> dict[tuple[CameraKind, str], Picture]:
         """The pictures of cameras with a tick, of the selected env: what the view's frustums wear."""
         return {
             key: picture
-            for key, picture in view.pictures.items()
-            if picture.env == view.selected_env
+            for key, picture in seen.pictures.items()
+            if picture.env == seen.env
             and key in self._cameras
-            and (key == view.studio.selected or self._cameras[key].wanted())
+            and (key == seen.placed or self._cameras[key].wanted())
         }
 
-    def _build(self, task: TaskDescription) -> None:
+    def _build(self, seen: Seen) -> None:
         """One folder a camera. One that is still there keeps it, with its ticks and its place on the page."""
         for key, camera in self._cameras.items():
             for modality, tick in camera.ticks.items():
-                self._remembered[(*key, modality)] = tick.value is True
+                self._remembered[(*key, modality)] = tick.value
         before, self._cameras = self._cameras, {}
-        stay = {(c.kind, c.name): modalities_of(c) for c in task.cameras} if task.can_render else {}
+        stay = {(c.kind, c.name): modalities_of(c) for c in seen.cameras} if seen.can_render else {}
         for key in [key for key, camera in before.items() if stay.get(key) != tuple(camera.ticks)]:
             before.pop(key).folder.remove()
-        if not task.can_render:
+        if not seen.can_render:
             note = (
                 "This machine has no render device, so there are no pictures. "
                 "Run workbench doctor to see what is missing."
             )
-        elif not task.cameras:
+        elif not seen.cameras:
             note = self._no_camera
         else:
             note = ""
@@ -147,10 +165,10 @@ class CamerasPanel(Part[SessionView]):
         if note:
             return
         first_of_kind = {}
-        for camera in task.cameras:
+        for camera in seen.cameras:
             first_of_kind.setdefault(camera.kind, camera.name)
         with self._folder:
-            for order, info in enumerate(task.cameras):
+            for order, info in enumerate(seen.cameras):
                 key = (info.kind, info.name)
                 camera = before.get(key)
                 if camera is None:
@@ -164,82 +182,62 @@ class CamerasPanel(Part[SessionView]):
     def _build_camera(self, info: CameraInfo, first: bool) -> _Camera:
         gui = self._server.gui
         folder = gui.add_folder(f"{info.name} · {KIND_NAMES[info.kind]}")
-        ticks, captions = {}, {}
+        ticks, captions, images = {}, {}, {}
         with folder:
             about = gui.add_html("", order=1.0)
             for order, modality in enumerate(modalities_of(info)):
                 on = self._remembered.get((info.kind, info.name, modality), first and modality == "rgb")
                 ticks[modality] = gui.add_checkbox(modality, on, order=10.0 * order + 10)
+                images[modality] = CameraImage(self._server, folder, order=10.0 * order + 11)
                 captions[modality] = gui.add_html("", order=10.0 * order + 12)
-        camera = _Camera(info, ticks, captions, folder, about)
+        camera = _Camera(info, ticks, captions, folder, about, images)
         about.content = facts(camera)
         return camera
 
-    def _ask(self) -> None:
-        """Ask for exactly the pictures that have a tick."""
+    def _ask(self, seen: Seen) -> None:
         wanted = tuple(
             CameraRequest(camera.info.name, camera.info.kind, modalities)
             for key, camera in self._cameras.items()
-            if (modalities := self._wanted_of(key, camera))
+            if (modalities := self._wanted_of(key, camera, seen))
         )
         if wanted != self._asked:
             self._asked = wanted
-            self._session.change(cameras=wanted)
+            self._ask_for(wanted)
         for camera in self._cameras.values():
             for modality, tick in camera.ticks.items():
-                shown = tick.value is True
-                camera.captions[modality].visible = shown
-                if modality in camera.images:
-                    camera.images[modality].visible = shown
+                camera.captions[modality].visible = tick.value
+                camera.images[modality].show(tick.value)
 
-    def _wanted_of(self, key: CameraKey, camera: _Camera) -> tuple[str, ...]:
+    def _wanted_of(self, key: CameraKey, camera: _Camera, seen: Seen) -> tuple[str, ...]:
+        """Those with a tick; and of a camera that is placed what the Studio shows of it, in its own size."""
         wanted = camera.wanted()
-        if self._quick:
-            return wanted  # it is looked through in another size, and need not be drawn in its own
-        if key != self._studio:
+        if seen.quick or key != seen.placed:
             return wanted
         return tuple(m for m in modalities_of(camera.info) if m in (COLOUR, self._studio_shows(), *wanted))
 
-    def _mark_stale(self, view: SessionView) -> None:
+    def _mark_stale(self, seen: Seen) -> None:
         """Say of pictures that are on the page, and are not of the moment that is, that they are not."""
         for key, camera in self._cameras.items():
-            picture = view.pictures.get(key)
-            here = picture is not None and picture.env == view.selected_env
+            picture = seen.pictures.get(key)
+            here = picture is not None and picture.env == seen.env
             stale = not here and any(image.visible for image in camera.images.values())
             if stale != camera.stale:
                 camera.stale = stale
                 camera.facts.content = facts(camera)
 
-    def _draw_camera(
-        self, camera: _Camera, picture: Picture, task: TaskDescription, milliseconds: float
-    ) -> None:
+    def _draw_camera(self, camera: _Camera, picture: Picture, seen: Seen) -> None:
         if picture.depth is not None:
             camera.depth_span = depth_span(camera.depth_span, picture)
         for modality in camera.wanted():
-            coloured = in_colours(picture, modality, task.segmentation, camera.depth_span)
+            coloured = in_colours(picture, modality, seen.segmentation, camera.depth_span)
             if coloured is None:
                 continue
             pixels, caption = coloured
             if modality == COLOUR:
-                # A recorded picture was rendered when it was recorded.
-                took = f"{milliseconds:.0f}" if np.isfinite(milliseconds) else ""
+                took = "" if seen.milliseconds is None else f"{seen.milliseconds:.0f}"
                 caption = render("rgb_caption", milliseconds=took)
-            self._draw_image(camera, modality, pixels)
-            if modality in camera.captions:
-                camera.captions[modality].content = caption
-
-    def _draw_image(self, camera: _Camera, modality: str, pixels: np.ndarray) -> None:
-        handle = camera.images.get(modality)
-        if handle is None:
-            with camera.folder:
-                camera.images[modality] = self._server.gui.add_image(
-                    pixels,
-                    format=image_format(modality),
-                    jpeg_quality=75,
-                    order=camera.ticks[modality].order + 1,
-                )
-        else:
-            handle.image = pixels
+            camera.images[modality].draw(modality, pixels)
+            camera.captions[modality].content = caption
 
 
 def modalities_of(info: CameraInfo) -> tuple[str, ...]:

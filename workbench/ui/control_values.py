@@ -82,29 +82,13 @@ def checked_choice(value: object, options: Iterable[Choice], name: str) -> Choic
     raise ValueError(f"That {name} is not one of those on offer.")
 
 
-def checked_text(value: object, longest: int, name: str) -> str:
-    """``value`` as one line of at most ``longest`` characters, all of them printable. Not escaped: text is
-    escaped where it goes into HTML or markdown.
-
-    Raises:
-        ValueError: It is not a text, is longer, or has line breaks, control or direction characters.
-    """
-    if not isinstance(value, str):
-        raise ValueError(f"The {name} is not a text.")
-    if len(value) > longest:
-        raise ValueError(f"The {name} is longer than {longest} characters.")
-    if not value.isprintable():
-        raise ValueError(f"The {name} has characters that cannot be shown, such as a line break.")
-    return value
-
-
 LARGEST_INT = 2**53
 """Up to here a browser counts in ones. msgpack ends at 2 ** 64."""
 LONGEST_LINE = 10_000
 LONGEST_TEXT = 100_000
 """Characters of a text field with several lines, such as a camera that is pasted as JSON."""
-_NAME = "name_of_control"
-"""Attribute: viser's handles have no other place for it, and cannot be a dictionary's keys."""
+_NAME, _LONGEST = "name_of_control", "longest_of_control"
+"""Attributes: viser's handles have no other place for them, and cannot be a dictionary's keys."""
 
 
 def name_control(control: Any, name: str) -> None:
@@ -115,6 +99,11 @@ def name_control(control: Any, name: str) -> None:
 def name_of(control: Any) -> str:
     """Its label, unless it was given a name."""
     return getattr(control, _NAME, "") or control.label
+
+
+def limit_text(control: Any, longest: int) -> None:
+    """At most so many characters; of a single line all of them printable: no control or direction characters."""
+    setattr(control, _LONGEST, longest)
 
 
 def check_value(control: Any, value: object) -> None:
@@ -153,13 +142,16 @@ def check_value(control: Any, value: object) -> None:
 
 
 def _check_text(control: viser.GuiTextHandle, value: object, name: str) -> None:
-    longest = LONGEST_TEXT if control.multiline else LONGEST_LINE
+    limit = getattr(control, _LONGEST, None)
+    longest = limit or (LONGEST_TEXT if control.multiline else LONGEST_LINE)
     if not isinstance(value, str):
         raise ValueError(f"The {name} is a text.")
     if len(value) > longest:
         raise ValueError(f"The {name} takes {longest} characters; those are {len(value)}.")
     if "\0" in value or (not control.multiline and len(value.splitlines()) > 1):
         raise ValueError(f"The {name} takes one line of text.")
+    if limit and not control.multiline and not value.isprintable():
+        raise ValueError(f"The {name} has characters that cannot be shown.")
 
 
 def _check_number(value: object, now: float, low: Any, high: Any, name: str) -> None:

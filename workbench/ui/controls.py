@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, ClassVar, Generic, TypeVar
 
 import viser
@@ -28,14 +29,28 @@ HANDS_OFF = 0.5
 """Seconds after a person touched an input in which it is not written to."""
 
 
+@contextmanager
+def refusals_told(
+    client: viser.ClientHandle | None,
+    title: str = "Not possible",
+    then: Callable[[], None] = lambda: None,
+) -> Iterator[None]:
+    """A ValueError within ends what is within, and is shown to the page that asked."""
+    try:
+        yield
+    except ValueError as error:
+        then()
+        if client is not None:
+            client.add_notification(title, str(error), color="orange", auto_close_seconds=8.0)
+
+
 class Control(Generic[Handle, T]):
     """Ties one viser input to one setting of the session.
 
     Args:
-        handle: The input.
-        read: The input's value as the session's, checked; raises ValueError with a sentence for the
-            person when it is out of range, since a page may send anything.
-        send: Asks the session for it. Must not block.
+        handle: The input. What it cannot hold never comes here (`control_values.check_value`).
+        send: Asks the session for a value. Must not block. Raises ValueError with a sentence for the person.
+        read: The input's value as the session's; raises as `send`.
         shown: The session's value as the input's.
         settle: Seconds without a change before a value is sent.
         clock: Of the page.
@@ -46,8 +61,8 @@ class Control(Generic[Handle, T]):
     def __init__(
         self,
         handle: Handle,
-        read: Callable[[Any], T],
         send: Callable[[T], None],
+        read: Callable[[Any], T] = lambda value: value,
         shown: Callable[[T], Any] = lambda value: value,
         settle: float = 0.0,
         clock: Clock = time.monotonic,
@@ -79,8 +94,7 @@ class Control(Generic[Handle, T]):
         if client is not None:
             self._apply(client)
         elif idle > HANDS_OFF + self._settle:
-            shown = self._shown(value)
-            self.handle.value = shown
+            self.handle.value = self._shown(value)
 
     def enable(self, enabled: bool) -> None:
         self.handle.disabled = not enabled
@@ -100,8 +114,8 @@ class Control(Generic[Handle, T]):
 
     def _apply(self, client: viser.ClientHandle) -> None:
         # Callbacks run in a pool of threads and finish in any order: the handle has the newest.
-        try:
+        with refusals_told(client, then=self._let_go):
             self._send(self._read(self.handle.value))
-        except ValueError as error:
-            self._touched = -1e9
-            client.add_notification("Not possible", str(error), color="orange", auto_close_seconds=6.0)
+
+    def _let_go(self) -> None:
+        self._touched = -1e9

@@ -21,7 +21,7 @@ from workbench.session.view import SessionView
 from workbench.ui.fragments import render
 from workbench.ui.parts import Part
 from workbench.ui.presses import Paged, Presses
-from workbench.ui.timeline_strip import polylines
+from workbench.ui.timeline_panel import polylines
 
 Filter = Literal["all", "failed", "running", "flagged"]
 FILTERS: tuple[Filter, ...] = ("all", "failed", "running", "flagged")

@@ -183,7 +183,7 @@ class InspectPanel(Part[SessionView]):
         self._due = DrawDue(READ_EVERY, clock)
 
     def draw(self, view: SessionView) -> None:
-        choice = self._show.value if self._show.value in CHOICES else NOTHING
+        choice = self._show.value
         self._ask(view, choice)
         self._take(view)
         no_step = self._no_step_yet(view)
@@ -198,7 +198,7 @@ class InspectPanel(Part[SessionView]):
         """The reading whose contacts are to be drawn in the view; None draws none: they are of what is live."""
         here = self._now is not None and self._now.env == view.selected_env
         known = view.timeline.shown is None and not self._no_step_yet(view)
-        shown = self._forces.value is True and here and known
+        shown = self._forces.value and here and known
         return self._now if shown else None
 
     def _no_step_yet(self, view: SessionView) -> bool:
@@ -212,7 +212,7 @@ class InspectPanel(Part[SessionView]):
     def _ask(self, view: SessionView, choice: str) -> None:
         chosen: tuple[Section | None, ...] = (
             CHOICES[choice],
-            "contacts" if self._forces.value is True else None,
+            "contacts" if self._forces.value else None,
         )
         sections: tuple[Section, ...] = tuple(section for section in SECTIONS if section in chosen)
         wanted = (view.task_serial, view.step_serial, view.selected_env, sections)

@@ -13,7 +13,7 @@ import viser
 
 from workbench.recording.library import Library, LibraryError
 from workbench.recording.library_row import LONGEST_NOTE, LibraryRow, clean_tags
-from workbench.ui.fragments import render, size
+from workbench.ui.fragments import counted, render, size
 from workbench.ui.library_rows import in_words
 
 MOST_NAMES = 6
@@ -70,7 +70,7 @@ def ask_text(
     def answer(_event: object) -> None:
         typed = field.value
         if question.close():
-            answered(typed if isinstance(typed, str) else "")
+            answered(typed)
 
     form.on_submit(answer)
     save.on_click(answer)
@@ -187,7 +187,7 @@ class LibraryEdits:
             lambda: ask_whether(
                 self._server,
                 "Empty the trash",
-                f"Delete {trash.files} files ({size(trash.size)}) for good?",
+                f"Delete {counted(trash.files, 'file')} ({size(trash.size)}) for good?",
                 [],
                 "This cannot be undone.",
                 "Delete for good",

@@ -153,12 +153,12 @@ class LibraryList:
         with self.lock:
             self.outcome, self.first = outcome, 0
 
-    def look_for(self, words: object, task: object) -> None:
-        """List what has these words, and is of this task; what a page sends may be of any type."""
+    def look_for(self, words: str, task: str | None) -> None:
+        """List what has these words, and is of this task, if there still is one of it."""
         with self.lock:
             known = {row.task for row in self._library.rows()}
-            words = words[:LONGEST_WORDS] if isinstance(words, str) else ""
-            task = task if isinstance(task, str) and task in known else None
+            words = words[:LONGEST_WORDS]
+            task = task if task in known else None
             if (words, task) != (self.words, self.task):
                 self.words, self.task, self.first = words, task, 0
 

@@ -18,7 +18,7 @@ from workbench.session.kept_worker import Vitals
 from workbench.session.memory_limit import in_words
 from workbench.session.printed import Printed
 from workbench.session.view import SessionView
-from workbench.ui.control_values import checked_text
+from workbench.ui.control_values import limit_text
 from workbench.ui.fragments import render
 from workbench.ui.parts import Part
 
@@ -137,6 +137,7 @@ class LogPanel(Part[SessionView]):
         self._filter = server.gui.add_text(
             "Filter", "", hint="Only lines with this in them; stderr: or stdout: before it takes one stream."
         )
+        limit_text(self._filter, LONGEST_FILTER)
         self._hold = server.gui.add_checkbox("Hold still", False, hint="Let new lines wait while you read.")
         self._html = server.gui.add_html("")
         self._clear = server.gui.add_button("Clear", icon=viser.Icon.ERASER, color="gray")
@@ -160,15 +161,8 @@ class LogPanel(Part[SessionView]):
         for control in (self._filter, self._hold, self._clear):
             control.visible = bool(view.printed.lines or view.printed.dropped)
 
-    def _on_filter(self, event: viser.GuiEvent) -> None:
-        try:
-            self._wanted = checked_text(self._filter.value, LONGEST_FILTER, "filter").strip()
-        except ValueError as error:
-            if event.client is not None:
-                event.client.add_notification(
-                    "Not possible", str(error), color="orange", auto_close_seconds=6.0
-                )
-            return
+    def _on_filter(self, event: viser.GuiEvent[viser.GuiTextHandle]) -> None:
+        self._wanted = event.target.value.strip()
         self._asked += 1
 
     def _on_clear(self, clear: Callable[[], None]) -> None:

@@ -23,6 +23,7 @@ from workbench.recording.new_file import new_file
 from workbench.recording.scene_eye import Eye
 from workbench.recording.scene_film import scene_frames
 from workbench.recording.sources import Source
+from workbench.ui.fragments import counted
 from workbench.ui.scene_html import write_scene_html
 
 What = Literal["film", "scene", "page", "sheet", "lerobot"]
@@ -85,7 +86,7 @@ def make(wanted: Wanted, on_progress: OnProgress = lambda done, doing: None) -> 
     if not paths:
         raise ValueError("\n".join(not_made))
     on_progress(1.0, "done")
-    words = f"{len(paths)} file{'' if len(paths) == 1 else 's'}"
+    words = counted(len(paths), "file")
     if not_made:
         words += f"; {len(not_made)} could not be made. {' '.join(not_made)}"
     return Made(tuple(paths), words, tuple(not_made))
@@ -148,7 +149,7 @@ def _dataset(wanted: Wanted, on_progress: OnProgress) -> Made:
         wanted.export,
         lambda done, doing: on_progress(done / max(count, 1), doing),
     )
-    words = f"{made.episodes} episode{'' if made.episodes == 1 else 's'}, {made.frames} frames"
+    words = f"{counted(made.episodes, 'episode')}, {counted(made.frames, 'frame')}"
     if made.left_out:
         words += f"; {made.left_out} without success left out"
     if made.not_fitting:

@@ -14,19 +14,24 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from types import FrameType
+from typing import Any, NoReturn
 
 import msgspec
 
 from workbench.machine.child_python import child_environment, python_command
 from workbench.machine.family import describe_exit
+from workbench.machine.guarded_terminal import guard_terminal
+from workbench.machine.software_vulkan import ensure_render_device
 from workbench.machine.watched_thread import say_failure
-from workbench.ui.make_shared import Made, Wanted
+from workbench.ui.make_shared import Made, Wanted, make
 
 END_SECONDS = 5.0
 
@@ -116,7 +121,7 @@ class Making:
 
     def _ask(self, wanted: Wanted) -> tuple[str, Made | None]:
         with subprocess.Popen(
-            python_command("-m", "workbench.ui.making_process"),
+            python_command("-m", "workbench.ui.making"),
             env=child_environment(),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -176,3 +181,44 @@ def decode(text: str) -> Wanted:
         raise NotImplementedError(f"{kind} does not cross this pipe")
 
     return msgspec.json.decode(text.encode(), type=Wanted, dec_hook=path)
+
+
+# --- the process: ``python -m workbench.ui.making`` -------------------------------------------------
+
+SAY_EVERY = 0.1
+"""Seconds. A sheet of pictures is quick, and a line a frame would be more to read than to make."""
+
+
+def main() -> None:
+    def on_signal(number: int, frame: FrameType | None) -> NoReturn:
+        raise SystemExit(1)  # through the blocks that take half-written files away
+
+    signal.signal(signal.SIGTERM, on_signal)
+    guard_terminal()  # what is said of recordings has names from them in it
+    # What libraries print goes where the author sees it, and not between our lines.
+    ours = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
+
+    def say(**said: object) -> None:
+        print(json.dumps(said), file=ours, flush=True)
+
+    last = 0.0
+
+    def on_progress(done: float, doing: str) -> None:
+        nonlocal last
+        if time.monotonic() - last >= SAY_EVERY:
+            last = time.monotonic()
+            say(done=done, doing=doing)
+
+    wanted = decode(sys.stdin.read())
+    if wanted.what == "scene":
+        os.environ.update(ensure_render_device(install=False).env)
+    try:
+        made = make(wanted, on_progress)
+        say(made=[os.fspath(path) for path in made.paths], words=made.words)
+    except (ValueError, OSError, RuntimeError) as error:
+        say(problem=str(error))
+
+
+if __name__ == "__main__":
+    main()

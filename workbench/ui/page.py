@@ -17,8 +17,7 @@ import viser
 
 from workbench.session.session import Session
 from workbench.session.view import SessionView
-from workbench.ui.banner import Banner
-from workbench.ui.busy_banner import BusyBanner
+from workbench.ui.banner import Banner, BusyBanner
 from workbench.ui.camera_frustums import LARGE, SMALL, CameraFrustums, without_the_viewpoint
 from workbench.ui.cameras_panel import CamerasPanel
 from workbench.ui.commands import Command, register
@@ -122,7 +121,10 @@ class Page:
             version = VersionPanel(server, session)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
             self._cameras = CamerasPanel(
-                server, session, studio_shows=lambda: self._studio.shows, clock=clock
+                server,
+                lambda cameras: session.change(cameras=cameras),
+                studio_shows=lambda: self._studio.shows,
+                clock=clock,
             )
         with tabs.add_tab("Studio", viser.Icon.CAMERA_PLUS):
             self._studio = StudioPanel(server, session, clock)
@@ -142,8 +144,7 @@ class Page:
         with tabs.add_tab("Log", viser.Icon.TERMINAL_2):
             log = LogPanel(server, session.clear_printed)
         on_run = self._run, self._view_panel, version
-        cameras = self._studio, self._cameras
-        return run_tab, [*on_run, *cameras, *reward, self._judgement, self._inspect, self._record, log]
+        return run_tab, [*on_run, self._studio, *reward, self._judgement, self._inspect, self._record, log]
 
     def _add_table_of_envs(self) -> None:
         self._env_window = self._server.gui.add_panel(order=5.0)
@@ -174,7 +175,11 @@ class Page:
     def redraw(self) -> None:
         """Draw the session as it is now."""
         view = self._session.view()
-        draw_apart(self._server, lambda: self._parts.draw(view), lambda: self._draw_scene(view))
+        draw_apart(self._server, lambda: self._draw_panels(view), lambda: self._draw_scene(view))
+
+    def _draw_panels(self, view: SessionView) -> None:
+        self._parts.draw(view)
+        self._cameras.draw(view.seen)
 
     def _toggle_envs(self) -> None:
         self._envs_open = not self._envs_open
@@ -193,10 +198,11 @@ class Page:
     # --- the 3-D view ----------------------------------------------------------------------------
 
     def _draw_scene(self, view: SessionView) -> None:
-        task, step = view.task, view.step
+        task, step, seen = view.task, view.step, view.seen
         if (
             task is None
             or step is None
+            or seen is None
             or step.poses.shape[:2]
             != (
                 task.num_envs,
@@ -220,7 +226,7 @@ class Page:
             )
         self._scene.move(step.poses, self._layout, env if one else None)
         self._mark.draw(self._layout, env, shown=task.num_envs > 1 and not one)
-        pictures = self._cameras.shown_pictures(view) if self._cameras.show_frustums else {}
+        pictures = self._cameras.shown_pictures(seen) if self._cameras.show_frustums else {}
         alone = one or task.num_envs == 1
         if alone:
             pictures = without_the_viewpoint(pictures, view.pictures)

@@ -79,19 +79,7 @@ class Presses:
             pressed: called with the number that was pressed, below `NUMBERS`, and the page that did it, on a thread of
                 viser's.
         """
-        if key not in self._ids:
-            with self._folder:
-                number = self._server.gui.add_number("·", 0)
-            name_control(number, _in_words(key))
-
-            def typed(event: viser.GuiEvent[viser.GuiNumberHandle[int]]) -> None:
-                sent = number_of(event.target.value)
-                if event.client is not None and sent is not None:
-                    pressed(sent, event.client)
-
-            number.on_update(typed)
-            self._ids[key] = element_id(number)
-        return self._ids[key]
+        return self._typed(key, lambda sent, client: pressed(sent % NUMBERS, client))
 
     def place_id(
         self, key: Hashable, pressed: Callable[[float, float, viser.ClientHandle | None], None]
@@ -102,15 +90,18 @@ class Presses:
             pressed: called with the place in the picture, 0, 0 at its upper left corner and 1, 1 at its lower right
                 one, and the page that did it, on a thread of viser's.
         """
+        return self._typed(key, lambda sent, client: pressed(*place_of(sent), client))
+
+    def _typed(self, key: Hashable, take: Callable[[int, viser.ClientHandle], None]) -> str:
+        """The id of a hidden input whose number is taken."""
         if key not in self._ids:
             with self._folder:
-                number = self._server.gui.add_number("·", 0)
+                number = self._server.gui.add_number("·", 0, min=0)
             name_control(number, _in_words(key))
 
             def typed(event: viser.GuiEvent[viser.GuiNumberHandle[int]]) -> None:
-                place = place_of(event.target.value)
-                if event.client is not None and place is not None:
-                    pressed(*place, event.client)
+                if event.client is not None:
+                    take(event.target.value, event.client)
 
             number.on_update(typed)
             self._ids[key] = element_id(number)
@@ -152,16 +143,7 @@ def _in_words(key: Hashable) -> str:
     return " ".join(_in_words(part) for part in key) if isinstance(key, tuple) else str(key)
 
 
-def number_of(sent: object) -> int | None:
-    """What ``choosable.html`` sends, without its running part; None for anything that it does not send."""
-    if isinstance(sent, bool) or not isinstance(sent, (int, float)) or not 0 <= sent < 2**53:
-        return None
-    return int(sent) % NUMBERS
-
-
-def place_of(number: object) -> tuple[float, float] | None:
-    """Column and row in 0..1 of what ``placeable.html`` sends; None for anything that it does not send."""
-    if isinstance(number, bool) or not isinstance(number, (int, float)) or not 0 <= number < 2**53:
-        return None
-    place = int(number) % PARTS**2
+def place_of(number: int) -> tuple[float, float]:
+    """Column and row in 0..1 of what ``placeable.html`` sends."""
+    place = number % PARTS**2
     return (place // PARTS) / (PARTS - 1), (place % PARTS) / (PARTS - 1)

@@ -40,7 +40,7 @@ SCRIPTS = (
     "pressed_by_key.js",
     "view_stays.js",
     "library_keys.js",
-    "timeline_width.js",
+    "view_width.js",
     "unfolded.js",
     "typed_first.js",
     "typed_numbers.js",

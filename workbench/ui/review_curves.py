@@ -15,6 +15,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from workbench.core.step import StepResult
+from workbench.recording.episode import Episode
 from workbench.session.review import MOST_COMPARED
 from workbench.session.review_events import ACTION, REWARD, TERMS, curves
 from workbench.session.review_view import ReviewView, column_at
@@ -23,7 +25,6 @@ from workbench.ui.fragments import render
 from workbench.ui.line_chart import LONGEST, Line, LineChart, span_of
 from workbench.ui.numbers_panel import NumberRow, number_rows
 from workbench.ui.parts import Part
-from workbench.ui.review_as_session import step_of
 from workbench.ui.review_scene import COLOURS, letter
 
 CHARTS = {"reward": 150, "also": 150, "terms": 150, "action": 190}
@@ -166,6 +167,21 @@ class ReviewCurves(Part[ReviewView]):
             dot = np.full(len(x), np.nan)
             dot[min(round(at / every.step), len(x) - 1)] = dotted.values[at]
         self._charts[chart].draw(title, x, lines, dot, span_of([line.values for line in lines]))
+
+
+def step_of(episode: Episode, state: int) -> StepResult:
+    """One state of a recording as a batch of one env."""
+    before = state - 1
+    return StepResult(
+        elapsed_steps=np.array([state], np.int32),
+        reward=np.asarray(episode.reward[before : before + 1] if state else [0.0], np.float32),
+        terminated=np.asarray(episode.terminated[before : before + 1] if state else [False], bool),
+        truncated=np.asarray(episode.truncated[before : before + 1] if state else [False], bool),
+        evaluate={name: values[state : state + 1] for name, values in episode.evaluate.items()},
+        poses=np.zeros((1, 0, 7), np.float32) if episode.poses is None else episode.poses[state : state + 1],
+        action=episode.action[before : before + 1] if state else None,
+        others=episode.others_at(state),
+    )
 
 
 def known(number: str, state: int) -> str:

@@ -22,6 +22,7 @@ from workbench.session.review import MOST_OPEN, Review
 from workbench.session.review_events import success_words
 from workbench.session.review_pictures import PictureReader
 from workbench.session.review_view import ReviewView
+from workbench.session.view import Seen
 from workbench.ui.cameras_panel import CamerasPanel
 from workbench.ui.commands import Command, register
 from workbench.ui.fragments import render
@@ -30,7 +31,6 @@ from workbench.ui.library_panel import LibraryPanel
 from workbench.ui.parts import Clock, DrawDue, Part, Parts
 from workbench.ui.presses import Presses
 from workbench.ui.redraw_loop import RedrawLoop, draw_apart
-from workbench.ui.review_as_session import as_session_view
 from workbench.ui.review_compare_panel import ReviewComparePanel
 from workbench.ui.review_curves import ReviewCurves, ReviewNumbers
 from workbench.ui.review_panel import ReviewPanel
@@ -143,7 +143,7 @@ class ReviewPage:
         more = [add(server, places) for add in offers.parts]
         with review_tab:
             self._view_panel = ViewPanel(server, dark)
-        self._timeline = ReviewTimeline(server, review)
+        self._timeline = ReviewTimeline(server, review, clock)
         self._in_3d = ReviewIn3D(server, review, stage)
         own = self._panel, self._timeline, *self._in_tabs, self._library
         self._parts = Parts((*own, *(part for part in more if part is not None)), clock)
@@ -166,7 +166,9 @@ class ReviewPage:
             self._panel = ReviewPanel(server, review, self._offers.on_step_back, self._offers.going)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
             self._cameras_note = server.gui.add_html("")
-            self._cameras = CamerasPanel(server, self, "This recording has no pictures.", clock=self._clock)
+            self._cameras = CamerasPanel(
+                server, self._want, "This recording has no pictures.", clock=self._clock
+            )
         with tabs.add_tab("Curves", viser.Icon.CHART_LINE):
             numbers, curves = ReviewNumbers(server), ReviewCurves(server)
         with tabs.add_tab("Compare", viser.Icon.ARROWS_DIFF):
@@ -305,8 +307,7 @@ class ReviewPage:
 
     # --- cameras -----------------------------------------------------------------------------------
 
-    def change(self, *, cameras: tuple[CameraRequest, ...]) -> None:
-        """Which pictures to decode: the Cameras tab asks as it asks the session."""
+    def _want(self, cameras: tuple[CameraRequest, ...]) -> None:
         self._requests = cameras
 
     def _take_pictures(self, view: ReviewView) -> None:
@@ -324,12 +325,20 @@ class ReviewPage:
             self._pictures, self._pictures_serial = pictures, self._pictures_serial + 1
 
     def _draw_cameras(self, view: ReviewView) -> None:
-        chosen = view.chosen
+        episode = None if view.chosen is None else view.chosen.episode
         self._cameras_note.content = render("note", text=self._reader.problem) if self._reader.problem else ""
-        if chosen is None:
-            return
-        cameras = self._reader.cameras(chosen.episode)
-        self._cameras.draw(as_session_view(view, cameras, self._pictures, self._pictures_serial))
+        self._cameras.draw(
+            episode
+            and Seen(
+                self._reader.cameras(episode),
+                # Each recording brings its own cameras.
+                view.opened_serial * 1000 + view.selected,
+                self._pictures,
+                self._pictures_serial,
+                episode.segmentation,
+                view.selected,
+            )
+        )
 
     # --- keys --------------------------------------------------------------------------------------
 

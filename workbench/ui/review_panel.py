@@ -18,7 +18,6 @@ from workbench.session.recorded_text import version_of
 from workbench.session.review import MOST_COMPARED, SPEEDS, Review
 from workbench.session.review_events import success_words
 from workbench.session.review_view import Opened, ReviewView
-from workbench.ui.control_values import checked_choice
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
 from workbench.ui.parts import Part
@@ -67,7 +66,6 @@ class ReviewPanel(Part[ReviewView]):
         )
         self._loop = Control(
             gui.add_checkbox("Loop", False, visible=False),
-            read=bool,
             send=review.set_loop,
         )
         self._problems = gui.add_html("")
@@ -78,11 +76,7 @@ class ReviewPanel(Part[ReviewView]):
         align: viser.GuiDropdownHandle = gui.add_dropdown(
             "Align at", ("start",), initial_value="start", visible=False
         )
-        self._align = Control(
-            align,
-            read=lambda value: checked_choice(value, review.view().alignments, "moment"),
-            send=review.align,
-        )
+        self._align = Control(align, send=review.align)
         self._never = gui.add_html("")
         self._facts = gui.add_html("")
         self._changes = ChangesOnDisk()

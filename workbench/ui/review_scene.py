@@ -24,8 +24,7 @@ from workbench.session.review_compare import distances
 from workbench.session.review_view import Opened, ReviewView
 from workbench.ui.camera_frustums import SMALL, CameraFrustums, without_the_viewpoint
 from workbench.ui.env_layout import EnvLayout, acting_box, env_under_ray, lay_out
-from workbench.ui.ground_numbers import GroundNumbers
-from workbench.ui.selection_mark import SelectionMark
+from workbench.ui.selection_mark import SelectionMark, ViewLabel
 from workbench.ui.stage import Stage
 from workbench.ui.timeline_panel import HEIGHT as TIMELINE_HEIGHT
 from workbench.ui.viewpoint import Viewpoint, frame_all, frame_one
@@ -34,6 +33,9 @@ COLOURS = ("#228be6", "#f08c00", "#2f9e44", "#be4bdb")
 """Of the recordings that are compared, in legends, curves and the view."""
 SEE_THROUGH = 0.45
 """Alpha of a ghost. Less vanishes over a white table, more hides what is behind."""
+MOST_NAMED = 16
+"""Recordings side by side that are all named. A browser lays a label out anew at every frame: of sixty it draws half as
+many (measured)."""
 APART = 5e-4
 """Metres from which on a ghost is drawn beside the body that it is a ghost of."""
 _SAME_PLACE = 1e-5
@@ -179,7 +181,7 @@ class ReviewIn3D:
         self._review = review
         self.bodies, self._framing = stage.scene, stage.framing
         self._mark = SelectionMark(server)
-        self._numbers = GroundNumbers(server)
+        self._names = [ViewLabel(server, f"/names {index}", "top-center") for index in range(MOST_NAMED)]
         self._frustums = CameraFrustums(server)
         self._scene: ReviewScene | None = None
         self._scene_of: object = None
@@ -257,12 +259,15 @@ class ReviewIn3D:
         self._frustums.draw(cameras, pictures, scene.layout.offsets[view.selected], SMALL)
 
     def _draw_names(self, view: ReviewView, scene: ReviewScene | None) -> None:
-        """The names of those that are not selected; the selected one's is on its frame."""
-        if scene is None:
-            self._numbers.clear()
-            return
-        names = ("" if index == view.selected else letter(index) for index in range(len(view.opened)))
-        self._numbers.draw(scene.layout, tuple(names))
+        """The names of those that are not selected, where they are few; the selected one's is on its frame."""
+        few = scene is not None and len(view.opened) <= MOST_NAMED
+        for index, label in enumerate(self._names):
+            if scene is None or not few or index >= len(view.opened) or index == view.selected:
+                label.draw(None)
+            else:
+                layout = scene.layout
+                front = np.array([layout.high[0], (layout.low[1] + layout.high[1]) / 2, layout.floor_height])
+                label.draw(letter(index), front + layout.offsets[index])
 
     def _viewpoint(self, aspect: float, height: float) -> Viewpoint:
         scene, view = self._scene, self._review.view()

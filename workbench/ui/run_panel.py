@@ -7,13 +7,14 @@ second page and this panel cannot disagree.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 
 import viser
 
 from workbench.session.messages import ActionDimension, ActionSource, EpisodeEnd
 from workbench.session.session import Session
 from workbench.session.view import SessionView
-from workbench.ui.control_values import checked_int, checked_number, checked_text
+from workbench.ui.control_values import limit_text
 from workbench.ui.controls import Control
 from workbench.ui.parts import Part
 
@@ -54,9 +55,6 @@ class ActionSliders:
                             step=(high - low) / 200,
                             initial_value=min(max(start, low), high),
                         ),
-                        read=lambda value, low=low, high=high, name=dimension.name: checked_number(
-                            value, low, high, name
-                        ),
                         send=lambda _: self._send(),
                     )
                 )
@@ -64,17 +62,18 @@ class ActionSliders:
     def draw(self, shown: bool, values: tuple[float, ...]) -> None:
         self._folder.visible = shown
         if shown and len(values) == len(self._controls):
-            for dimension, control, value in zip(self._dimensions, self._controls, values, strict=True):
-                low, high = slider_bounds(dimension)
-                control.show(min(max(value, low), high))
+            for control, value in zip(self._controls, self._in_bounds(values), strict=True):
+                control.show(value)
 
     def _send(self) -> None:
         # All of them at their newest: two sliders moved at once arrive in any order.
-        values = []
-        for dimension, control in zip(self._dimensions, self._controls, strict=True):
+        self._session.change(sliders=tuple(self._in_bounds(c.handle.value for c in self._controls)))
+
+    def _in_bounds(self, values: Iterable[float]) -> Iterator[float]:
+        """A browser adds steps up to a little more than the end; a policy may give more than a slider has."""
+        for dimension, value in zip(self._dimensions, values, strict=True):
             low, high = slider_bounds(dimension)
-            values.append(checked_number(control.handle.value, low, high, dimension.name))
-        self._session.change(sliders=tuple(values))
+            yield min(max(value, low), high)
 
     def _send_centre(self) -> None:
         self._session.change(sliders=tuple(sum(slider_bounds(d)) / 2 for d in self._dimensions))
@@ -128,7 +127,6 @@ class RunPanel(Part[SessionView]):
         with self._env_folder:
             self._env = Control(
                 gui.add_slider("Selected", min=0, max=1, step=1, initial_value=0),
-                read=lambda value: checked_int(value, 0, self._num_envs() - 1, "env"),
                 send=lambda env: session.change(selected_env=env),
             )
             self._neighbours = gui.add_button_group("", (PREVIOUS, NEXT))
@@ -149,7 +147,6 @@ class RunPanel(Part[SessionView]):
                 gui.add_number(
                     "Seed", 0, min=0, max=LARGEST_SEED, step=1, hint="A new seed resets every env with it."
                 ),
-                read=int,
                 send=session.set_seed,
                 settle=0.6,
             )
@@ -175,6 +172,7 @@ class RunPanel(Part[SessionView]):
                 send=lambda policy: session.change(action_source="policy", policy=policy or None),
                 settle=0.8,
             )
+            limit_text(self._policy.handle, 500)
             self._policy_hint = gui.add_html(
                 '<div class="wb-note">Type <code>module:function</code> or <code>file.py:function</code>. '
                 "It is called with the observation and returns the action.</div>"
@@ -259,8 +257,8 @@ class RunPanel(Part[SessionView]):
         policy = self._policy.handle.value.strip() if source == "policy" else ""
         self._session.change(action_source=source, policy=policy or None)
 
-    def _read_policy(self, value: object) -> str:
-        text = checked_text(value, 500, "policy").strip()
+    def _read_policy(self, value: str) -> str:
+        text = value.strip()
         if text and ":" not in text:
             raise ValueError("A policy is written module:function or file.py:function.")
         return text

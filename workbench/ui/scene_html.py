@@ -25,7 +25,7 @@ from workbench.recording.scene_eye import Eye, usual_eye
 from workbench.session.review_events import success_words
 from workbench.ui.door import DoorOptions, open_door
 from workbench.ui.env_layout import lay_out
-from workbench.ui.fragments import render
+from workbench.ui.fragments import counted, render
 from workbench.ui.scene_view import SceneView
 
 TRIANGLES = 80_000
@@ -63,7 +63,7 @@ def write_scene_html(
             page = _recorded(door.server, episode, eye, on_progress)
         finally:
             door.close()
-        title = f"{episode.info.task}, {episode.length} steps"
+        title = f"{episode.info.task}, {counted(episode.length, 'step')}"
         page = page.replace("</body>", _caption(episode) + "</body>", 1)
         page = re.sub(r"<title>.*?</title>", lambda _: f"<title>{html.escape(title)}</title>", page, count=1)
         temporary.write_text(page, encoding="utf-8")

@@ -5,6 +5,9 @@ Level and round the bodies, never over them, so that nothing of the task is cove
 
 from __future__ import annotations
 
+from functools import partial
+from typing import Literal
+
 import numpy as np
 import viser
 from numpy.typing import NDArray
@@ -41,23 +44,43 @@ class LineSet:
             self._handle.points = np.asarray(points, np.float32)
 
 
+class ViewLabel:
+    """A text in the 3-D view that comes, changes and goes; `anchor` says which part of it is at its place."""
+
+    def __init__(
+        self, server: viser.ViserServer, name: str, anchor: Literal["top-center", "bottom-left"]
+    ) -> None:
+        self._add = partial(server.scene.add_label, name, anchor=anchor)
+        self._handle: viser.LabelHandle | None = None
+
+    def draw(self, text: str | None, place: NDArray | None = None) -> None:
+        """Write this at (3,), metres in the view; None takes it away."""
+        if text is None or place is None:
+            if self._handle is not None:
+                self._handle.remove()
+                self._handle = None
+        elif self._handle is None:
+            self._handle = self._add(text, position=place)
+        else:
+            self._handle.text, self._handle.position = text, place
+
+
 class SelectionMark:
     def __init__(self, server: viser.ViserServer) -> None:
-        self._server = server
         self._frame = LineSet(server, "/selected/frame", COLOUR, 3.0)
-        self._label: viser.LabelHandle | None = None
-        self._drawn: tuple[int, int, bool, str] | None = None
+        self._label = ViewLabel(server, "/selected/label", "top-center")
+        self._drawn: tuple[int, int, str] | None = None
 
     def draw(self, layout: EnvLayout, env: int, shown: bool, name: str | None = None) -> None:
         """Mark this env; not `shown` when it is alone in the view and needs no mark. `name` is said instead of its number."""
         name = f"env {env}" if name is None else name
-        wanted = (id(layout), env, shown, name)
-        if wanted == self._drawn:
-            return
-        self._drawn = wanted
         if not shown:
             self.clear()
             return
+        wanted = (id(layout), env, name)
+        if wanted == self._drawn:
+            return
+        self._drawn = wanted
         offset = layout.offsets[env]
         corner_low = layout.low[:2] + offset[:2] - MARGIN * 0.4
         corner_high = layout.high[:2] + offset[:2] + MARGIN * 0.4
@@ -69,17 +92,9 @@ class SelectionMark:
         edges = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
         label_at = np.array([x1, (y0 + y1) / 2, z])
         self._frame.draw(edges)
-        if self._label is None:
-            self._label = self._server.scene.add_label(
-                "/selected/label", name, position=label_at, anchor="top-center"
-            )
-        else:
-            self._label.text = name
-            self._label.position = label_at
+        self._label.draw(name, label_at)
 
     def clear(self) -> None:
-        self._drawn = None if self._label is not None else self._drawn
+        self._drawn = None
         self._frame.draw(None)
-        if self._label is not None:
-            self._label.remove()
-            self._label = None
+        self._label.draw(None)

@@ -112,7 +112,7 @@ class SharePanel:
     def draw(self, chosen: Chosen) -> None:
         self._chosen = chosen
         view = self._making.view()
-        what = WHAT.get(self._what.value)
+        what = WHAT[self._what.value]
         camera = self._camera.value
         now = (chosen, view, what, camera)
         if now == self._drawn:
@@ -136,17 +136,13 @@ class SharePanel:
         self._make.visible = not view.running
         self._stop.visible = view.running
         self._make.disabled = not chosen.sources
-        will = (
-            None
-            if view.running or not names or what is None
-            else will_make(what, chosen, camera, self._folder)
-        )
+        will = None if view.running or not names else will_make(what, chosen, camera, self._folder)
         self._will.content = "" if will is None else render("share_will", will=will)
         self._made.content = self._html(view)
 
     def _start(self, client: viser.ClientHandle | None) -> None:
-        chosen, what = self._chosen, WHAT.get(self._what.value)
-        if not chosen.sources or what is None:
+        chosen, what = self._chosen, WHAT[self._what.value]
+        if not chosen.sources:
             return
         wanted = Wanted(what, chosen.sources, Path(), eye=_eye_of(client) if chosen.in_view else None)
         if what == "lerobot":

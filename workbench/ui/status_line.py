@@ -14,10 +14,10 @@ from workbench.session.env_table import EnvRows
 from workbench.session.last_words import Busy
 from workbench.session.view import SessionView
 from workbench.ui.env_panel import first_flagged, mask
-from workbench.ui.fragments import place, render
+from workbench.ui.fragments import counted, place, render
 from workbench.ui.parts import Clock, Part
 from workbench.ui.presses import Presses
-from workbench.ui.timeline_strip import step_in_words
+from workbench.ui.timeline_panel import step_in_words
 from workbench.ui.version_panel import took
 
 NEWS = 6.0
@@ -140,7 +140,7 @@ def status_values(view: SessionView, fresh: bool = False, marked: bool = False) 
         "backend": "" if task is None else task.backend,
         "device": "" if task is None else task.device,
         "at": step_in_words(view),
-        "envs": "" if task is None else ("1 env" if task.num_envs == 1 else f"{task.num_envs} envs"),
+        "envs": "" if task is None else counted(task.num_envs, "env"),
         "moving": moving,
         "steps_per_second": f"{view.steps_per_second:.0f}",
         "env_steps_per_second": ""

@@ -36,7 +36,7 @@ from workbench.session.step_back import (
     write_source,
 )
 from workbench.session.view import SessionView
-from workbench.ui.busy_banner import is_shown as is_busy_for_long
+from workbench.ui.banner import is_busy_for_long
 from workbench.ui.fragments import render
 from workbench.ui.parts import Part
 from workbench.ui.put_together import Workplace
@@ -315,7 +315,6 @@ class StepInPart(Part[ReviewView]):
             self._besides.content = render("note", text=words) if words else ""
 
     def _chosen(self) -> None:
-        # What a page sends as its choice may be anything.
         self._step_in.recorded_source = self._code.value == RECORDED
         self._step_in.everywhere = self._envs.value == ALL
 

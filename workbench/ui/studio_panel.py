@@ -26,18 +26,20 @@ from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera, StudioView
 from workbench.session.view import SessionView
+from workbench.ui.camera_compare import CameraCompare
+from workbench.ui.camera_export import CameraExport
 from workbench.ui.camera_frustums import Placed
 from workbench.ui.camera_gizmo import CameraGizmo
-from workbench.ui.camera_judging import CameraJudging
 from workbench.ui.camera_lens import CameraLens
 from workbench.ui.camera_moves import Floats, Frame, Snap, nudged, panned
 from workbench.ui.camera_numbers import CameraNumbers
 from workbench.ui.camera_pick import CameraPick
+from workbench.ui.camera_suggest import CameraSuggest
+from workbench.ui.camera_verdict import CameraVerdict
 from workbench.ui.camera_writing import CameraWriting
 from workbench.ui.cameras_panel import KIND_NAMES
 from workbench.ui.commands import Command
-from workbench.ui.control_values import checked_choice
-from workbench.ui.controls import Control
+from workbench.ui.controls import Control, refusals_told
 from workbench.ui.fragments import render
 from workbench.ui.look_through import LookThrough
 from workbench.ui.parts import Clock, Part
@@ -89,7 +91,7 @@ class StudioPanel(Part[SessionView]):
         choices: tuple[str, ...] = (NOBODY,)
         self._choice: Control[Any, Any] = Control(
             gui.add_dropdown("Camera", choices, initial_value=NOBODY, visible=False),
-            read=lambda value: self._names[checked_choice(value, self._names, "camera")],
+            read=lambda name: self._names.get(name),
             send=self.select,
             shown=self._name_of,
         )
@@ -103,7 +105,9 @@ class StudioPanel(Part[SessionView]):
         self._numbers = CameraNumbers(server, self._placing, look_at=lambda: self._look_at)
         self._lens = CameraLens(server, self._placing)
         self._writing.add_members()
-        self._judging = CameraJudging(server, session)
+        verdict, compare = CameraVerdict(server, session), CameraCompare(server, session)
+        self._suggest = CameraSuggest(server, session)
+        self._folders = verdict, compare, self._suggest, CameraExport(server, session)
         self._presses = Presses(server)
         with self._picture.folder:
             self._pick = CameraPick(server, session, self._presses)
@@ -139,7 +143,7 @@ class StudioPanel(Part[SessionView]):
             offset: (3,) where the selected env stands in the view.
         """
         self._placing.offset = offset
-        self._judging.draw_in_view(view, offset)
+        self._suggest.draw_in_view(view, offset)
         self._pick.draw_in_view(view, offset)
         chosen = self._shown(view.studio)
         camera = chosen if view.timeline.shown is None else None
@@ -180,7 +184,10 @@ class StudioPanel(Part[SessionView]):
         self._lens.draw(camera)
         self._picture.draw(view)
         self._pick.draw(view, shown=self._picture.visible)
-        self._judging.draw(view)
+        for part in self._folders:
+            # Folders without a subject would be dead controls.
+            part.folder.visible = chosen is not None
+            part.draw(view)
         if chosen is not None:
             self._facts.content = self._facts_of(chosen, view)
         if camera is not None:
@@ -332,12 +339,10 @@ class StudioPanel(Part[SessionView]):
     def _put(self, client: viser.ClientHandle | None) -> None:
         if client is None:
             return
-        try:
+        with refusals_told(client):
             camera, now, frame = self._placing.require()
             self._placing.begin()
             self._placing.place(camera.key, self._look.settings_from(client, now, frame), "viewer")
-        except ValueError as error:
-            client.add_notification("Not possible", str(error), color="orange", auto_close_seconds=6.0)
 
     def _new_from_viewer(self, client: viser.ClientHandle, settings: CameraSettings) -> CameraSettings:
         return self._look.settings_from(client, settings, Frame(None, self._placing.offset))

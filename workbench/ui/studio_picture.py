@@ -10,19 +10,17 @@ from __future__ import annotations
 import math
 import time
 
-import numpy as np
 import viser
-from numpy.typing import NDArray
 
 from workbench.core.camera_settings import CameraKey
 from workbench.core.pictures import Picture
 from workbench.session.preview import MODALITIES as IN_A_QUICK_LOOK
 from workbench.session.session import Session
 from workbench.session.view import SessionView
-from workbench.ui.cameras_panel import FASTEST, modalities_of
+from workbench.ui.cameras_panel import FASTEST, CameraImage, modalities_of
 from workbench.ui.false_colour import DepthRange
 from workbench.ui.fragments import render
-from workbench.ui.in_colours import COLOUR, depth_span, image_format, in_colours
+from workbench.ui.in_colours import COLOUR, depth_span, in_colours
 from workbench.ui.parts import Clock
 
 
@@ -31,7 +29,6 @@ class StudioPicture:
 
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
         self._server, self._session = server, session
-        self._picture: viser.GuiImageHandle | None = None
         self._drawn: tuple[CameraKey, Picture, str] | None = None
         self._clock, self._drawn_at = clock, -math.inf
         self._span: DepthRange | None = None
@@ -41,6 +38,7 @@ class StudioPicture:
         self.folder = server.gui.add_folder(None)
         with self.folder:
             server.gui.add_html(render("studio_picture"))
+        self._picture = CameraImage(server, self.folder)
         self._caption = server.gui.add_html("", visible=False)
 
     @property
@@ -53,7 +51,7 @@ class StudioPicture:
 
     @property
     def visible(self) -> bool:
-        return self._picture is not None and self._picture.visible
+        return self._picture.visible
 
     def draw(self, view: SessionView) -> None:
         studio, key = view.studio, view.studio.selected
@@ -66,9 +64,8 @@ class StudioPicture:
             picture = studio.quick
             if studio.wants_quick:
                 self._session.studio.look()
-        if self._picture is not None:
-            # The last one stays while the next is drawn; that of another camera does not.
-            self._picture.visible = self._drawn is not None and self._drawn[0] == key
+        # The last one stays while the next is drawn; that of another camera does not.
+        self._picture.show(self._drawn is not None and self._drawn[0] == key)
         self._caption.visible = self.visible and bool(self._caption.content)
         kind = self.shows
         if key is None or picture is None or picture.env != view.selected_env or view.task is None:
@@ -81,15 +78,5 @@ class StudioPicture:
         if coloured is None:
             return  # it is not there yet
         self._drawn, self._drawn_at = (key, picture, kind), self._clock()
-        self._put(kind, *coloured)
-
-    def _put(self, kind: str, pixels: NDArray[np.uint8], caption: str) -> None:
-        form = image_format(kind)
-        if self._picture is None:
-            with self.folder:
-                self._picture = self._server.gui.add_image(pixels, format=form, jpeg_quality=80)
-        else:
-            self._picture.format = form
-            self._picture.image = pixels
-            self._picture.visible = True
-        self._caption.content = caption
+        pixels, self._caption.content = coloured
+        self._picture.draw(kind, pixels)

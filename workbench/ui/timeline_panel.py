@@ -13,20 +13,27 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import groupby
+from typing import Any, Protocol, TypeVar
 
+import numpy as np
 import viser
+from numpy.typing import NDArray
 
+from workbench.session.history import FAIL, NOT_A_NUMBER, RESET, SUCCESS, TRUNCATED, WENT_BACK
 from workbench.session.session import Session
-from workbench.session.timeline import Scope
+from workbench.session.timeline import Scope, Strip
 from workbench.session.view import SessionView
-from workbench.ui.control_values import checked_int, name_control
+from workbench.ui.control_values import name_control
 from workbench.ui.controls import Control
-from workbench.ui.fragments import render
-from workbench.ui.over_the_view import GAP, FitsTheView
+from workbench.ui.fragments import counted, render
 from workbench.ui.parts import Clock, DrawDue, Part
-from workbench.ui.timeline_strip import strip_values
 
-WIDEST, NARROWEST = 760, 280
+GAP = 12
+"""Pixels between what lies over the view and its edges; as ``view_width.js`` has it."""
+WIDEST = 760
 HEIGHT = 205
 """Pixels of the view that it lies over, for whoever frames a scene."""
 REDRAW_EVERY = 0.2
@@ -41,58 +48,119 @@ GO_ON = "Go on from here"
 UNDO = "undo"
 """How the button begins that takes back a jump; what and of how many envs follows."""
 WALK = (LAST_EVENT, LAST_STEP, NEXT_STEP, NEXT_EVENT, NOW, EPISODE)
+View = TypeVar("View", contravariant=True)
 
 
-class TimelinePanel(Part[SessionView]):
-    def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
-        self._session, self._clock = session, clock
+class Seeks(Protocol):
+    """What is moved through time; its own module says what a place in time is."""
+
+    def seek(self, place: Any, /) -> None: ...
+    def seek_by(self, steps: int, /) -> None: ...
+    def seek_event(self, direction: int, /) -> None: ...
+
+
+class TimeBar(Part[View]):
+    """A slider over time, a strip under it and a row of buttons, across the bottom of the view.
+
+    Args:
+        seeks: What slider, buttons and arrow keys move.
+        name: Of the slider.
+        does: What further buttons do, by how they begin.
+    """
+
+    def __init__(
+        self,
+        server: viser.ViserServer,
+        seeks: Seeks,
+        name: str,
+        does: dict[str, Callable[[], None]],
+        clock: Clock,
+    ) -> None:
+        self._seeks = seeks
+        steps = {LAST_STEP: -1, NEXT_STEP: 1}
+        events = {LAST_EVENT: -1, NEXT_EVENT: 1}
+        self._does = {
+            **{label: partial(seeks.seek_by, by) for label, by in steps.items()},
+            **{label: partial(seeks.seek_event, by) for label, by in events.items()},
+            **does,
+        }
         gui = server.gui
         self._panel = gui.add_panel(visible=False, order=10.0)
         with self._panel.add_tab("Timeline", viser.Icon.HISTORY):
-            self._slider = Control(
-                gui.add_slider("", min=-1, max=0, step=1, initial_value=0),
-                read=lambda value: checked_int(value, -(10**9), 0, "step of the past"),
-                send=self._seek,
-                clock=clock,
+            self._slider: Control[viser.GuiSliderHandle[int], int] = Control(
+                gui.add_slider("", min=-1, max=0, step=1, initial_value=0), self._on_slider, clock=clock
             )
-            name_control(self._slider.handle, "step of the past")
+            name_control(self._slider.handle, name)
             self._strip = gui.add_html("")
-            # One of these two rows is there, and they are equally high: a panel that grows is moved up only a moment
-            # later, its last row is cut off until then, and a second press on "step" would meet another button.
-            self._hint = gui.add_html("")
-            self._travel = gui.add_button_group("", (GO_ON,), visible=False)
-            self._walk = gui.add_button_group("", WALK)
-            name_control(self._travel, "way to go on")
+            self._add_rows(gui)
+            self._walk: viser.GuiButtonGroupHandle = gui.add_button_group("", tuple(self._does))
             name_control(self._walk, "step to take")
         self._walk.on_click(lambda event: self._on_walk(event.target.value))
-        self._travel.on_click(lambda event: self._on_travel(event.target.value))
         # Across the bottom of the view: viser docks panels at the sides only.
         self._panel.float(x=GAP, y=-GAP, width=WIDEST)
-        self._fits = FitsTheView(server, self._panel, WIDEST, NARROWEST)
-        self._episode_only = False
-        self._range = (0, 0)
-        """Serials of the slider's ends."""
         self._shown: int | None = None
         self._before_slider: int | None = None
         """What was shown before the slider was last moved."""
+
+    def _add_rows(self, gui: viser.GuiApi) -> None:
+        """Between the strip and the buttons."""
+
+    def step_by(self, steps: int) -> None:
+        """An arrow key."""
+        if not Control.took_the_key():
+            self._seeks.seek_by(steps)
+
+    def to_event(self, direction: int) -> None:
+        """An arrow key with shift; what a slider that has the focus made of it is taken back."""
+        if Control.took_the_key():
+            self._seeks.seek(self._before_slider)
+        self._seeks.seek_event(direction)
+
+    def _on_slider(self, value: int) -> None:
+        self._before_slider = self._shown
+        self._seeks.seek(self._place_of(value))
+
+    def _place_of(self, value: int) -> int | None:
+        return value
+
+    def _on_walk(self, name: str) -> None:
+        next(does for label, does in self._does.items() if name.startswith(label))()
+
+    def _draw_panel(self, there: bool, shown: int | None) -> bool:
+        self._panel.visible = there
+        self._shown = shown
+        return there
+
+    def _set_ends(self, low: int, high: int) -> None:
+        handle = self._slider.handle
+        # Never an empty range, which the browser divides by.
+        handle.min, handle.max, handle.visible = min(low, high - 1), high, low < high
+
+
+class TimelinePanel(TimeBar[SessionView]):
+    def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
+        zooms = {EPISODE: partial(self._zoom, True), EVERYTHING: partial(self._zoom, False)}
+        does = {NOW: self.go_live, **zooms, UNDO: session.past.undo}
+        super().__init__(server, session.past, "step of the past", does, clock)
+        self._session, self._clock = session, clock
+        self._travel.on_click(lambda event: self._on_travel(event.target.value))
+        self._episode_only = False
+        self._range = (0, 0)
+        """Serials of the slider's ends."""
         self._newest = 0
         """The serial that the page last took for 0."""
         self._range_at = -math.inf
         self._strip_due = DrawDue(REDRAW_EVERY, clock)
         self._stood: tuple[object, float] = (None, 0.0)
 
+    def _add_rows(self, gui: viser.GuiApi) -> None:
+        # One of these two is there, and they are equally high: a panel that grows is moved up only a moment later, its
+        # last row is cut off until then, and a second press on "step" would meet another button.
+        self._hint = gui.add_html("")
+        self._travel = gui.add_button_group("", (GO_ON,), visible=False)
+        name_control(self._travel, "way to go on")
+
     # --- what buttons and keys do ------------------------------------------------------------------
-
-    def step_by(self, steps: int) -> None:
-        """An arrow key."""
-        if not Control.took_the_key():
-            self._session.past.seek_by(steps)
-
-    def to_event(self, direction: int) -> None:
-        """An arrow key with shift; what a slider that has the focus made of it is taken back."""
-        if Control.took_the_key():
-            self._session.past.seek(self._before_slider)
-        self._session.past.seek_event(direction)
 
     def go_live(self) -> None:
         self._session.past.seek(None)
@@ -104,24 +172,13 @@ class TimelinePanel(Part[SessionView]):
     def go_on(self) -> None:
         self._session.past.go_on("this")
 
-    def _seek(self, value: int) -> None:
-        self._before_slider = self._shown
-        self._session.past.seek(None if value == 0 else self._newest + value)
+    def _place_of(self, value: int) -> int | None:
+        return None if value == 0 else self._newest + value
 
-    def _on_walk(self, name: object) -> None:
-        if name in (LAST_STEP, NEXT_STEP):
-            self._session.past.seek_by(1 if name == NEXT_STEP else -1)
-        elif name in (LAST_EVENT, NEXT_EVENT):
-            self._session.past.seek_event(1 if name == NEXT_EVENT else -1)
-        elif name == NOW:
-            self.go_live()
-        elif name in (EPISODE, EVERYTHING):
-            self._episode_only = name == EPISODE
-            self._range_at = -math.inf
-        elif isinstance(name, str) and name.startswith(UNDO):
-            self._session.past.undo()
+    def _zoom(self, episode_only: bool) -> None:
+        self._episode_only, self._range_at = episode_only, -math.inf
 
-    def _on_travel(self, name: object) -> None:
+    def _on_travel(self, name: str) -> None:
         for scope, label in zip(SCOPES, self._travel.options, strict=False):
             if label == name:
                 self._session.past.go_on(scope)
@@ -129,17 +186,12 @@ class TimelinePanel(Part[SessionView]):
     # --- drawing -----------------------------------------------------------------------------------
 
     def draw(self, view: SessionView) -> None:
-        past = view.timeline
-        there = view.task is not None and past.moments > 0
-        self._panel.visible = there
-        if not there or view.task is None:
-            return
-        self._shown = past.shown
-        self._fits.fit()
-        self._draw_slider(view)
-        self._draw_buttons(view)
-        self._draw_strip(view)
-        self._ask_for_pictures(view)
+        there = view.task is not None and view.timeline.moments > 0
+        if self._draw_panel(there, view.timeline.shown):
+            self._draw_slider(view)
+            self._draw_buttons(view)
+            self._draw_strip(view)
+            self._ask_for_pictures(view)
 
     def _draw_slider(self, view: SessionView) -> None:
         past, now = view.timeline, self._clock()
@@ -149,10 +201,7 @@ class TimelinePanel(Part[SessionView]):
             stretch = self._session.past.stretch() if self._episode_only else None
             self._range = (past.first, past.last) if stretch is None else stretch
             self._newest = past.last
-            low, high = (serial - self._newest for serial in self._range)
-            handle = self._slider.handle
-            # Never an empty range, which the browser divides by.
-            handle.min, handle.max = min(low, high - 1), high
+            self._set_ends(*(serial - self._newest for serial in self._range))
         self._slider.show(0 if past.shown is None else past.shown - self._newest)
 
     def _draw_buttons(self, view: SessionView) -> None:
@@ -192,3 +241,113 @@ def go_on_labels(view: SessionView) -> tuple[str, ...]:
         return (GO_ON,)
     env = f"env {view.selected_env}"
     return (f"{GO_ON}: {env}", "all envs", f"{env} into all envs")
+
+
+POINTS = 240
+"""Of the reward's line, each the least and the greatest of its steps: a spike of one step stays visible."""
+LINE_HEIGHT = 30.0
+"""Units of the picture's height that the line has; the marks are above."""
+MARKS: tuple[tuple[int, str, str], ...] = (
+    (NOT_A_NUMBER, "odd", "reward is NaN or infinite"),
+    (FAIL, "fail", "fail"),
+    (SUCCESS, "success", "success"),
+    (TRUNCATED, "limit", "time limit"),
+    (WENT_BACK, "back", "went back"),
+    (RESET, "reset", "reset"),
+)
+"""Which of them is drawn where several happened, in this order: the flag, its style, its name."""
+MOST_MARKS = 150
+
+
+def place_between(low: float, high: float, at: float) -> float:
+    """Per cent of the strip's width."""
+    return round(100 * (at - low) / max(high - low, 1), 3)
+
+
+def strip_values(strip: Strip, view: SessionView) -> dict[str, object]:
+    """What the template ``timeline`` is given; places are per cent of the strip's width."""
+    past = view.timeline
+    place = partial(place_between, strip.low, strip.high)
+    origins = dict(strip.branches)
+    marks = []
+    for serial, flags in strip.events[-MOST_MARKS:]:
+        style, name = next((style, name) for flag, style, name in MARKS if flags & flag)
+        if style == "back":
+            origin = origins.get(serial)
+            name = "from a recording" if origin is None else f"went back {counted(serial - origin, 'step')}"
+        marks.append({"x": place(serial), "style": style, "name": name, "ago": past.last - serial})
+    arcs = [
+        {
+            "a": place(max(origin, strip.low)),
+            "b": place(at),
+            "middle": (place(max(origin, strip.low)) + place(at)) / 2,
+        }
+        for at, origin in strip.branches
+    ]
+    bands = [
+        {"x": place(a), "width": round(place(b) - place(a), 3), "odd": number % 2, "branch": a in origins}
+        for number, (a, b) in enumerate(strip.stretches)
+    ]
+    shown = past.last if past.shown is None else past.shown
+    return {
+        "marks": marks,
+        "arcs": arcs,
+        "bands": bands,
+        "lines": reward_lines(strip.reward),
+        "cursor": place(min(max(shown, strip.low), strip.high)),
+        "live": past.shown is None,
+        "ago": past.last - shown,
+        "where": where(view),
+        "used": megabytes(past.used),
+        "limit": megabytes(past.limit),
+        "moments": past.moments,
+        "kinds": [(style, name) for _, style, name in MARKS if any(m["style"] == style for m in marks)],
+    }
+
+
+def step_in_words(view: SessionView) -> str:
+    """How far the selected env is into its episode: a single step is too small to be seen in the view."""
+    task, step = view.task, view.step
+    if task is None or step is None or view.selected_env >= len(step.elapsed_steps):
+        return ""
+    limit = f" / {task.max_episode_steps}" if task.max_episode_steps else ""
+    env = "" if task.num_envs == 1 else f"env {view.selected_env}: "
+    return f"{env}step {int(step.elapsed_steps[view.selected_env])}{limit}"
+
+
+def where(view: SessionView) -> str:
+    """Env, step of its episode and simulated time of what is shown."""
+    words = step_in_words(view)
+    if not words or view.task is None or view.step is None:
+        return words
+    return f"{words}, {view.step.elapsed_steps[view.selected_env] * view.task.control_dt:.2f} s"
+
+
+def reward_lines(reward: NDArray[np.float32]) -> list[str]:
+    """SVG polylines of the finite rewards over x 0..100 and y 0..`LINE_HEIGHT`, greatest on top, with a gap where there
+    is none; no line without two different ones."""
+    finite = reward[np.isfinite(reward)]
+    if not len(finite) or finite.min() == finite.max():
+        return []
+    low, high = float(finite.min()), float(finite.max())
+    known = np.where(np.isfinite(reward), reward, np.nan)
+    if len(known) <= POINTS:
+        places, values = np.arange(len(known)), known
+    else:
+        edges = np.linspace(0, len(known), POINTS // 2 + 1).astype(int)[:-1]
+        values = np.stack([np.fmin.reduceat(known, edges), np.fmax.reduceat(known, edges)], 1).reshape(-1)
+        places = np.repeat(edges, 2)
+    x = 100 * places / (len(known) - 1)
+    y = LINE_HEIGHT * (1 - (values - low) / (high - low))
+    return polylines([None if np.isnan(b) else f"{a:.2f},{b:.1f}" for a, b in zip(x, y, strict=True)])
+
+
+def polylines(points: Sequence[str | None]) -> list[str]:
+    """What SVG's polylines are given for these points, with a gap at each None."""
+    runs = [[point for point in run if point] for there, run in groupby(points, key=bool) if there]
+    # A line of one point is not drawn; one of length zero with round ends is a dot.
+    return [" ".join(run if len(run) > 1 else run * 2) for run in runs]
+
+
+def megabytes(size: int) -> str:
+    return f"{size / 1024**2:.0f}" if size >= 10 * 1024**2 else f"{size / 1024**2:.1f}"

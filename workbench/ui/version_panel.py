@@ -17,7 +17,6 @@ from workbench.authoring.problem import Problem
 from workbench.session.messages import LoadLevel, ReloadReport
 from workbench.session.session import Session
 from workbench.session.view import SessionView
-from workbench.ui.control_values import checked_choice
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
 from workbench.ui.parts import Part
@@ -42,7 +41,6 @@ class VersionPanel(Part[SessionView]):
         with server.gui.add_folder("Version of the file"):
             self._task = Control(
                 add_dropdown("Task", self._names, visible=False, hint="The file has several tasks."),
-                read=lambda value: checked_choice(value, self._names, "task"),
                 send=session.versions.choose_class,
             )
             self._html = server.gui.add_html("")

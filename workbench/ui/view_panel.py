@@ -41,7 +41,7 @@ class ViewPanel(Part[SessionView]):
 
     @property
     def triangles(self) -> int:
-        return DETAILS.get(self._detail.value, DETAILS["normal"])
+        return DETAILS[self._detail.value]
 
     def toggle_only_selected(self) -> None:
         self._show.value = ALL if self.only_selected else ONE

@@ -1,7 +1,5 @@
-// How wide the timeline may be, for the style sheet: --wb-timeline-most, in pixels.
-//
-// What lies over the view must not lie over the controls beside it. The server fits the timeline when a page has said
-// how wide its view has become; while a docked panel opens that is some frames too late, and the controls are covered.
+// How wide what lies over the view may be, for the style sheet, in pixels: --wb-timeline-most, and --wb-view-most of what
+// begins at the view's right edge. It must not lie over the controls beside the view.
 "use strict";
 {
   const GAP = 12; // as timeline_panel.py has it
@@ -12,7 +10,9 @@
     // page takes the other's place there is no timeline, and the view may not change any more once there is one.
     const left = panel ? panel.getBoundingClientRect().left : inView.left + GAP;
     const most = inView.right - left - GAP;
-    document.documentElement.style.setProperty("--wb-timeline-most", `${most}px`);
+    const { style } = document.documentElement;
+    style.setProperty("--wb-timeline-most", `${most}px`);
+    style.setProperty("--wb-view-most", `${inView.width - 2 * GAP}px`);
   });
   const looked = new MutationObserver(() => {
     const view = document.querySelector("canvas[data-engine]");
