@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from workbench.task_arguments import Rules, history_bytes, task_options
+from workbench.task_arguments import EnvArguments, Rules, history_bytes
 
 
 @pytest.mark.parametrize(
@@ -16,7 +16,7 @@ def test_a_size_is_read_as_people_write_it(text: str, size: int) -> None:
 
 @pytest.mark.parametrize("rules", ["stop", "warn", "off", None])
 def test_the_degree_of_the_rules_is_an_option_of_the_task(rules: Rules) -> None:
-    assert task_options(4, "cpu", 0, (), rules).rules == rules
+    assert EnvArguments(4, "cpu", rules).options().rules == rules
 
 
 @pytest.mark.parametrize("text", ["", "0", "many", "-3MB", "12XB", "1e9MB", "10", "nan GB", "9" * 400 + "GB"])
@@ -34,11 +34,11 @@ def test_the_limits_themselves_are_taken_and_what_is_past_them_is_not(
     num_envs: int, seed: int, named: str | None
 ) -> None:
     if named is None:
-        options = task_options(num_envs, "cpu", seed, ())
+        options = EnvArguments(num_envs, seed=seed).options()
         assert (options.num_envs, options.seed) == (num_envs, seed)
     else:
         with pytest.raises(ValueError, match=named):
-            task_options(num_envs, "cpu", seed, ())
+            EnvArguments(num_envs, seed=seed).options()
 
 
 def test_the_smallest_and_the_largest_history_are_taken() -> None:
@@ -49,12 +49,11 @@ def test_the_smallest_and_the_largest_history_are_taken() -> None:
 
 
 def test_an_argument_of_the_env_is_json_or_else_a_string() -> None:
-    options = task_options(
-        1, "cpu", 0, ("robot_uids=fetch", "flag=true", "size=0.5", "pair=[1, 2]", "text=a=b")
-    )
+    given = ("robot_uids=fetch", "flag=true", "size=0.5", "pair=[1, 2]", "text=a=b")
+    options = EnvArguments(env=given).options()
     assert options.env_kwargs == {
         "robot_uids": "fetch", "flag": True, "size": 0.5, "pair": [1, 2], "text": "a=b",
     }  # fmt: skip
     for wrong in ("robot_uids", "=1", "a-b=1", "1a=1"):
         with pytest.raises(ValueError, match="--env takes name=value"):
-            task_options(1, "cpu", 0, (wrong,))
+            EnvArguments(env=(wrong,)).options()

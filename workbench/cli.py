@@ -21,15 +21,23 @@ from workbench.exit_codes import Exit
 from workbench.machine.guarded_terminal import guard_terminal
 from workbench.machine.quick_imports import quick_imports
 from workbench.machine.software_vulkan import use_private_driver
-from workbench.task_arguments import Backend, Rules, history_bytes, imported, task_options
+from workbench.session.record_options import RecordArguments
+from workbench.task_arguments import (
+    BatchArguments,
+    EnvArguments,
+    Imports,
+    PageArguments,
+    Rules,
+    history_bytes,
+    imported,
+)
 from workbench.terminal import err, print_finding, print_problem, refuse, say
 from workbench.terminal import out as terminal
 
 Task = Annotated[str, tyro.conf.Positional]
 """A task file, ``file.py:ClassName``, ``package.module:ClassName``, or a registered env id such as ``PickCube-v1``."""
 
-Imports = Annotated[tuple[str, ...], tyro.conf.UseAppendAction, tyro.conf.arg(name="import")]
-"""Modules that register tasks."""
+_FEW = EnvArguments(num_envs=4)
 
 app = tyro.extras.SubcommandApp()
 
@@ -38,37 +46,22 @@ app = tyro.extras.SubcommandApp()
 def open_page(
     task: Task,
     /,
-    num_envs: int = 16,
-    backend: Backend = "auto",
-    seed: int = 0,
-    host: str = "127.0.0.1",
-    port: int = 8080,
-    socket: Path | None = None,
-    token: bool = True,
+    *,
+    envs: EnvArguments,
+    page: PageArguments,
     recordings: Path = Path("recordings"),
     history: str = "256MB",
     memory_limit: str = "auto",
     spare: bool = True,
     trust: bool = False,
-    rules: Rules = None,
     debug: bool = False,
     debug_port: int | None = None,
     debug_wait: bool = False,
-    env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
-    imports: Imports = (),
 ) -> int:
     """Open a task in a browser page that follows its file.
 
     Args:
         task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
-        num_envs: environments to run at once.
-        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto: cpu, while no test of gpu has passed anywhere.
-        seed: seed of the first reset; env i gets seed + i.
-        host: address to listen on; anything but this machine's own needs the token.
-        port: port of the page; 0 takes any free one.
-        socket: listen on a Unix socket with this path instead, for machines that others use too: only you can
-            connect, by the ssh line that is printed.
-        token: ask for the token of the printed address (--no-token: this machine only).
         recordings: folder for recorded episodes.
         history: memory that the steps of the past may take, such as 64MB or 2GB; the oldest go first.
         memory_limit: memory that the task's process may use, such as 8GB; auto is 80 % of this machine's, none
@@ -76,15 +69,10 @@ def open_page(
         spare: keep a second process ready to take over when the task's dies (--no-spare: it then takes some
             seconds more, and about 0.8 GB of memory less).
         trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it.
-        rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
-            given, what writes over the state of other envs stops, all else is a warning.
         debug: let a debugger (debugpy, as of VS Code) attach to the task's process, from this machine only; breakpoint()
             stops for it. Whoever else can log in to this machine can attach as well.
         debug_port: port for the debugger; 5678 if it is free, else any. Means --debug.
         debug_wait: load the task only when a debugger has attached. Means --debug.
-        env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
-        imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
-            repeatable.
     """
     from workbench.authoring.reference import why_not_there
 
@@ -97,17 +85,17 @@ def open_page(
     from workbench.ui.door import DoorOptions
 
     try:
-        options = task_options(num_envs, backend, seed, env, rules, imports)
+        options = envs.options()
         past = history_bytes(history)
         debug = debug or debug_wait or debug_port is not None
-        if debug and socket is not None:
+        if debug and page.socket is not None:
             raise ValueError(
                 "--debug opens a port that every user of this machine can connect to, which --socket is there to avoid: "
                 "leave one of them out"
             )
         at_port = port_for_debugger(debug_port) if debug else None
         worker = WorkerOptions(parse_memory(memory_limit), spare, at_port, debug_wait)
-        at = DoorOptions(host=host, port=port, socket=socket, token=token)
+        at = DoorOptions(**vars(page))
     except ValueError as error:
         return refuse(str(error))
     return open_in_terminal(task, options, at, worker, recordings, past, trust)
@@ -115,53 +103,19 @@ def open_page(
 
 @app.command
 def record(
-    task: Task,
-    /,
-    episodes: int | None = None,
-    successes: int | None = None,
-    tries: int | None = None,
-    num_envs: int = 4,
-    workers: int = 1,
-    seed: int = 0,
-    actions: str = "random",
-    use_env_states: bool = False,
-    out: Path = Path("recordings"),
-    pictures: bool = True,
-    max_steps: int | None = None,
-    backend: Backend = "auto",
-    rules: Rules = None,
+    recording: Annotated[RecordArguments, tyro.conf.PositionalRequiredArgs],
+    envs: EnvArguments = _FEW,
     debug: bool = False,
-    env: Annotated[tuple[str, ...], tyro.conf.UseAppendAction] = (),
-    imports: Imports = (),
 ) -> int:
     """Record episodes of a task without a page: for each an .rrd, and ManiSkill's own .h5 with its .json.
 
     Args:
-        task: a task file, file.py:ClassName, package.module:ClassName, or a registered env id such as PickCube-v1.
-        episodes: how many, over all envs; 4, or as many as a file of actions has.
-        successes: go on until so many episodes succeeded, and keep no others.
-        tries: give up after so many episodes where successes are wanted; 100 for each.
-        num_envs: environments to run at once, over all workers.
-        workers: processes, each with its share of the envs; the episodes are the same with any number.
-        seed: seed of the first episode; each further one counts up.
-        actions: random, zero, hold; a policy as module:function or file.py:function; or a file: .npy or .npz with
-            actions, or .h5 with ManiSkill's demonstrations, which begin from their own seeds.
-        use_env_states: put every env state of a demonstration back after its step.
-        out: folder for the files.
-        pictures: record what every camera sees (--no-pictures is much faster).
-        max_steps: longest episode; else the task's own limit.
-        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto: cpu, while no test of gpu has passed anywhere.
-        rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
-            given, what writes over the state of other envs stops, all else is a warning.
         debug: wait for a debugger (debugpy, as of VS Code) before the task is loaded, with one worker; breakpoint() stops for
             it. Whoever else can log in to this machine can attach as well.
-        env: further arguments of the task class, as name=value (value in JSON, or text); repeatable.
-        imports: a module that registers the task's id, such as lab.tasks, imported in the process that runs the task;
-            repeatable.
     """
     from workbench.authoring.reference import why_not_there
 
-    if (why := why_not_there(task)) is not None:
+    if (why := why_not_there(recording.task)) is not None:
         return refuse(why)
     use_private_driver()
     with quick_imports():
@@ -170,27 +124,22 @@ def record(
         from workbench.session.record import RecordOptions
 
     try:
-        options = task_options(num_envs, backend, seed, env, rules, imports)
-        if debug and workers > 1:
+        options = envs.options()
+        if debug and recording.workers > 1:
             raise ValueError("--debug is for one process: leave out --workers")
         if debug:
             debug_here(say)
     except ValueError as error:
         return refuse(str(error))
-    what = RecordOptions(
-        task, out, episodes, successes, tries, actions, use_env_states, pictures, max_steps, workers, options
-    )
-    return record_in_terminal(what, err, print_problem, refuse, print_finding)
+    return record_in_terminal(RecordOptions(**vars(recording), options=options))
 
 
 @app.command
 def review(
     folder: Annotated[Path, tyro.conf.Positional] = Path("recordings"),
     /,
-    host: str = "127.0.0.1",
-    port: int = 8080,
-    socket: Path | None = None,
-    token: bool = True,
+    *,
+    page: PageArguments,
     rules: Rules = None,
     task: Annotated[tuple[Path, ...], tyro.conf.UseAppendAction] = (),
     imports: Imports = (),
@@ -201,11 +150,6 @@ def review(
     Args:
         folder: where the recordings are, in folders below it too: .rrd, .h5 and .json of the workbench, and .h5
             with .json of ManiSkill's RecordEpisode.
-        host: address to listen on; anything but this machine's own needs the token.
-        port: port of the page; 0 takes any free one.
-        socket: listen on a Unix socket with this path instead, for machines that others use too: only you can
-            connect, by the ssh line that is printed.
-        token: ask for the token of the printed address (--no-token: this machine only).
         rules: what happens where a task that is opened from here breaks a rule of GPU simulation: stop, warn, or off
             to check none. If not given, what writes over the state of other envs stops, all else is a warning.
         task: a task file in which the envs of ManiSkill's recordings may be found; repeatable. Envs that ManiSkill
@@ -230,7 +174,7 @@ def review(
     from workbench.ui.door import DoorOptions
 
     try:
-        at = DoorOptions(host=host, port=port, socket=socket, token=token)
+        at = DoorOptions(**vars(page))
         base = TaskOptions(rules=rules, imports=imported(imports))
     except ValueError as error:
         return refuse(str(error))
@@ -244,12 +188,10 @@ def rescore(
     task: str | None = None,
     recorded_source: bool = False,
     use_env_states: bool = False,
-    num_envs: int = 16,
-    backend: Backend = "auto",
-    rules: Rules = None,
+    *,
+    batch: BatchArguments,
     csv: Path | None = None,
     json: Path | None = None,
-    imports: Imports = (),
     trust: bool = False,
 ) -> int:
     """Judge recorded episodes again with today's reward and evaluate, and say what is otherwise (on the page: Judge again).
@@ -260,14 +202,8 @@ def rescore(
             one each names.
         recorded_source: judge each by the text that it was recorded with.
         use_env_states: put every recorded state in after its step, so that nothing drifts from the record.
-        num_envs: episodes to run at once.
-        backend: cpu (batched), gpu (ManiSkill's GPU simulation), or auto: cpu, while no test of gpu has passed anywhere.
-        rules: what happens where the task breaks a rule of GPU simulation: stop, warn, or off to check none. If not
-            given, what writes over the state of other envs stops, all else is a warning.
         csv: also write the table to this file, as CSV.
         json: also write the table to this file, as JSON.
-        imports: a module that registers ids that recordings name, such as lab.tasks, imported in the processes that
-            run their tasks; repeatable.
         trust: run what recordings from elsewhere name or hold without asking, in this run; nothing is kept of it. Without
             it, and without a terminal to ask in, nothing is run and the exit code is 4.
     """
@@ -280,7 +216,7 @@ def rescore(
         if table is not None and not table.resolve().parent.is_dir():
             return refuse(f"there is no folder {table.resolve().parent} to write {table.name} into")
     try:
-        base = task_options(num_envs, backend, 0, (), rules, imports)
+        base = batch.options()
     except ValueError as error:
         return refuse(str(error))
     use_private_driver()
@@ -289,7 +225,7 @@ def rescore(
     from workbench.session.rescore_all import RescoreOptions
     from workbench.trust_prompt import not_trusted
 
-    what = RescoreOptions(places, task, recorded_source, use_env_states, num_envs, base)
+    what = RescoreOptions(places, task, recorded_source, use_env_states, batch.num_envs, base)
     try:
         return run_rescore(what, terminal, err, csv, json, print_finding, trust)
     except NotTrusted as error:
@@ -326,7 +262,7 @@ def share(
     from workbench.share_command import share_in_terminal
 
     use_private_driver()
-    return share_in_terminal(files, mp4, html, sheet, out, err, refuse)
+    return share_in_terminal(files, mp4, html, sheet, out)
 
 
 @app.command
@@ -356,21 +292,14 @@ def export(
         state: observations that become observation.state, such as agent/qpos; else all that the robot knows of itself.
         environment_state: observations that become observation.environment_state, such as extra; else none.
     """
+    if fps is not None and fps < 1:
+        return refuse(f"--fps must be 1 or more, not {fps}")
+    from workbench.recording.lerobot_export import ExportOptions
+    from workbench.recording.lerobot_frames import Choice
     from workbench.share_command import export_in_terminal
 
-    return export_in_terminal(
-        files,
-        lerobot,
-        only_successes,
-        only_fitting,
-        task,
-        fps,
-        cameras,
-        state,
-        environment_state,
-        err,
-        refuse,
-    )
+    choice = Choice(state, environment_state, cameras)
+    return export_in_terminal(files, lerobot, ExportOptions(choice, only_successes, only_fitting, task, fps))
 
 
 @app.command
@@ -412,7 +341,7 @@ def main(args: Sequence[str] | None = None) -> None:
             prog="workbench",
             description="Workbench: write ManiSkill tasks in front of a live, batched view of them.",
             args=args,
-            config=(tyro.conf.DisallowNone,),
+            config=(tyro.conf.OmitArgPrefixes, tyro.conf.DisallowNone),
         )
     except KeyboardInterrupt:  # in the seconds before a command listens for it: importing torch takes some
         code = refuse("interrupted")

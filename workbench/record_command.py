@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
-from rich.console import Console
 from rich.markup import escape
 from rich.progress import (
     BarColumn,
@@ -23,15 +22,14 @@ from rich.progress import Progress as Bar
 
 from workbench.authoring.library_names import named_like_library
 from workbench.authoring.modules import hidden_by_libraries
-from workbench.authoring.problem import Problem, TaskError
+from workbench.authoring.problem import TaskError
 from workbench.authoring.reference import named_file
 from workbench.core.backends import gpu_left_alone
-from workbench.core.rules import Finding
 from workbench.jobs.pool import PoolError
 from workbench.recording.landing import try_folder
 from workbench.recording.mend import mend
 from workbench.session.record import Progress, Recorded, RecordOptions, record, with_given_actions
-from workbench.terminal import say
+from workbench.terminal import err, print_finding, print_problem, refuse, say
 
 
 class _StopAtInterrupt:
@@ -56,13 +54,7 @@ class _StopAtInterrupt:
         self._say("ending after this step; Ctrl-C again ends at once")
 
 
-def record_in_terminal(
-    what: RecordOptions,
-    console: Console,
-    say_problem: Callable[[Problem], None],
-    refuse: Callable[[str], int],
-    say_finding: Callable[[Finding], None],
-) -> int:
+def record_in_terminal(what: RecordOptions) -> int:
     """Record, and say what came of it; returns the exit code."""
     columns = (
         TextColumn("{task.description}", markup=False),
@@ -77,13 +69,13 @@ def record_in_terminal(
         try_folder(what.out)
         asked, _ = with_given_actions(what)
         if mended := mend(what.out):
-            console.print(f"{_episodes(len(mended))} that an earlier recording left half written: mended")
+            err.print(f"{_episodes(len(mended))} that an earlier recording left half written: mended")
         file = named_file(what.task)
         for hidden in () if file is None else hidden_by_libraries(file.resolve()):
-            console.print(f"[yellow]{escape(named_like_library(hidden))}[/]", soft_wrap=True)
+            err.print(f"[yellow]{escape(named_like_library(hidden))}[/]", soft_wrap=True)
         if (left_alone := gpu_left_alone(what.options.backend)) is not None:
-            console.print(f"[yellow]{escape(left_alone)}[/]", soft_wrap=True)
-        with Bar(*columns, console=console) as bar:
+            err.print(f"[yellow]{escape(left_alone)}[/]", soft_wrap=True)
+        with Bar(*columns, console=err) as bar:
             row = bar.add_task("opening", total=asked.successes or asked.episodes)
             with _StopAtInterrupt(lambda words: bar.update(row, description=words)) as interrupt:
                 recorded = record(
@@ -91,11 +83,11 @@ def record_in_terminal(
                     lambda activity: bar.update(row, description=activity),
                     _Rate(bar, row, interrupt).show,
                     lambda: interrupt.asked,
-                    say_finding,
+                    print_finding,
                 )
             bar.update(row, completed=len(recorded.written), description="recorded")
     except TaskError as error:
-        say_problem(error.problem)
+        print_problem(error.problem)
         _say_what_is_kept(what, before)
         return 1
     except (OSError, ValueError, PoolError) as error:
@@ -103,7 +95,7 @@ def record_in_terminal(
         return refuse(str(error))
     except KeyboardInterrupt:
         return refuse("interrupted; episodes that had ended are kept")
-    return _say(asked, recorded, refuse)
+    return _say(asked, recorded)
 
 
 class _Rate:
@@ -131,7 +123,7 @@ def _say_what_is_kept(asked: RecordOptions, before: set[Path]) -> None:
         )
 
 
-def _say(asked: RecordOptions, recorded: Recorded, refuse: Callable[[str], int]) -> int:
+def _say(asked: RecordOptions, recorded: Recorded) -> int:
     for episode in recorded.written:
         ended = {None: "", True: "success", False: "no success"}[episode.success]
         say(f"{episode.path}  {episode.steps} steps  return {episode.total_reward:.3f}  {ended}".rstrip())

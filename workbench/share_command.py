@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from workbench.recording.lerobot_export import DoesNotFit, ExportOptions
-from workbench.recording.lerobot_frames import Choice
-from workbench.recording.sources import Source, sources_among
-from workbench.terminal import say
+from workbench.recording.sources import sources_among
+from workbench.terminal import err, refuse, say
 from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted, make
 
 SCENE, CAMERAS = "scene", "cameras"
@@ -23,8 +21,6 @@ def share_in_terminal(
     html: bool,
     sheet: bool,
     out: Path,
-    err: Console,
-    refuse: Callable[[str], int],
 ) -> int:
     """Returns the exit code."""
     try:
@@ -41,35 +37,19 @@ def share_in_terminal(
     wanted += [Wanted("sheet", sources, out)] if sheet else []
     if not wanted:
         return refuse("say what to make: --mp4 CAMERA, --mp4 scene, --html or --sheet")
-    return _make_all(wanted, err, refuse)
+    return _make_all(wanted)
 
 
-def export_in_terminal(
-    files: Sequence[Path],
-    folder: Path,
-    only_successes: bool,
-    only_fitting: bool,
-    task: str | None,
-    fps: int | None,
-    cameras: tuple[str, ...] | None,
-    state: tuple[str, ...],
-    environment_state: tuple[str, ...],
-    err: Console,
-    refuse: Callable[[str], int],
-) -> int:
+def export_in_terminal(files: Sequence[Path], folder: Path, options: ExportOptions) -> int:
     """Returns the exit code."""
-    if fps is not None and fps < 1:
-        return refuse(f"--fps must be 1 or more, not {fps}")
     try:
-        sources: tuple[Source, ...] = sources_among(files)
+        sources = sources_among(files)
     except (OSError, ValueError) as error:
         return refuse(str(error))
-    choice = Choice(state=state, environment=environment_state, cameras=cameras)
-    options = ExportOptions(choice, only_successes, only_fitting, task, fps)
-    return _make_all([Wanted("lerobot", sources, folder, export=options)], err, refuse)
+    return _make_all([Wanted("lerobot", sources, folder, export=options)])
 
 
-def _make_all(wanted: Sequence[Wanted], err: Console, refuse: Callable[[str], int]) -> int:
+def _make_all(wanted: Sequence[Wanted]) -> int:
     made: list[Made] = []
     not_made: list[str] = []
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeRemainingColumn())

@@ -37,6 +37,7 @@ from workbench.session.messages import Stepped, TaskOptions
 from workbench.session.open_task import OpenedTask, blamed, open_task, reset_checked, step_checked
 from workbench.session.policy import find_policy
 from workbench.session.record_acting import RecordActing
+from workbench.session.record_options import RecordArguments
 from workbench.session.recorded_pictures import recorded_pictures
 
 _STEPS_WITHOUT_LIMIT = 200
@@ -48,24 +49,9 @@ _ELSEWHERE = 1e-4
 
 
 @dataclass(frozen=True)
-class RecordOptions:
-    task: str
-    out: Path
-    episodes: int | None = None
-    """How many; None for 4, or for as many as the file of actions has."""
-    successes: int | None = None
-    """Record until so many succeeded, and keep no others."""
-    tries: int | None = None
-    """Give up after so many episodes where successes are wanted; None for 100 for each."""
-    actions: str = "random"
-    """``random``, ``zero``, ``hold``, a policy ``module:function`` or ``file.py:function``, or a file of actions."""
-    use_env_states: bool = False
-    """Put every env state of a demonstration back after its step, so that nothing drifts."""
-    pictures: bool = True
-    max_steps: int | None = None
-    """Longest episode; None takes the task's own limit, or 200 steps where it has none."""
-    workers: int = 1
-    """Processes; each has its share of the envs."""
+class RecordOptions(RecordArguments):
+    """What to record, and how its task is made."""
+
     options: TaskOptions = field(default_factory=lambda: TaskOptions(num_envs=4))
 
 
