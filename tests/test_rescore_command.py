@@ -9,7 +9,8 @@ import pytest
 from rich.console import Console
 
 from workbench.rescore_command import print_verdicts
-from workbench.session.rescore_messages import EpisodeFile, Verdict
+from workbench.session.rescore_messages import EpisodeFile
+from workbench.session.verdict import Verdict
 
 NAME = "WorkbenchPushCube-v1_seed626610453_env00_2026-11-22T01-07-22"
 VERDICTS = [

@@ -22,7 +22,8 @@ from workbench.machine.terminal_text import plain_text
 from workbench.session import rescore_words as words
 from workbench.session.clearance import Clearances
 from workbench.session.rescore_all import Progress, RescoreOptions, rescore_all
-from workbench.session.rescore_messages import Verdict
+from workbench.session.rescore_messages import EpisodeFile
+from workbench.session.verdict import Verdict
 from workbench.trust_prompt import TerminalPrompt, can_ask
 
 
@@ -77,12 +78,12 @@ def run_rescore(
     print_verdicts(verdicts, out)
     for note in (*notes, *words.not_carried(verdicts)):
         err.print(f"[yellow]{escape(plain_text(note))}[/]", soft_wrap=True)
-    if doubt := words.doubts(verdicts):
-        err.print(f"[yellow]{escape(plain_text(doubt))}[/]", soft_wrap=True)
+    if words.is_doubtful(verdicts):
+        err.print(f"[yellow]{escape(plain_text(words.doubts(verdicts, words.PUT_IN)))}[/]", soft_wrap=True)
     return Exit.DONE
 
 
-def print_verdicts(verdicts: list[Verdict], out: Console) -> None:
+def print_verdicts(verdicts: list[Verdict[EpisodeFile]], out: Console) -> None:
     """The table, and a sentence over all of it.
 
     Names of recordings take 55 characters. Where that leaves no room for the rest, as in a terminal of 80 columns, a
@@ -101,10 +102,10 @@ def print_verdicts(verdicts: list[Verdict], out: Console) -> None:
     out.print(escape(words.summary(verdicts)), soft_wrap=True)
 
 
-def _cells(verdict: Verdict) -> list[str]:
+def _cells(verdict: Verdict[EpisodeFile]) -> list[str]:
     judged = not verdict.why_not
     cells = [
-        verdict.file.name,
+        verdict.of.name,
         str(verdict.seed) if verdict.seed >= 0 else "",
         str(verdict.length) if judged else "",
         words.returns(verdict) if judged else "",
@@ -114,7 +115,7 @@ def _cells(verdict: Verdict) -> list[str]:
     return [plain_text(cell) for cell in cells]
 
 
-def _print_lines(verdict: Verdict, out: Console) -> None:
+def _print_lines(verdict: Verdict[EpisodeFile], out: Console) -> None:
     name, seed, steps, total, changed, drift = _cells(verdict)
     out.print(escape(name), style=_style(verdict), soft_wrap=True)
     named = (("seed", seed), ("steps", steps), ("return", total), ("drift", drift))
@@ -124,5 +125,5 @@ def _print_lines(verdict: Verdict, out: Console) -> None:
             out.print(Padding(escape(line), (0, 0, 0, 4)), style=_style(verdict))
 
 
-def _style(verdict: Verdict) -> str:
+def _style(verdict: Verdict[EpisodeFile]) -> str:
     return "yellow" if verdict.why_not else "bold" if verdict.differs else "dim"

@@ -7,9 +7,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from tests.drive.waiting import until
+from workbench.session.judging import JudgedView
 from workbench.session.kept_worker import WorkerOptions
 from workbench.session.messages import TaskOptions
-from workbench.session.rescorer import Rescorer, RescoreView
+from workbench.session.rescorer import Rescorer
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 
@@ -84,10 +85,10 @@ def start_over(session: Session, seed: int) -> SessionView:
     return wait_until(session, came, "the reset")
 
 
-def rescored(rescorer: Rescorer, *states: str) -> RescoreView:
+def rescored(rescorer: Rescorer, *states: str) -> JudgedView:
     """What a page shows of the judging of recordings once it is in one of these states."""
 
-    def wanted() -> RescoreView | None:
+    def wanted() -> JudgedView | None:
         view = rescorer.view
         return view if view.state in states else None
 

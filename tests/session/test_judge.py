@@ -17,7 +17,7 @@ import pytest
 from tests.drive.session import TASKS, live_session, wait_until
 from tests.drive.waiting import until
 from workbench.session.history import Moment
-from workbench.session.judge import JudgementView, StoppedBy
+from workbench.session.judging import JudgedView, StoppedBy
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 
@@ -65,7 +65,7 @@ class Desk:
         history = session._state.timeline.history
         return list(history.between(history.first, history.last))
 
-    def judged(self, *states: str) -> JudgementView:
+    def judged(self, *states: str) -> JudgedView:
         before = self.serial
 
         def reached(view: SessionView) -> bool:
@@ -113,19 +113,21 @@ def test_a_reward_that_is_doubled_is_judged_as_the_double_to_the_last_bit(desk: 
         curve = desk.session.judged_curve("reward", env)
         np.testing.assert_array_equal(curve.old, rewards[:, env])
         np.testing.assert_array_equal(curve.new, 2 * rewards[:, env])
-    assert view.summary.drift_metres == 0 and view.summary.drift_radians == 0
-    assert view.summary.differing == view.summary.episodes == episodes_of(record) >= 3 * N
-    assert view.summary.mean_return[1] == pytest.approx(2 * view.summary.mean_return[0])
-    assert view.summary.differing_names == {"reward"}
-    assert not view.not_carried
+    assert all(verdict.metres == verdict.radians == 0 for verdict in view.verdicts)
+    assert len(view.verdicts) == episodes_of(record) >= 3 * N
+    for verdict in view.verdicts:
+        assert verdict.differing == ("reward",) and verdict.of.env in range(N)
+        assert verdict.returns[1] == pytest.approx(2 * verdict.returns[0])
+    assert view.differing_names == {"reward"}
+    assert not view.warnings
 
 
 def test_code_that_comes_to_the_same_differs_nowhere(desk: Desk, record) -> None:
     desk.edit(REWARD, f"third = 3\n        {REWARD.replace('3', 'third')}")
     view = desk.judged()
-    assert view.summary.episodes == episodes_of(record) >= 3 * N
-    assert view.summary.differing == 0 and view.summary.differing_names == frozenset()
-    assert view.summary.drift_metres == 0
+    assert len(view.verdicts) == episodes_of(record) >= 3 * N
+    assert not any(verdict.differing or verdict.metres for verdict in view.verdicts)
+    assert view.differing_names == frozenset()
 
 
 def test_episodes_that_succeed_otherwise_are_listed_with_their_steps(desk: Desk, record) -> None:
@@ -145,11 +147,12 @@ def test_episodes_that_succeed_otherwise_are_listed_with_their_steps(desk: Desk,
                 wanted[env, record[begin].serial] = (int(step.step.elapsed_steps[env]), step.serial)
     assert len(wanted) > 2
     found = {
-        (d.env, d.first): (d.success[1], d.at) for d in view.summary.differences if d.success[1] is not None
+        (v.of.env, int(v.of.serials[0])): (v.success[1], v.of.at(v.look_at))
+        for v in view.verdicts
+        if v.success[1] is not None
     }
     assert found == wanted
-    assert all(d.success[0] is None for d in view.summary.differences)
-    assert view.summary.successes == (0, len(wanted))
+    assert all(verdict.success[0] is None for verdict in view.verdicts)
 
 
 def test_code_that_raises_is_told_with_its_line_and_the_record_stays(desk: Desk, record) -> None:
@@ -209,7 +212,7 @@ def test_a_judgement_that_loops_for_ever_can_be_stopped_and_the_next_one_runs(de
     assert not Path(f"/proc/{process}").exists()
     desk.note()
     desk.edit(REWARD, f"{REWARD} * 2")
-    assert desk.judged("done").summary.differing > 0
+    assert any(verdict.differs for verdict in desk.judged("done").verdicts)
 
 
 def test_a_judge_that_dies_is_told_and_the_next_judgement_has_another(desk: Desk, record) -> None:

@@ -10,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.session.moments import table
+from workbench.core.recorded_run import pose_distances
 from workbench.core.step import StepResult
 from workbench.session.history import History
-from workbench.session.judgement import Judgement, drift
+from workbench.session.judgement import Judgement
 from workbench.session.messages import Stepped
 
 BODIES = 2
@@ -78,7 +79,6 @@ def test_differences_are_those_that_plain_loops_find(seed: int, rows: int, envs:
             steps = [r for r in inside if not jumped[r].any()]
             if not steps:
                 continue
-            returns = tuple(float(sum(side[r].reward[env] for r in steps)) for side in (old, new))
             success = tuple(
                 next(
                     (int(side[r].elapsed_steps[env]) for r in inside if side[r].evaluate["success"][env]),
@@ -86,23 +86,49 @@ def test_differences_are_those_that_plain_loops_find(seed: int, rows: int, envs:
                 )
                 for side in (old, new)
             )
-            same = all(old[r].reward[env] == new[r].reward[env] for r in steps)
-            rows_of = tuple(
-                next((r for r in inside if side[r].evaluate["success"][env]), None) for side in (old, new)
+            flags = [[bool(side[r].evaluate["success"][env]) for r in inside] for side in (old, new)]
+            others = [r for r in steps if old[r].reward[env] != new[r].reward[env]]
+            parted = others + [r for r, a, b in zip(inside, *flags, strict=True) if a != b]
+            wanted[env, begin] = (
+                success,
+                tuple(float(sum(side[r].reward[env] for r in steps)) for side in (old, new)),
+                len(steps),
+                int(old[min(parted)].elapsed_steps[env]) if parted else None,
+                looked_at(old, new, inside, others, env, parted),
             )
-            if not same or rows_of[0] != rows_of[1]:
-                wanted[env, begin] = (success, returns)
-    summary = judgement.summary()
-    found = {(d.env, d.first): (d.success, d.returns) for d in summary.differences}
+    found = {
+        (v.of.env, int(v.of.serials[0])): (
+            v.success,
+            v.returns,
+            v.length,
+            v.first_difference,
+            None if v.look_at is None else v.of.at(v.look_at),
+        )
+        for v in judgement.verdicts()
+    }
     assert found == wanted
-    assert summary.differing == len(wanted)
-    order = [
-        (2 * (d.success[0] != d.success[1]) + (d.fail[0] != d.fail[1]), abs(d.returns[1] - d.returns[0]))
-        for d in summary.differences
-    ]
-    assert order == sorted(order, reverse=True)
-    for difference in summary.differences:
-        assert jumped[difference.at].any() is np.False_ or jumped[difference.at, difference.env]
+    names = set()
+    if any(v.differs for v in judgement.verdicts()):
+        names = {name for v in judgement.verdicts() for name in v.differing}
+        assert names & {"reward", "success"}
+    assert judgement.names()[1] == names
+
+
+def looked_at(
+    old: list[StepResult],
+    new: list[StepResult],
+    inside: list[int],
+    others: list[int],
+    env: int,
+    parted: list[int],
+) -> int | None:
+    """The moment that shows most: success, else the largest change of the reward, else the first difference."""
+    then, now = (next((r for r in inside if side[r].evaluate["success"][env]), None) for side in (old, new))
+    if then != now:
+        return then if now is None else now
+    if others:
+        return max(others, key=lambda r: (abs(old[r].reward[env] - new[r].reward[env]), -r))
+    return min(parted, default=None)
 
 
 def test_the_newest_run_is_judged_first_and_each_begins_with_a_jump_of_all() -> None:
@@ -133,18 +159,61 @@ def test_the_record_ends_at_a_jump_that_cannot_be_put_back() -> None:
     assert Judgement(recorded(old, jumped, [b""] * 6)).steps == 0
 
 
-def test_equal_rewards_and_flags_are_no_difference_and_not_a_number_is_one() -> None:
+def test_a_moment_that_is_judged_anew_is_compared_anew_and_not_a_number_is_a_difference() -> None:
     old, _, _ = drawn(3, 5, 2)
     jumped = np.zeros((5, 2), bool)
     jumped[0] = True
     judgement = Judgement(recorded(old, jumped))
     for row in range(5):
         judgement.add(row, old[row])
-    assert judgement.summary().differences == () and judgement.summary().differing_names == frozenset()
-    broken = replace(old[3], reward=np.array([np.nan, old[3].reward[1]], np.float32))
-    judgement.add(3, broken)
-    (difference,) = judgement.summary().differences
-    assert (difference.env, difference.at) == (0, 3) and np.isinf(difference.largest)
+    assert [verdict.differing for verdict in judgement.verdicts()] == [(), ()]
+    assert judgement.names() == (("reward", "success", "height"), frozenset())
+    judgement.add(3, replace(old[3], reward=np.array([np.nan, old[3].reward[1]], np.float32)))
+    first, second = judgement.verdicts()
+    assert first.of.env == 0 and first.differing == ("reward",) and np.isinf(first.largest)
+    assert first.look_at is not None and first.of.at(first.look_at) == 3
+    assert second.of.name == "env 1" and not second.differs
+    assert judgement.names() == (("reward", "success", "height"), frozenset({"reward"}))
+
+
+def test_an_entry_that_only_one_version_has_differs_and_comes_first() -> None:
+    old, _, jumped = drawn(3, 5, 2)
+    judgement = Judgement(recorded(old, jumped))
+    assert judgement.names() == (("reward", "success", "height"), frozenset())
+    for row in judgement.runs()[0]:
+        judgement.add(row, replace(old[row], evaluate={**old[row].evaluate, "width": old[row].reward}))
+    assert judgement.names() == (("reward", "width", "success", "height"), frozenset({"width"}))
+    assert not any(verdict.differing for verdict in judgement.verdicts())
+
+
+def test_steps_are_those_of_the_episode_also_where_its_beginning_is_not_kept() -> None:
+    old, new, _ = drawn(1, 6, 2)
+    jumped = np.zeros((6, 2), bool)
+    elapsed = [np.full(2, 40 + row, np.int32) for row in range(6)]
+    same = [replace(old[row], elapsed_steps=elapsed[row], evaluate={}) for row in range(6)]
+    judgement = Judgement(recorded(same, jumped))
+    for row in range(6):
+        judgement.add(row, same[row])
+    judgement.add(4, replace(same[4], reward=same[4].reward + 1))
+    verdict = judgement.verdicts()[1]
+    assert (verdict.first_difference, verdict.look_at, verdict.of.begin) == (44, 44, 40)
+    assert verdict.of.at(44) == 4
+
+
+def test_drift_is_that_of_each_env_in_its_own_run() -> None:
+    old, _, _ = drawn(1, 6, 2)
+    jumped = np.zeros((6, 2), bool)
+    jumped[0] = True
+    judgement = Judgement(recorded(old, jumped))
+    for row in range(6):
+        poses = old[row].poses.copy()
+        poses[1, 0, 0] += 0.1 * (row == 3)
+        poses[1, 1, 3:] = (np.cos(0.1), np.sin(0.1), 0, 0)
+        judgement.add(row, replace(old[row], poses=poses))
+    still, moved = judgement.verdicts()
+    assert (still.metres, still.radians, still.drift_at) == (0, 0, None)
+    assert moved.metres == pytest.approx(0.1) and moved.radians == pytest.approx(0.2, rel=1e-5)
+    assert moved.drift_at == 3
 
 
 def test_what_is_not_judged_yet_has_no_new_value() -> None:
@@ -176,8 +245,10 @@ def test_drift_is_the_furthest_body_in_metres_and_radians() -> None:
     angle = 1e-4  # below what an arc cosine tells in single precision
     now[1, 0, 3:] = (-np.cos(angle / 2), -np.sin(angle / 2), 0, 0)
     was[2, 0] = now[2, 0] = np.nan  # a body that this env does not have
-    metres, radians = drift(now, was)
-    np.testing.assert_allclose(metres, [0.05, 0, 0], rtol=1e-6)
-    np.testing.assert_allclose(radians, [0, angle, 0], rtol=1e-2)
+    metres, radians = pose_distances(now, was)
+    np.testing.assert_allclose(metres, [[0, 0.05], [0, 0], [0, 0]], rtol=1e-6)
+    np.testing.assert_allclose(radians, [[0, 0], [angle, 0], [0, 0]], rtol=1e-2)
     now[2, 1, 0] = np.nan
-    assert np.isinf(drift(now, was)[0][2])
+    assert np.isinf(pose_distances(now, was)).sum() == 2
+    was[2, 1] = np.nan
+    assert not np.isinf(pose_distances(now, was)).any()

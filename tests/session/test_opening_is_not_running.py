@@ -34,7 +34,7 @@ from workbench.session.rescore import find_episodes
 from workbench.session.rescore_all import RescoreOptions, rescore_all
 from workbench.session.rescorer import Rescorer
 from workbench.session.review import Review
-from workbench.ui.rescore_panel import status_html
+from workbench.ui.judged_panel import status_html
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -256,7 +256,7 @@ def test_on_a_page_it_is_asked_and_a_no_leaves_the_others(foreign: Path, recorde
         rescorer.start(find_episodes((foreign / "recordings",)))
         view = rescored(rescorer, "done", "failed")
         assert view.state == "done" and len(view.verdicts) == 2, view
-        (said,) = view.hidden
+        (said,) = view.warnings
         assert f"{foreign / 'numpy.py'} has the name of a library" in said and said in unescape(
             status_html(view)
         )

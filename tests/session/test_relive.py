@@ -52,7 +52,7 @@ def test_what_follows_a_state_that_was_gone_into_is_what_was_recorded_to_the_las
     run, env = recorded.run(1), 1
     step, arrival = arrive(task, run, state, [env])
     assert (arrival.way, arrival.metres, arrival.radians) == ("re-simulated", 0, 0)
-    assert arrival.missed == {} and arrival.otherwise == () and not arrival.begins_otherwise
+    assert arrival.missed == {} and not arrival.begins_otherwise
     assert step.elapsed_steps[env] == state and task.env.episode_seeds[env] == 7
     for name, values in recorded.steps[state].evaluate.items():
         # The terms of a reward are those of an action, and none was made now.

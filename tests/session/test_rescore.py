@@ -13,8 +13,8 @@ import pytest
 from tests.session.recorded_runs import Recorded, opened, reaching, record
 from workbench.core.recorded_run import RecordedRun
 from workbench.recording.episode import Episode, EpisodeInfo
-from workbench.session.rescore_messages import Verdict
 from workbench.session.rescore_run import rescore
+from workbench.session.verdict import Verdict
 
 pytestmark = pytest.mark.thorough
 
@@ -69,7 +69,7 @@ def judged(
     files = [Held(recorded.run(k).until(STEPS - 3 * k), name=str(k), id=str(k)) for k in range(5)]
     verdicts = list(rescore(task, files, use_env_states=use_env_states))
     task.env.close()
-    return sorted(verdicts, key=lambda verdict: verdict.file.name)
+    return sorted(verdicts, key=lambda verdict: verdict.of.name)
 
 
 @pytest.mark.parametrize("use_env_states", [False, True], ids=["actions", "states"])
@@ -137,7 +137,7 @@ def test_what_cannot_be_judged_says_why_and_the_rest_is(tmp_path: Path, recorded
         Held(run.until(4), name="fine"),
         Held(replace(run, env_states={}), name="no states"),
     ]
-    told = {verdict.file.name: verdict for verdict in rescore(task, files, use_env_states=True)}
+    told = {verdict.of.name: verdict for verdict in rescore(task, files, use_env_states=True)}
     task.env.close()
     assert "3 numbers" in told["narrow"].why_not and told["empty"].why_not == "it has no step"
     assert told["no states"].why_not == "it holds no env states"

@@ -279,7 +279,7 @@ def test_a_recording_with_a_changed_file_is_judged_by_what_is_left_or_says_why(
         content[len(content) // 2] ^= 1
         path.write_bytes(content)
     verdicts, _ = rescore_all(RescoreOptions((tmp_path / "r",), task=str(author / "push_cube.py")))
-    by_name = {verdict.file.path.stem: verdict for verdict in verdicts}
+    by_name = {verdict.of.path.stem: verdict for verdict in verdicts}
     assert not by_name[one.stem].why_not and not by_name[one.stem].differs
     assert f"{one.stem}.h5: was cut short or changed" in words.not_carried(verdicts)[0]
     assert f"{other.stem}.h5 was cut short or changed" in by_name[other.stem].why_not

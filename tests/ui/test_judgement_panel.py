@@ -11,32 +11,32 @@ import pytest
 from tests.drive.panels import Clock, Panels
 from tests.ui.scenes import running
 from workbench.authoring.problem import Problem
-from workbench.session.judge import JudgementView
-from workbench.session.judgement import EpisodeDifference, JudgedCurve, Summary
+from workbench.session import rescore_words as words
+from workbench.session.judgement import JudgedCurve, PastRun
+from workbench.session.judging import JudgedView
 from workbench.session.timeline import TimelineView
-from workbench.ui import judged_in_words as words
-from workbench.ui.judgement_panel import MOST_ROWS, JudgementPanel, chart_data, status_html
+from workbench.session.verdict import Verdict
+from workbench.ui.judged_panel import MOST_ROWS, status_html
+from workbench.ui.judgement_panel import JudgementPanel, chart_data, in_a_line
 from workbench.ui.line_chart import LONGEST
 
 
-def episode(env: int = 0, **changes: Any) -> EpisodeDifference:
-    return replace(
-        EpisodeDifference(env, 10 * env, 10 * env + 5, (None, None), (None, None), (1.0, 2.0), 0.25, 0.0),
-        **changes,
-    )
+def episode(env: int = 0, **changes: Any) -> Verdict[PastRun]:
+    """An episode of fifty moments that differs at its fifth step."""
+    run = PastRun(env, 0, 10 * env + np.arange(50))
+    reward = {"first_difference": 5, "look_at": 5, "differing": ("reward",), "largest": 0.25}
+    return replace(Verdict(run, length=49, returns=(1.0, 2.0), metres=0.0), **{**reward, **changes})
 
 
-def summary(*differences: EpisodeDifference, **changes: Any) -> Summary:
-    names = ("reward", "success")
-    differing = frozenset({"reward"} if differences else ())
-    found = Summary(
-        12, len(differences), differences, (3, 3), (1.0, 2.0), ("", ""), 0.0, 0.0, None, names, differing
-    )
-    return replace(found, **changes)
+def same(env: int = 0, **changes: Any) -> Verdict[PastRun]:
+    nothing = {"first_difference": None, "look_at": None, "differing": (), "largest": 0.0}
+    return episode(env, **{**nothing, "returns": (1.0, 1.0), **changes})
 
 
-def done(found: Summary | None, **changes: Any) -> JudgementView:
-    return replace(JudgementView("done", 1, 50, 50, summary=found), **changes)
+def done(*verdicts: Verdict[PastRun], **changes: Any) -> JudgedView:
+    differing = frozenset(name for verdict in verdicts for name in verdict.differing)
+    told = {"names": ("reward", "success"), "differing_names": differing, "task": "the new code", **changes}
+    return replace(JudgedView("done", 1, verdicts, 50, 50), **told)
 
 
 class RecordedSession:
@@ -73,7 +73,7 @@ class Judging:
     panels: Panels
     clock: Clock
 
-    def draw(self, judged: JudgementView, **changes: Any) -> None:
+    def draw(self, judged: JudgedView, **changes: Any) -> None:
         self.clock.passes()
         timeline = TimelineView(first=0, last=1000)
         self.panel.draw(running(40, judgement=judged, **{"timeline": timeline, **changes}))
@@ -88,32 +88,31 @@ def judging(panels: Panels, clock: Clock) -> Judging:
 @pytest.mark.parametrize(
     ("judged", "says"),
     [
-        (JudgementView("none"), ""),
-        (JudgementView("loading"), "loading the new code"),
-        (JudgementView("judging", 1, 26, 50, summary=summary()), "50 %"),
-        (done(summary(episode())), "1 of 12 episodes differ."),
-        (JudgementView("stopped", 1, 26, 50, why="the file was saved again"), "the file was saved again"),
+        (JudgedView("none"), ""),
+        (JudgedView("loading"), "loading the new code"),
+        (JudgedView("judging", done=26, total=50), "50 %"),
+        (done(episode(), same(1)), "1 of 2 episodes differs."),
+        (done(same(1), differing_names={"new"}), "as they were. Other entries differ: new."),
+        (JudgedView("stopped", why="the file was saved again"), "the file was saved again"),
     ],
 )
-def test_one_line_says_how_far_it_is_and_what_came_of_it(judged: JudgementView, says: str) -> None:
-    assert words.in_a_line(judged).endswith(says) and bool(words.in_a_line(judged)) == bool(says)
+def test_one_line_says_how_far_it_is_and_what_came_of_it(judged: JudgedView, says: str) -> None:
+    assert in_a_line(judged).endswith(says) and bool(in_a_line(judged)) == bool(says)
 
 
 def test_outcomes_are_said_before_rewards() -> None:
     moved = episode(success=(None, 41), fail=(7, None))
-    assert words.difference(moved) == ["success now at step 41, was never", "fail never now, was at step 7"]
-    assert words.difference(episode()) == ["reward by up to 0.25"]
+    assert words.what_changed(moved) == "success now at step 41, was never, fail never now, was at step 7"
+    assert words.what_changed(episode()) == "reward by up to 0.25, from step 5"
 
 
 def test_nothing_that_differs_is_one_sentence() -> None:
-    same = done(summary(mean_return=(1.0, 1.0)))
-    assert (
-        words.headline(same) == "Nothing differs in 12 episodes: reward, success and fail are as they were."
-    )
-    assert words.numbers(same) == []
-    other = done(summary(differing_names=frozenset({"height"})))
-    assert words.headline(other).endswith("Other entries differ: height.")
-    assert "so far" in words.headline(replace(same, state="judging"))
+    both = same(0), same(1)
+    says = "Nothing differs in 2 episodes: reward, success and fail are as they were."
+    assert words.headline(both) == says and words.numbers(both) == ["mean return: 1"]
+    assert words.headline([same(0), same(1, differing=("height",))]).endswith("Other entries differ: height.")
+    assert "2 episodes so far:" in words.headline(both, so_far=True)
+    assert words.headline([episode(0), episode(1)], so_far=True) == "2 of 2 episodes differ so far."
 
 
 @pytest.mark.parametrize(
@@ -124,39 +123,39 @@ def test_nothing_that_differs_is_one_sentence() -> None:
         (0.032, 0.0, "up to 3.2 cm", True),
         (0.0, 0.2, "11°", True),
         (float("inf"), 0.0, "more than can be told", True),
-        (float("nan"), 0.0, "more than can be told", True),
     ],
 )
 def test_drift_is_told_and_doubted_where_it_is_large(
     metres: float, radians: float, says: str, far: bool
 ) -> None:
-    found = summary(drift_metres=metres, drift_radians=radians, drift_at=(7, 3))
-    assert says in words.drift(found)
-    assert words.is_far(found) == far
-    assert ("env 7" in words.drift(found)) == far
+    found = [same(1), same(7, metres=metres, radians=radians)]
+    assert says in words.doubts(found)
+    assert words.is_doubtful(found) == far
+    assert ("In 1 episode" in words.doubts(found)) == far
+    assert metres == 0 or ("env 7" in words.doubts(found)) == far
 
 
 def test_a_problem_is_told_with_file_and_line_and_escaped() -> None:
     problem = Problem("reward", "KeyError: '<b>'", "/home/me/push.py", 88, "raise <b>", "")
-    html = status_html(done(None, state="failed", why="the new code raised", problem=problem, done=20))
+    html = status_html(done(state="failed", why="the new code raised", problem=problem, done=20))
     assert "push.py:88" in html and "20 of 50" in html
     assert "<b>" not in html and "&lt;b&gt;" in html
 
 
 def test_nothing_is_shown_before_the_first_judgement(judging: Judging) -> None:
-    judging.draw(JudgementView())
+    judging.draw(JudgedView())
     assert not any(judging.panels.shows(name) for name in ("Stop judging", "Curve"))
     assert judging.panels.html("wb-again") == "" and judging.panels.charts() == []
 
 
 def test_only_what_runs_can_be_stopped(judging: Judging) -> None:
     for state, stoppable in (("loading", True), ("judging", True), ("done", False), ("failed", False)):
-        judging.draw(done(None, state=state, serial=hash(state)))
+        judging.draw(done(state=state, serial=hash(state)))
         assert judging.panels.shows("Stop judging") == stoppable and judging.panels.html("wb-again")
 
 
 def test_the_new_line_lies_over_the_recorded_one(judging: Judging) -> None:
-    judging.draw(done(summary(episode(3))), selected_env=3)
+    judging.draw(done(episode(3)), selected_env=3)
     (chart,) = judging.panels.charts()
     _, old, new = chart.data
     assert (old == 3).all() and (new == 6).all()
@@ -165,20 +164,20 @@ def test_the_new_line_lies_over_the_recorded_one(judging: Judging) -> None:
         "as recorded",
         "judged again",
     ]
-    judging.draw(done(summary(), serial=2), selected_env=3)
+    judging.draw(done(same(3), serial=2), selected_env=3)
     assert judging.panels.charts() == [] and not judging.panels.shows("Curve")
 
 
 def test_a_choice_that_is_none_draws_the_reward(judging: Judging) -> None:
-    judging.draw(done(summary(episode(1))))
+    judging.draw(done(episode(1)))
     judging.panels.claim("Curve", "../../etc")
-    judging.draw(done(summary(episode(1)), serial=2))
+    judging.draw(done(episode(1), serial=2))
     assert [str(chart.title)[:13] for chart in judging.panels.charts()] == ["reward of env"]
 
 
 def test_rows_go_to_their_moment_and_forgotten_moments_only_to_their_env(judging: Judging) -> None:
     session = judging.session
-    judging.draw(done(summary(*(episode(env) for env in range(MOST_ROWS + 3)))))
+    judging.draw(done(same(30), *(episode(env) for env in range(MOST_ROWS + 3))))
     assert f"1 to {MOST_ROWS} of {MOST_ROWS + 3}" in judging.panels.html()
     judging.panels.press("row 2")
     judging.panels.press("on")
@@ -195,7 +194,7 @@ def test_the_key_goes_round(judging: Judging) -> None:
     session = judging.session
     judging.panel.go_to_difference(1)
     assert session.asked == []
-    judging.draw(done(summary(episode(0), episode(1))))
+    judging.draw(done(episode(0), episode(1)))
     for wanted in (("show", 0, 5), ("show", 1, 15), ("show", 0, 5)):
         judging.panel.go_to_difference(1)
         assert session.asked[-1] == wanted
@@ -217,14 +216,12 @@ def test_of_a_long_record_the_part_round_the_shown_moment_is_drawn() -> None:
 
 def test_a_reward_that_turned_nan_is_said_so_and_counted_in_the_mean() -> None:
     lost, nan = float("inf"), float("nan")
-    assert words.difference(episode(largest=lost, returns=(1.0, nan))) == ["reward NaN now"]
-    assert words.difference(episode(largest=lost, returns=(nan, 1.0))) == ["reward no longer NaN"]
-    assert words.difference(episode(largest=lost, returns=(nan, nan))) == ["reward NaN at other steps"]
-    told = done(summary(episode(), mean_return=(1.0, 2.0), lost_returns=("", "NaN in 3 of 12")))
-    assert words.numbers(told)[-1] == "mean return: 1 → 2, NaN in 3 of 12"
-    assert (
-        words.numbers(done(summary(episode(), mean_return=(1.0, nan), lost_returns=("", "NaN in 12 of 12"))))[
-            -1
-        ]
-        == "mean return: 1 → NaN in 12 of 12"
-    )
+    for returns, says in (
+        ((1.0, nan), "NaN now"),
+        ((nan, 1.0), "no longer NaN"),
+        ((nan, nan), "NaN at other steps"),
+    ):
+        assert words.what_changed(episode(largest=lost, returns=returns)) == f"reward {says}, from step 5"
+    told = [episode(returns=(1.0, 2.0)), episode(1, returns=(1.0, nan))]
+    assert words.numbers(told) == ["mean return: 1 → 2, NaN in 1 of 2"]
+    assert words.numbers(told[1:]) == ["mean return: 1 → NaN in 1 of 1"]

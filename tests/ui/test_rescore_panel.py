@@ -16,10 +16,12 @@ from tests.drive.waiting import until
 from workbench.authoring.problem import Problem
 from workbench.recording.library import Library
 from workbench.session import rescore_words as words
-from workbench.session.rescore_messages import EpisodeFile, Verdict
-from workbench.session.rescorer import RescoreView
+from workbench.session.judging import JudgedView
+from workbench.session.rescore_messages import EpisodeFile
 from workbench.session.review import Review
-from workbench.ui.rescore_panel import MOST_ROWS, RescoreChoices, RescorePanel, in_order, status_html
+from workbench.session.verdict import Verdict
+from workbench.ui.judged_panel import MOST_ROWS, status_html
+from workbench.ui.rescore_panel import IDLE, RescoreChoices, RescorePanel
 from workbench.ui.step_in import episode_files
 
 
@@ -35,9 +37,8 @@ def verdict(id: str = "a", **changes: Any) -> Verdict:
 def test_success_is_said_before_rewards_and_what_is_the_same_is_said_to_be() -> None:
     moved = verdict(success=(None, 41), fail=(7, None), first_difference=7)
     assert words.what_changed(moved) == "success now at step 41, was never, fail never now, was at step 7"
-    assert (
-        words.what_changed(verdict(largest=0.25, first_difference=4)) == "reward by up to 0.25, from step 4"
-    )
+    reward = verdict(largest=0.25, first_difference=4, differing=("reward",))
+    assert words.what_changed(reward) == "reward by up to 0.25, from step 4"
     assert words.what_changed(verdict()) == "as it was"
     assert words.what_changed(verdict(differing=("height",))) == "as it was, but for height"
     assert words.what_changed(verdict(why_not="it has no step")) == "not judged: it has no step"
@@ -51,22 +52,14 @@ def test_all_of_them_are_one_sentence() -> None:
         verdict("c", why_not="x"),
     ]
     assert words.summary(many) == (
-        "1 of 2 episodes differs; successes: 0 → 1; mean return 5.5 → 7.5; 1 episode not judged."
+        "1 of 2 episodes differs. Episodes with success: 0 → 1. Mean return: 5.5 → 7.5. 1 episode not judged."
     )
     assert words.summary(many[:1]).startswith("Nothing differs in 1 episode:")
     assert words.summary(many[2:]) == "No episode could be judged."
-    assert words.doubts(many) == "" and "3.2 cm" in words.doubts([verdict(metres=0.032)])
-
-
-def test_what_changed_most_comes_first_and_what_was_not_judged_last() -> None:
-    given = [
-        verdict("same"),
-        verdict("skipped", why_not="x"),
-        verdict("less", first_difference=1, returns=(1.0, 1.1)),
-        verdict("more", first_difference=1, returns=(1.0, 9.0)),
-        verdict("moved", first_difference=1, success=(None, 2), returns=(1.0, 1.0)),
-    ]
-    assert [v.file.id for v in in_order(given)] == ["moved", "more", "less", "same", "skipped"]
+    assert "to the last bit" in words.doubts(many) and not words.is_doubtful(many)
+    assert words.doubts([verdict(metres=None)]) == ""
+    told = words.doubts([verdict(metres=0.032)], words.PUT_IN)
+    assert "3.2 cm" in told and "furthest in push_a" in told and told.endswith(words.PUT_IN)
 
 
 def test_numbers_that_are_none_are_null_in_json() -> None:
@@ -76,19 +69,22 @@ def test_numbers_that_are_none_are_null_in_json() -> None:
 
 def test_a_reward_that_turned_nan_is_said_so_and_counted_in_the_mean() -> None:
     nan = float("nan")
-    lost = verdict("lost", largest=float("inf"), first_difference=4, returns=(1.0, nan))
+    lost = verdict(
+        "lost", largest=float("inf"), first_difference=4, returns=(1.0, nan), differing=("reward",)
+    )
     assert words.what_changed(lost) == "reward NaN now, from step 4"
     assert words.returns(lost) == "1 → NaN"
     other = verdict("other", returns=(2.0, 2.0))
-    assert "mean return 1.5 → 2, NaN in 1 of 2." in words.summary([lost, other])
+    assert "Mean return: 1.5 → 2, NaN in 1 of 2." in words.summary([lost, other])
 
 
 def test_a_problem_is_told_with_file_and_line_and_escaped() -> None:
     problem = Problem("reward", "KeyError: '<b>'", "/home/me/push.py", 88, "raise <b>", "")
-    html = status_html(RescoreView("failed", 1, 3, why="the code raised", problem=problem))
+    html = status_html(JudgedView("failed", total=3, why="the code raised", problem=problem))
     assert "push.py:88" in html and "<b>" not in html and "&lt;b&gt;" in html
-    assert "Select recordings" in status_html(RescoreView())
-    assert "1 of 3" in status_html(RescoreView("judging", 2, 3, (verdict(),), task="Push-v1"))
+    assert "Select recordings" in status_html(JudgedView(), idle=IDLE)
+    told = JudgedView("judging", 2, (verdict(),), 1, 3, "episodes", task="Push-v1")
+    assert "judging with Push-v1: 1 of 3 episodes" in status_html(told)
 
 
 @pytest.fixture
@@ -117,7 +113,7 @@ class Told:
     """Stands where what judges again stands for the panel: what it has told last."""
 
     def __init__(self) -> None:
-        self.view = RescoreView()
+        self.view = JudgedView()
 
     def stop(self) -> None:
         raise AssertionError("nobody asked for that")
@@ -134,7 +130,7 @@ class Rescoring:
     choices: RescoreChoices
     told: Told
 
-    def draw(self, told: RescoreView) -> None:
+    def draw(self, told: JudgedView) -> None:
         self.told.view = told
         self.clock.passes()
         self.panel.draw(self.review.view())
@@ -161,7 +157,7 @@ def test_a_row_opens_its_episode_at_the_first_difference(
         verdict(rows[seed].id, seed=seed, first_difference=seed + 1, returns=(0.0, float(seed)))
         for seed in (1, 2, 3)
     ]
-    rescoring.draw(RescoreView("done", 1, 3, tuple(given)))
+    rescoring.draw(JudgedView("done", 1, tuple(given), 3, 3))
     assert "3 of 3 episodes differ" in rescoring.panels.html() and "seed 3" in rescoring.panels.html()
     assert not any(rescoring.panels.shows(name) for name in ("Judge what is open", "Stop"))
     rescoring.panels.press("row 1")  # by the change of their returns: 3, 2, 1
@@ -175,7 +171,7 @@ def test_a_row_opens_its_episode_at_the_first_difference(
 
 def test_a_long_list_is_turned_a_page_at_a_time(rescoring: Rescoring) -> None:
     many = tuple(verdict(str(k), first_difference=1, returns=(0.0, 99.0 - k), seed=k) for k in range(23))
-    rescoring.draw(RescoreView("done", 1, 23, many))
+    rescoring.draw(JudgedView("done", 1, many, 23, 23))
     assert (
         rescoring.panels.html().count('data-press="') == MOST_ROWS + 2
         and "1 to 10 of 23" in rescoring.panels.html()
@@ -183,7 +179,7 @@ def test_a_long_list_is_turned_a_page_at_a_time(rescoring: Rescoring) -> None:
     rescoring.panels.press("on")
     rescoring.panels.press("on")
     rescoring.panels.press("on")
-    rescoring.draw(RescoreView("done", 2, 23, many))
+    rescoring.draw(JudgedView("done", 2, many, 23, 23))
     assert "21 to 23 of 23" in rescoring.panels.html()
 
 
@@ -191,6 +187,8 @@ def test_what_a_page_sends_as_its_choice_may_be_anything(rescoring: Rescoring) -
     assert rescoring.panels.control("Code").value == "as recorded"
     rescoring.panels.set("Recorded states", True)
     rescoring.panels.claim("Code", "../../etc")
+    assert rescoring.choices == RescoreChoices(True, True)
+    rescoring.panels.set("Code", "today's")
     assert rescoring.choices == RescoreChoices(False, True)
 
 

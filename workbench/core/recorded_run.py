@@ -1,4 +1,4 @@
-"""What of a recorded episode it takes to live through it again, as plain arrays that can cross a pipe.
+"""What of a recorded episode it takes to live through it again, and how far apart two poses are: plain arrays.
 
 Whoever reads a recording need not know an env, and the env need not know files: between them goes this. State 0 is
 the reset; action t leads to state t + 1.
@@ -51,3 +51,24 @@ class RecordedRun:
             evaluate={name: rows[: state + 1] for name, rows in self.evaluate.items()},
             reward=self.reward[:state],
         )
+
+
+def pose_distances(a: NDArray, b: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """How far apart poses are: (...) metres and (...) radians.
+
+    Args:
+        a, b: (..., 7) position in metres and quaternion wxyz. Where both lack a pose (NaN) the distance is 0, where one
+            does it is infinite.
+    """
+    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
+    lacks = ~np.isfinite(a).all(-1), ~np.isfinite(b).all(-1)
+    with np.errstate(invalid="ignore"):
+        metres = np.linalg.norm(a[..., :3] - b[..., :3], axis=-1)
+        # From the chord between the quaternions: the arc cosine of their product cannot tell angles below 3e-4 from
+        # none in single precision. q and -q are the same rotation.
+        p, q = a[..., 3:], b[..., 3:]
+        chord = np.minimum(np.linalg.norm(p - q, axis=-1), np.linalg.norm(p + q, axis=-1))
+        radians = 4 * np.arcsin(np.clip(chord / 2, 0, 1))
+    found = (np.where(lacks[0] | lacks[1], np.inf, way) for way in (metres, radians))
+    metres, radians = (np.where(lacks[0] & lacks[1], 0.0, way) for way in found)
+    return metres, radians

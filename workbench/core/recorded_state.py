@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from workbench.core import seams
 from workbench.core.fresh_physics import renew_physics
 from workbench.core.partial_reset import active_controllers
+from workbench.core.recorded_run import pose_distances
 from workbench.core.scene_index import in_every_env, scene_index
 from workbench.core.task_env import flat_entries, to_numpy
 
@@ -109,33 +110,30 @@ def apart(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tuple[float
     Args:
         now, was: (D,) by name.
     """
-    metres = radians = 0.0
-    for name, value in now.items():
-        other = was.get(name)
-        if other is None or other.shape != value.shape or len(value) < _FIXED:
-            continue
-        a, b = value.astype(np.float64), other.astype(np.float64)
-        if np.isnan(a).all() or np.isnan(b).all():
-            continue  # an env that lacks it
-        metres = max(metres, float(np.linalg.norm(a[:3] - b[:3])))
-        # The chord, and not the arc cosine of the product, which loses small angles; q and -q are the same.
-        chord = min(np.linalg.norm(a[3:_POSE] - b[3:_POSE]), np.linalg.norm(a[3:_POSE] + b[3:_POSE]))
-        radians = max(radians, float(4 * np.arcsin(min(1.0, chord / 2))))
-        joints = (len(value) - _FIXED) // 2
-        if joints:
-            qpos = slice(_FIXED, _FIXED + joints)
-            radians = max(radians, float(np.abs(a[qpos] - b[qpos]).max()))
-    return _or_inf(metres), _or_inf(radians)
+    both = [
+        (value, was[name])
+        for name, value in now.items()
+        # An env that lacks it has NaN throughout.
+        if name in was
+        and was[name].shape == value.shape
+        and len(value) >= _FIXED
+        and not np.isnan(value).all()
+        and not np.isnan(was[name]).all()
+    ]
+    if not both:
+        return 0.0, 0.0
+    metres, radians = pose_distances(*(np.stack([pair[k][:_POSE] for pair in both]) for k in (0, 1)))
+    joints = [
+        np.abs(np.subtract(*pair, dtype=np.float64)[_FIXED : (_FIXED + len(pair[0])) // 2]) for pair in both
+    ]
+    turned = np.concatenate([radians, *joints]).max()
+    return float(metres.max()), float(turned) if np.isfinite(turned) else float("inf")
 
 
 def same_state(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> bool:
     """Whether all that both have is equal to the last bit, velocities included."""
     both = [name for name in was if name in now and now[name].shape == was[name].shape]
     return all(np.array_equal(now[name], was[name], equal_nan=True) for name in both)
-
-
-def _or_inf(value: float) -> float:
-    return value if np.isfinite(value) else float("inf")
 
 
 def _width(struct: Any) -> int:

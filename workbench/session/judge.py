@@ -17,12 +17,12 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from enum import Enum
 from typing import Literal
 
 from workbench.authoring.problem import Problem
 from workbench.session.askers import Background
-from workbench.session.judgement import JudgedCurve, Judgement, Summary
+from workbench.session.judgement import JudgedCurve, Judgement
+from workbench.session.judging import JudgedState, JudgedView, StoppedBy
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
 from workbench.session.messages import Load, Loaded, TaskDescription
 from workbench.session.moment_messages import JudgeMoments, MomentToJudge
@@ -33,47 +33,11 @@ _CHUNK_SECONDS = 0.1
 """About how long one answer takes: how soon progress is seen, and stopping heard."""
 _MOST_AT_ONCE = 64
 _SUMMARY_EVERY = 0.5
-"""Seconds; making one takes some milliseconds for a long history."""
-
-
-class StoppedBy(Enum):
-    """Why a judgement ended before it was done; the value is what the page says."""
-
-    HAND = "stopped by hand"
-    SAVE = "the file was saved again"
-    LOAD = "another version was loaded"
-    LOSS = "the episodes are gone"
-    CLOSING = "closing"
-
-
-JudgeState = Literal["none", "loading", "judging", "done", "stopped", "failed"]
-
-
-@dataclass(frozen=True)
-class JudgementView:
-    """How far the judgement is and what it came to."""
-
-    state: JudgeState = "none"
-    """``loading``: the new code is being loaded by the process that judges. ``stopped``: by a person or a save."""
-    serial: int = 0
-    """Grows with every change."""
-    done: int = 0
-    total: int = 0
-    """Control steps of the batch."""
-    stopped_by: StoppedBy | None = None
-    why: str = ""
-    """Why it stopped or failed, in words."""
-    problem: Problem | None = None
-    """What the new code raised."""
-    not_carried: tuple[str, ...] = ()
-    """What could not be put back at the beginnings of episodes, each with its reason."""
-    steps_per_second: float = 0.0
-    """Control steps of the batch per second of wall time."""
-    summary: Summary | None = None
+"""Seconds between two looks at what it comes to so far."""
 
 
 def what_a_load_means(
-    before: TaskDescription | None, loaded: Loaded, view: JudgementView
+    before: TaskDescription | None, loaded: Loaded, view: JudgedView
 ) -> Literal["judge", "keep", "forget"]:
     """Whether the episodes of the version before are to be judged with the one that was loaded.
 
@@ -113,13 +77,13 @@ class Judge:
         self._lock = threading.Lock()
         self._case: _Case | None = None
         """What is shown: what is being judged, or was last."""
-        self._view = JudgementView()
+        self._view = JudgedView()
         self._process = Background("that judges", "to judge with")
         # Changes and failures are told by `_tell`, with all that there is to them.
         self._lane = Lane("judge", lambda: None, lambda why: None, IDLE_SECONDS, self._process.end)
 
     @property
-    def view(self) -> JudgementView:
+    def view(self) -> JudgedView:
         return self._view
 
     @property
@@ -156,7 +120,7 @@ class Judge:
         with self._lock:
             self._stop(StoppedBy.LOSS)
             self._case = None
-            self._view = JudgementView(serial=self._view.serial + 1)
+            self._view = JudgedView(serial=self._view.serial + 1)
         self._on_change()
 
     def close(self) -> None:
@@ -174,7 +138,7 @@ class Judge:
     def _run(self, job: Job, case: _Case) -> None:
         with self._lock:
             job.check()  # stopped before it began: what was judged before stays to be seen
-            self._case, self._view = case, JudgementView(serial=self._view.serial)
+            self._case, self._view = case, JudgedView(serial=self._view.serial)
         with self._process.turn(job):
             try:
                 self._load(job, case)
@@ -229,16 +193,17 @@ class Judge:
             count = max(1, min(int(wanted), 2 * count, _MOST_AT_ONCE))
             at = chunk.stop
 
-    def _tell(self, case: _Case, state: JudgeState, why: str = "", problem: Problem | None = None) -> None:
+    def _tell(self, case: _Case, state: JudgedState, why: str = "", problem: Problem | None = None) -> None:
         with self._lock:
             if self._case is not case:
                 return  # it was forgotten
             before, judgement = self._view, case.judgement
             stopped = case.stopped if state == "stopped" else None
             now = time.monotonic()
-            summary = before.summary
+            names = before.names, before.differing_names
+            verdicts = before.verdicts
             if state != "judging" or now - case.summed > _SUMMARY_EVERY:
-                summary = judgement.summary() if judgement.judged_steps else None
+                verdicts, names = tuple(judgement.verdicts()), judgement.names()
                 case.summed = now
             self._view = replace(
                 before,
@@ -246,12 +211,18 @@ class Judge:
                 serial=before.serial + 1,
                 done=judgement.judged_steps,
                 total=judgement.steps,
+                steps=judgement.judged_steps,
+                seconds=case.seconds,
+                task="the new code",
                 stopped_by=stopped,
                 why=why if stopped is None else stopped.value,
                 problem=problem,
-                not_carried=tuple(f"{what}: {reason}" for what, reason in case.not_carried.items()),
-                steps_per_second=judgement.judged_steps / case.seconds if case.seconds else 0.0,
-                summary=summary,
+                warnings=tuple(
+                    f"not put back: {what}: {reason}" for what, reason in case.not_carried.items()
+                ),
+                verdicts=verdicts,
+                names=names[0],
+                differing_names=names[1],
             )
         self._on_change()
 

@@ -9,76 +9,43 @@ PickCube and StackCube none, PushT 7e-8 m, PushCube with a going back among its 
 oldest kept moment is in the middle of an episode, and for tasks whose state a snapshot cannot hold whole (see
 `core.snapshot`).
 
-An *episode* here is what one env lived through without a jump, up to its reset or to going back. It is judged as
-far as it was recorded, also where the new code would have ended it before.
+A *run* here is what one env lived through without a jump, up to its reset or to going back.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.core.recorded_run import pose_distances
 from workbench.core.snapshot_bytes import WholeSnapshot
 from workbench.core.step import StepResult
 from workbench.session.history import History, Moment
-from workbench.session.number_text import lost_text
+from workbench.session.verdict import Said, Verdict, compare, single_numbers
 
 MOST_ENTRIES = 24
 """Entries of ``evaluate`` that are compared; each takes 8 bytes for every moment and env."""
-SAME_REWARD = 1e-5
-"""Rewards that differ by no more than this share of the largest recorded one count as the same."""
-MOST_DIFFERENCES = 200
-
-Flag = Literal["success", "fail"]
 
 
-@dataclass(frozen=True)
-class EpisodeDifference:
-    """One episode of one env that is judged otherwise now."""
+@dataclass(frozen=True, eq=False)
+class PastRun:
+    """What one env lived through without a jump."""
 
     env: int
-    first: int
-    """Serial of its first moment."""
-    at: int
-    """Serial of the moment to look at: where success or failure is, or else where the reward differs most."""
-    success: tuple[int | None, int | None]
-    """Steps of the episode at which it was first true, as recorded and now; None for never."""
-    fail: tuple[int | None, int | None]
-    returns: tuple[float, float]
-    """Sums of the rewards, as recorded and now."""
-    largest: float
-    """The largest change of one reward."""
-    drift: float
-    """Metres."""
+    begin: int
+    """Control steps of its episode before its first moment."""
+    serials: NDArray[np.int64]
+    """(T + 1,) of its moments."""
 
+    @property
+    def name(self) -> str:
+        return f"env {self.env}"
 
-@dataclass(frozen=True)
-class Summary:
-    """What is known so far."""
-
-    episodes: int
-    """Those with at least one judged step."""
-    differing: int
-    """Of these, those judged otherwise now."""
-    differences: tuple[EpisodeDifference, ...]
-    """What changed most first: success and failure, then return. At most `MOST_DIFFERENCES`."""
-    successes: tuple[int, int] | None
-    """Episodes with a success, as recorded and now; None for a task without one."""
-    mean_return: tuple[float, float]
-    """Of those whose return is finite, as recorded and now; NaN where none is."""
-    lost_returns: tuple[str, str]
-    """How many are not, as `lost_text` says it."""
-    drift_metres: float
-    drift_radians: float
-    drift_at: tuple[int, int] | None
-    """Env and serial where the bodies are furthest from the record; None where nothing drifted."""
-    names: tuple[str, ...]
-    """What `Judgement.curve` has; ``reward`` first, then what differs, then the rest."""
-    differing_names: frozenset[str]
+    def at(self, step: int) -> int:
+        """Serial of the moment after a step of its episode."""
+        return int(self.serials[step - self.begin])
 
 
 @dataclass(frozen=True)
@@ -125,13 +92,14 @@ class Judgement:
         self._new: dict[str, NDArray[np.float32]] = {}
         for row, moment in enumerate(self._moments):
             self._write(self._old, row, moment.as_recorded)
-        self._metres = np.zeros((count, envs), np.float32)
-        self._radians = np.zeros((count, envs), np.float32)
-        # Episodes by number over the batch: which one each env is in at each row.
+        self._drift = np.zeros((count, envs, 2), np.float32)
+        # Runs by number over the batch: which one each env is in at each row.
         within = np.cumsum(self._jumped, axis=0) - 1
         sizes = within[-1] + 1 if count else np.zeros(0, np.int64)
-        self._episode = within + (np.cumsum(sizes) - sizes)
-        self._episodes = int(sizes.sum())
+        self._run = within + (np.cumsum(sizes) - sizes)
+        self._changed: set[int] = set()
+        """Numbers of runs of which more was judged since `verdicts` was asked."""
+        self._verdicts: dict[int, Verdict[PastRun]] = {}
 
     @property
     def steps(self) -> int:
@@ -170,9 +138,11 @@ class Judgement:
         was = self._moments[row].step.poses
         if step.poses.shape != was.shape:
             raise ValueError(f"the bodies are others now: poses {step.poses.shape}, were {was.shape}")
-        self._metres[row], self._radians[row] = drift(step.poses, was)
+        far = pose_distances(step.poses, was)
+        self._drift[row] = np.stack([each.max(axis=1, initial=0.0) for each in far], axis=1)
         self._write(self._new, row, step)
         self._judged[row] = True
+        self._changed.update(self._run[row].tolist())
 
     def let_go(self) -> None:
         """Forget the moments and their snapshots, when no more rows will come."""
@@ -193,179 +163,49 @@ class Judgement:
 
     # --- what it comes to --------------------------------------------------------------------------
 
-    def summary(self) -> Summary:
-        steps = self._is_step & self._judged
-        old, new = self._old.get("reward", self._metres[:0]), self._new.get("reward")
-        if new is None or not steps.any():
-            return Summary(0, 0, (), None, (0.0, 0.0), ("", ""), 0.0, 0.0, None, ("reward",), frozenset())
-        rows, envs = np.nonzero(np.broadcast_to(steps[:, None], self._jumped.shape))
-        episode = self._episode[rows, envs]
-        change = _difference(new[rows, envs], old[rows, envs])
-        largest = self._most(episode, change)
-        seen = np.bincount(episode, minlength=self._episodes) > 0
-        returns = [np.zeros(self._episodes), np.zeros(self._episodes)]
-        for total, values in zip(returns, (old, new), strict=True):
-            np.add.at(total, episode, values[rows, envs])
-        success, fail = self._first_true("success"), self._first_true("fail")
-        scale = np.max(np.abs(old[steps]), initial=0.0, where=np.isfinite(old[steps]))
-        otherwise = largest > SAME_REWARD * scale
-        for before, now in (success, fail):
-            otherwise |= before != now
-        otherwise &= seen
-        far = self._most(episode, self._metres[rows, envs])
-        names = self._names()
-        furthest = np.unravel_index(int(np.argmax(self._metres)), self._metres.shape)
-        metres = float(self._metres[furthest])
-        differences = self._differences(
-            otherwise, largest, change, rows, episode, success, fail, returns, far
-        )
-        return Summary(
-            episodes=int(seen.sum()),
-            differing=int(otherwise.sum()),
-            differences=tuple(differences),
-            successes=None
-            if "success" not in self._old and "success" not in self._new
-            else (int((success[0][seen] >= 0).sum()), int((success[1][seen] >= 0).sum())),
-            mean_return=(_mean(returns[0][seen]), _mean(returns[1][seen])),
-            lost_returns=(lost_text(returns[0][seen]), lost_text(returns[1][seen])),
-            drift_metres=metres,
-            drift_radians=float(self._radians.max()),
-            drift_at=(int(furthest[1]), int(self._serial[furthest[0]])) if metres > 0 else None,
-            names=names,
-            differing_names=frozenset(name for name in names if self._differs(name)),
+    def verdicts(self) -> list[Verdict[PastRun]]:
+        """Of each run of which a step was judged, as far as it was."""
+        for number in self._changed:
+            rows, env = self._rows_of(number)
+            if len(rows) > 1:
+                self._verdicts[number] = self._compared(rows, env)
+        self._changed.clear()
+        return [*self._verdicts.values()]
+
+    def names(self) -> tuple[tuple[str, ...], frozenset[str]]:
+        """What `curve` has: ``reward`` first, then what differs, then the rest; and what differs."""
+        names = dict.fromkeys(["reward", *self._old, *self._new])
+        differing = {name for verdict in self.verdicts() for name in verdict.differing}
+        if self._new:
+            differing |= self._old.keys() ^ self._new.keys()
+        return tuple(sorted(names, key=lambda name: (name != "reward", name not in differing))), frozenset(
+            differing
         )
 
-    def _differences(
-        self,
-        otherwise: NDArray[np.bool_],
-        largest: NDArray[np.float64],
-        change: NDArray[np.float64],
-        rows: NDArray[np.int64],
-        episode: NDArray[np.int64],
-        success: tuple[NDArray[np.int64], NDArray[np.int64]],
-        fail: tuple[NDArray[np.int64], NDArray[np.int64]],
-        returns: list[NDArray[np.float64]],
-        far: NDArray[np.float64],
-    ) -> Iterator[EpisodeDifference]:
-        moved = (success[0] != success[1]).astype(int) * 2 + (fail[0] != fail[1])
-        by = _difference(returns[1], returns[0])
-        order = np.lexsort((-by, -moved))
-        order = order[otherwise[order]][:MOST_DIFFERENCES]
-        # The row where an episode's reward differs most: of equal ones the first.
-        is_largest = change == largest[episode]
-        at = np.full(self._episodes, len(self._serial), np.int64)
-        np.minimum.at(at, episode[is_largest], rows[is_largest])
-        begins, env_of = (
-            np.empty(self._episodes, np.int64),
-            np.empty(self._episodes, np.int64),
-        )
-        first_rows, first_envs = np.nonzero(self._jumped)
-        begins[self._episode[first_rows, first_envs]] = first_rows
-        env_of[self._episode[first_rows, first_envs]] = first_envs
-        for number in order:
-            row, env = int(at[number]), int(env_of[number])
-            for before, now in (success, fail):
-                if before[number] != now[number]:
-                    row = int(now[number] if now[number] >= 0 else before[number])
-                    break
-            yield EpisodeDifference(
-                env=env,
-                first=int(self._serial[begins[number]]),
-                at=int(self._serial[row]),
-                success=self._steps_at(success, number, env),
-                fail=self._steps_at(fail, number, env),
-                returns=(float(returns[0][number]), float(returns[1][number])),
-                largest=float(largest[number]),
-                drift=float(far[number]),
+    def _rows_of(self, number: int) -> tuple[NDArray[np.int64], int]:
+        """The rows of a run that are judged: its jump, and its control steps; and its env."""
+        env = int(np.searchsorted(self._run[0], number, side="right")) - 1
+        first, end = np.searchsorted(self._run[:, env], [number, number + 1])
+        counts = self._judged[first:end] & self._is_step[first:end]
+        counts[0] = self._judged[first]
+        return first + np.flatnonzero(counts), env
+
+    def _compared(self, rows: NDArray[np.int64], env: int) -> Verdict[PastRun]:
+        begin = int(self._elapsed[rows[0], env])
+        old, new = (
+            Said(
+                table["reward"][rows[1:], env],
+                {name: column[rows, env] for name, column in table.items() if name != "reward"},
             )
-
-    def _steps_at(
-        self, rows: tuple[NDArray[np.int64], NDArray[np.int64]], episode: int, env: int
-    ) -> tuple[int | None, int | None]:
-        before, now = int(rows[0][episode]), int(rows[1][episode])
-        return (
-            None if before < 0 else int(self._elapsed[before, env]),
-            None if now < 0 else int(self._elapsed[now, env]),
+            for table in (self._old, self._new)
         )
-
-    def _first_true(self, name: Flag) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """For each episode the first judged row at which this was true, as recorded and now; -1 for none."""
-        # At a jump only the envs that jumped live through something.
-        counts = self._judged[:, None] & (self._is_step[:, None] | self._jumped)
-        found: list[NDArray[np.int64]] = []
-        for values in (self._old.get(name), self._new.get(name)):
-            first = np.full(self._episodes, len(self._serial), np.int64)
-            if values is not None:
-                rows, envs = np.nonzero(counts & (values > 0.5))
-                np.minimum.at(first, self._episode[rows, envs], rows)
-            found.append(np.where(first < len(self._serial), first, -1))
-        return found[0], found[1]
-
-    def _most(self, episode: NDArray[np.int64], values: NDArray) -> NDArray[np.float64]:
-        most = np.zeros(self._episodes)
-        np.maximum.at(most, episode, values)
-        return most
-
-    def _names(self) -> tuple[str, ...]:
-        names = list(dict.fromkeys([*self._old, *self._new]))
-        return ("reward", *sorted((n for n in names if n != "reward"), key=lambda n: not self._differs(n)))
-
-    def _differs(self, name: str) -> bool:
-        old, new = self._old.get(name), self._new.get(name)
-        if old is None or new is None:
-            return True
-        rows = self._is_step & self._judged
-        scale = np.max(np.abs(old[rows]), initial=0.0, where=np.isfinite(old[rows]))
-        return bool((_difference(new[rows], old[rows]) > SAME_REWARD * scale).any())
+        run = PastRun(env, begin, self._serial[rows])
+        return compare(run, old, new, self._drift[rows, env], begin=begin)
 
     def _write(self, table: dict[str, NDArray[np.float32]], row: int, step: StepResult) -> None:
-        for name, value in (("reward", step.reward), *_numbers(step)):
+        for name, value in (("reward", step.reward), *single_numbers(step)):
             if name not in table:
                 if len(table) > MOST_ENTRIES:
                     continue
                 table[name] = np.full(self._jumped.shape, np.nan, np.float32)
             table[name][row] = value
-
-
-def drift(
-    now: NDArray[np.float32], was: NDArray[np.float32]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """How far the bodies of each env are from where they were: (N,) metres and (N,) radians of the furthest.
-
-    Args:
-        now, was: (N, B, 7) as `StepResult.poses`; a body that an env does not have is NaN in both.
-    """
-    a, b = now.astype(np.float64), was.astype(np.float64)
-    metres = np.linalg.norm(a[..., :3] - b[..., :3], axis=-1)
-    # The angle from the chord between the quaternions: the arc cosine of their product cannot tell angles
-    # below 3e-4 from none in single precision. q and -q are the same rotation.
-    same = np.where((a[..., 3:] * b[..., 3:]).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
-    chord = np.linalg.norm(a[..., 3:] - same * b[..., 3:], axis=-1)
-    radians = 4 * np.arcsin(np.clip(chord / 2, 0, 1))
-    absent = np.isnan(a).any(axis=-1) & np.isnan(b).any(axis=-1)
-    for values in (metres, radians):
-        values[absent] = 0.0
-        values[np.isnan(values)] = np.inf
-    return metres.max(axis=1, initial=0.0), radians.max(axis=1, initial=0.0)
-
-
-def _numbers(step: StepResult) -> Iterator[tuple[str, NDArray]]:
-    """The entries of ``evaluate`` that are one number or flag for each env."""
-    count = len(step.reward)
-    for name, values in step.evaluate.items():
-        if values.dtype.kind in "fiub" and values.shape in ((count,), (count, 1)):
-            yield name, values.reshape(count)
-
-
-def _mean(values: NDArray) -> float:
-    """Of those that are finite; NaN where none is."""
-    finite = values[np.isfinite(values)]
-    return float(finite.mean()) if len(finite) else float("nan")
-
-
-def _difference(new: NDArray, old: NDArray) -> NDArray[np.float64]:
-    """How far apart; infinite where one is not a number, zero where both are not or are the same infinity."""
-    with np.errstate(invalid="ignore"):
-        apart = np.abs(np.asarray(new, np.float64) - np.asarray(old, np.float64))
-    apart[(np.isnan(new) & np.isnan(old)) | (new == old)] = 0.0
-    return np.where(np.isnan(apart), np.inf, apart)

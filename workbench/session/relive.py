@@ -40,8 +40,6 @@ from workbench.session.open_task import OpenedTask, blamed, reset_checked, step_
 
 FAR_METRES, FAR_RADIANS = 1e-4, 1e-3
 """From here on a state is another one than the recorded, and is put back to it."""
-_SAME_VALUE = 1e-3
-"""Entries of ``evaluate`` that differ by no more, or by no more than this share, say the same of a state."""
 
 Way = Literal["re-simulated", "corrected", "put there"]
 
@@ -62,8 +60,6 @@ class Arrival:
     """The reset with its seed gave another state than the recorded one, which was put in its place."""
     missed: dict[str, str] = field(default_factory=dict)
     """What could not be put back, and why."""
-    otherwise: tuple[str, ...] = ()
-    """Entries that ``evaluate`` says otherwise of the same state."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +153,6 @@ def arrive(
         step = task.judge()
     metres, radians = _distance(env, chosen, run.state(state))
     way: Way = "put there" if why_not and state > 0 else "corrected" if corrected else "re-simulated"
-    near = metres is not None and metres <= FAR_METRES and (radians or 0.0) <= FAR_RADIANS
     return step, Arrival(
         way,
         state,
@@ -166,7 +161,6 @@ def arrive(
         corrected,
         any(each.otherwise for each in beginnings.values()),
         missed,
-        otherwise_said(step, chosen[0], run, state) if near else (),
     )
 
 
@@ -179,24 +173,6 @@ def why_not_lived_through(opened: OpenedTask, run: RecordedRun) -> str:
     if width == recorded:
         return ""
     return f"the recorded actions have {recorded} numbers each, and this robot takes {width}: they were not made again"
-
-
-def otherwise_said(step: StepResult, env: int, run: RecordedRun, state: int) -> tuple[str, ...]:
-    """Entries of ``evaluate`` that are another value, of this env now, than the record has for that state."""
-    differ = []
-    for name, rows in run.evaluate.items():
-        now = step.evaluate.get(name)
-        if name.startswith("reward_terms/") or now is None or state >= len(rows):
-            continue
-        a, b = np.asarray(now[env]), np.asarray(rows[state])
-        if a.shape != b.shape or a.dtype.kind not in "fiub" or b.dtype.kind not in "fiub":
-            continue
-        a, b = a.astype(float), b.astype(float)
-        if np.isnan(b).all():
-            continue  # the record lacks it there
-        if not np.allclose(a, b, rtol=_SAME_VALUE, atol=_SAME_VALUE, equal_nan=True):
-            differ.append(name)
-    return tuple(differ)
 
 
 def _kept(opened: OpenedTask, others: list[int]) -> tuple[Snapshot | None, str]:

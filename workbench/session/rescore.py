@@ -1,29 +1,19 @@
-"""What today's code says of recorded episodes, beside what was said when they were recorded.
+"""Which recorded episodes are judged again, and in which env each is.
 
-This is the comparison and the plain data around it; the envs that live through the episodes again are in
-`rescore_run`, and the process that does it for a page is kept by `rescorer`. An episode is judged as far as it was
-recorded, also where today's code would have ended it before.
-
-What is judged is the run anew and not the record, so how far it came from the record is measured at every state
-and belongs to each verdict. With the recorded states put in after every step nothing drifts, and contacts are those of
-one step from the state before.
+The envs that live through them are in `rescore_run`, and the process that does it for a page is kept by `rescorer`.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from workbench.authoring.library_names import named_like_library
 from workbench.authoring.modules import hidden_by_libraries
 from workbench.authoring.reference import TaskName, named_file
-from workbench.core.recorded_run import RecordedRun
 from workbench.recording.description import info_from
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.json_file import NotJson, read_json
@@ -32,11 +22,11 @@ from workbench.recording.reading import find_trajectories
 from workbench.recording.side_files import side_files_in_words
 from workbench.recording.unreadable import UnreadableRecording
 from workbench.session.clearance import Wanted, recorded_content
-from workbench.session.judgement import SAME_REWARD
 from workbench.session.messages import TaskOptions
 from workbench.session.recorded_text import NoText
-from workbench.session.rescore_messages import EpisodeFile, Verdict
+from workbench.session.rescore_messages import EpisodeFile
 from workbench.session.step_back import class_in, options_of, reference_of
+from workbench.session.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -57,61 +47,6 @@ class Group:
     def wanted(self) -> Wanted:
         """What has to be cleared before it is judged."""
         return Wanted(self.reference, self.info, self.recorded_source)
-
-
-@dataclass
-class Heard:
-    """What the task says of an episode now, while it is lived through."""
-
-    reward: list[float] = field(default_factory=list)
-    """(T,)"""
-    evaluate: dict[str, list[float]] = field(default_factory=dict)
-    """(T + 1,) each, of those that are one number or flag an env."""
-    metres: float | None = None
-    drift_at: int | None = None
-
-    def drifted(self, metres: float, state: int) -> None:
-        if self.metres is None or metres > self.metres:
-            self.metres, self.drift_at = metres, state
-
-
-def verdict_of(file: EpisodeFile, run: RecordedRun, task: str, heard: Heard) -> Verdict:
-    """Compare what was recorded with what was heard."""
-    old = np.asarray(run.reward, np.float64)
-    new = np.asarray(heard.reward, np.float64)
-    if len(old) and np.isnan(old).all():
-        # A recording of somebody else's that holds no rewards: there is nothing to compare with.
-        apart = np.zeros(len(old))
-    else:
-        apart = _apart(new, old)
-    scale = np.max(np.abs(old), initial=0.0, where=np.isfinite(old))
-    differs = np.flatnonzero(apart > SAME_REWARD * scale)
-    firsts = [int(differs[0]) + 1] if len(differs) else []
-    flags: dict[str, tuple[int | None, int | None]] = {}
-    for name in ("success", "fail"):
-        was, now = _flags(run.evaluate.get(name)), _flags(heard.evaluate.get(name))
-        flags[name] = _first_true(was), _first_true(now)
-        if was is not None or now is not None:
-            a, b = (np.zeros(run.length + 1, bool) if f is None else f for f in (was, now))
-            states = np.flatnonzero(a[: run.length + 1] != b[: run.length + 1])
-            firsts += [int(states[0])] if len(states) else []
-    return Verdict(
-        file=file,
-        task=task,
-        seed=run.seed,
-        length=run.length,
-        success=flags["success"],
-        fail=flags["fail"],
-        has_success="success" in run.evaluate or "success" in heard.evaluate,
-        returns=(float(old.sum()), float(new.sum())),
-        largest=float(apart.max(initial=0.0)),
-        first_difference=min(firsts, default=None),
-        differing=tuple(_differing(run.evaluate, heard.evaluate)),
-        metres=heard.metres,
-        drift_at=heard.drift_at if heard.metres else None,
-        old_reward=old.astype(np.float32),
-        new_reward=new.astype(np.float32),
-    )
 
 
 def find_episodes(places: Sequence[Path]) -> list[EpisodeFile]:
@@ -151,7 +86,7 @@ def group_episodes(
     task: str | None = None,
     file: Path | None = None,
     recorded_source: bool = False,
-) -> tuple[list[Group], list[Verdict]]:
+) -> tuple[list[Group], list[Verdict[EpisodeFile]]]:
     """Which env each episode is judged in; and those that cannot be read, with the reason.
 
     Args:
@@ -161,7 +96,7 @@ def group_episodes(
         recorded_source: each is judged by the text that it was recorded with.
     """
     groups: dict[str, Group] = {}
-    unread: list[Verdict] = []
+    unread: list[Verdict[EpisodeFile]] = []
     for episode in files:
         try:
             info = _info_of(episode)
@@ -194,9 +129,11 @@ def hidden_in_words(reference: TaskName) -> list[str]:
     return [] if file is None else [named_like_library(hidden) for hidden in hidden_by_libraries(file)]
 
 
-def not_judged(group: Group, verdicts: Iterable[Verdict], why_not: str) -> list[Verdict]:
+def not_judged(
+    group: Group, verdicts: Iterable[Verdict[EpisodeFile]], why_not: str
+) -> list[Verdict[EpisodeFile]]:
     """Of those of the group that have no verdict: a folder holds recordings of many tasks, and one of them may be gone."""
-    judged = {verdict.file.id for verdict in verdicts}
+    judged = {verdict.of.id for verdict in verdicts}
     missing = [file for file in group.files if file.id not in judged]
     return [Verdict(file, task=group.info.task, why_not=why_not) for file in missing]
 
@@ -251,38 +188,3 @@ def _info_of(file: EpisodeFile) -> EpisodeInfo:
                 f"{file.path.name} is a recording, but a broken one ({type(error).__name__}: {error})"
             ) from error
     return file.read().info
-
-
-def _flags(values: Any) -> NDArray[np.bool_] | None:
-    """(T + 1,) of an entry that is a flag; None for one that is not there."""
-    if values is None:
-        return None
-    rows = np.asarray(values)
-    return (np.nan_to_num(rows.reshape(len(rows), -1)[:, 0].astype(float)) > 0.5) if len(rows) else None
-
-
-def _first_true(flags: NDArray[np.bool_] | None) -> int | None:
-    return None if flags is None or not flags.any() else int(np.argmax(flags))
-
-
-def _differing(old: Mapping[str, NDArray], new: Mapping[str, list[float]]) -> Iterator[str]:
-    for name, values in new.items():
-        was = old.get(name)
-        if name in ("success", "fail") or was is None:
-            continue
-        rows = np.asarray(was)
-        if rows.shape not in ((len(values),), (len(values), 1)) or rows.dtype.kind not in "fiub":
-            continue
-        a, b = rows.reshape(-1).astype(float), np.asarray(values, float)
-        known = ~np.isnan(a)  # a state that lacks the entry
-        scale = np.max(np.abs(a), initial=0.0, where=np.isfinite(a))
-        if (_apart(b[known], a[known]) > max(SAME_REWARD * scale, 1e-7)).any():
-            yield name
-
-
-def _apart(new: NDArray, old: NDArray) -> NDArray[np.float64]:
-    """How far apart; infinite where one is not a number, zero where both are not or are the same infinity."""
-    with np.errstate(invalid="ignore"):
-        apart = np.abs(new - old)
-    apart[(np.isnan(new) & np.isnan(old)) | (new == old)] = 0.0
-    return np.where(np.isnan(apart), np.inf, apart)

@@ -25,9 +25,10 @@ from workbench.session.rescore import (
     not_judged,
     with_renderer,
 )
-from workbench.session.rescore_messages import Verdict
+from workbench.session.rescore_messages import EpisodeFile
 from workbench.session.rescore_run import rescore
 from workbench.session.step_back import CannotStepIn, write_source
+from workbench.session.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ def rescore_all(
     on_finding: Callable[[Finding], None] = warn_of,
     clearances: Clearances | None = None,
     on_notice: Callable[[str], None] = lambda notice: None,
-) -> tuple[list[Verdict], tuple[str, ...]]:
+) -> tuple[list[Verdict[EpisodeFile]], tuple[str, ...]]:
     """The verdicts, in the order of the files; and what is not as it was recorded on purpose, in words.
 
     Args:
@@ -122,7 +123,7 @@ def rescore_all(
     if failed and len(failed) == len(groups):
         raise failed[0]
     place = {file.id: number for number, file in enumerate(files)}
-    verdicts.sort(key=lambda verdict: place[verdict.file.id])
+    verdicts.sort(key=lambda verdict: place[verdict.of.id])
     return verdicts, tuple(dict.fromkeys(group.note for group in groups if group.note))
 
 

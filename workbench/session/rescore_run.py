@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,9 @@ from workbench.core.step import StepResult
 from workbench.recording.read_episode import UnreadableRecording
 from workbench.session.open_task import OpenedTask, blamed, step_checked
 from workbench.session.relive import Beginning, begin_again, why_not_lived_through
-from workbench.session.rescore import Heard, verdict_of
-from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored, Verdict
+from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored
 from workbench.session.step_back import run_of
+from workbench.session.verdict import Said, Verdict, compare, single_numbers
 
 _TELL_EVERY = 0.2
 """Seconds."""
@@ -49,10 +49,39 @@ class _Seat:
     task: str
     run: RecordedRun
     beginning: Beginning
-    heard: Heard
     unread: dict[str, str]
-    at: int = 0
-    """The state that it is in."""
+    reward: list[float] = field(default_factory=list)
+    """(T,) What the task says of it now, as the following."""
+    evaluate: dict[str, list[float]] = field(default_factory=dict)
+    """(T + 1,) each."""
+    drift: list[tuple[float, float]] = field(default_factory=list)
+    """(T + 1,) metres and radians from the record, where it has states."""
+
+    @property
+    def at(self) -> int:
+        """The state that it is in."""
+        return len(self.reward)
+
+    def verdict(self) -> Verdict[EpisodeFile]:
+        run = self.run
+        # A recording of somebody else's that holds no rewards: there is nothing to compare with.
+        old = np.zeros(0) if np.isnan(run.reward).all() else run.reward
+        recorded = {
+            name: rows.reshape(len(rows))
+            for name, rows in run.evaluate.items()
+            if rows.dtype.kind in "fiub" and rows.shape in ((len(rows),), (len(rows), 1))
+        }
+        now = {name: np.array(rows) for name, rows in self.evaluate.items()}
+        return compare(
+            self.file,
+            Said(old, recorded),
+            Said(np.array(self.reward), now),
+            np.array(self.drift) if run.env_states else None,
+            task=self.task,
+            seed=run.seed,
+            begins_otherwise=self.beginning.otherwise,
+            missed=self.beginning.missed | self.unread,
+        )
 
 
 def rescore(
@@ -61,7 +90,7 @@ def rescore(
     *,
     use_env_states: bool = False,
     on_steps: Callable[[int], None] = lambda steps: None,
-) -> Iterator[Verdict]:
+) -> Iterator[Verdict[EpisodeFile]]:
     """Judge these episodes with the code that is open; a verdict for each, in the order in which they end.
 
     Args:
@@ -97,10 +126,7 @@ def rescore(
         steps += len(seats)
         on_steps(steps)
         for env in [env for env, seat in seats.items() if seat.at == seat.run.length]:
-            seat = seats.pop(env)
-            verdict = verdict_of(seat.file, seat.run, seat.task, seat.heard)
-            missed = seat.beginning.missed | seat.unread
-            yield replace(verdict, begins_otherwise=seat.beginning.otherwise, missed=missed)
+            yield seats.pop(env).verdict()
 
 
 def answer(opened: OpenedTask, request: Rescore, tell: Callable[[int, int, Rescored], None]) -> Rescored:
@@ -113,7 +139,7 @@ def answer(opened: OpenedTask, request: Rescore, tell: Callable[[int, int, Resco
         what is new since then.
     """
     told, steps = time.monotonic(), 0
-    ready: list[Verdict] = []
+    ready: list[Verdict[EpisodeFile]] = []
 
     def on_steps(now: int) -> None:
         nonlocal told, steps
@@ -133,7 +159,7 @@ def answer(opened: OpenedTask, request: Rescore, tell: Callable[[int, int, Resco
     return Rescored(tuple(ready), steps)
 
 
-def _ready(opened: OpenedTask, file: EpisodeFile, use_env_states: bool) -> _Ready | Verdict:
+def _ready(opened: OpenedTask, file: EpisodeFile, use_env_states: bool) -> _Ready | Verdict[EpisodeFile]:
     try:
         episode = file.read()
     except (UnreadableRecording, OSError) as error:
@@ -158,7 +184,7 @@ def _begin(opened: OpenedTask, begun: dict[int, _Ready]) -> dict[int, _Seat]:
     now = read_states(task.env)
     seats: dict[int, _Seat] = {}
     for env, ready in begun.items():
-        seat = seats[env] = _Seat(ready.file, ready.task, ready.run, beginnings[env], Heard(), ready.unread)
+        seat = seats[env] = _Seat(ready.file, ready.task, ready.run, beginnings[env], ready.unread)
         _hear(seat, first, env, now)
     return seats
 
@@ -174,26 +200,22 @@ def _one_step(opened: OpenedTask, seats: dict[int, _Seat], use_env_states: bool)
     else:
         step = step_checked(task, opened.loaded, action)
     now = read_states(task.env)
-    for seat in seats.values():
-        seat.at += 1
     if use_env_states:
         with blamed("restore", opened.loaded, task):
-            write_states(task.env, {env: seat.run.state(seat.at) for env, seat in seats.items()})
+            write_states(task.env, {env: seat.run.state(seat.at + 1) for env, seat in seats.items()})
             step = task.judge(action if task.parts else None)
         now = read_states(task.env)
     for env, seat in seats.items():
-        seat.heard.reward.append(float(step.reward[env]))
+        seat.reward.append(float(step.reward[env]))
         _hear(seat, step, env, now)
 
 
 def _hear(seat: _Seat, step: StepResult, env: int, now: dict[str, NDArray[np.float32]]) -> None:
-    states = len(seat.heard.reward) + 1
-    for name, values in step.evaluate.items():
-        if values.dtype.kind in "fiub" and values.shape in ((len(step.reward),), (len(step.reward), 1)):
-            rows = seat.heard.evaluate.setdefault(name, [])
-            # The terms of a reward are there from the first step on.
-            rows += [np.nan] * (states - 1 - len(rows))
-            rows.append(float(values.reshape(-1)[env]))
+    for name, values in single_numbers(step):
+        rows = seat.evaluate.setdefault(name, [])
+        # The terms of a reward are there from the first step on.
+        rows += [np.nan] * (seat.at - len(rows))
+        rows.append(float(values[env]))
     recorded = seat.run.state(seat.at)
-    if recorded:
-        seat.heard.drifted(apart({name: rows[env] for name, rows in now.items()}, recorded)[0], seat.at)
+    far = apart({name: rows[env] for name, rows in now.items()}, recorded) if recorded else (0.0, 0.0)
+    seat.drift.append(far)

@@ -13,17 +13,16 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
-from workbench.authoring.problem import Problem
 from workbench.authoring.reference import TaskName, named_file
 from workbench.session.askers import Background
 from workbench.session.calls import Progress
 from workbench.session.clearance import Clearances, NotCleared
+from workbench.session.judging import RUNNING, JudgedView, StoppedBy
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
 from workbench.session.messages import Load, TaskOptions
 from workbench.session.rescore import Group, group_episodes, hidden_in_words, not_judged, with_renderer
-from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored, Verdict
+from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored
 from workbench.session.step_back import CannotStepIn, write_source
 
 MOST_AT_ONCE = 16
@@ -32,36 +31,6 @@ IDLE_SECONDS = 300.0
 """How long the process is kept without work."""
 MOST_NAMED = 3
 """Of the versions that are judged with, where there are many."""
-
-RescoreState = Literal["none", "asking", "loading", "judging", "done", "stopped", "failed"]
-
-
-@dataclass(frozen=True)
-class RescoreView:
-    """How far it is, and what it came to."""
-
-    state: RescoreState = "none"
-    serial: int = 0
-    """Grows with every change."""
-    total: int = 0
-    """Episodes."""
-    verdicts: tuple[Verdict, ...] = ()
-    """In the order in which they came."""
-    steps: int = 0
-    """Control steps of all episodes so far."""
-    seconds: float = 0.0
-    """That they took, without loading."""
-    task: str = ""
-    """What is being judged with."""
-    recorded_source: bool = False
-    use_env_states: bool = False
-    notes: tuple[str, ...] = ()
-    hidden: tuple[str, ...] = ()
-    """Of files beside a task that no import finds, a sentence each."""
-    why: str = ""
-    """Why it failed."""
-    problem: Problem | None = None
-    """What the code raised."""
 
 
 @dataclass(frozen=True)
@@ -85,13 +54,13 @@ class Rescorer:
         self._base = base or TaskOptions()
         self._lock = threading.Lock()
         """Of `view`: what a job that was stopped still has to say is not heard."""
-        self._view = RescoreView()
+        self._view = JudgedView()
         self._process = Background("that judges", "to judge with")
         # `_run` tells of failures itself, with what the code raised.
         self._lane = Lane("rescore", lambda: None, lambda why: None, IDLE_SECONDS, self._process.end)
 
     @property
-    def view(self) -> RescoreView:
+    def view(self) -> JudgedView:
         return self._view
 
     def start(
@@ -109,20 +78,22 @@ class Rescorer:
         with self._lock:
             # Under the lock, or the job might tell how far it is before it is said that it begins.
             self._lane.start("judging", lambda job: self._run(job, asked))
-            self._view = RescoreView(
+            self._view = JudgedView(
                 "loading",
                 self._view.serial + 1,
-                len(files),
-                recorded_source=recorded_source,
-                use_env_states=use_env_states,
+                total=len(files),
+                unit="episodes",
             )
 
     def stop(self) -> None:
         """Go no further; what is known by now stays to be seen."""
         with self._lock:
             self._lane.stop()
-            if self._view.state in ("asking", "loading", "judging"):
-                self._view = replace(self._view, state="stopped", serial=self._view.serial + 1)
+            if self._view.state in RUNNING:
+                why = StoppedBy.HAND
+                self._view = replace(
+                    self._view, state="stopped", stopped_by=why, why=why.value, serial=self._view.serial + 1
+                )
 
     def close(self) -> None:
         """End it all; returns when the thread has ended."""
@@ -178,8 +149,8 @@ class Rescorer:
         try:
             if asked.recorded_source:
                 folder, reference = write_source(group.info)
-            hidden = tuple(dict.fromkeys((*self._view.hidden, *hidden_in_words(reference))))
-            self._tell(job, state="loading", task=_judged_with(group, asked), hidden=hidden)
+            warnings = tuple(dict.fromkeys((*self._view.warnings, *hidden_in_words(reference))))
+            self._tell(job, state="loading", task=_judged_with(group, asked), warnings=warnings)
             # Never patched into what the last episodes were judged in.
             load = Load(reference, group.options, level="rebuilt")
             try:
@@ -217,7 +188,8 @@ class Rescorer:
         with self._lock:
             if job.stopped:
                 return
-            self._view = replace(self._view, serial=self._view.serial + 1, **values)  # type: ignore[arg-type]
+            view = replace(self._view, serial=self._view.serial + 1, **values)  # type: ignore[arg-type]
+            self._view = replace(view, done=len(view.verdicts))
 
 
 def _judged_with(group: Group, asked: _Asked) -> str:

@@ -18,17 +18,19 @@ from pathlib import PurePath
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.core.recorded_run import pose_distances
 from workbench.recording.episode import Episode
 from workbench.session.lengths import length
 from workbench.session.number_text import number_text
+from workbench.session.verdict import gap, unlike
 
 ARM = 0.1
 """Metres; a body of this size is thought at each pose, so that an angle is a way."""
 TOLERANCES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2)
 """Metres. A replay on other threads or another machine differs by 1e-6 to 1e-5."""
 USUAL_TOLERANCE = 1e-4
-_NUMBERS_DIFFER = 1e-5
-"""Relative to the larger of 1 and the number: files keep 32 bits."""
+_LEAST = 1e-5
+"""What numbers of two recordings differ by at least: a replay elsewhere differs by less."""
 _MOST_LINES = 600
 
 
@@ -164,16 +166,8 @@ def _bodies(
 
 def distances(a: NDArray, b: NDArray) -> NDArray[np.float64]:
     """(..., ) metres between poses (..., 7), turning included; 0 where both lack the body, inf where one does."""
-    a, b = np.asarray(a, np.float64), np.asarray(b, np.float64)
-    lacks = ~np.isfinite(a).all(-1), ~np.isfinite(b).all(-1)
-    with np.errstate(invalid="ignore"):
-        way = np.linalg.norm(a[..., :3] - b[..., :3], axis=-1)
-        # From the chord, not from arccos: that makes 3e-4 of the last bit of a float.
-        p, q = (x[..., 3:] / np.linalg.norm(x[..., 3:], axis=-1, keepdims=True) for x in (a, b))
-        chord = np.minimum(np.linalg.norm(p - q, axis=-1), np.linalg.norm(p + q, axis=-1))
-        way = way + ARM * 4 * np.arcsin(np.clip(chord / 2, 0, 1))
-    way = np.where(lacks[0] | lacks[1], np.inf, way)
-    return np.where(lacks[0] & lacks[1], 0.0, way)
+    metres, radians = pose_distances(a, b)
+    return metres + ARM * radians
 
 
 def _steps(a: NDArray, b: NDArray, rows: tuple[slice, slice]) -> tuple[NDArray, NDArray]:
@@ -194,10 +188,7 @@ def _numbers(
         return Parting(name, begin, f"shape {a.shape[1:]} → {b.shape[1:]}", "", totals)
     yes = a.dtype.kind == "b" and b.dtype.kind == "b"
     one, two = (np.asarray(x, np.float64).reshape(len(x), -1) for x in (a, b))
-    with np.errstate(invalid="ignore"):
-        gap = np.abs(one - two)
-        differs = gap > _NUMBERS_DIFFER * np.maximum(1.0, np.maximum(np.abs(one), np.abs(two)))
-    differs |= np.isnan(one) != np.isnan(two)
+    differs = unlike(one, two, _LEAST)
     rows = np.flatnonzero(differs.any(axis=1))
     if not len(rows):
         return Parting(name, None, "", "", totals)
@@ -205,7 +196,8 @@ def _numbers(
     column = int(np.flatnonzero(differs[first])[0])
     said = [_said(x[first, column], yes, first) for x in (one, two)]
     label = "" if one.shape[1] == 1 else f"[{column}] "
-    most = "" if yes else number_text(float(np.nanmax(gap, initial=0.0)), ".3g")
+    apart = gap(one, two)
+    most = "" if yes else number_text(float(apart[np.isfinite(apart)].max(initial=0.0)), ".3g")
     return Parting(name, begin + first, f"{label}{said[0]} → {said[1]}", most, totals)
 
 

@@ -29,8 +29,9 @@ from workbench.session.camera_studio import CameraStudio
 from workbench.session.curves import TermCurves
 from workbench.session.debugger_words import listening_for_a_debugger
 from workbench.session.env_table import EnvRows
-from workbench.session.judge import Judge, StoppedBy, what_a_load_means
+from workbench.session.judge import Judge, what_a_load_means
 from workbench.session.judgement import JudgedCurve, Judgement
+from workbench.session.judging import StoppedBy
 from workbench.session.keep_past import PastKeeper
 from workbench.session.kept_worker import Death, KeptWorker, WorkerOptions
 from workbench.session.last_words import Busy

@@ -60,6 +60,4 @@ def how(arrival: Arrival) -> str:
         words += "; every body is where it was, to the last bit"
     else:
         words += f"; bodies are within {length(arrival.metres)} of where they were"
-    if arrival.otherwise:
-        words += f"; evaluate says otherwise of this state: {', '.join(arrival.otherwise)}"
     return words + "."

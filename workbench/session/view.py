@@ -15,7 +15,7 @@ from workbench.core.inspection import Inspection
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.core.step import StepResult
 from workbench.session.curves import Curves
-from workbench.session.judge import JudgementView
+from workbench.session.judging import JudgedView
 from workbench.session.keep_status import KeepStatus
 from workbench.session.kept_worker import Vitals
 from workbench.session.last_words import Busy
@@ -125,7 +125,7 @@ class SessionView:
     """The last lines that the author's code printed."""
     vitals: Vitals = Vitals()
     """What the processes hold."""
-    judgement: JudgementView = JudgementView()
+    judgement: JudgedView = JudgedView()
     """What the new code says of the episodes that were run with the old."""
     studio: StudioView = StudioView()
     """Cameras, as they are placed by hand."""

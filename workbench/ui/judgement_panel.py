@@ -6,33 +6,32 @@ differs. On a small screen all that lies below the edge, so the line above says 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.session.judge import JudgementView
-from workbench.session.judgement import EpisodeDifference, JudgedCurve
-from workbench.session.lengths import length
+from workbench.session import rescore_words as words
+from workbench.session.judgement import JudgedCurve, PastRun
+from workbench.session.judging import JudgedView
 from workbench.session.session import Session
+from workbench.session.verdict import Verdict, in_order
 from workbench.session.view import SessionView
-from workbench.ui import judged_in_words as words
 from workbench.ui.fragments import render
-from workbench.ui.line_chart import LONGEST, ThenAndNow
+from workbench.ui.judged_panel import JudgedPanel
+from workbench.ui.line_chart import LONGEST
 from workbench.ui.parts import Part
-from workbench.ui.presses import Paged, Presses
 
-MOST_ROWS = 8
-"""Of the list, at a time."""
+TITLE = "The past, judged again"
 
 
-class JudgementPanel(Part[SessionView]):
-    every = 0.25
-
+class JudgementPanel(JudgedPanel[SessionView, PastRun]):
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
-        self._server, self._session = server, session
-        self._status = server.gui.add_html("", visible=False)
-        self._stop = server.gui.add_button("Stop judging", icon=viser.Icon.PLAYER_STOP, visible=False)
-        self._stop.on_click(lambda _: session.stop_judging())
+        super().__init__(server, "env")
+        self._session = session
+        self._add_status("Stop judging", session.stop_judging)
         names: tuple[str, ...] = ("reward",)
         self._name: viser.GuiDropdownHandle = server.gui.add_dropdown(
             "Curve",
@@ -40,11 +39,12 @@ class JudgementPanel(Part[SessionView]):
             visible=False,
             hint="Which number is drawn, as recorded and as the new code has it",
         )
-        self._chart = ThenAndNow(server)
-        self._list = server.gui.add_html("", visible=False)
-        self._presses = Presses(server)
-        self._pages = Paged(self._presses, MOST_ROWS)
-        self._listed: tuple[EpisodeDifference, ...] = ()
+        self._add_chart()
+        self._add_list()
+        self._verdicts: Sequence[Verdict[PastRun]] = ()
+        self._shown: tuple[int, int | None] = 0, None
+        """Env and moment on the page."""
+        self._first = 0
 
     def key(self, view: SessionView) -> object:
         past = view.timeline
@@ -53,71 +53,47 @@ class JudgementPanel(Part[SessionView]):
 
     def draw(self, view: SessionView) -> None:
         judged = view.judgement
-        self._status.visible = judged.state != "none"
-        self._stop.visible = judged.state in ("loading", "judging")
+        self._shown, self._first = (view.selected_env, view.timeline.shown), view.timeline.first
         if judged.state == "none":
             self._pages.go_to(0)
-        else:
-            self._status.content = status_html(judged)
-        self._draw_list(judged, view)
-        self._draw_chart(judged, view)
+        self._draw_status(judged, TITLE)
+        if judged.verdicts is not self._verdicts:
+            self._verdicts = judged.verdicts
+            self._listed = in_order([verdict for verdict in judged.verdicts if verdict.differs])
+        self._draw_list(self._listed)
+        self._draw_curve(judged, view)
 
-    # --- the chart -----------------------------------------------------------------------------------
-
-    def _draw_chart(self, judged: JudgementView, view: SessionView) -> None:
-        summary = judged.summary
-        names = () if summary is None else summary.names
-        differs = summary is not None and bool(summary.differing or summary.differing_names)
+    def _draw_curve(self, judged: JudgedView, view: SessionView) -> None:
+        names, env = judged.names, view.selected_env
         if names and self._name.options != names:
             self._name.options = names
         # What a page sends as its choice may be anything.
         name = self._name.value if self._name.value in names else "reward"
-        curve = self._session.judged_curve(name, view.selected_env) if differs else None
+        differs = bool(self._listed or judged.differing_names)
+        curve = self._session.judged_curve(name, env) if differs else None
         self._name.visible = curve is not None
-        if curve is None or len(curve.tick) < 2:
+        if curve is None:
             self._chart.hide()
-            return
-        self._chart.draw(
-            f"{name} of env {view.selected_env}, before and now", chart_data(curve, view.timeline.shown)
-        )
+        else:
+            self._draw_chart(f"{name} of env {env}, before and now", *chart_data(curve, view.timeline.shown))
 
     # --- the list ------------------------------------------------------------------------------------
 
-    def _draw_list(self, judged: JudgementView, view: SessionView) -> None:
-        self._listed = () if judged.summary is None else judged.summary.differences
-        self._list.visible = bool(self._listed)
-        if not self._listed:
-            return
-        shown = self._pages.places(len(self._listed))
-        rows = [self._row(place, view) for place in shown]
-        self._list.content = render("differences", rows=rows, more=self._pages.shown)
-
-    def _row(self, place: int, view: SessionView) -> dict[str, object]:
-        episode = self._listed[place]
-        far = episode.drift > words.FAR_METRES
-        kept = episode.at >= view.timeline.first
+    def _of_row(self, verdict: Verdict[PastRun]) -> dict[str, Any]:
+        env, at = place = _place(verdict)
+        kept = at >= self._first
         return {
-            "env": episode.env,
-            "lines": words.difference(episode),
-            "returns": words.change(*episode.returns),
-            "drift": f"drifted {length(episode.drift)}" if far else "",
+            "name": str(env),
             "hint": "Show this moment" if kept else "This moment is no longer in the history",
-            "selected": view.timeline.shown == episode.at and view.selected_env == episode.env,
-            "press": self._presses.id_of(
-                ("row", place % MOST_ROWS), lambda _, k=place % MOST_ROWS: self._go(k)
-            ),
+            "selected": self._shown == place,
         }
 
-    def _go(self, row: int) -> None:
-        place = self._pages.first + row
-        if place < len(self._listed):
-            self._show_episode(self._listed[place])
-
-    def _show_episode(self, episode: EpisodeDifference) -> None:
-        if episode.at >= self._session.view().timeline.first:
-            self._session.show(episode.env, episode.at)
+    def _show(self, verdict: Verdict[PastRun]) -> None:
+        env, at = _place(verdict)
+        if at >= self._session.view().timeline.first:
+            self._session.show(env, at)
         else:
-            self._session.change(selected_env=episode.env)
+            self._session.change(selected_env=env)
 
     def go_to_difference(self, by: int) -> None:
         """Show the next (1) or last (-1) moment of the list, from the one that is shown; round the end."""
@@ -125,16 +101,20 @@ class JudgementPanel(Part[SessionView]):
         if not listed:
             return
         view = self._session.view()
-        here = next(
-            (k for k, e in enumerate(listed) if (e.at, e.env) == (view.timeline.shown, view.selected_env)),
-            -1 if by > 0 else 0,
-        )
+        shown = view.selected_env, view.timeline.shown
+        here = next((k for k, one in enumerate(listed) if _place(one) == shown), -1 if by > 0 else 0)
         place = (here + by) % len(listed)
         self._pages.go_to(place)
-        self._show_episode(listed[place])
+        self._show(listed[place])
 
 
-def chart_data(curve: JudgedCurve, shown: int | None) -> tuple[NDArray[np.float64], ...]:
+def _place(verdict: Verdict[PastRun]) -> tuple[int, int]:
+    """Env, and serial of the moment to look at."""
+    assert verdict.look_at is not None
+    return verdict.of.env, verdict.of.at(verdict.look_at)
+
+
+def chart_data(curve: JudgedCurve, shown: int | None) -> tuple[NDArray, ...]:
     """As uPlot wants it: x, the record, what is said now, and a point at the moment that is shown, if one is.
 
     Of a long record the newest part, or the part round the moment that is shown.
@@ -145,14 +125,22 @@ def chart_data(curve: JudgedCurve, shown: int | None) -> tuple[NDArray[np.float6
         end = int(np.searchsorted(curve.serial, shown)) + LONGEST // 2
     end = min(max(end, LONGEST), count)
     part = slice(max(0, end - LONGEST), end)
-    x, old, new = (np.asarray(v[part], np.float64) for v in (curve.tick, curve.old, curve.new))
+    x, old, new = (v[part] for v in (curve.tick, curve.old, curve.new))
     if shown is None or shown not in curve.serial[part]:
         return x, old, new
     return x, old, new, np.where(curve.serial[part] == shown, np.where(np.isnan(new), old, new), np.nan)
 
 
-def status_html(judged: JudgementView) -> str:
-    return render("judgement", judged=judged, words=words)
+def in_a_line(judged: JudgedView) -> str:
+    """For who does not see the rest; empty while there is nothing to say."""
+    if judged.state == "loading":
+        return "The past is judged again: loading the new code"
+    if judged.state == "judging":
+        # In tenths, or a page that is played on would be written to at every look.
+        return f"The past is judged again: {10 * int(10 * judged.done / max(1, judged.total))} %"
+    if judged.state == "done":
+        return f"{TITLE}: {words.headline(judged.verdicts, others=judged.differing_names)}"
+    return f"{TITLE}: {judged.why}" if judged.why else ""
 
 
 class JudgedAbove(Part[SessionView]):
@@ -160,7 +148,7 @@ class JudgedAbove(Part[SessionView]):
         self._line = server.gui.add_html("", visible=False)
 
     def draw(self, view: SessionView) -> None:
-        says = words.in_a_line(view.judgement)
+        says = in_a_line(view.judgement)
         self._line.visible = bool(says)
         if says:
             self._line.content = render("judged_above", says=says)

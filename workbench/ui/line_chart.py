@@ -5,8 +5,6 @@ once when uPlot makes its chart anew, which it does for a change of anything but
 axis shows another part of the data than before, for good, and in the end none of it. And uPlot finds no range for
 data with NaN in it, and draws through it. So all that draw curves have the chart through here: only data are ever
 sent to a chart that is shown, with gaps where there is no number, and for other lines another chart is shown.
-
-The chart of one number as it was recorded, and as the new code has it: the record thin and grey, the new over it.
 """
 
 from __future__ import annotations
@@ -159,31 +157,3 @@ def span_of(lines: Sequence[NDArray[np.float64]]) -> Span | None:
     """The range of a chart: of a yes or no always the same one, whether it changes or not; else that of the data."""
     values = np.concatenate([[], *lines])
     return YES_OR_NO if np.isin(values[np.isfinite(values)], (0.0, 1.0)).all() else None
-
-
-RECORD_COLOUR = "#adb5bd"
-
-
-class ThenAndNow:
-    """The chart, in the present container, once there is something to draw."""
-
-    def __init__(self, server: viser.ViserServer) -> None:
-        self._chart = LineChart(server, server.gui.add_folder(None), height=160)
-
-    @property
-    def handle(self) -> viser.GuiUplotHandle | None:
-        """None before there was something to draw."""
-        return self._chart.handle
-
-    def hide(self) -> None:
-        self._chart.hide()
-
-    def draw(self, title: str, data: Sequence[NDArray[np.float64]]) -> None:
-        """
-        Args:
-            title: Over the chart.
-            data: Steps, the record, what is said now, each (K,); and a point at the moment that is shown, if one is.
-        """
-        x, old, new, *dot = data
-        lines = Line("as recorded", old, RECORD_COLOUR, 1.2), Line("judged again", new)
-        self._chart.draw(title, x, lines, dot[0] if dot else None, span_of(data[1:]))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import viser
@@ -16,16 +17,17 @@ import viser
 from workbench.authoring.reference import RecordedTask, named_file
 from workbench.recording.episode import EpisodeInfo
 from workbench.session import rescore_words as words
+from workbench.session.judging import RUNNING
 from workbench.session.recorded_text import version_of
-from workbench.session.rescore_messages import EpisodeFile, Verdict
-from workbench.session.rescorer import Rescorer, RescoreView
+from workbench.session.rescore_messages import EpisodeFile
+from workbench.session.rescorer import Rescorer
 from workbench.session.review import Review
 from workbench.session.review_view import ReviewView
 from workbench.session.step_back import class_in, reference_of
+from workbench.session.verdict import Verdict, in_order
 from workbench.ui.fragments import render
-from workbench.ui.line_chart import LONGEST, ThenAndNow
-from workbench.ui.parts import Part
-from workbench.ui.presses import Paged, Presses
+from workbench.ui.judged_panel import JudgedPanel
+from workbench.ui.line_chart import LONGEST
 from workbench.ui.review_scene import COLOURS, letter
 
 TODAYS, RECORDED = "today's", "as recorded"
@@ -83,9 +85,10 @@ def _recorded(infos: Sequence[EpisodeInfo]) -> str:
     return f"With the text that each recording holds{version}. It runs here; you are asked first where it was not recorded here."
 
 
-MOST_ROWS = 10
-"""Of the list, at a time."""
-RUNNING = ("asking", "loading", "judging")
+IDLE = (
+    "Runs today's reward and evaluate over recorded episodes, from their seeds and with their actions, and lists what is "
+    "judged otherwise now. Select recordings in the Library and press Judge again there, or judge what is open."
+)
 
 
 @dataclass
@@ -98,7 +101,7 @@ class RescoreChoices:
     """Asked before the files that the recordings name."""
 
 
-class RescorePanel(Part[ReviewView]):
+class RescorePanel(JudgedPanel[ReviewView, EpisodeFile]):
     """The panel in the present container.
 
     Args:
@@ -110,7 +113,7 @@ class RescorePanel(Part[ReviewView]):
         known: Task files that the server knows of besides those that recordings name.
     """
 
-    every = 0.2
+    advice = words.PUT_IN
 
     def __init__(
         self,
@@ -121,7 +124,8 @@ class RescorePanel(Part[ReviewView]):
         choices: RescoreChoices,
         known: Callable[[], Sequence[Path]] = tuple,
     ) -> None:
-        self._server, self._rescorer, self._review = server, rescorer, review
+        super().__init__(server, "episode")
+        self._rescorer, self._review = rescorer, review
         self._find, self._choices, self._known = find, choices, known
         gui = server.gui
         self._begin = gui.add_button("Judge what is open", icon=viser.Icon.GAVEL, visible=False)
@@ -143,14 +147,9 @@ class RescorePanel(Part[ReviewView]):
             hint="Put the recorded state in after every step, so that nothing drifts from the record",
         )
         self._states.on_update(lambda _: self._chosen())
-        self._stop = gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, visible=False)
-        self._stop.on_click(lambda _: rescorer.stop())
-        self._status = gui.add_html("")
-        self._list = gui.add_html("")
-        self._presses = Presses(server)
-        self._chart = ThenAndNow(server)
-        self._pages = Paged(self._presses, MOST_ROWS)
-        self._listed: list[Verdict] = []
+        self._add_status("Stop", rescorer.stop)
+        self._add_list()
+        self._add_chart()
         self._selected: str | None = None
 
     def judge(self, ids: Sequence[str]) -> None:
@@ -186,13 +185,10 @@ class RescorePanel(Part[ReviewView]):
     def draw(self, view: ReviewView) -> None:
         self._draw_codes(view)
         told = self._rescorer.view
-        running = told.state in RUNNING
-        self._begin.visible = bool(view.opened) and not running
-        self._stop.visible = running
-        self._status.content = status_html(told)
-        self._listed = in_order(told.verdicts)
-        self._draw_list()
-        self._draw_chart()
+        self._begin.visible = bool(view.opened) and told.state not in RUNNING
+        self._draw_status(told, idle=IDLE)
+        self._draw_list(in_order(told.verdicts))
+        self._draw_curve()
 
     def _draw_codes(self, view: ReviewView) -> None:
         if self._codes_of == (wanted := self._codes_are_of(view)):
@@ -212,84 +208,47 @@ class RescorePanel(Part[ReviewView]):
         self._code.value = chosen.label
         self._told.content = render("note", text=chosen.told)
 
-    def _draw_list(self) -> None:
-        rows = [self._row(place) for place in self._pages.places(len(self._listed))]
-        self._list.content = render("rescore_table", rows=rows, more=self._pages.shown)
-
-    def _row(self, place: int) -> dict[str, object]:
-        verdict = self._listed[place]
+    def _of_row(self, verdict: Verdict[EpisodeFile]) -> dict[str, Any]:
         at = verdict.first_difference
         return {
             **self._letter_of(verdict),
-            "episode": f"seed {verdict.seed}" if verdict.seed >= 0 else verdict.file.name[-24:],
-            "changed": words.what_changed(verdict),
-            "returns": "" if verdict.why_not else words.returns(verdict),
-            "drift": f"drifted {words.drift(verdict)}" if verdict.drifted else "",
-            "hint": f"{verdict.file.name}. Press to open it"
+            "name": f"seed {verdict.seed}" if verdict.seed >= 0 else verdict.of.name[-24:],
+            "hint": f"{verdict.of.name}. Press to open it"
             + (f" at step {at}, the first that differs" if at is not None else ""),
-            "selected": verdict.file.id == self._selected,
-            "same": not verdict.differs,
-            "press": self._presses.id_of(
-                ("row", place % MOST_ROWS), lambda _, k=place % MOST_ROWS: self._go(k)
-            ),
+            "selected": verdict.of.id == self._selected,
         }
 
-    def _letter_of(self, verdict: Verdict) -> dict[str, str]:
+    def _letter_of(self, verdict: Verdict[EpisodeFile]) -> dict[str, str]:
         """As it is drawn with, if it is one of several that are open."""
         opened = [one.id for one in self._review.view().opened]
-        if len(opened) < 2 or verdict.file.id not in opened:
+        if len(opened) < 2 or verdict.of.id not in opened:
             return {"letter": "", "colour": ""}
-        index = opened.index(verdict.file.id)
+        index = opened.index(verdict.of.id)
         return {"letter": letter(index), "colour": COLOURS[index % len(COLOURS)]}
 
-    def _go(self, row: int) -> None:
-        place = self._pages.first + row
-        if place >= len(self._listed):
-            return
-        verdict = self._listed[place]
-        self._selected = verdict.file.id
+    def _show(self, verdict: Verdict[EpisodeFile]) -> None:
+        self._selected = verdict.of.id
         view = self._review.view()
-        opened = next((k for k, one in enumerate(view.opened) if one.id == verdict.file.id), None)
+        opened = next((k for k, one in enumerate(view.opened) if one.id == verdict.of.id), None)
         if opened is None:
-            self._review.open((verdict.file.id,), verdict.first_difference)
+            self._review.open((verdict.of.id,), verdict.first_difference)
             return
         self._review.select(opened)
         if verdict.first_difference is not None:
             self._review.seek(verdict.first_difference - view.anchors[opened])
 
-    def _draw_chart(self) -> None:
-        chosen = next((v for v in self._listed if v.file.id == self._selected), None)
-        if chosen is None or len(chosen.new_reward) < 2:
+    def _draw_curve(self) -> None:
+        chosen = next((v for v in self._listed if v.of.id == self._selected), None)
+        if chosen is None:
             self._chart.hide()
             return
-        end = min(len(chosen.new_reward), len(chosen.old_reward))
+        end = chosen.length
         if chosen.first_difference is not None:
             end = min(end, max(LONGEST, chosen.first_difference + LONGEST // 2))
         part = slice(max(0, end - LONGEST), end)
-        steps = np.arange(1, len(chosen.new_reward) + 1, dtype=np.float64)[part]
-        data = (steps, *(np.asarray(v[part], np.float64) for v in (chosen.old_reward, chosen.new_reward)))
-        title = f"reward of {f'seed {chosen.seed}' if chosen.seed >= 0 else chosen.file.name}, then and now"
-        self._chart.draw(title, data)
-
-
-def in_order(verdicts: Sequence[Verdict]) -> list[Verdict]:
-    """What changed most first: success and fail, then return; what is as it was, and what was not judged, last."""
-
-    def key(verdict: Verdict) -> tuple[bool, bool, bool, float]:
-        moved = verdict.success[0] != verdict.success[1] or verdict.fail[0] != verdict.fail[1]
-        change = abs(verdict.returns[1] - verdict.returns[0])
-        return (
-            bool(verdict.why_not),
-            not verdict.differs,
-            not moved,
-            -change if np.isfinite(change) else -np.inf,
+        steps = np.arange(1, chosen.length + 1)
+        name = f"seed {chosen.seed}" if chosen.seed >= 0 else chosen.of.name
+        self._draw_chart(
+            f"reward of {name}, then and now",
+            *(values[part] for values in (steps, chosen.old_reward, chosen.new_reward)),
         )
-
-    return sorted(verdicts, key=key)
-
-
-def status_html(told: RescoreView) -> str:
-    known = told.verdicts if told.state != "none" else ()
-    rate = told.steps / told.seconds if told.seconds > 0.5 else 0.0
-    headline = words.summary(known) if known and told.state in ("done", "stopped") else ""
-    return render("rescore", told=told, known=known, rate=rate, headline=headline, words=words)

@@ -1,0 +1,211 @@
+"""What is said of a run now, compared with what was said of it when it was recorded.
+
+A run is what one env lives through: T control steps and T + 1 states. It is compared as far as both were said, also where
+today's code would have ended it before. What is judged is the run anew and not the record, so how far it came from the
+record belongs to each verdict.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from workbench.core.step import StepResult
+
+SAME_SHARE, SAME_NUMBER = 1e-5, 1e-7
+"""Numbers that differ by no more than this share of the largest recorded one, or by no more than this, are the same."""
+FAR_METRES, FAR_RADIANS = 1e-3, 1e-2
+"""A body further than this from the record makes a comparison doubtful."""
+FLAGS = ("success", "fail")
+_MAIN = ("reward", *FLAGS)
+Of = TypeVar("Of")
+
+
+@dataclass(frozen=True)
+class Said:
+    """What a task says of a run, as far as it is one number or flag."""
+
+    reward: NDArray
+    """(T,); empty where none was recorded."""
+    evaluate: Mapping[str, NDArray]
+    """(T + 1,) each; NaN in a state without it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Verdict(Generic[Of]):
+    """One run as it was judged then, and as it is judged now."""
+
+    of: Of
+    """Where the run is."""
+    task: str = ""
+    seed: int = -1
+    length: int = 0
+    """Control steps."""
+    success: tuple[int | None, int | None] = (None, None)
+    """The first step of the episode after which it was true, then and now; None for never."""
+    fail: tuple[int | None, int | None] = (None, None)
+    has_success: bool = False
+    returns: tuple[float, float] = (0.0, 0.0)
+    largest: float = 0.0
+    """The largest change of one reward."""
+    first_difference: int | None = None
+    """The first step of which the reward, success or fail is another; None where all are as they were."""
+    look_at: int | None = None
+    """The step to look at: where success or fail is, or else where the reward differs most."""
+    differing: tuple[str, ...] = ()
+    """``reward``, and the entries of ``evaluate``, that are others somewhere."""
+    metres: float | None = None
+    """How far the body that was furthest from the record was; None where it holds no states to compare with."""
+    radians: float = 0.0
+    """How much the body or joint that was turned most was."""
+    drift_at: int | None = None
+    """The step after which the body was furthest."""
+    begins_otherwise: bool = False
+    """The reset with its seed gave another first state, and the recorded one was put in its place."""
+    missed: dict[str, str] = field(default_factory=dict)
+    """What of the record could not be put into the env, and why."""
+    why_not: str = ""
+    """Why it was not judged; all else is then empty."""
+    old_reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+    new_reward: NDArray[np.float32] = field(default_factory=lambda: np.zeros(0, np.float32))
+
+    @property
+    def differs(self) -> bool:
+        """Whether reward, success or fail is another now."""
+        return self.first_difference is not None
+
+    @property
+    def others(self) -> tuple[str, ...]:
+        """Those of `differing` that are neither reward, success nor fail."""
+        return tuple(name for name in self.differing if name not in _MAIN)
+
+    @property
+    def drifted(self) -> bool:
+        """Whether what differs may come of other states and not of the code."""
+        return self.metres is not None and not (self.metres <= FAR_METRES and self.radians <= FAR_RADIANS)
+
+
+def compare(
+    of: Of,
+    old: Said,
+    new: Said,
+    drift: NDArray[np.float64] | None = None,
+    *,
+    begin: int = 0,
+    task: str = "",
+    seed: int = -1,
+    begins_otherwise: bool = False,
+    missed: Mapping[str, str] | None = None,
+) -> Verdict[Of]:
+    """Compare what was recorded with what is said now.
+
+    Args:
+        old: as long as `new`, or longer.
+        drift: (T + 1, 2) metres and radians that the furthest body is from the record in each state; None if not known.
+        begin: the steps of its episode that were made before the run.
+    """
+    steps = len(new.reward)
+    recorded = len(old.reward) > 0
+    was = np.asarray(old.reward[:steps] if recorded else np.full(steps, np.nan), np.float64)
+    apart = gap(was, new.reward) if recorded else np.zeros(steps)
+    others = {name: np.flatnonzero(_others(old.evaluate, new.evaluate, name)) for name in new.evaluate}
+    others["reward"] = 1 + np.flatnonzero(unlike(was, new.reward)) if recorded else np.zeros(0, np.int64)
+    turned: dict[str, tuple[int | None, int | None]] = {}
+    for name in FLAGS:
+        flags = [_flag(said.evaluate.get(name), steps + 1) for said in (old, new)]
+        others[name] = np.flatnonzero(flags[0] != flags[1])
+        then, now = (begin + int(np.argmax(flag)) if flag.any() else None for flag in flags)
+        turned[name] = then, now
+    first = min((begin + int(others[name][0]) for name in _MAIN if len(others[name])), default=None)
+    look_at = first
+    if len(others["reward"]):
+        look_at = begin + 1 + int(np.argmax(apart))
+    for then, now in (turned["fail"], turned["success"]):
+        if then != now:
+            look_at = then if now is None else now
+    far = None if drift is None or not len(drift) else int(np.argmax(drift[:, 0]))
+    return Verdict(
+        of=of,
+        task=task,
+        seed=seed,
+        length=steps,
+        success=turned["success"],
+        fail=turned["fail"],
+        has_success="success" in old.evaluate or "success" in new.evaluate,
+        returns=(float(was.sum()), float(np.sum(new.reward, dtype=np.float64))),
+        largest=float(apart.max(initial=0.0)),
+        first_difference=first,
+        look_at=look_at,
+        differing=tuple(name for name in dict.fromkeys((*_MAIN, *others)) if len(others[name])),
+        metres=None if far is None or drift is None else float(drift[far, 0]),
+        radians=0.0 if far is None or drift is None else float(drift[:, 1].max()),
+        drift_at=None if far is None or drift is None or not drift[far, 0] else begin + far,
+        begins_otherwise=begins_otherwise,
+        missed=dict(missed or {}),
+        old_reward=was.astype(np.float32),
+        new_reward=np.asarray(new.reward, np.float32),
+    )
+
+
+def in_order(verdicts: Sequence[Verdict[Of]]) -> list[Verdict[Of]]:
+    """What changed most first: success, fail, then return; what is as it was, and what was not judged, last."""
+
+    def key(verdict: Verdict[Of]) -> tuple[bool, bool, int, float]:
+        moved = 2 * (verdict.success[0] != verdict.success[1]) + (verdict.fail[0] != verdict.fail[1])
+        change = float(gap(*map(np.atleast_1d, verdict.returns))[0])
+        return bool(verdict.why_not), not verdict.differs, -moved, -change
+
+    return sorted(verdicts, key=key)
+
+
+def single_numbers(step: StepResult) -> Iterator[tuple[str, NDArray]]:
+    """The entries of ``evaluate`` that are one number or flag for each env: (N,) each."""
+    count = len(step.reward)
+    for name, values in step.evaluate.items():
+        if values.dtype.kind in "fiub" and values.shape in ((count,), (count, 1)):
+            yield name, values.reshape(count)
+
+
+def gap(old: NDArray, new: NDArray) -> NDArray[np.float64]:
+    """How far apart; infinite where one is not a number, zero where both are not or are the same infinity."""
+    a, b = np.asarray(old, np.float64), np.asarray(new, np.float64)
+    with np.errstate(invalid="ignore"):
+        apart = np.abs(b - a)
+    apart[(np.isnan(a) & np.isnan(b)) | (a == b)] = 0.0
+    return np.where(np.isnan(apart), np.inf, apart)
+
+
+def unlike(old: NDArray, new: NDArray, least: float = SAME_NUMBER) -> NDArray[np.bool_]:
+    """Where numbers are not the same.
+
+    Args:
+        least: what differs by no more is the same.
+    """
+    apart = gap(old, new)
+    scale = np.max(np.abs(old), initial=0.0, where=np.isfinite(old)) if apart.any() else 0.0
+    return apart > max(SAME_SHARE * scale, least)
+
+
+def _others(old: Mapping[str, NDArray], new: Mapping[str, NDArray], name: str) -> NDArray[np.bool_]:
+    """(T + 1,) of the states in which an entry that both have is another."""
+    a, b = old.get(name), np.asarray(new[name], np.float64)
+    if a is None or len(a) < len(b):
+        return np.zeros(len(b), bool)
+    a = np.asarray(a[: len(b)], np.float64)
+    differs = unlike(a, b)
+    # Many a file says nothing of the state that a run begins with.
+    differs[:1] &= ~np.isnan(a[:1])
+    return differs
+
+
+def _flag(values: NDArray | None, states: int) -> NDArray[np.bool_]:
+    """(states,) of an entry that is a flag: False where it is not said."""
+    found = np.zeros(states, bool)
+    if values is not None:
+        said = np.nan_to_num(np.asarray(values[:states], np.float64)) > 0.5
+        found[: len(said)] = said
+    return found
