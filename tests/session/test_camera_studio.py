@@ -16,7 +16,7 @@ from tests.session.studio import BASE, PEOPLE, camera, moved, said
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.session.messages import CameraRequest, TaskOptions
 from workbench.session.session import Session
-from workbench.session.studio_view import StudioView
+from workbench.session.studio_view import StudioView, Wish
 from workbench.session.view import SessionView
 
 pytestmark = pytest.mark.usefixtures("child_process")
@@ -49,7 +49,7 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Session, 
         wait_until(session, lambda view: view.task is not None, "the first load")
         there = replace(camera(session, BASE).now, position=(0.31, 0.02, 0.55))
         session.studio.place(BASE, there)
-        session.studio.file.plan_write(BASE)
+        session.studio.plan(Wish("edit", BASE))
         refused = wait_until(session, said(lambda s: s.writing.stage == "refused"), "the refusal")
         session.studio.file.copy_task()
         planned = wait_until(session, said(lambda s: s.writing.stage == "planned"), "the plan in the copy")
@@ -202,7 +202,7 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     studio, before = session.studio, task_file.read_text()
     start = camera(session, BASE).now
     studio.place(BASE, replace(start, position=(0.31, 0.02, 0.55), fov=1.2))
-    studio.file.plan_write(BASE)
+    studio.plan(Wish("edit", BASE))
     view = wait_until(session, said(lambda s: s.writing.stage in ("planned", "refused")), "the plan")
     assert view.studio.writing.stage == "planned", view.studio.writing.message
     assert task_file.read_text() == before and "+" in view.studio.writing.edit.diff
@@ -234,7 +234,7 @@ def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(
     studio, before = session.studio, task_file.read_text()
     there = replace(camera(session, BASE).now, position=(0.2, 0.1, 0.7))
     studio.place(BASE, there)
-    studio.file.plan_remove(BASE)
+    studio.plan(Wish("remove", BASE))
     view = wait_until(session, said(lambda s: s.writing.stage in ("planned", "refused")), "the plan")
     assert view.studio.writing.stage == "planned", view.studio.writing.message
     studio.file.write()
@@ -278,12 +278,12 @@ def settled(session: Session, reached: Callable[[StudioView], bool], what: str) 
 
 def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved(session: Session) -> None:
     session.studio.judge(BASE)
-    report = settled(session, lambda s: s.report_of == BASE, "the judgement").report
+    report = settled(session, lambda s: s.looked.report_of == BASE, "the judgement").looked.report
     assert sorted(report.envs) == [0, 1] and not session.view().studio.report_stale
     (cube,) = report.wanted_objects(("cube",))
     assert cube.summary().seen == 1.0
     session.studio.make_sheet(BASE)
-    sheet = settled(session, lambda s: len(s.sheet) == 2, "the pictures of all envs").sheet
+    sheet = settled(session, lambda s: len(s.looked.sheet) == 2, "the pictures of all envs").looked.sheet
     assert [p.env for p in sheet] == [report.envs[i] for i in report.worst_first()]
     # Turned to the sky.
     start = camera(session, BASE).now
@@ -291,10 +291,10 @@ def test_a_camera_is_judged_in_all_envs_and_the_report_is_stale_when_it_is_moved
     session.studio.place(BASE, away)
     assert session.view().studio.report_stale
     session.studio.judge(BASE)
-    studio = settled(session, lambda s: s.report is not report, "the judgement of the placement")
-    assert studio.report.wanted_objects(("cube",))[0].summary().seen == 0.0 and not studio.report_stale
+    studio = settled(session, lambda s: s.looked.report is not report, "the judgement of the placement")
+    assert studio.looked.report.wanted_objects(("cube",))[0].summary().seen == 0.0 and not studio.report_stale
     session.studio.compare(BASE, start)
-    pair = settled(session, lambda s: s.compared is not None, "the comparison").compared
+    pair = settled(session, lambda s: s.looked.compared is not None, "the comparison").looked.compared
     assert pair is not None
     here, there = pair
     assert np.allclose(here.pose[3:], away.quaternion) and np.allclose(there.pose[3:], start.quaternion)
@@ -305,15 +305,15 @@ def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session:
     start_over(session, 0)
     step(session, 4)
     session.studio.judge_steps(BASE)
-    studio = settled(session, lambda s: len(s.report_moments) == 5, "five moments")
-    assert [moment.step for moment in studio.report_moments] == [0, 1, 2, 3, 4]
-    assert {moment.env for moment in studio.report_moments} == {0} == set(studio.report.envs)
-    (cube,) = studio.report.wanted_objects(("cube",))
+    studio = settled(session, lambda s: len(s.looked.report_moments) == 5, "five moments")
+    assert [moment.step for moment in studio.looked.report_moments] == [0, 1, 2, 3, 4]
+    assert {moment.env for moment in studio.looked.report_moments} == {0} == set(studio.looked.report.envs)
+    (cube,) = studio.looked.report.wanted_objects(("cube",))
     assert cube.summary().seen == 1.0
-    session.past.seek(studio.report_moments[2].serial)
+    session.past.seek(studio.looked.report_moments[2].serial)
     assert session.view().step.elapsed_steps[0] == 2
     session.studio.judge_steps(BASE, 2)
-    moments = settled(session, lambda s: len(s.report_moments) == 2, "its ends").report_moments
+    moments = settled(session, lambda s: len(s.looked.report_moments) == 2, "its ends").looked.report_moments
     assert [moment.step for moment in moments] == [0, 4], (
         "of the whole episode, also where a moment in it is shown"
     )
@@ -321,7 +321,7 @@ def test_a_camera_is_judged_over_the_steps_of_the_episode_that_is_shown(session:
     wait_until(session, lambda v: not v.step.elapsed_steps.any() or v.timeline.shown is not None, "another")
     session.past.seek(None)
     session.studio.judge_steps(BASE)
-    settled(session, lambda s: len(s.report_moments) == 1, "the episode that has just begun")
+    settled(session, lambda s: len(s.looked.report_moments) == 1, "the episode that has just begun")
 
 
 def test_a_picked_pixel_is_the_place_of_what_is_seen_there(session: Session) -> None:
@@ -332,7 +332,7 @@ def test_a_picked_pixel_is_the_place_of_what_is_seen_there(session: Session) -> 
     beside = replace(camera(session, BASE).now, position=(x + 0.4, y, z), quaternion=(0.0, 0.0, 0.0, 1.0))
     session.studio.place(BASE, beside)
     session.studio.pick(BASE, 0.5, 0.5)
-    picked = settled(session, lambda s: s.picked is not None, "the pixel").picked
+    picked = settled(session, lambda s: s.looked.picked is not None, "the pixel").looked.picked
     assert picked.body == "cube" and abs(picked.depth - 0.38) < 2e-3
     assert np.allclose(picked.point, [x + 0.02, y, z], atol=5e-3)
 
@@ -341,22 +341,24 @@ def test_seeds_are_judged_and_places_searched_in_a_process_of_their_own(session:
     studio = session.studio
     studio.judge(BASE, 3)
     assert session.view().studio.progress is not None
-    found = settled(session, lambda s: s.report_seeds == 3, "three seeds")
-    assert len(found.report.envs) == 3 and found.report_of == BASE and not found.report_before
+    found = settled(session, lambda s: s.looked.report_seeds == 3, "three seeds")
+    assert len(found.looked.report.envs) == 3 and found.looked.report_of == BASE and not found.looked.judging
     studio.suggest(BASE, ("cube",), (0.2, -0.4, 0.3), (0.6, 0.4, 0.8), 2)
-    offered = settled(session, lambda s: len(s.suggestions) > 0, "suggestions").suggestions
+    offered = settled(session, lambda s: len(s.looked.suggestions) > 0, "suggestions").looked.suggestions
     assert offered[0].score >= offered[-1].score > 0 and "cube: in 2 of 2 envs" in offered[0].words
     studio.take_suggestion(0)
     wait_until(session, lambda v: moved(v) == {BASE}, "the suggestion taken")
     studio.judge(BASE, 500)
     wait_until(
-        session, said(lambda s: s.report_before and s.report is not None), "what is known, as from before"
+        session,
+        said(lambda s: s.looked.judging and s.looked.report is not None),
+        "what is known, as from before",
     )
     wait_until(
         session, said(lambda s: s.progress is not None and s.progress.total == 500), "a long judgement"
     )
     studio.stop()
-    wait_until(session, said(lambda s: s.progress is None and not s.report_before), "its end")
+    wait_until(session, said(lambda s: s.progress is None and not s.looked.judging), "its end")
     studio.suggest(BASE, ("nothing",), (0.0, 0.0, 0.3), (0.1, 0.1, 0.4), 1)
     wait_until(session, said(lambda s: "no object 'nothing'" in s.problem), "why not")
 

@@ -8,7 +8,7 @@ episodes, of another in the background. There is one job of each kind at a time,
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -18,14 +18,13 @@ from numpy.typing import NDArray
 from workbench.core.camera_frames import compose
 from workbench.core.camera_report import CameraReport, join_reports
 from workbench.core.camera_settings import CameraKey, CameraSettings
-from workbench.core.camera_suggestion import OfferedPlacement
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.session.askers import Asker, Background
 from workbench.session.camera_messages import DrawCamera, JudgeCamera, SuggestCameras
 from workbench.session.history import Lived
 from workbench.session.lane import Job, Lane
 from workbench.session.messages import Load, Reset
-from workbench.session.studio_view import JudgedMoment, Picked, Progress
+from workbench.session.studio_view import JudgedMoment, Looked, Picked, Progress
 
 FIRST_SEED = 10_000
 """The same seeds for every judgement, so that two can be compared; others than people begin with."""
@@ -51,26 +50,8 @@ class ShownMoment:
         return None if self.poses is None else self.poses[env]
 
 
-@dataclass(frozen=True)
-class Looked:
-    """What is known by now."""
-
-    report: CameraReport | None = None
-    report_of: CameraKey | None = None
-    report_settings: CameraSettings | None = None
-    """How the camera stood when it was judged."""
-    report_seeds: int = 0
-    report_moments: tuple[JudgedMoment, ...] = ()
-    outdated: bool = False
-    """The report is of a version that was."""
-    judging: bool = False
-    """A judgement is under way, and the report is that of the one before."""
-    suggestions: tuple[OfferedPlacement, ...] = ()
-    suggestions_of: CameraKey | None = None
-    compared: tuple[Picture, Picture] | None = None
-    picked: Picked | None = None
-    sheet: tuple[Picture, ...] = ()
-    problem: str = ""
+Case = tuple[int, NDArray[np.float32] | None, JudgedMoment | None]
+"""Where a camera is judged: the env; (B, 7) its bodies, None for now; which moment of the past that is."""
 
 
 class CameraJudging:
@@ -106,33 +87,26 @@ class CameraJudging:
 
     def judge(self, key: CameraKey, now: CameraSettings | None, moment: ShownMoment) -> None:
         """Judge a camera as it stands, in all envs, at the shown moment."""
-
-        def work(job: Job) -> None:
-            reports: list[CameraReport] = []
-            with self._judging_anew():
-                for env in range(moment.num_envs):
-                    job.tell(env, moment.num_envs)
-                    reports.append(self._live.ask(job.check, JudgeCamera(key, None, env, moment.of(env))))
-                self._know_report(key, now, join_reports(reports), 0)
-
-        self._live_lane.start(f"judging {key[1]} in all envs", work)
+        cases: list[Case] = [(env, moment.of(env), None) for env in range(moment.num_envs)]
+        self._judge_live(f"judging {key[1]} in all envs", key, now, cases, len(cases))
 
     def judge_steps(self, key: CameraKey, now: CameraSettings | None, moments: Sequence[Lived]) -> None:
         """Judge a camera as it stands at moments of the past; what is known so far can be seen all the while."""
+        cases: list[Case] = [
+            (env, step.poses[env], JudgedMoment(moment.serial, env, int(step.elapsed_steps[env])))
+            for moment, env in moments
+            for step in [moment.step]
+        ]
+        self._judge_live(f"judging {key[1]} over {len(moments)} steps", key, now, cases, _TELL_EVERY)
 
+    def _judge_live(
+        self, what: str, key: CameraKey, now: CameraSettings | None, cases: Sequence[Case], every: int
+    ) -> None:
         def work(job: Job) -> None:
-            reports: list[CameraReport] = []
-            done: list[JudgedMoment] = []
             with self._judging_anew():
-                for moment, env in moments:
-                    job.tell(len(done), len(moments))
-                    question = JudgeCamera(key, None, env, moment.step.poses[env])
-                    reports.append(self._live.ask(job.check, question))
-                    done.append(JudgedMoment(moment.serial, env, int(moment.step.elapsed_steps[env])))
-                    if len(done) % _TELL_EVERY == 0 or len(done) == len(moments):
-                        self._know_report(key, now, join_reports(reports), 0, tuple(done))
+                self._judge(job, self._live, JudgeCamera(key, None, 0), now, cases, len(cases), every)
 
-        self._live_lane.start(f"judging {key[1]} over {len(moments)} steps", work)
+        self._live_lane.start(what, work)
 
     def judge_seeds(
         self, key: CameraKey, now: CameraSettings | None, moved: bool, load: Load, seeds: int
@@ -140,20 +114,54 @@ class CameraJudging:
         """Judge a camera over so many fresh episodes; what is known so far can be seen all the while."""
 
         def work(job: Job) -> None:
-            reports: list[CameraReport] = []
-            done = 0
             with self._judging_anew(), self._background.turn(job):
                 num_envs = self._background.ensure(job, _for_judging(load))
-                while done < seeds:
-                    self._background.ask(job.check, Reset(None, FIRST_SEED + done))
-                    for env in range(min(num_envs, seeds - done)):
-                        job.tell(done, seeds)
-                        question = JudgeCamera(key, now if moved else None, env)
-                        reports.append(self._background.ask(job.check, question))
-                        done += 1
-                    self._know_report(key, now, join_reports(reports), done)
+
+                def cases() -> Iterator[Case]:
+                    for seed in range(seeds):
+                        if seed % num_envs == 0:
+                            self._background.ask(job.check, Reset(None, FIRST_SEED + seed))
+                        yield seed % num_envs, None, None
+
+                question = JudgeCamera(key, now if moved else None, 0)
+                self._judge(job, self._background, question, now, cases(), seeds, num_envs, fresh=True)
 
         self._background_lane.start(f"judging {key[1]} over {seeds} seeds", work)
+
+    def _judge(
+        self,
+        job: Job,
+        asker: Asker,
+        question: JudgeCamera,
+        now: CameraSettings | None,
+        cases: Iterable[Case],
+        total: int,
+        every: int,
+        fresh: bool = False,
+    ) -> None:
+        """
+        Args:
+            question: but for where.
+            now: how the camera stands.
+            every: cases after which what is known so far is shown.
+            fresh: the cases are fresh episodes.
+        """
+        reports: list[CameraReport] = []
+        moments: list[JudgedMoment] = []
+        for env, poses, moment in cases:
+            job.tell(len(reports), total)
+            reports.append(asker.ask(job.check, replace(question, env=env, poses=poses)))
+            moments += [] if moment is None else [moment]
+            if len(reports) % every == 0 or len(reports) == total:
+                self._know(
+                    report=join_reports(reports),
+                    report_of=question.key,
+                    report_settings=now,
+                    report_seeds=len(reports) if fresh else 0,
+                    report_moments=tuple(moments),
+                    outdated=False,
+                    judging=False,
+                )
 
     def suggest(
         self,
@@ -251,24 +259,6 @@ class CameraJudging:
         modalities: tuple[str, ...] = ("rgb",),
     ) -> Picture:
         return self._live.ask(job.check, DrawCamera(key, settings, env, modalities, moment.of(env)))
-
-    def _know_report(
-        self,
-        key: CameraKey,
-        now: CameraSettings | None,
-        report: CameraReport,
-        seeds: int,
-        moments: tuple[JudgedMoment, ...] = (),
-    ) -> None:
-        self._know(
-            report=report,
-            report_of=key,
-            report_settings=now,
-            report_seeds=seeds,
-            report_moments=moments,
-            outdated=False,
-            judging=False,
-        )
 
     @contextmanager
     def _judging_anew(self) -> Iterator[None]:

@@ -20,7 +20,6 @@ from typing import Literal
 from workbench.core.camera_frames import Convention, Direction, with_pose
 from workbench.core.camera_settings import (
     CameraKey,
-    CameraKind,
     CameraSettings,
     differences,
     why_no_camera,
@@ -34,7 +33,7 @@ from workbench.session.messages import Load, PlaceCamera, Placed, ReloadLevel, R
 from workbench.session.preview import Preview, Sight
 from workbench.session.studio_cameras import StudioCameras
 from workbench.session.studio_file import StudioFile
-from workbench.session.studio_view import StudioView
+from workbench.session.studio_view import StudioCamera, StudioView, Wish
 
 MOST_SEEDS = 1000
 MOST_STEPS = 1000
@@ -122,18 +121,14 @@ class CameraStudio:
             )
         self.ask_for([key] if moved else [])
 
-    def plan_add(
-        self,
-        kind: CameraKind,
-        name: str,
-        settings: CameraSettings,
-        target: tuple[float, float, float] | None = None,
-    ) -> None:
-        """Find the edit that adds a camera which looks at `target`, and see what it would see: `first_sight`."""
-        self.file.plan_add(kind, name, settings, target)
-        moment, scale = self._shown(), min(1.0, _LARGEST / min(settings.width, settings.height))
-        self._first.forget()
-        self._first.look(Sight((kind, name), settings, moment.env, None, scale), moment.of(moment.env))
+    def plan(self, wish: Wish) -> None:
+        """Find the edit that fulfils a wish; what a new camera would see is `StudioView.first_sight`."""
+        self.file.plan(wish)
+        if wish.what == "add" and wish.settings is not None:
+            moment, smaller = self._shown(), _LARGEST / min(wish.settings.width, wish.settings.height)
+            sight = Sight(wish.key, wish.settings, moment.env, None, min(1.0, smaller))
+            self._first.forget()
+            self._first.look(sight, moment.of(moment.env))
 
     # --- judged ----------------------------------------------------------------------------------------
 
@@ -143,16 +138,17 @@ class CameraStudio:
         Args:
             seeds: 0 for the envs at the shown moment; else over so many freshly reset ones, in the background.
         """
+        camera = self._asked_for(key)
+        if camera is not None and seeds <= 0:
+            self._judging.judge(key, camera.now, self._shown())
+        elif camera is not None and (load := self._load()) is not None:
+            self._judging.judge_seeds(key, camera.now, camera.moved, load, min(seeds, MOST_SEEDS))
+
+    def _asked_for(self, key: CameraKey) -> StudioCamera | None:
         with self._lock:
-            known, now, moved = (
-                self._cameras.known(key),
-                self._cameras.placements.now(key),
-                self._cameras.placements.moved(key),
-            )
-        if known and seeds <= 0:
-            self._judging.judge(key, now, self._shown())
-        elif known and (load := self._load()) is not None:
-            self._judging.judge_seeds(key, now, moved, load, min(seeds, MOST_SEEDS))
+            camera = self._cameras.asked_for(key)
+        self._note()
+        return camera
 
     def judge_steps(self, key: CameraKey, most: int = MOST_STEPS) -> None:
         """Judge a camera as it is placed over the steps of the episode that the selected env is in.
@@ -160,11 +156,9 @@ class CameraStudio:
         Args:
             most: how many of them, evenly spread.
         """
-        with self._lock:
-            known, now = self._cameras.known(key), self._cameras.placements.now(key)
-        if known and (moments := self._episode(min(max(1, most), MOST_STEPS))):
-            self._judging.judge_steps(key, now, moments)
-        self._note()
+        camera = self._asked_for(key)
+        if camera is not None and (moments := self._episode(min(max(1, most), MOST_STEPS))):
+            self._judging.judge_steps(key, camera.now, moments)
 
     def suggest(
         self,
@@ -180,13 +174,15 @@ class CameraStudio:
             objects: names of objects, or of single links of them (``TaskDescription.objects``).
             low, high: metres, in the frame of the camera's mount, or the env's if it has none.
         """
-        with self._lock:
-            known, lens = self._cameras.known(key), self._cameras.placements.now(key)
-            if known and lens is None:
-                self._cameras.problem = f"{key[1]} cannot be placed: {self._cameras.refusal(key)}."
-        if known and lens is not None and (load := self._load()) is not None:
-            self._judging.suggest(key, lens, tuple(objects), low, high, load, seeds)
-        self._note()
+        camera = self._asked_for(key)
+        if camera is None:
+            return
+        if camera.now is None:
+            with self._lock:
+                self._cameras.problem = f"{key[1]} cannot be placed: {camera.refused}."
+            self._note()
+        elif (load := self._load()) is not None:
+            self._judging.suggest(key, camera.now, tuple(objects), low, high, load, seeds)
 
     def take_suggestion(self, index: int) -> None:
         """Place the camera as suggested."""
@@ -215,9 +211,7 @@ class CameraStudio:
 
     def make_sheet(self, key: CameraKey) -> None:
         """The pictures of all envs by one camera, worst first if it was judged over them."""
-        with self._lock:
-            known = self._cameras.known(key)
-        if known:
+        if self._asked_for(key) is not None:
             self._judging.make_sheet(key, self._shown())
 
     def set_quick_scale(self, scale: float) -> None:
@@ -304,17 +298,8 @@ class CameraStudio:
             moved = judged is None or was is None or bool(differences(judged, was, close=3e-4))
             return StudioView(
                 cameras=self._cameras.all_as_shown(),
-                report=looked.report,
-                report_of=looked.report_of,
-                report_seeds=looked.report_seeds,
-                report_moments=looked.report_moments,
+                looked=looked,
                 report_stale=looked.report is not None and (moved or looked.outdated),
-                report_before=looked.judging,
-                suggestions=looked.suggestions,
-                suggestions_of=looked.suggestions_of,
-                compared=looked.compared,
-                picked=looked.picked,
-                sheet=looked.sheet,
                 quick_scale=self._quick_scale,
                 quick=self._quick.picture(self._cameras.selected, env),
                 wants_quick=sight is not None and self._quick.wants(sight),
@@ -383,16 +368,20 @@ class CameraStudio:
                 PlaceCamera(key, settings) for key, settings in self._cameras.placements.all_moved.items()
             )
 
-    def placed(self, event: Placed) -> None:
-        """The worker's answer to a placement."""
+    def placed(self, event: Placed, task: TaskDescription | None) -> None:
+        """The worker's answer to a placement.
+
+        Args:
+            task: with the camera as it is now.
+        """
         again = False
         with self._lock:
             if event.why_not:
                 self._cameras.problem = f"{event.key[1]} could not be placed: {event.why_not}."
                 self._cameras.placements.refused(event.key)
                 again = event.settings is not None
-            elif event.info is not None:
-                self._cameras.changed(event.info)
+            else:
+                self._cameras.task = task
         self.ask_for([event.key] if again else [])
 
     def close(self) -> None:

@@ -11,7 +11,7 @@ this runs on the page's thread, and nothing here is thread-safe.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from workbench.authoring import camera_source
@@ -22,7 +22,7 @@ from workbench.authoring.modules import read_source
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.core.pictures import CameraInfo
 from workbench.session.messages import TaskDescription
-from workbench.session.studio_view import Change, Writing, WritingStage
+from workbench.session.studio_view import Change, Wish, Writing, WritingStage
 
 Plan = SourceEdit | Refusal
 
@@ -32,24 +32,28 @@ MADE: tuple[WritingStage, ...] = ("written", "checked", "mismatch")
 """Stages in which the change is in the file."""
 
 
-@dataclass(frozen=True)
-class Wish:
-    """What is to be written."""
+SENTENCES: dict[Change, tuple[str, str, str]] = {
+    "edit": ("This changes {old} in {file}.", "{old} is written to {file}, and the new env has it.", ""),
+    "add": ("This adds {new} to {file}.", "{old} is in {file}, and the env has it.", "{new} was not added."),
+    "duplicate": (
+        "This adds {new}, a copy of {old}, to {file}.",
+        "{new} is in {file}, a copy of {old}.",
+        "{new} was not added.",
+    ),
+    "rename": (
+        "This makes {old} {new} in {file}.",
+        "{old} is {new} in {file} now.",
+        "{old} was not renamed.",
+    ),
+    "remove": ("This takes {old} out of {file}.", "{old} is no longer in {file}.", "{old} was not removed."),
+}
+"""Of a change: what it would do, what it did, and what becomes of it when another plan comes in its place."""
+PLANNED, DONE, LEFT = range(3)
 
-    what: Change
-    key: CameraKey
-    """The camera that is changed, copied, renamed or removed, or the one that is added."""
-    settings: CameraSettings | None
-    """What it is to have."""
-    name: str = ""
-    """The new name."""
-    target: tuple[float, float, float] | None = None
-    """The point that one looks at which is added."""
 
-    @property
-    def result(self) -> CameraKey:
-        """The camera that the file has when it is done."""
-        return (self.key[0], self.name) if self.name else self.key
+def said(wish: Wish, when: int, file: str = "") -> str:
+    """The sentence of `SENTENCES`."""
+    return SENTENCES[wish.what][when].format(old=wish.key[1], new=wish.result[1], file=file)
 
 
 def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish, run: Run) -> Writing:
@@ -90,30 +94,8 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish, run: Run) -
             ways = " The text below is for a class of your own that inherits from it."
         message = f"Not written: {made.reason}.{ways}"
         return Writing("refused", wish.result, wish.what, None, made, message, can_copy)
-    message = f"{_intended(wish, made.names)} Nothing is written yet."
+    message = f"{said(wish, PLANNED, made.names)} Nothing is written yet."
     return Writing("planned", wish.result, wish.what, made, None, message)
-
-
-def _intended(wish: Wish, file: str) -> str:
-    old, new = wish.key[1], wish.result[1]
-    return {
-        "edit": f"This changes {old} in {file}.",
-        "add": f"This adds {new} to {file}.",
-        "duplicate": f"This adds {new}, a copy of {old}, to {file}.",
-        "rename": f"This makes {old} {new} in {file}.",
-        "remove": f"This takes {old} out of {file}.",
-    }[wish.what]
-
-
-def _left(wish: Wish) -> str:
-    """What becomes of a plan in whose place another comes; empty where nothing is lost by it."""
-    return {
-        "edit": "",
-        "add": f"{wish.result[1]} was not added.",
-        "duplicate": f"{wish.result[1]} was not added.",
-        "rename": f"{wish.key[1]} was not renamed.",
-        "remove": f"{wish.key[1]} was not removed.",
-    }[wish.what]
 
 
 def _made_elsewhere(task: TaskDescription, info: CameraInfo) -> str:
@@ -233,7 +215,7 @@ class CameraWriting:
         before = self.wish if self.view.stage == "planned" else None
         first = self._just_copied
         if before is not None and (before.what, before.key) != (wish.what, wish.key):
-            first = _left(before)
+            first = said(before, LEFT)
         self._just_copied = ""
         if first:
             view = replace(view, message=f"{first} {view.message}")
@@ -341,13 +323,9 @@ class CameraWriting:
             )
             self._made[-1:] = [(wish, self.view)]
             return
-        done = {
-            "add": f"{wish.key[1]} is in {file}, and the env has it.",
-            "remove": f"{wish.key[1]} is no longer in {file}.",
-            "rename": f"{wish.key[1]} is {wish.name} in {file} now.",
-            "duplicate": f"{wish.name} is in {file}, a copy of {wish.key[1]}.",
-        }.get(wish.what, f"{wish.key[1]} is written to {file}, and the new env has it.")
-        self.view = replace(view, stage="checked", message=done, refusal=None, loading=False)
+        self.view = replace(
+            view, stage="checked", message=said(wish, DONE, file), refusal=None, loading=False
+        )
         self._made[-1:] = [(wish, self.view)]
 
     def failed_to_load(self) -> None:

@@ -388,7 +388,7 @@ class Session:
             with self._lock:
                 self._state.take(event)
             if isinstance(event, Placed):
-                self.studio.placed(event)
+                self.studio.placed(event, self._state.now.task)
             if isinstance(event, Failed):
                 self.versions.failed(event)
                 if not self._state.problem_at_run:

@@ -7,7 +7,6 @@ placed at all. Not thread-safe: whoever asks holds `lock`.
 from __future__ import annotations
 
 import threading
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,11 +37,11 @@ class StudioCameras:
         infos = () if self.task is None else self.task.cameras
         return next((info for info in infos if info.key == key), None)
 
-    def known(self, key: CameraKey) -> bool:
-        """Whether there is such a camera; it is said if not. What went wrong before it was asked for is over."""
-        known = self.info(key) is not None
-        self.problem = "" if known else f"There is no {key[0]} camera {key[1]}."
-        return known
+    def asked_for(self, key: CameraKey) -> StudioCamera | None:
+        """The camera, if there is one; it is said if not. What went wrong before it was asked for is over."""
+        info = self.info(key)
+        self.problem = "" if info is not None else f"There is no {key[0]} camera {key[1]}."
+        return None if info is None else self._as_shown(info)
 
     def refusal(self, key: CameraKey) -> str | None:
         """Why a camera cannot be placed; None where it can."""
@@ -64,12 +63,6 @@ class StudioCameras:
         if info.mount not in names or step.poses.shape[1] != len(names) or env >= len(step.poses):
             return None  # another version is coming in
         return step.poses[env, names.index(info.mount)]
-
-    def changed(self, info: CameraInfo) -> None:
-        """The live camera is this one now."""
-        if self.task is not None:
-            infos = [info if c.key == info.key else c for c in self.task.cameras]
-            self.task = replace(self.task, cameras=tuple(infos))
 
     def all_as_shown(self) -> tuple[StudioCamera, ...]:
         """For the page, at the moment that was shown last."""

@@ -12,18 +12,19 @@ import time
 import traceback
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 from workbench.authoring.camera_source.cameras import Ran
 from workbench.authoring.source.text import Refused
-from workbench.core.camera_settings import CameraKey, CameraKind, CameraSettings, differences
+from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.session.askers import Asker
 from workbench.session.camera_messages import RunCameras
-from workbench.session.camera_writing import CameraWriting, Wish, copy, plan
+from workbench.session.camera_writing import CameraWriting, copy, plan
 from workbench.session.lane import JobFailed, Stopped
 from workbench.session.messages import Load, TaskDescription
 from workbench.session.studio_cameras import StudioCameras
-from workbench.session.studio_view import Writing
+from workbench.session.studio_view import Wish, Writing
 
 _PATIENCE = 60.0
 """Seconds in which the worker must have run the hooks: a question may be lost with a worker that ends."""
@@ -63,39 +64,11 @@ class StudioFile:
     def view(self) -> Writing:
         return self._writing.view
 
-    def plan_write(self, key: CameraKey) -> None:
-        """Find the edit that writes the placement of a camera; it becomes `StudioView.writing`."""
-        with self._cameras.lock:
-            wish = Wish("edit", key, self._cameras.placements.now(key))
-        self._plan(wish)
-
-    def plan_add(
-        self,
-        kind: CameraKind,
-        name: str,
-        settings: CameraSettings,
-        target: tuple[float, float, float] | None = None,
-    ) -> None:
-        """Find the edit that adds a camera; `target` is the point that it looks at, in the env's frame."""
-        self._plan(Wish("add", (kind, name), settings, target=target))
-
-    def plan_duplicate(self, key: CameraKey, name: str) -> None:
-        """Find the edit that adds a copy of a camera, placed as that one is now."""
-        with self._cameras.lock:
-            wish = Wish("duplicate", key, self._cameras.placements.now(key), name)
-        self._plan(wish)
-
-    def plan_rename(self, key: CameraKey, name: str) -> None:
-        """Find the edit that gives a camera another name."""
-        with self._cameras.lock:
-            wish = Wish("rename", key, self._cameras.placements.now(key), name)
-        self._plan(wish)
-
-    def plan_remove(self, key: CameraKey) -> None:
-        """Find the edit that removes a camera."""
-        self._plan(Wish("remove", key, None))
-
-    def _plan(self, wish: Wish) -> None:
+    def plan(self, wish: Wish) -> None:
+        """Find the edit that fulfils a wish; it becomes `StudioView.writing`."""
+        if wish.settings is None and wish.what != "remove":
+            with self._cameras.lock:
+                wish = replace(wish, settings=self._cameras.placements.now(wish.key))
         self._later(self._find_plan, wish)
 
     def _find_plan(self, wish: Wish) -> None:

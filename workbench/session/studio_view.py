@@ -29,6 +29,26 @@ Change = Literal["edit", "add", "duplicate", "rename", "remove"]
 
 
 @dataclass(frozen=True)
+class Wish:
+    """What is to be written."""
+
+    what: Change
+    key: CameraKey
+    """The camera that is changed, copied, renamed or removed, or the one that is added."""
+    settings: CameraSettings | None = None
+    """What it is to have; None where it is removed, and for as it is placed when it is asked for."""
+    name: str = ""
+    """The new name."""
+    target: tuple[float, float, float] | None = None
+    """The point that one looks at which is added, in the env's frame."""
+
+    @property
+    def result(self) -> CameraKey:
+        """The camera that the file has when it is done."""
+        return (self.key[0], self.name) if self.name else self.key
+
+
+@dataclass(frozen=True)
 class StudioCamera:
     """One camera, as the file has it and as it is placed."""
 
@@ -105,25 +125,21 @@ class JudgedMoment:
 
 
 @dataclass(frozen=True)
-class StudioView:
-    cameras: tuple[StudioCamera, ...] = ()
-    selected: CameraKey | None = None
-    undo: str | None = None
-    """What `CameraStudio.undo` takes back, in words (``moved base_camera``); None if there is nothing."""
-    redo: str | None = None
-    writing: Writing = Writing()
-    first_sight: Picture | None = None
-    """What the camera would see whose addition is planned."""
+class Looked:
+    """What came of looking at the cameras, by now."""
+
     report: CameraReport | None = None
     """Of the last judgement."""
     report_of: CameraKey | None = None
+    report_settings: CameraSettings | None = None
+    """How the camera stood when it was judged."""
     report_seeds: int = 0
     """Fresh episodes that it is of; 0 for the envs at the moment that was shown."""
     report_moments: tuple[JudgedMoment, ...] = ()
     """Where it is of an episode's steps: which one each of ``report.envs`` is; empty for all others."""
-    report_stale: bool = False
-    """The camera was moved since."""
-    report_before: bool = False
+    outdated: bool = False
+    """The report is of a version that was."""
+    judging: bool = False
     """Another judgement is under way, of which nothing is known yet."""
     suggestions: tuple[OfferedPlacement, ...] = ()
     """Best first."""
@@ -133,6 +149,24 @@ class StudioView:
     picked: Picked | None = None
     sheet: tuple[Picture, ...] = ()
     """The selected camera's picture in every env, worst first where it was judged."""
+    problem: str = ""
+    """Why the last question was not answered, as a sentence."""
+
+
+@dataclass(frozen=True)
+class StudioView:
+    cameras: tuple[StudioCamera, ...] = ()
+    selected: CameraKey | None = None
+    undo: str | None = None
+    """What `CameraStudio.undo` takes back, in words (``moved base_camera``); None if there is nothing."""
+    redo: str | None = None
+    writing: Writing = Writing()
+    first_sight: Picture | None = None
+    """What the camera would see whose addition is planned."""
+    looked: Looked = Looked()
+    """What came of looking at the cameras."""
+    report_stale: bool = False
+    """The camera was moved since it was judged, or another version runs."""
     quick_scale: float = 1.0
     """Other than 1: the chosen camera is looked through in a picture of so much of its own size."""
     quick: Picture | None = None

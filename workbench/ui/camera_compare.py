@@ -95,7 +95,7 @@ class CameraCompare:
         kept = None if camera is None else self._kept.get(camera.key)
         back = camera is not None and kept is not None and kept != camera.now
         self._take.visible = back
-        both = studio.compared
+        both = studio.looked.compared
         mine = (
             both is not None
             and camera is not None

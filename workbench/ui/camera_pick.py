@@ -81,7 +81,7 @@ class CameraPick:
 
 def picked_here(view: SessionView) -> Picked | None:
     """What was picked, if it is of the camera and the env that are selected."""
-    picked = view.studio.picked
+    picked = view.studio.looked.picked
     if picked is None or picked.key != view.studio.selected or picked.env != view.selected_env:
         return None
     return picked

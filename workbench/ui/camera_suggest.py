@@ -134,7 +134,7 @@ class CameraSuggest:
             if not wanted:
                 raise ValueError("Choose at least one object that must be seen.")
             self._bar.asked()
-            self._arrival.asked(self._session.view().studio.suggestions)
+            self._arrival.asked(self._session.view().studio.looked.suggestions)
             self._session.studio.suggest(key, wanted, *self._bounds(), self._resets.value)
 
     # --- drawn ---------------------------------------------------------------------------------------
@@ -147,15 +147,16 @@ class CameraSuggest:
         self._draw_mounted(camera)
         self._draw_bounds(camera)
         self._draw_names(view)
-        new = self._arrival.just_came(studio.suggestions)
-        wanted = (id(studio.suggestions), studio.selected, None if camera is None else camera.now, new)
+        offered = studio.looked.suggestions
+        new = self._arrival.just_came(offered)
+        wanted = (id(offered), studio.selected, None if camera is None else camera.now, new)
         if wanted == self._drawn:
             return
         self._drawn = wanted
-        mine = bool(studio.suggestions) and studio.suggestions_of == studio.selected
+        mine = bool(offered) and studio.looked.suggestions_of == studio.selected
         self._offers.visible = mine
         if mine and camera is not None:
-            content = self._offers_html(studio.suggestions, camera, new)
+            content = self._offers_html(offered, camera, new)
             self._offers.content = content
 
     def _draw_mounted(self, camera: StudioCamera | None) -> None:

@@ -100,7 +100,7 @@ class CameraVerdict:
         if key is None:
             return
         self._bar.asked()
-        self._report_arrival.asked(self._session.view().studio.report)
+        self._report_arrival.asked(self._session.view().studio.looked.report)
         over = self._over.value
         if over == STEPS:
             self._session.studio.judge_steps(key, self._steps.value)
@@ -111,18 +111,18 @@ class CameraVerdict:
         key = self._session.view().studio.selected
         if key is not None:
             self._sheet_bar.asked()
-            self._sheet_arrival.asked(self._session.view().studio.sheet)
+            self._sheet_arrival.asked(self._session.view().studio.looked.sheet)
             self._session.studio.make_sheet(key)
 
     def _show_moment(self, position: int) -> None:
-        moments = self._session.view().studio.report_moments
+        moments = self._session.view().studio.looked.report_moments
         if position < len(moments):
             self._session.show(moments[position].env, moments[position].serial)
 
     def _use(self, plane: str) -> None:
         studio = self._session.view().studio
-        camera, report = studio.chosen, studio.report
-        if camera is None or camera.now is None or report is None or studio.report_of != camera.key:
+        camera, report = studio.chosen, studio.looked.report
+        if camera is None or camera.now is None or report is None or studio.looked.report_of != camera.key:
             return
         value = report.depth.suggested_near if plane == "near" else report.depth.suggested_far
         if value is None:
@@ -144,10 +144,11 @@ class CameraVerdict:
         self._draw_sheet(view, camera)
 
     def _draw_report(self, studio: StudioView, camera: StudioCamera | None) -> None:
-        report = studio.report if camera is not None and studio.report_of == camera.key else None
+        looked = studio.looked
+        report = looked.report if camera is not None and looked.report_of == camera.key else None
         new = self._report_arrival.just_came(report)
         now = None if camera is None else camera.now
-        wanted = (id(report), studio.report_stale, studio.report_before, new, now)
+        wanted = (id(report), studio.report_stale, looked.judging, new, now)
         if wanted == self._drawn:
             return
         self._drawn = wanted
@@ -162,25 +163,25 @@ class CameraVerdict:
                 "words": f"step {moment.step}",
                 "press": self._presses.id_of(("moment", i), lambda _, i=i: self._show_moment(i)),
             }
-            for i, moment in enumerate(studio.report_moments)
+            for i, moment in enumerate(looked.report_moments)
         ]
-        how = Standing(studio.report_stale, studio.report_before, new)
-        self._report.content = report_html(report, camera, how, studio.report_seeds, uses, seen_at)
+        how = Standing(studio.report_stale, looked.judging, new)
+        self._report.content = report_html(report, camera, how, looked.report_seeds, uses, seen_at)
 
     def _draw_sheet(self, view: SessionView, camera: StudioCamera | None) -> None:
-        studio = view.studio
-        sheet = studio.sheet
+        looked = view.studio.looked
+        sheet = looked.sheet
         mine = camera is not None and bool(sheet) and (sheet[0].kind, sheet[0].camera) == camera.key
         new = self._sheet_arrival.just_came(sheet)
-        wanted = (id(sheet) if mine else None, id(studio.report), view.selected_env, new)
+        wanted = (id(sheet) if mine else None, id(looked.report), view.selected_env, new)
         if wanted == self._drawn_sheet:
             return
         self._drawn_sheet = wanted
         self._pictures.visible = mine
         if not mine or camera is None:
             return
-        judged = studio.report_of == camera.key and not studio.report_seeds and not studio.report_moments
-        report = studio.report if judged else None
+        judged = looked.report_of == camera.key and not looked.report_seeds and not looked.report_moments
+        report = looked.report if judged else None
         self._pictures.content = self._sheet_html(sheet, report, view.selected_env, new)
 
     def _sheet_html(

@@ -18,7 +18,7 @@ import viser
 from workbench.core.camera_settings import CameraKey, CameraKind, CameraSettings
 from workbench.core.pictures import Picture
 from workbench.session.session import Session
-from workbench.session.studio_view import StudioView, Writing
+from workbench.session.studio_view import StudioView, Wish, Writing
 from workbench.ui.camera_work import Arrival
 from workbench.ui.control_values import limit_text
 from workbench.ui.first_place import FirstPlace, aimed_at, first_place, objects_in
@@ -199,24 +199,17 @@ class CameraWriting:
     def _plan_write(self) -> None:
         camera = self._placing.camera
         if camera is not None:
-            self._ask(camera.key, camera.now, lambda: self._session.studio.file.plan_write(camera.key), False)
+            self._ask(Wish("edit", camera.key), camera.now)
 
-    def _ask(
-        self,
-        key: CameraKey,
-        placed: CameraSettings | None,
-        ask: Callable[[], None],
-        of_members: bool,
-        about: str = "",
-    ) -> None:
+    def _ask(self, wish: Wish, placed: CameraSettings | None, about: str = "") -> None:
         """Note what is asked for and where, and then ask: the answer may come at once."""
-        self._planned, self._about = (key, placed), about
+        self._planned, self._about = (wish.key, placed), about
         self._before = self._session.view().studio.writing
         self._say("")
-        change = self._member_change if of_members else self._change
+        change = self._change if wish.what == "edit" else self._member_change
         if change is not None:
             change.arrival.asked(self._before)
-        ask()
+        self._session.studio.plan(wish)
 
     def _on_member(self, event: viser.GuiEvent) -> None:
         try:
@@ -231,7 +224,7 @@ class CameraWriting:
             self._why_not.content = render("warning", text=why_not) if why_not else ""
 
     def _plan_member(self, what: object, client: viser.ClientHandle | None) -> None:
-        file, view = self._session.studio.file, self._session.view()
+        view = self._session.view()
         chosen = view.studio.chosen
         if what in (ADD_SENSOR, ADD_HUMAN) and client is not None:
             kind = "sensor" if what == ADD_SENSOR else "human"
@@ -244,16 +237,15 @@ class CameraWriting:
                 place = first_place(seen_from, names, places)
             else:
                 place = FirstPlace(seen_from, "", aimed_at(seen_from, places))
-            add = self._session.studio.plan_add
-            self._ask(key, None, lambda: add(kind, key[1], place.settings, place.target), True, place.words)
+            self._ask(Wish("add", key, place.settings, target=place.target), None, place.words)
         elif chosen is None:
             raise ValueError("Choose the camera first.")
         elif what == REMOVE:
-            self._ask(chosen.key, chosen.now, lambda: file.plan_remove(chosen.key), True)
+            self._ask(Wish("remove", chosen.key), chosen.now)
         elif what in (DUPLICATE, RENAME):
             name = self._checked_name(view.studio, chosen.key[0], chosen.key[1] if what == DUPLICATE else "")
-            plan = file.plan_duplicate if what == DUPLICATE else file.plan_rename
-            self._ask(chosen.key, chosen.now, lambda: plan(chosen.key, name), True)
+            change = "duplicate" if what == DUPLICATE else "rename"
+            self._ask(Wish(change, chosen.key, name=name), chosen.now)
 
     def _checked_name(self, view: StudioView, kind: CameraKind, like: str) -> str:
         """The name that was typed, or a free one like another; `ValueError` where neither is there."""
