@@ -14,6 +14,7 @@ import xxhash
 from tests.drive.episodes import Made
 from workbench.recording.annotations import write_into_description
 from workbench.recording.checksums import check, checksum
+from workbench.recording.document import Checksum
 from workbench.recording.library_read import read_found
 from workbench.recording.library_scan import scan_folder
 from workbench.recording.read_episode import UnreadableRecording, read_episode
@@ -91,8 +92,8 @@ def test_a_checksum_is_of_the_whole_file(tmp_path: Path, size: int) -> None:
     content = np.random.default_rng(size).bytes(size)
     path.write_bytes(content)
     found = checksum(path)
-    assert found == {"bytes": size, "xxh3_128": xxhash.xxh3_128(content).hexdigest()}
-    described = {"files": {".h5": found, ".rrd": {"bytes": 5}}}
+    assert found == Checksum(size, xxhash.xxh3_128(content).hexdigest())
+    described = {".h5": found, ".rrd": Checksum(5)}
     check(path, described)
     if size:
         flip(path, size - 1)

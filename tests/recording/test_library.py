@@ -3,6 +3,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import shutil
 import sqlite3
 import subprocess
@@ -15,6 +16,7 @@ from typing import Any
 import gymnasium as gym
 import h5py
 import mani_skill.envs  # noqa: F401  (registers the tasks)
+import msgspec
 import numpy as np
 import pytest
 import rerun as rr
@@ -29,7 +31,7 @@ from tests.recording.library_files import describe, jpeg
 from workbench.recording.library import Library, LibraryError
 from workbench.recording.library_index import LibraryIndex, index_path
 from workbench.recording.library_read import read_found
-from workbench.recording.library_row import Entry, LibraryRow, facts_as_dict, facts_from_dict
+from workbench.recording.library_row import Entry, Facts, LibraryRow, clean_facts
 from workbench.recording.library_scan import Found, scan_folder
 from workbench.recording.read_episode import read_episode
 from workbench.recording.reading import read_rows
@@ -226,20 +228,61 @@ _anything = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=5), inner, max_size=3),
     max_leaves=6,
 )
-_KEYS = (
-    "id task seed env_index length return success fail recovered source_hash written_at tags note thumbnail"
-)
+_TYPES: dict[str, tuple[type, ...]] = {
+    **dict.fromkeys(("id", "task", "source_hash", "written_at", "note"), (str,)),
+    **dict.fromkeys(("env_index", "length"), (int,)),
+    **dict.fromkeys(("success", "fail"), (bool, type(None))),
+    "seed": (int, type(None)),
+    "return": (int, float),
+    "recovered": (bool,),
+    "tags": (list,),
+    "thumbnail": (str, type(None)),
+}
+
+
+def is_wrong(name: str, value: Any) -> bool:
+    if type(value) not in _TYPES[name]:
+        return True
+    if name == "tags":
+        return not all(isinstance(tag, str) for tag in value)
+    return type(value) is int and name != "return" and not -(2**63) <= value < 2**63
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.fixed_dictionaries({}, optional=dict.fromkeys(_KEYS.split(), _anything)))
+@given(st.fixed_dictionaries({}, optional=dict.fromkeys(_TYPES, _anything)))
 def test_whatever_a_description_says_there_is_one_row_that_the_index_can_hold(fields: dict) -> None:
     with tempfile.TemporaryDirectory() as name:
         describe(Path(name), "a", **fields)
         ((facts, picture),) = read_found(Path(name), scan_folder(Path(name)).found["a"])
-    assert facts.kind == "workbench" and facts.problem is None
-    assert facts_from_dict(json.loads(json.dumps(facts_as_dict(facts)))) == facts
+    wrong = {key for key, value in fields.items() if is_wrong(key, value)}
+    said = re.search(
+        r"a\.json is not as a recording is described: .* at \$\.workbench\.(\w+)", facts.problem or ""
+    )
+    assert facts.kind == "workbench"
+    assert said[1] in wrong if wrong and said else (facts.problem is None and not wrong)
+    assert clean_facts(msgspec.msgpack.decode(msgspec.msgpack.encode(facts), type=Facts)) == facts
     assert picture is None or picture[:2] == b"\xff\xd8"
+
+
+def test_a_wrong_field_is_named_by_its_path_and_the_others_are_shown(tmp_path: Path, maniskill: Path) -> None:
+    describe(tmp_path, "ours", task="Push-v1", seed="seven", scene={"body_names": [], "body_kinds": []})
+    for suffix in (".json", ".h5"):
+        shutil.copy(maniskill / f"demo{suffix}", tmp_path)
+    said = json.loads((tmp_path / "demo.json").read_text())
+    said["episodes"][1]["elapsed_steps"] = "two"
+    (tmp_path / "demo.json").write_text(json.dumps(said))
+    good, wrong, ours = read(tmp_path)
+    assert (good.name, good.length, good.problem) == ("demo#traj_0", 3, None)
+    assert wrong.problem is not None and wrong.problem.endswith("at $.episodes[1].elapsed_steps.")
+    assert (ours.task, ours.seed, ours.length) == ("Push-v1", None, 12)
+    assert ours.problem == (
+        "ours.json is not as a recording is described: expected `int | null`, got `str` at $.workbench.seed."
+    )
+    describe(tmp_path, "ours", scene={"body_names": [], "body_kinds": []})
+    assert read(tmp_path)[2].problem == (
+        "ours.json is not as a recording is described: "
+        "object missing required field `body_hidden` at $.workbench.scene."
+    )
 
 
 def test_a_copy_of_a_recording_is_another_row(tmp_path: Path) -> None:

@@ -235,10 +235,13 @@ def test_what_is_no_recording_is_said(child_process: None, tmp_path: Path) -> No
     ours.with_suffix(".rrd").unlink()
     assert read_episode(ours).length == STEPS
     ours.with_suffix(".json").write_text('{"workbench": {"length": 3}}')
-    with pytest.raises(UnreadableRecording, match="a broken one"):
+    with pytest.raises(
+        UnreadableRecording,
+        match=r"is not as a recording is described: object missing required field `id` at \$\.workbench",
+    ):
         read_episode(ours)
     ours.with_suffix(".json").write_text('{"workbench": {"leng')
-    with pytest.raises(UnreadableRecording, match=r"no JSON that can be read"):
+    with pytest.raises(UnreadableRecording, match=r"is not JSON, or was cut short"):
         read_episode(ours)
     ours.with_suffix(".json").unlink()
     with pytest.raises(UnreadableRecording, match=r"json is missing"):

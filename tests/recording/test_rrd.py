@@ -77,6 +77,15 @@ def test_whoever_has_turned_rerun_off_still_gets_the_whole_recording(
     assert os.environ["RERUN"] == "off"
 
 
+def test_options_of_a_reset_that_json_has_no_words_for_are_said_as_text(
+    child_process: None, make_episode: Maker, tmp_path: Path
+) -> None:
+    episode = make_episode()
+    episode.info = dataclasses.replace(episode.info, reset_options={"at": Path("/there")})
+    files = episode.write(tmp_path)
+    assert read_episode(files.json).info.reset_options == {"at": "/there"}
+
+
 def test_threads_that_write_episodes_of_one_scene_share_its_meshes(
     child_process: None, make_episode: Maker, tmp_path: Path
 ) -> None:

@@ -23,7 +23,7 @@ from workbench.machine.user_folder import user_folder
 from workbench.recording.annotations import write_into_description
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.made_here import KEY_FILE, MadeHere, made_here
-from workbench.recording.read_episode import read_episode
+from workbench.recording.read_episode import UnreadableRecording, read_episode
 from workbench.recording.recover import recover
 from workbench.session.clearance import Answer, Clearances, NotCleared, Question, Since, Wanted
 from workbench.session.recorded_scene import SceneError, SceneProcess
@@ -290,8 +290,7 @@ def test_names_out_of_a_recording_cannot_write_to_a_terminal(foreign: Path) -> N
         {"id": "another"},
         {"made_here": None},
         {"made_here": {"content": "0" * 64, "place": "0" * 64}},
-        {"made_here": {"content": "\ud800", "place": 3}},
-        {"made_here": [1]},
+        {"made_here": {"content": "\ud800", "place": ""}},
     ],
 )
 def test_an_edited_recording_has_lost_its_seal(recording: Path, values: dict[str, Any]) -> None:
@@ -300,6 +299,13 @@ def test_an_edited_recording_has_lost_its_seal(recording: Path, values: dict[str
     assert made_here(info_of(recording)) is MadeHere.NO
     if "source" in values:
         assert len(asked(as_recorded(recording))) == 1
+
+
+@pytest.mark.parametrize("value", [{"content": "0" * 64, "place": 3}, {}, [1]])
+def test_what_is_no_seal_is_a_broken_recording(recording: Path, value: object) -> None:
+    edit(recording, made_here=value)
+    with pytest.raises(UnreadableRecording, match=r"a broken one: .* at \$\.workbench\.made_here"):
+        info_of(recording)
 
 
 def test_one_that_comes_back_with_another_file_beside_it_is_asked_about(

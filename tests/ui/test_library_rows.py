@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import datetime
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -8,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from workbench.recording.library_row import Facts, LibraryRow, facts_as_dict, facts_from_dict
+from workbench.recording.library_row import Facts, LibraryRow, clean_facts
 from workbench.ui.library_rows import (
     COLUMNS,
     SECOND_LINE,
@@ -160,8 +161,8 @@ def test_an_empty_list_says_which_filter_emptied_it() -> None:
 
 
 def test_a_return_that_is_nan_is_said_and_comes_last_whichever_way_it_is_sorted() -> None:
-    kept = facts_from_dict(facts_as_dict(row("n", total_reward=float("nan")).facts))
+    kept = clean_facts(row("n", total_reward=float("nan")).facts)
     lost = row("n", total_reward=kept.total_reward)
-    assert kept == facts_from_dict(facts_as_dict(kept))
+    assert kept == clean_facts(replace(kept, total_reward=float("nan")))
     assert cells(lost, {}, NOW)["total"] == "NaN"
     assert {ids(ordered((*ROWS[:2], lost), "return", down))[-1] for down in (True, False)} == {"n"}

@@ -17,7 +17,7 @@ import json
 from pathlib import Path
 
 from workbench.machine.regular_file import open_regular_file
-from workbench.recording.json_file import read_json
+from workbench.recording.document import Document, read_json
 from workbench.recording.library_row import clean_note, clean_tags
 from workbench.recording.replace_file import replace_file
 
@@ -76,7 +76,7 @@ def write_into_description(path: Path, tags: tuple[str, ...], note: str) -> None
         ValueError: it is no recording of ours. The message is the end of a sentence.
     """
     described = read_json(path, MOST_NOTES_BYTES)
-    if not isinstance(described, dict) or not isinstance(described.get("workbench"), dict):
+    if not isinstance(described, dict) or not Document(described).is_ours:
         raise ValueError("is not a recording of the workbench")
     described["workbench"] |= {"tags": list(tags), "note": note}
     # Indented as what was read: these files are looked at.

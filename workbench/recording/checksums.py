@@ -13,49 +13,41 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import xxhash
 
 from workbench.machine.regular_file import open_regular_file
+from workbench.recording.document import Checksum
 
-_HASH = "xxh3_128"
 _BLOCK = 1 << 20
 
 
-def checksum(path: Path) -> dict[str, Any]:
-    """Of the file at `path`, as JSON. Raises OSError."""
+def checksum(path: Path) -> Checksum:
+    """Of the file at `path`. Raises OSError."""
     hashed = xxhash.xxh3_128()
     size = 0
     with open_regular_file(path) as file:
         while block := file.read(_BLOCK):
             hashed.update(block)
             size += len(block)
-    return {"bytes": size, _HASH: hashed.hexdigest()}
+    return Checksum(size, hashed.hexdigest())
 
 
-def check(path: Path, described: Mapping[str, Any]) -> None:
-    """Compare the file at `path` with what `described`, the ``workbench`` of its ``.json``, says of it, if it says anything.
+def check(path: Path, said: Mapping[str, Checksum]) -> None:
+    """Compare the file at `path` with what its ``.json`` says of files of its suffix, if it says anything.
 
     Raises:
         OSError: it is another, and how; or it cannot be read.
     """
-    if (why := wrong_size(described, path.suffix, path.stat().st_size)) is not None:
+    if (why := wrong_size(said, path.suffix, path.stat().st_size)) is not None:
         raise OSError(why)
-    said = _said(described, path.suffix).get(_HASH)
-    if isinstance(said, str) and checksum(path)[_HASH] != said:
+    written = said.get(path.suffix)
+    if written is not None and written.xxh3_128 is not None and checksum(path) != written:
         raise OSError("its checksum is not the one that was written down with it")
 
 
-def wrong_size(described: Mapping[str, Any], suffix: str, size: int) -> str | None:
+def wrong_size(said: Mapping[str, Checksum], suffix: str, size: int) -> str | None:
     """What is wrong with a file that is `size` bytes long; None for nothing."""
-    said = _said(described, suffix).get("bytes")
-    if not isinstance(said, int) or said == size:
+    if suffix not in said or said[suffix].size == size:
         return None
-    return f"it has {size} bytes, and had {said}"
-
-
-def _said(described: Mapping[str, Any], suffix: str) -> Mapping[str, Any]:
-    files = described.get("files")
-    said = files.get(suffix) if isinstance(files, dict) else None
-    return said if isinstance(said, dict) else {}
+    return f"it has {size} bytes, and had {said[suffix].size}"

@@ -24,10 +24,10 @@ from numpy.typing import NDArray
 from workbench.core.pictures import CameraInfo
 from workbench.machine.regular_file import open_regular_file
 from workbench.recording import lerobot_format as form
+from workbench.recording.document import read_json
 from workbench.recording.encoded_pictures import MOST_PIXELS, EncodedPictures
 from workbench.recording.episode import NO_SEED, CameraTrack, Episode, EpisodeInfo
 from workbench.recording.film_pictures import FilmPictures
-from workbench.recording.json_file import read_json
 from workbench.recording.unreadable import UnreadableRecording
 
 USUAL_FOVY = math.radians(60)

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import json
 import logging
 import os
 import sqlite3
@@ -24,18 +23,21 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from workbench.recording.library_row import Entry, Facts, facts_as_dict, facts_from_dict
+import msgspec
+
+from workbench.recording.library_row import Entry, Facts, clean_facts
 from workbench.recording.library_scan import found_of
 
 log = logging.getLogger(__name__)
 
-VERSION = 3
+VERSION = 4
 """Raised whenever rows are read or kept in another way: what another version left is read again."""
 LOCKED_SECONDS = 3.0
 MOST_INDICES = 200
 """Of folders that were looked into."""
+_ROWS = msgspec.msgpack.Decoder(list[Facts])
 _TABLES = (
-    "CREATE TABLE IF NOT EXISTS read (key TEXT PRIMARY KEY, signature TEXT NOT NULL, rows TEXT NOT NULL)",
+    "CREATE TABLE IF NOT EXISTS read (key TEXT PRIMARY KEY, signature TEXT NOT NULL, rows BLOB NOT NULL)",
     "CREATE TABLE IF NOT EXISTS pictures (key TEXT, row INTEGER, jpeg BLOB NOT NULL, PRIMARY KEY (key, row))",
 )
 
@@ -71,7 +73,7 @@ class LibraryIndex:
                 kept = {}
                 for key, signature, rows in database.execute("SELECT key, signature, rows FROM read"):
                     found_of(key, signature)  # raises where it is none
-                    kept[key] = Kept(signature, tuple(facts_from_dict(row) for row in json.loads(rows)))
+                    kept[key] = Kept(signature, tuple(map(clean_facts, _ROWS.decode(rows))))
                 return kept
         except (sqlite3.Error, ValueError, TypeError, KeyError) as error:
             self._begin_anew(error)
@@ -89,7 +91,7 @@ class LibraryIndex:
                 database.executemany(
                     "INSERT INTO read VALUES (?, ?, ?)",
                     [
-                        (key, signature, json.dumps([facts_as_dict(facts) for facts, _ in entries]))
+                        (key, signature, msgspec.msgpack.encode([facts for facts, _ in entries]))
                         for key, signature, entries in read
                     ],
                 )

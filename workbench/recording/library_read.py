@@ -22,9 +22,9 @@ from PIL import Image
 from workbench.machine.regular_file import NotARegularFile, open_regular_file
 from workbench.recording.annotations import read_notes
 from workbench.recording.checksums import wrong_size
+from workbench.recording.document import Document, EpisodeWords, WrongDocument, read_document
 from workbench.recording.encoded_pictures import open_picture
 from workbench.recording.episode import acted_by_from, acted_by_in_words
-from workbench.recording.json_file import NotJson, read_json
 from workbench.recording.library_row import (
     Entry,
     Facts,
@@ -70,15 +70,15 @@ def read_found(folder: Path, found: Found) -> list[Entry]:
 def _read(folder: Path, found: Found) -> list[Entry]:
     if ".json" in found.sizes:
         try:
-            described = read_json(found.path(folder, ".json"))
-        except NotJson as error:
+            document = read_document(found.path(folder, ".json"))
+        except WrongDocument as error:
             return [_broken(folder, found, str(error))]
-        if isinstance(described, dict) and isinstance(described.get("workbench"), dict):
-            return [_ours(folder, found, described["workbench"])]
-        if isinstance(described, dict) and found.key.split("/")[-2:] == DATASET_KEY:
+        if document.is_ours:
+            return [_ours(found, document)]
+        if document.said and found.key.split("/")[-2:] == DATASET_KEY:
             return _lerobots(folder, found)
-        if isinstance(described, dict) and isinstance(described.get("episodes"), list):
-            return _maniskills(folder, found, described)
+        if document.is_maniskills:
+            return _maniskills(folder, found, document)
         if ".h5" in found.sizes:
             return [_broken(folder, found, "names neither an env nor episodes")]
     elif ".h5" in found.sizes:
@@ -102,14 +102,19 @@ def _noted(facts: Facts, notes: dict[str, tuple[tuple[str, ...], str]]) -> Facts
     return replace(facts, tags=tags, note=note)
 
 
-def _ours(folder: Path, found: Found, described: dict[str, Any]) -> Entry:
+def _ours(found: Found, document: Document) -> Entry:
     name = Path(found.key).name
     lost = [f"{name}{suffix}" for suffix in (".h5", ".rrd") if suffix not in found.sizes]
     problem = f"{' and '.join(lost)} {'is' if len(lost) == 1 else 'are'} missing." if lost else None
+    try:
+        written = document.description().files or {}
+    except WrongDocument as error:
+        written, problem = {}, problem or text(f"{name}.json {error}.", 500)
     for suffix, size in found.sizes.items():
         # What only the bytes tell is told when it is opened: a list of thousands reads none of them.
-        if problem is None and (why := wrong_size(described, suffix, size)) is not None:
+        if problem is None and (why := wrong_size(written, suffix, size)) is not None:
             problem = f"{name}{suffix} was cut short or changed: {why}."
+    described = document.said["workbench"]
     facts = replace(_episode("workbench", described, found.times[".json"] / 1e9), problem=problem)
     return facts, _thumbnail(described.get("thumbnail"))
 
@@ -171,55 +176,60 @@ def _small_jpeg(small: Image.Image) -> bytes:
     return written.getvalue()
 
 
-def _maniskills(folder: Path, found: Found, described: dict[str, Any]) -> list[Entry]:
+def _maniskills(folder: Path, found: Found, document: Document) -> list[Entry]:
     """One row an episode of ManiSkill's ``RecordEpisode`` and of its demonstrations: they have the same form."""
     name = Path(found.key).name
-    env_info = described.get("env_info")
-    task = text(env_info.get("env_id")) if isinstance(env_info, dict) else ""
-    episodes = [episode for episode in described["episodes"] if isinstance(episode, dict)]
     written = found.newest / 1e9
-    left_out = len(episodes) - MOST_EPISODES
-    episodes = episodes[:MOST_EPISODES]
+    count = len(document.said["episodes"])
+    try:
+        task, problem = text(document.env().env_id), None
+    except WrongDocument as error:
+        task, problem = "", text(f"{name}.json {error}.", 500)
     if ".h5" not in found.sizes:
         if not task:
             return []  # a .json of something else that has episodes
         lost = f"{name}.h5, which {name}.json describes, is missing."
-        return [(Facts("maniskill", task=task, written=written, length=None, problem=lost), None)]
-    numbers = [whole(episode.get("episode_id")) for episode in episodes]
-    totals, pictures, problem = _look_into(found.path(folder, ".h5"), [f"traj_{n}" for n in numbers])
+        return [(Facts("maniskill", task=task, written=written, problem=lost), None)]
+    said = [_or_why(document, number) for number in range(min(count, MOST_EPISODES))]
+    names = [f"traj_{one.episode_id}" for one in said if isinstance(one, EpisodeWords)]
+    totals, pictures, broken = _look_into(found.path(folder, ".h5"), names)
+    problem = problem or broken
     if not task and problem is None:
         problem = f"{name}.json does not name the env."
     entries: list[Entry] = []
-    for episode, trajectory in zip(episodes, (f"traj_{n}" for n in numbers)):
-        success = truth(episode.get("success"))
-        reset = episode.get("reset_kwargs")
-        seed = whole(episode.get("episode_seed"))
-        if seed is None and isinstance(reset, dict):
-            seed = whole(reset.get("seed"))
+    for one in said:
+        if isinstance(one, str):
+            why = problem or text(f"{name}.json {one}.", 500)
+            entries.append((Facts("maniskill", task=task, written=written, problem=why), None))
+            continue
+        trajectory = f"traj_{one.episode_id}"
         lost = None if problem or trajectory in totals else f"{name}.h5 has no {trajectory}."
-        entries.append(
-            (
-                Facts(
-                    "maniskill",
-                    task=task,
-                    trajectory=trajectory,
-                    written=written,
-                    seed=seed,
-                    length=whole(episode.get("elapsed_steps")),
-                    total_reward=totals.get(trajectory),
-                    success=success,
-                    fail=truth(episode.get("fail")),
-                    control_mode=text(episode.get("control_mode")),
-                    acted_by=text(described.get("source_type")),
-                    problem=problem or lost,
-                ),
-                pictures.get(trajectory),
-            )
+        facts = Facts(
+            "maniskill",
+            task=task,
+            trajectory=trajectory,
+            written=written,
+            seed=one.seed,
+            length=whole(one.elapsed_steps),
+            total_reward=totals.get(trajectory),
+            success=truth(one.success),
+            fail=truth(one.fail),
+            control_mode=text(one.control_mode),
+            acted_by=text(document.source_type),
+            problem=problem or lost,
         )
-    if left_out > 0:
-        more = f"{name}.json names {left_out:,} episodes more than the {MOST_EPISODES:,} that are listed of a file."
+        entries.append((facts, pictures.get(trajectory)))
+    if count > MOST_EPISODES:
+        more = f"{name}.json names {count - MOST_EPISODES:,} episodes more than the {MOST_EPISODES:,} that are listed of a file."
         entries.append((Facts("maniskill", task=task, written=written, problem=more), None))
     return entries
+
+
+def _or_why(document: Document, number: int) -> EpisodeWords | str:
+    try:
+        return document.episode(number)
+    except WrongDocument as error:
+        return str(error)
 
 
 def _lerobots(folder: Path, found: Found) -> list[Entry]:

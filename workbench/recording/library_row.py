@@ -10,12 +10,11 @@ from __future__ import annotations
 import datetime
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal
 
 Kind = Literal["workbench", "maniskill", "rrd only", "lerobot"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
 LONGEST_TAG = 40
 LONGEST_NOTE = 1000
 MOST_TAGS = 20
@@ -125,42 +124,20 @@ class LibraryRow:
         return self.facts.problem
 
 
-# --- to the index and back ------------------------------------------------------------------------
-
-
-def facts_as_dict(facts: Facts) -> dict[str, Any]:
-    return asdict(facts)
-
-
-def facts_from_dict(values: object) -> Facts:
-    """Of what `facts_as_dict` gave, by whichever version.
-
-    Raises:
-        ValueError: it is no such thing.
-    """
-    known = {field.name for field in fields(Facts)}
-    if not isinstance(values, dict) or set(values) != known or values["kind"] not in KINDS:
-        raise ValueError("an entry of another version")
-    return Facts(
-        kind=values["kind"],
-        task=text(values["task"]),
-        trajectory=None if values["trajectory"] is None else text(values["trajectory"]),
-        uid=text(values["uid"]),
-        written=number(values["written"]),
-        seed=whole(values["seed"]),
-        env_index=whole(values["env_index"]),
-        length=whole(values["length"]),
-        total_reward=total(values["total_reward"]),
-        success=truth(values["success"]),
-        success_once=truth(values["success_once"]),
-        fail=truth(values["fail"]),
-        control_mode=text(values["control_mode"]),
-        acted_by=text(values["acted_by"]),
-        source_hash=text(values["source_hash"]),
-        tags=clean_tags(values["tags"]),
-        note=clean_note(values["note"]),
-        recovered=values["recovered"] is True,
-        problem=None if values["problem"] is None else text(values["problem"], 500),
+def clean_facts(facts: Facts) -> Facts:
+    """`facts` as a table can bear them, of whichever process or version says them."""
+    texts = ("task", "uid", "control_mode", "acted_by", "source_hash")
+    wholes = ("seed", "env_index", "length")
+    return replace(
+        facts,
+        **{name: text(getattr(facts, name)) for name in texts},
+        **{name: whole(getattr(facts, name)) for name in wholes},
+        trajectory=None if facts.trajectory is None else text(facts.trajectory),
+        written=number(facts.written),
+        total_reward=total(facts.total_reward),
+        tags=clean_tags(facts.tags),
+        note=clean_note(facts.note),
+        problem=None if facts.problem is None else text(facts.problem, 500),
     )
 
 

@@ -19,17 +19,14 @@ from hashlib import sha256
 from typing import Any
 
 from workbench.machine.user_folder import create_private, read_private, set_aside
-from workbench.recording.episode import EpisodeInfo, Seal
+from workbench.recording.document import SHARED, Description, SealWords, as_json
+from workbench.recording.episode import EpisodeInfo
 
 log = logging.getLogger(__name__)
 
 KEY_FILE = "recordings.key"
 _KEY_BYTES = 32
-_COVERED = (
-    "id", "task", "env_index", "seed", "control_dt", "control_mode", "backend", "versions", "env_kwargs",
-    "reset_options", "max_episode_steps", "written_at", "source_hash", "source", "side_files", "recovered",
-)  # fmt: skip
-"""Names that `EpisodeInfo` and a recording's description share."""
+_COVERED = {*SHARED, "seed", "source"} - {"acted_by"}
 _told: set[str] = set()
 
 
@@ -42,7 +39,7 @@ class MadeHere(Enum):
     """And the file that it names now is the one that was open then (with another text, perhaps)."""
 
 
-def seal(said: Mapping[str, Any], source_file: str | None) -> dict[str, Any] | None:
+def seal(said: Description, source_file: str | None) -> SealWords | None:
     """For the description `said` of a recording that is being made; None, which is told once, where there can be no key.
 
     Args:
@@ -53,17 +50,9 @@ def seal(said: Mapping[str, Any], source_file: str | None) -> dict[str, Any] | N
     except OSError as error:
         _tell_once(f"What is recorded is not known as recorded here when it is judged again: {error}")
         return None
-    values = {name: said.get(name) for name in _COVERED}
-    content = _content(values, said.get("source_file"), said.get("files"), said.get("acted_by") or ())
-    return {"content": _mac(key, "content", content), "place": _mac(key, "place", source_file or "")}
-
-
-def seal_from(said: Mapping[str, Any]) -> Seal | None:
-    """What a description holds of a seal, to be checked by `made_here`."""
-    held = said.get("made_here")
-    if not isinstance(held, dict):
-        return None
-    return Seal(str(held.get("content")), str(held.get("place")), said.get("source_file"), said.get("files"))
+    values = {name: getattr(said, name) for name in _COVERED}
+    content = _content(values, said.source_file, said.files, said.acted_by)
+    return SealWords(_mac(key, "content", content), _mac(key, "place", source_file or ""))
 
 
 def made_here(info: EpisodeInfo) -> MadeHere:
@@ -108,8 +97,7 @@ def is_sealed(text: str, found: object) -> bool:
 
 def _content(values: Mapping[str, Any], main: Any, files: Any, acted_by: Sequence[Sequence[Any]]) -> str:
     """One text for what JSON reads back as the same."""
-    whole = [values, main, files, [list(pair) for pair in acted_by]]
-    return json.dumps(json.loads(json.dumps(whole, default=str)), sort_keys=True)
+    return json.dumps(as_json([values, main, files, acted_by]), sort_keys=True)
 
 
 def _mac(key: bytes, what: str, text: str) -> str:

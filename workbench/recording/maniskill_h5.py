@@ -5,13 +5,12 @@ Names, types and shapes are those of ``mani_skill.utils.wrappers.record.RecordEp
 
 - ``actions`` (T, A) float32, ``rewards`` (T,) float32, ``terminated``, ``truncated``, and ``success`` and ``fail`` if the task has them,
   (T,) bool, ``env_states/{actors,articulations}/<name>`` (T + 1, D), ``obs/...`` (T + 1, ...).
-- the ``.json``: ``env_info``, ``commit_info``, ``episodes`` and ``source_type`` as there; ``workbench`` besides (see `description`).
+- the ``.json``: ``env_info``, ``commit_info``, ``episodes`` and ``source_type`` as there; ``workbench`` besides (see `document`).
 """
 
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 
 from workbench.recording.columns import OBS, STATE
 from workbench.recording.description import describe_beside
+from workbench.recording.document import json_text
 from workbench.recording.survey import Survey
 
 TRAJECTORY = "traj_0"
@@ -110,7 +110,7 @@ def _packing(shape: tuple[int, ...], dtype: np.dtype) -> h5py.h5p.PropDCID:
 
 def write_json(survey: Survey, path: Path, folder: Path, files: Sequence[Path]) -> None:
     """Write what is to be said of the episode, and of its other `files`, to `path`; they will lie in `folder`. Raises OSError."""
-    content = json.dumps(_document(survey, folder, files), indent=2, default=str).encode()
+    content = json_text(_document(survey, folder, files), indent=2).encode()
     with path.open("xb") as file:
         file.write(content)
 

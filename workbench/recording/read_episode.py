@@ -10,7 +10,7 @@ Pictures stay in the file until one is asked for.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,18 @@ from numpy.typing import NDArray
 from workbench.core.geometry import SceneGeometry
 from workbench.core.shared_shapes import SharedShapes
 from workbench.recording.checksums import check
-from workbench.recording.description import Column, columns_from, info_from, task_file
+from workbench.recording.document import (
+    CameraWords,
+    ColumnWords,
+    Description,
+    WrongDocument,
+    description_in,
+    read_document,
+    task_file,
+)
 from workbench.recording.encoded_pictures import EncodedPictures, Modality
 from workbench.recording.entry_texts import tracks_from
 from workbench.recording.episode import CameraTrack, Episode, Unread
-from workbench.recording.json_file import NotJson, parse_json, read_json
 from workbench.recording.layout import (
     OBSERVATION,
     batch_entity,
@@ -40,7 +47,6 @@ from workbench.recording.read_maniskill import read_maniskill as read_maniskill
 from workbench.recording.read_maniskill import trajectories as trajectories
 from workbench.recording.rerun_table import RerunTable, rows_at
 from workbench.recording.safe_h5 import open_h5
-from workbench.recording.survey import camera_from
 from workbench.recording.unreadable import UnreadableRecording as UnreadableRecording
 
 MOST_STATES = 10_000_000
@@ -79,17 +85,18 @@ def read_inert(path: Path, shapes: SharedShapes | None = None) -> tuple[Episode,
         raise UnreadableRecording(f"{path.name} is not there any more.")
     unread: list[Unread] = []
     beside, not_json = _beside(there.get(".json"))
+    files = {} if beside is None else beside.files or {}
     table = states = None
     if ".rrd" in there:
         try:
-            check(there[".rrd"], beside)
+            check(there[".rrd"], files)
             table = RerunTable(there[".rrd"], shapes)
         except (OSError, ValueError, RuntimeError) as error:
             lost = "its 3-D scene, its pictures and what evaluate() said are missing"
             unread.append(_unread(there[".rrd"], error, lost))
     if ".h5" in there:
         try:
-            check(there[".h5"], beside)
+            check(there[".h5"], files)
             states = _read_states(there[".h5"])
         except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
             unread.append(_unread(there[".h5"], error, "its env states are missing"))
@@ -101,18 +108,17 @@ def read_inert(path: Path, shapes: SharedShapes | None = None) -> tuple[Episode,
         )
     said = beside or _description(there.get(".json"), not_json, table, path)
     try:
-        episode = _episode(said, table, path.parent)
+        episode = _episode(said, table)
         if states is not None:
             _add_states(episode, states)
         elif table is not None:
-            episode.obs = dict(_observations(table, columns_from(said["obs"]), episode.length + 1))
-    except (OSError, RuntimeError, KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+            episode.obs = dict(_observations(table, said.obs, episode.length + 1))
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError, IndexError) as error:
         raise UnreadableRecording(
             f"{path.stem} is a recording, but a broken one ({type(error).__name__}: {error})"
         ) from error
     episode.unread = tuple(unread)
-    source_path = said.get("source_path")
-    return episode, source_path if isinstance(source_path, str) else None
+    return episode, said.source_path or None
 
 
 def _unread(file: Path, error: Exception, lost: str) -> Unread:
@@ -121,25 +127,29 @@ def _unread(file: Path, error: Exception, lost: str) -> Unread:
     return Unread(file.name, f"was cut short or changed ({why}): {lost}.")
 
 
-def _beside(file: Path | None) -> tuple[dict[str, Any], Exception | None]:
-    """What the .json says; nothing where it is none of ours, and why where it is none at all."""
+def _beside(file: Path | None) -> tuple[Description | None, Exception | None]:
+    """What the .json says; nothing where it is none of ours, and why where it is no JSON."""
     if file is None:
-        return {}, None
+        return None, None
     try:
-        said = read_json(file)
-    except (OSError, NotJson) as error:
-        return {}, error
-    ours = said.get("workbench") if isinstance(said, dict) else None
-    return (ours if isinstance(ours, dict) else {}), None
+        document = read_document(file)
+    except (OSError, WrongDocument) as error:
+        return None, error
+    try:
+        return document.description() if document.is_ours else None, None
+    except WrongDocument as error:
+        raise UnreadableRecording(
+            f"{file.stem} is a recording, but a broken one: {file.name} {error}."
+        ) from error
 
 
 def _description(
     file: Path | None, not_json: Exception | None, table: RerunTable | None, path: Path
-) -> dict[str, Any]:
+) -> Description:
     """What the recording says of itself where there is no .json of ours."""
     if file is not None and table is None:
         if not_json is not None:
-            raise UnreadableRecording(f"{file.name} is no JSON that can be read: {not_json}") from not_json
+            raise UnreadableRecording(f"{file.name} {not_json}.") from not_json
         raise UnreadableRecording(f"{file.name} is not from the workbench; read it as ManiSkill's.")
     if table is None:
         raise UnreadableRecording(f"{path.stem}.json is missing, which says what is in {path.name}.")
@@ -147,73 +157,71 @@ def _description(
     if not isinstance(said, str):
         raise UnreadableRecording(f"{path.stem}.rrd is from another program, or from an older workbench.")
     files, texts = (_list(table.property("source", key)) for key in ("files", "texts"))
-    return {**parse_json(said), "source": dict(zip(files, texts))}
+    try:
+        return description_in(said, dict(zip(files, texts)))
+    except WrongDocument as error:
+        raise UnreadableRecording(f"{path.stem}.rrd {error}.") from error
 
 
 def _list(value: Any) -> list[Any]:
     return [] if value is None else value if isinstance(value, list) else [value]
 
 
-def _episode(said: dict[str, Any], table: RerunTable | None, folder: Path) -> Episode:
-    states = int(said["length"]) + 1
+def _episode(said: Description, table: RerunTable | None) -> Episode:
+    states = said.length + 1
     if not 0 < states <= MOST_STATES:
-        raise ValueError(f"it says that it has {said['length']} steps")
-    scene = said["scene"]
-    names = tuple(scene["body_names"])
+        raise ValueError(f"it says that it has {said.length} steps")
     geometry = poses = None
     cameras: list[CameraTrack] = []
     if table is not None:
-        bare = SceneGeometry(1, names, tuple(scene["body_kinds"]), tuple(scene["body_hidden"]), ())
+        scene = said.scene
+        bare = SceneGeometry(1, scene.body_names, scene.body_kinds, scene.body_hidden, ())
         entities = body_entities(bare)
         geometry = table.geometry(bare, entities)
         _check_room("the poses", (states, len(entities), 7), np.dtype(np.float32))
         poses = table.poses(entities, states)
-        cameras = list(_cameras(said["cameras"], table, states))
-    evaluate = {
-        name: _column(table, evaluate_entity(name), column, 0, states)
-        for name, column in columns_from(said["evaluate"]).items()
-        if table is not None
-    }
-    batch = {
-        name: _column(table, batch_entity(name), column, 0, states)
-        for name, column in columns_from(said.get("batch") or {}).items()
-        if table is not None
-    }
-    actions = Column(np.dtype(np.float32), (len(said["action_names"]),))
-    number, flag = Column(np.dtype(np.float32), ()), Column(np.dtype(np.bool_), ())
+        cameras = list(_cameras(said.cameras, table, states))
+    actions, number, flag = ("<f4", (len(said.action_names),)), ("<f4", ()), ("|b1", ())
     return Episode(
-        info=info_from({**said, "source_path": None}, folder),
+        info=said.info(),
         geometry=geometry,
-        segmentation={int(key): name for key, name in said["segmentation"].items()},
+        segmentation=said.segmentation,
         poses=poses,
         action=_column(table, "/action", actions, 1, states),
-        action_names=tuple(said["action_names"]),
+        action_names=said.action_names,
         reward=_column(table, "/reward", number, 1, states),
         terminated=_column(table, "/episode/terminated", flag, 1, states),
         truncated=_column(table, "/episode/truncated", flag, 1, states),
-        evaluate=evaluate,
+        evaluate=_columns(table, said.evaluate, evaluate_entity, states),
         cameras=cameras,
-        batch=batch,
-        texts=tracks_from(said.get("texts") or {}),
+        batch=_columns(table, said.batch, batch_entity, states),
+        texts=tracks_from(said.texts),
     )
 
 
-def _column(table: RerunTable | None, entity: str, column: Column, first: int, states: int) -> NDArray:
-    """States `first` to the last of the numbers of `entity`, as `column` says they were."""
-    shape = (states - first, *column.shape)
-    _check_room(entity, shape, column.dtype)
-    fill = np.nan if column.dtype.kind == "f" else 0
-    out = np.full(shape, fill, dtype=column.dtype)
+def _columns(
+    table: RerunTable | None, said: Mapping[str, ColumnWords], entity_of: Callable[[str], str], states: int
+) -> dict[str, NDArray]:
+    if table is None:
+        return {}
+    return {name: _column(table, entity_of(name), words, 0, states) for name, words in said.items()}
+
+
+def _column(table: RerunTable | None, entity: str, words: ColumnWords, first: int, states: int) -> NDArray:
+    """States `first` to the last of the numbers of `entity`, as `words` say they were."""
+    dtype, shape = np.dtype(words[0]), (states - first, *words[1])
+    _check_room(entity, shape, dtype)
+    out = np.full(shape, np.nan if dtype.kind == "f" else 0, dtype=dtype)
     if table is None or out.size == 0:
         return out
     steps, values = table.scalars(entity)
     if len(steps) == 0:
         return out
     flat = out.reshape(len(out), -1)
-    if column.dtype.kind == "b":
+    if dtype.kind == "b":
         values = values != 0
     at = rows_at(steps, first, states)
-    flat[at >= 0] = values[at[at >= 0]].astype(column.dtype)
+    flat[at >= 0] = values[at[at >= 0]].astype(dtype)
     return out
 
 
@@ -225,8 +233,8 @@ def _check_room(what: str, shape: tuple[int, ...], dtype: np.dtype) -> None:
         raise ValueError(f"{what} is said to be {shape} numbers")
 
 
-def _cameras(said: Sequence[dict[str, Any]], table: RerunTable, states: int) -> Iterator[CameraTrack]:
-    infos = [camera_from(words) for words in said]
+def _cameras(said: Sequence[CameraWords], table: RerunTable, states: int) -> Iterator[CameraTrack]:
+    infos = [words.info() for words in said]
     for info, entity in zip(infos, camera_entities(infos)):
         held: dict[Modality, tuple[NDArray[np.int64], EncodedPictures]] = {}
         for modality in ("rgb", "depth", "segmentation"):
@@ -244,14 +252,14 @@ def _cameras(said: Sequence[dict[str, Any]], table: RerunTable, states: int) -> 
 
 
 def _observations(
-    table: RerunTable, columns: dict[str, Column], states: int
+    table: RerunTable, columns: Mapping[str, ColumnWords], states: int
 ) -> Iterator[tuple[str, NDArray]]:
     begin = 0
-    together = Column(np.dtype(np.float64), (sum(math.prod(column.shape) for column in columns.values()),))
-    values = _column(table, OBSERVATION, together, 0, states)
-    for name, column in columns.items():
-        end = begin + math.prod(column.shape)
-        yield name, values[:, begin:end].astype(column.dtype).reshape(states, *column.shape)
+    together = sum(math.prod(shape) for _, shape in columns.values())
+    values = _column(table, OBSERVATION, ("<f8", (together,)), 0, states)
+    for name, (dtype, shape) in columns.items():
+        end = begin + math.prod(shape)
+        yield name, values[:, begin:end].astype(dtype).reshape(states, *shape)
         begin = end
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from transforms3d.quaternions import mat2quat
 
 from workbench.core.pictures import CameraInfo
+from workbench.recording.document import Document, EpisodeWords, WrongDocument, read_document
 from workbench.recording.encoded_pictures import (
     MILLIMETRES_PER_METRE,
     MODALITIES,
@@ -26,7 +27,6 @@ from workbench.recording.encoded_pictures import (
     encode,
 )
 from workbench.recording.episode import NO_SEED, CameraTrack, Episode, EpisodeInfo
-from workbench.recording.json_file import read_json
 from workbench.recording.safe_h5 import H5Dataset, H5Group, RefusedH5, open_h5
 from workbench.recording.unreadable import UnreadableRecording
 
@@ -93,25 +93,24 @@ def _number(name: str) -> tuple[int, str]:
     return (int(digits) if digits.isdigit() else 1 << 60, name)
 
 
-def _said(path: Path, trajectory: str) -> tuple[dict[str, Any], dict[str, Any]]:
+def _said(path: Path, trajectory: str) -> tuple[Document, EpisodeWords]:
     try:
-        document = read_json(path)
-        for episode in document["episodes"]:
-            if f"traj_{episode['episode_id']}" == trajectory:
-                return document, episode
+        document = read_document(path)
+        for number, said in enumerate(document.said["episodes"]):
+            if f"traj_{said['episode_id']}" == trajectory:
+                return document, document.episode(number)
     except OSError as error:
         raise UnreadableRecording(f"{path.name} cannot be read: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise UnreadableRecording(f"{path.name} is not what ManiSkill writes beside an .h5") from error
+    except WrongDocument as error:
+        raise UnreadableRecording(f"{path.name} {error}.") from error
+    except (KeyError, TypeError) as error:
+        raise UnreadableRecording(f"{path.name} is not what ManiSkill writes beside an .h5.") from error
     raise UnreadableRecording(f"{path.name} says nothing of {trajectory}.")
 
 
-def _episode(
-    group: H5Group, document: dict[str, Any], said: dict[str, Any], path: Path, trajectory: str
-) -> Episode:
-    env_info = document.get("env_info") or {}
-    kwargs = dict(env_info.get("env_kwargs") or {})
-    reset = said.get("reset_kwargs") or {}
+def _episode(group: H5Group, document: Document, said: EpisodeWords, path: Path, trajectory: str) -> Episode:
+    env = document.env()
+    kwargs = env.env_kwargs or {}
     actions, action_names = _actions(group["actions"])
     length = len(actions)
     flags = {
@@ -119,24 +118,22 @@ def _episode(
     }
     rewards = group.numbers("rewards") if "rewards" in group else np.full(length, np.nan)
     frequency = (kwargs.get("sim_config") or {}).get("control_freq") or 0
-    seed: Any = said.get("episode_seed", reset.get("seed"))
-    seed = seed[0] if isinstance(seed, list) and seed else seed
     info = EpisodeInfo(
-        task=str(env_info.get("env_id") or "unknown task"),
+        task=env.env_id or "unknown task",
         env_index=0,
-        seed=NO_SEED if seed is None else int(seed),
+        seed=NO_SEED if said.seed is None else said.seed,
         source_file=None,
         source_hash="",
         source={},
         control_dt=1 / frequency if frequency else _UNKNOWN_DT,
-        control_mode=said.get("control_mode"),
+        control_mode=said.control_mode if isinstance(said.control_mode, str) else None,
         backend=str(kwargs.get("sim_backend") or "physx_cpu"),
         env_kwargs=kwargs,
-        reset_options=dict(reset.get("options") or {}),
-        max_episode_steps=env_info.get("max_episode_steps"),
+        reset_options=(said.reset_kwargs and said.reset_kwargs.options) or {},
+        max_episode_steps=env.max_episode_steps,
         written_at=_written(path),
         id=f"{path.stem}/{trajectory}",
-        acted_by=_acted_by(document),
+        acted_by=((0, document.source_type),) if document.source_type else (),
     )
     obs = group.get("obs")
     return Episode(
@@ -154,12 +151,6 @@ def _episode(
         env_states=dict(leaves(group.get("env_states"))),
         obs=dict(leaves(obs, skip=_PICTURES)),
     )
-
-
-def _acted_by(document: dict[str, Any]) -> tuple[tuple[int, str], ...]:
-    """``RecordEpisode`` may be told (``source_type="RL"``), and ManiSkill's demonstrations say it."""
-    said = " ".join(text.split()) if isinstance(text := document.get("source_type"), str) else ""
-    return ((0, said[:80]),) if said else ()
 
 
 def _written(path: Path) -> str:

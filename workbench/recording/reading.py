@@ -16,10 +16,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from workbench.core.shared_shapes import SharedShapes
-from workbench.recording.description import task_file
+from workbench.recording.document import task_file
 from workbench.recording.encoded_pictures import Modality
 from workbench.recording.episode import Episode
-from workbench.recording.library_row import Entry, Facts, facts_from_dict, text
+from workbench.recording.library_row import Entry, Facts, clean_facts, text
 from workbench.recording.library_scan import NOTES, Found
 from workbench.recording.reader.episode_wire import KnownShapes, unpacked
 from workbench.recording.reader.processes import (
@@ -188,13 +188,9 @@ def _beyond(paths: Iterable[Path]) -> list[Path]:
 def _entries(found: Found, answered: Answered | ReaderEnded) -> list[Entry]:
     answer = answered.answer if isinstance(answered, Answered) else answered
     if isinstance(answer, RowsRead) and len(answer.facts) == len(answer.thumbnails):
-        try:
-            return [
-                (facts_from_dict(facts), _thumbnail(jpeg))
-                for facts, jpeg in zip(answer.facts, answer.thumbnails)
-            ]
-        except ValueError:
-            pass
+        return [
+            (clean_facts(facts), _thumbnail(jpeg)) for facts, jpeg in zip(answer.facts, answer.thumbnails)
+        ]
     why = "gave something that is no row"
     if isinstance(answer, Failed):
         why = answer.words

@@ -11,10 +11,10 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from workbench.recording.document import WrongDocument, read_document
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.episode_writer import SCENE_SUFFIX, tidy
 from workbench.recording.journal import FOLDER, claim
-from workbench.recording.json_file import read_json
 from workbench.recording.landing import RecordingError, candidates, reason
 from workbench.recording.make_files import (
     SUFFIXES,
@@ -105,9 +105,8 @@ def _stems(folder: Path, stem: str) -> Iterator[str]:
 
 def _id_of(path: Path) -> str | None:
     try:
-        said = read_json(path)
-        return said["workbench"]["id"]
-    except (OSError, ValueError, KeyError, TypeError):
+        return read_document(path).said["workbench"]["id"]
+    except (OSError, WrongDocument, KeyError, TypeError):
         return None
 
 

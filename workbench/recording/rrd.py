@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import datetime
 import errno
-import json
 import os
 import re
 import uuid
@@ -24,6 +23,7 @@ from rerun.error_utils import catch_and_log_exceptions
 from workbench.recording.blueprint import Arrangement, arrangement, blueprint_of
 from workbench.recording.blueprint_in_file import BlueprintBytes, add_blueprint, encode_blueprint
 from workbench.recording.description import describe
+from workbench.recording.document import fields_of, json_text
 from workbench.recording.episode import EpisodeInfo, acted_by_in_words
 from workbench.recording.layout import static_chunks, time_chunks
 from workbench.recording.rerun_chunks import property_chunk, static_chunk
@@ -116,9 +116,9 @@ def properties(survey: Survey) -> dict[str, dict[str, Any]]:
 
     ``success`` and ``fail`` are those of the last state, ``success_once`` and ``fail_once`` of any, as
     in ManiSkill's own metrics. ``source`` holds the text of the task's files, so that the episode can
-    be made again where the files have changed since. ``workbench`` is `description` for programs.
+    be made again where the files have changed since. ``workbench`` is the `Description` for programs.
     """
-    said = describe(survey)
+    said = fields_of(describe(survey))
     words = ("task", "seed", "env_index", "length", "return", "control_mode", "control_dt", "backend", "id")
     words += ("source_file", "source_hash", "max_episode_steps", "written_at", "recovered")
     episode = {name: said[name] for name in words}
@@ -126,12 +126,12 @@ def properties(survey: Survey) -> dict[str, dict[str, Any]]:
         episode[name] = bool(said[name])
     episode["acted_by"] = acted_by_in_words(survey.info.acted_by)
     for name in ("env_kwargs", "reset_options"):
-        episode[name] = json.dumps(said[name])
+        episode[name] = json_text(said[name])
     values: dict[str, dict[str, Any]] = {"episode": episode}
     if said["versions"]:
         values["versions"] = dict(said["versions"])
     if said["source"]:
         values["source"] = {"files": list(said["source"]), "texts": list(said["source"].values())}
     # The texts are megabytes in no task, and once is enough.
-    values["workbench"] = {"description": json.dumps({**said, "source": None})}
+    values["workbench"] = {"description": json_text({**said, "source": None})}
     return values

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from workbench.recording.json_file import read_json
+from workbench.recording.document import WrongDocument, read_document
 from workbench.recording.lerobot_read import is_lerobot, lerobot_rows
 from workbench.recording.read_maniskill import trajectories
 from workbench.recording.unreadable import UnreadableRecording
@@ -55,7 +55,6 @@ def _in_folder(folder: Path) -> Iterator[tuple[Path, str | None]]:
 
 def _is_ours(path: Path) -> bool:
     try:
-        said = read_json(path)
-    except (OSError, ValueError):
+        return read_document(path).is_ours
+    except (OSError, WrongDocument):
         return False
-    return isinstance(said, dict) and isinstance(said.get("workbench"), dict)

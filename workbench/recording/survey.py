@@ -15,12 +15,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.geometry import SceneGeometry
 from workbench.core.pictures import CameraInfo
 from workbench.recording.columns import EVALUATE, assemble, layout_type
+from workbench.recording.document import CameraWords, json_text
 from workbench.recording.encoded_pictures import MODALITIES, Modality
 from workbench.recording.entry_texts import KIND as TEXT
 from workbench.recording.entry_texts import TextTrack, tracks_of
@@ -53,17 +55,16 @@ class Header:
 def header_text(header: Header) -> str:
     """`header` without its meshes, as JSON."""
     geometry = header.geometry
-    info = json.dumps(asdict(header.info), default=str)
-    return json.dumps(
+    info = json_text(asdict(header.info))
+    return json_text(
         {
             "info": info,
             "made_here": seal_text(info),
             "bodies": [geometry.num_envs, geometry.body_names, geometry.body_kinds, geometry.body_hidden],
             "segmentation": {str(key): name for key, name in header.segmentation.items()},
             "action_names": header.action_names,
-            "cameras": [camera_words(camera) for camera in header.cameras],
-        },
-        default=str,
+            "cameras": [CameraWords.of(camera) for camera in header.cameras],
+        }
     )
 
 
@@ -80,36 +81,13 @@ def header_from(text: str, geometry: SceneGeometry | None) -> Header:
         geometry=geometry,
         segmentation={int(key): name for key, name in said["segmentation"].items()},
         action_names=tuple(said["action_names"]),
-        cameras=tuple(camera_from(words) for words in said["cameras"]),
+        cameras=tuple(words.info() for words in msgspec.convert(said["cameras"], list[CameraWords])),
         made_here=is_sealed(info, said.get("made_here")),
     )
 
 
 def _info_from(said: Mapping[str, Any]) -> EpisodeInfo:
     return EpisodeInfo(**{**said, "acted_by": acted_by_from(said.get("acted_by")), "seal": None})
-
-
-def camera_words(camera: CameraInfo) -> dict[str, Any]:
-    """`camera` as JSON; where its config stands in the source is of no use to another day."""
-    return {
-        "name": camera.name,
-        "kind": camera.kind,
-        "width": camera.width,
-        "height": camera.height,
-        "fovy": float(camera.fovy),
-        "near": float(camera.near),
-        "far": float(camera.far),
-        "intrinsic": np.asarray(camera.intrinsic, dtype=np.float64).tolist(),
-        "mount": camera.mount,
-        "modalities": list(camera.modalities),
-    }
-
-
-def camera_from(words: Mapping[str, Any]) -> CameraInfo:
-    held = dict(words)
-    held["intrinsic"] = np.array(held["intrinsic"], dtype=np.float32)
-    held["modalities"] = tuple(held["modalities"])
-    return CameraInfo(**held)
 
 
 @dataclass

@@ -9,14 +9,12 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from workbench.authoring.library_names import named_like_library
 from workbench.authoring.modules import hidden_by_libraries
 from workbench.authoring.reference import TaskName, named_file
-from workbench.recording.description import info_from
+from workbench.recording.document import Document, WrongDocument, read_document
 from workbench.recording.episode import EpisodeInfo
-from workbench.recording.json_file import NotJson, read_json
 from workbench.recording.made_here import made_here
 from workbench.recording.reading import find_trajectories
 from workbench.recording.side_files import side_files_in_words
@@ -155,11 +153,11 @@ def with_renderer(options: TaskOptions) -> TaskOptions:
 
 
 def _episodes_in(file: Path) -> Iterator[EpisodeFile]:
-    said = _said(file.with_suffix(".json"))
-    if isinstance(said.get("workbench"), dict):
-        id = str(said["workbench"].get("id") or file.with_suffix("").resolve())
+    document = _document(file)
+    if document.is_ours:
+        id = str(document.said["workbench"].get("id") or file.with_suffix("").resolve())
         yield EpisodeFile(id, file.stem, file.with_suffix(".json"))
-    elif "episodes" in said and file.with_suffix(".h5").is_file():
+    elif document.is_maniskills and file.with_suffix(".h5").is_file():
         data = file.with_suffix(".h5")
         for name in find_trajectories(data):
             yield EpisodeFile(f"{data.resolve()}#{name}", f"{file.stem}#{name}", data, name)
@@ -169,22 +167,17 @@ def _episodes_in(file: Path) -> Iterator[EpisodeFile]:
         raise UnreadableRecording(f"{file} is no recording of an episode.")
 
 
-def _said(file: Path) -> dict[str, Any]:
+def _document(file: Path) -> Document:
+    """The one beside `file`; where there is none, one that says nothing."""
     try:
-        said = read_json(file)
-    except (OSError, NotJson):
-        return {}
-    return said if isinstance(said, dict) else {}
+        return read_document(file.with_suffix(".json"))
+    except (OSError, WrongDocument):
+        return Document({})
 
 
 def _info_of(file: EpisodeFile) -> EpisodeInfo:
     """Raises as `EpisodeFile.read`, which it spares where it can: pictures and meshes need not be read for it."""
-    said = _said(file.path).get("workbench") if file.path.suffix == ".json" else None
-    if isinstance(said, dict):
-        try:
-            return info_from(said, file.path.parent)
-        except (KeyError, TypeError, ValueError) as error:
-            raise UnreadableRecording(
-                f"{file.path.name} is a recording, but a broken one ({type(error).__name__}: {error})"
-            ) from error
-    return file.read().info
+    try:
+        return _document(file.path).description().info(file.path.parent)
+    except WrongDocument:
+        return file.read().info

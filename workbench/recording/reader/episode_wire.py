@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
-from workbench.core.pictures import CameraInfo
 from workbench.core.shared_shapes import SharedShapes
+from workbench.recording.document import CameraWords, SceneWords
 from workbench.recording.encoded_pictures import MODALITIES, MOST_PIXELS, EncodedPictures, Modality
 from workbench.recording.entry_texts import tracks_from, tracks_words
 from workbench.recording.episode import CameraTrack, Episode, Unread
@@ -110,25 +110,14 @@ def _geometry(geometry: SceneGeometry, arrays: ArrayPacker, sent: SentShapes) ->
         number, shape = sent.number(*sent.shapes.shared(visual.mesh, visual.material), arrays)
         shapes += [] if shape is None else [shape]
         visuals.append(VisualRead(visual.name, number, arrays.ref(visual.bodies)))
-    return GeometryRead(
-        list(geometry.body_names), list(geometry.body_kinds), list(geometry.body_hidden), shapes, visuals
-    )
+    scene = SceneWords(geometry.body_names, geometry.body_kinds, geometry.body_hidden)
+    return GeometryRead(scene, shapes, visuals)
 
 
 def _camera(track: CameraTrack, arrays: ArrayPacker) -> CameraRead:
-    info = track.info
     held: dict[Modality, EncodedPictures | None] = {m: getattr(track, m) for m in MODALITIES}
     return CameraRead(
-        name=info.name,
-        kind=info.kind,
-        width=info.width,
-        height=info.height,
-        fovy=float(info.fovy),
-        near=float(info.near),
-        far=float(info.far),
-        intrinsic=arrays.ref(info.intrinsic),
-        mount=info.mount,
-        modalities=list(info.modalities),
+        camera=CameraWords.of(track.info),
         frame=arrays.ref(track.frame),
         pose=arrays.ref(track.pose),
         pictures={m: len(pictures) for m, pictures in held.items() if pictures is not None},
@@ -296,8 +285,9 @@ def _unpacked_geometry(
 ) -> SceneGeometry:
     for shape in read.shapes:
         known[process, shape.number] = shapes.shared(*_shape(shape, arrays))
-    bodies = len(read.body_names)
-    _must(len(read.body_kinds) == len(read.body_hidden) == bodies, "kinds of other bodies than there are")
+    scene = read.scene
+    bodies = len(scene.body_names)
+    _must(len(scene.body_kinds) == len(scene.body_hidden) == bodies, "kinds of other bodies than there are")
     visuals = []
     for visual in read.visuals:
         _must((process, visual.shape) in known, "a visual without a shape")
@@ -312,9 +302,7 @@ def _unpacked_geometry(
                 visual.name, mesh, material, np.zeros(len(worn), np.int32), worn.astype(np.int32, copy=False)
             )
         )
-    return SceneGeometry(
-        1, tuple(read.body_names), tuple(read.body_kinds), tuple(read.body_hidden), tuple(visuals)
-    )
+    return SceneGeometry(1, scene.body_names, scene.body_kinds, scene.body_hidden, tuple(visuals))
 
 
 def _shape(read: ShapeRead, arrays: ArrayReader) -> tuple[Mesh, Material]:
@@ -354,20 +342,15 @@ def _shape(read: ShapeRead, arrays: ArrayReader) -> tuple[Mesh, Material]:
 
 
 def _track(read: CameraRead, number: int, arrays: ArrayReader, fetch: FetchPicture) -> CameraTrack:
-    frame, pose, intrinsic = (arrays.array(ref) for ref in (read.frame, read.pose, read.intrinsic))
-    _must(frame.ndim == 1 and frame.dtype.kind in "iu", f"{read.name}: frames of shape {frame.shape}")
-    _must(pose.shape == (len(frame), 7), f"{read.name}: {len(frame)} frames and poses of shape {pose.shape}")
-    _must(intrinsic.shape == (3, 3), f"{read.name}: a lens of shape {intrinsic.shape}")
+    info, frame, pose = read.camera.info(), arrays.array(read.frame), arrays.array(read.pose)
+    _must(frame.ndim == 1 and frame.dtype.kind in "iu", f"{info.name}: frames of shape {frame.shape}")
+    _must(pose.shape == (len(frame), 7), f"{info.name}: {len(frame)} frames and poses of shape {pose.shape}")
     _must(
-        read.width > 0 and read.height > 0 and read.width * read.height <= MOST_PIXELS,
-        f"{read.name}: pictures of {read.width} x {read.height}",
+        info.width > 0 and info.height > 0 and info.width * info.height <= MOST_PIXELS,
+        f"{info.name}: pictures of {info.width} x {info.height}",
     )
     for count in read.pictures.values():
-        _must(count == len(frame), f"{read.name}: {len(frame)} frames and {count} pictures")
-    info = CameraInfo(
-        read.name, read.kind, read.width, read.height, read.fovy, read.near, read.far,
-        intrinsic.astype(np.float32, copy=False), read.mount, tuple(read.modalities),
-    )  # fmt: skip
+        _must(count == len(frame), f"{info.name}: {len(frame)} frames and {count} pictures")
     held = {m: PicturesRead(m, number, count, fetch) for m, count in read.pictures.items()}
     return CameraTrack(
         info, frame.astype(np.int64, copy=False), pose.astype(np.float32, copy=False),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 import msgspec
 
+from workbench.recording.document import CameraWords, SceneWords, TracksWords
 from workbench.recording.encoded_pictures import Modality
 from workbench.recording.episode import EpisodeInfo, Unread
+from workbench.recording.library_row import Facts
 from workbench.recording.reader.wire import ArrayRef
 
 Kind = Literal["ours", "maniskill", "lerobot"]
@@ -70,22 +72,12 @@ REQUESTS: msgspec.msgpack.Decoder[Request] = msgspec.msgpack.Decoder(Request)
 
 
 class RowsRead(msgspec.Struct, frozen=True, tag=True):
-    facts: list[dict[str, Any]]
-    """Of `facts_as_dict`."""
+    facts: list[Facts]
     thumbnails: list[bytes | None]
 
 
 class CameraRead(msgspec.Struct, frozen=True):
-    name: str
-    kind: Literal["sensor", "human"]
-    width: int
-    height: int
-    fovy: float
-    near: float
-    far: float
-    intrinsic: ArrayRef
-    mount: str | None
-    modalities: list[str]
+    camera: CameraWords
     frame: ArrayRef
     pose: ArrayRef
     pictures: dict[Modality, int]
@@ -113,15 +105,9 @@ class VisualRead(msgspec.Struct, frozen=True):
 
 
 class GeometryRead(msgspec.Struct, frozen=True):
-    body_names: list[str]
-    body_kinds: list[Literal["link", "dynamic", "kinematic", "static"]]
-    body_hidden: list[bool]
+    scene: SceneWords
     shapes: list[ShapeRead]
     visuals: list[VisualRead]
-
-
-TracksSaid = dict[str, list[tuple[int, tuple[str, str, bool, bool] | None]]]
-"""As `entry_texts.tracks_words`."""
 
 
 class EpisodeRead(msgspec.Struct, frozen=True, tag=True):
@@ -142,7 +128,7 @@ class EpisodeRead(msgspec.Struct, frozen=True, tag=True):
     env_states: dict[str, ArrayRef]
     obs: dict[str, ArrayRef]
     batch: dict[str, ArrayRef]
-    texts: TracksSaid
+    texts: TracksWords
     unread: list[Unread]
 
 

@@ -9,7 +9,7 @@ from collections import OrderedDict
 from workbench.recording.encoded_pictures import MODALITIES, EncodedPictures
 from workbench.recording.episode import CameraTrack, Episode
 from workbench.recording.library_read import read_found
-from workbench.recording.library_row import facts_as_dict, text
+from workbench.recording.library_row import text
 from workbench.recording.library_scan import found_of
 from workbench.recording.reader.episode_wire import SentShapes, packed
 from workbench.recording.reader.requests import (
@@ -88,8 +88,7 @@ class _Reader:
         if isinstance(wanted, Rows):
             found = found_of(os.fsdecode(wanted.key), wanted.signature)
             entries = read_found(path_of(wanted.folder), found)
-            rows = [facts_as_dict(facts) for facts, _ in entries]
-            return RowsRead(rows, [thumbnail for _, thumbnail in entries]), None
+            return RowsRead([facts for facts, _ in entries], [thumbnail for _, thumbnail in entries]), None
         if isinstance(wanted, Open):
             return self._open(wanted)
         if isinstance(wanted, PictureAt):
