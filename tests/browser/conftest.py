@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -33,19 +32,10 @@ def _desk(opened: Opened, file: Path, browser: Browser, width: int, height: int)
     with page_at(browser, opened.url, width, height) as (page, errors):
         expect(page.get_by_text("paused", exact=True)).to_be_visible(timeout=120_000)
         desk = Desk(page, errors, file, opened)
-        _select_the_first_env(desk)
+        desk.select_the_first_env()
         yield desk
     # The next file begins with what this one began with.
     file.write_text(TASK.read_text())
-
-
-def _select_the_first_env(desk: Desk) -> None:
-    """Whichever the file before has left selected."""
-    timeline = desk.page.locator(".wb-timeline")
-    expect(timeline).to_contain_text("env ")
-    while (now := re.search(r"env (\d+)", timeline.inner_text())) and now[1] != "0":
-        desk.press("p")
-        expect(timeline).not_to_contain_text(f"env {now[1]}")
 
 
 @pytest.fixture(scope="session")

@@ -13,6 +13,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 
 from tests.browser.conftest import At
 from tests.drive.studio import press as press_tool
+from tests.drive.studio import tool
 from tests.drive.waiting import until
 
 pytestmark = pytest.mark.browser
@@ -29,7 +30,7 @@ FOLDERS = {
 
 
 @pytest.fixture(scope="module")
-def page(example: At, browser: Browser) -> Iterator[Page]:
+def opened(example: At, browser: Browser) -> Iterator[Page]:
     """The Studio tab on base_camera, with every folder that judges open."""
     with example(browser, height=900) as desk:
         page = desk.page
@@ -42,9 +43,20 @@ def page(example: At, browser: Browser) -> Iterator[Page]:
             page.get_by_text(folder, exact=True).click()
             expect(page.get_by_role("button", name=inside, exact=True)).to_be_visible()
         yield page
-        press_tool(page, "Back to the file")
-        expect(page.get_by_text(re.compile("^As push_cube.py has it"))).to_be_visible()
+        back_to_the_file(page)
         assert not desk.errors
+
+
+@pytest.fixture
+def page(opened: Page) -> Page:
+    back_to_the_file(opened)
+    return opened
+
+
+def back_to_the_file(page: Page) -> None:
+    if "wb-off" not in tool(page, "Back to the file")["classes"]:
+        press_tool(page, "Back to the file")
+    expect(page.get_by_text(re.compile("^As push_cube.py has it"))).to_be_visible()
 
 
 def press(page: Page, name: str) -> None:

@@ -26,6 +26,12 @@ def page(task_file: Path, browser: Browser) -> Iterator[Page]:
     # Without pictures there are no shaders to wait for.
     arguments = ("--num-envs", str(ENVS), "--env", "render_backend=none")
     with page_on(task_file, *arguments, browser=browser) as (page, errors, _):
+        assert envs(page) == []
+        page.get_by_role("tab", name="Inspect").click()
+        assert page.locator(".wb-inspect").inner_text().startswith("Choose what to read")
+        page.keyboard.press("b")
+        until(lambda: envs(page) == list(range(ENVS)), "the rows")
+        play_until_step(page, 6)
         yield page
         assert not errors
 
@@ -62,12 +68,17 @@ def cell(page: Page, env: int, column: int) -> str:
     )
 
 
-def test_a_row_is_pressed_and_its_env_selected_also_while_the_envs_play(page: Page) -> None:
-    assert envs(page) == []
-    page.keyboard.press("b")
-    until(lambda: envs(page) == list(range(ENVS)), "the rows")
+def play_until_step(page: Page, steps: int) -> None:
+    page.get_by_role("tab", name="Run").click()
     page.get_by_role("button", name="Play", exact=True).click()
-    until(lambda: int(cell(page, 0, 2)) > 6, "steps in the table")
+    until(lambda: int(cell(page, 0, 2)) > steps, "steps in the table")
+    page.get_by_role("button", name="Pause", exact=True).click()
+    expect(page.get_by_text("paused", exact=True)).to_be_visible()
+
+
+def test_a_row_is_pressed_and_its_env_selected_also_while_the_envs_play(page: Page) -> None:
+    page.get_by_role("tab", name="Run").click()
+    page.get_by_role("button", name="Play", exact=True).click()
     for env in (3, 1, 5):
         press(page, f"tr[data-env='{env}']")
         until(lambda env=env: selected(page) == [env], f"env {env} selected")
@@ -118,7 +129,6 @@ def show(page: Page, what: str) -> None:
 
 def test_the_selected_env_is_read_out_and_changes_are_marked(page: Page) -> None:
     page.get_by_role("tab", name="Inspect").click()
-    assert page.locator(".wb-inspect").inner_text().startswith("Choose what to read")
     show(page, "joints")
     expect(page.get_by_text("panda_joint7", exact=True)).to_be_visible()
     show(page, "observation")
@@ -132,6 +142,7 @@ def test_the_selected_env_is_read_out_and_changes_are_marked(page: Page) -> None
 
 
 def test_a_pose_is_copied(page: Page) -> None:
+    page.get_by_role("tab", name="Inspect").click()
     show(page, "poses")
     page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     expect(page.locator(".wb-leaves").get_by_text("cube", exact=True)).to_be_visible()

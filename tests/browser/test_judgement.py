@@ -28,6 +28,9 @@ def desk(example_without_pictures: At, browser: Browser) -> Iterator[Desk]:
         expect(page.get_by_text("paused", exact=True)).to_be_visible()
         page.get_by_role("button", name="Reset all", exact=True).click()
         page.get_by_role("tab", name="Reward").click()
+        # Before there is something to say.
+        expect(page.locator(".wb-again")).to_have_count(0)
+        expect(page.get_by_role("button", name="Stop judging")).to_have_count(0)
         yield desk
 
 
@@ -37,11 +40,6 @@ def says(desk: Desk, pattern: str) -> None:
 
 def rows(desk: Desk) -> Locator:
     return desk.page.locator(".wb-again-table tbody tr")
-
-
-def test_nothing_is_shown_before_there_is_something_to_say(desk: Desk) -> None:
-    expect(desk.page.locator(".wb-again")).to_have_count(0)
-    expect(desk.page.get_by_role("button", name="Stop judging")).to_have_count(0)
 
 
 def test_an_edited_reward_is_drawn_over_the_recorded_one_and_what_differs_is_listed(desk: Desk) -> None:
@@ -65,6 +63,7 @@ def test_an_edited_reward_is_drawn_over_the_recorded_one_and_what_differs_is_lis
 def test_a_row_shows_its_env_at_its_moment_and_a_key_goes_to_the_next(desk: Desk) -> None:
     desk.edit(REWARD, f"{REWARD} * 2")
     until(lambda: rows(desk).count() >= 6, "the list")
+    expect(desk.page.get_by_role("button", name="Stop judging")).to_have_count(0)
     row = rows(desk).nth(2)
     env = row.locator("td").first.inner_text()
     row.click()
@@ -78,6 +77,7 @@ def test_a_row_shows_its_env_at_its_moment_and_a_key_goes_to_the_next(desk: Desk
     expect(rows(desk).nth(2)).to_have_class("wb-selected")
     desk.page.keyboard.press("End")
     expect(desk.page.locator(".wb-timeline").get_by_text("live", exact=True)).to_be_visible()
+    desk.select_the_first_env()
 
 
 def test_an_edit_that_changes_no_number_is_one_line(desk: Desk) -> None:

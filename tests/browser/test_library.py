@@ -43,7 +43,7 @@ class Shown:
 
 
 @pytest.fixture(scope="module")
-def shown(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[Shown]:
+def opened(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator[Shown]:
     folder = tmp_path_factory.mktemp("recordings")
     for k in range(COUNT):
         when = f"2026-11-21T10:{k:02}:00"
@@ -67,7 +67,8 @@ def shown(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterato
     drawing.start()
     with page_at(browser, "about:blank") as (page, errors):
         page.set_default_timeout(15_000)
-        page.add_init_script(path=web_assets_folder() / "pressed.js")
+        for script in ("pressed.js", "library_keys.js", "typed_first.js"):
+            page.add_init_script(path=web_assets_folder() / script)
         page.goto(f"http://127.0.0.1:{server.get_port()}")
         page.add_style_tag(path=web_assets_folder() / "panels" / "page.css")
         page.wait_for_selector(".wb-library tbody")
@@ -77,6 +78,19 @@ def shown(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterato
     drawing.join()
     library.close()
     server.stop()
+
+
+@pytest.fixture
+def shown(opened: Shown) -> Shown:
+    """All recordings, the newest first, none selected."""
+    opened.page.keyboard.press("Escape")
+    while opened.seeds()[0] != COUNT - 1 or len(opened.seeds()) != 50:
+        before = opened.seeds()
+        opened.page.locator("[data-press]", has_text="date").first.click()
+        until(lambda before=before: opened.seeds() != before, "another order")
+    opened.panel.select(())
+    opened.opened.clear()
+    return opened
 
 
 def test_rows_are_selected_by_mouse_and_keys_and_opened(shown: Shown) -> None:
@@ -121,7 +135,6 @@ def test_words_are_looked_for_as_they_are_typed(shown: Shown) -> None:
     shown.page.get_by_text("Clear the filter").click()
     until(lambda: len(shown.seeds()) == 50, "all of them")
     expect(field).to_have_value("")
-    shown.page.evaluate((web_assets_folder() / "library_keys.js").read_text())
     pill = shown.page.locator(".wb-library-pills .wb-on")
     field.click()
     shown.page.keyboard.type("even")
@@ -150,7 +163,6 @@ def test_a_recording_is_tagged_and_deleted_and_comes_back(shown: Shown) -> None:
     save = page.get_by_role("button", name="Save", exact=True)
     expect(save).to_be_visible()
     # Letters and Enter as fast as they can be pressed: all of them count.
-    page.evaluate((web_assets_folder() / "typed_first.js").read_text())
     page.get_by_role("dialog").get_by_role("textbox").focus()
     page.keyboard.type("wobbly, good")
     page.keyboard.press("Enter")
@@ -183,6 +195,9 @@ def test_a_recording_is_tagged_and_deleted_and_comes_back(shown: Shown) -> None:
 def test_a_new_recording_appears_by_itself_with_all_of_its_seed(shown: Shown) -> None:
     largest = 2**31 - 1
     describe(shown.library.folder, "new", id="new", seed=largest, written_at="2026-11-21T12:00:00")
-    shown.page.locator("[data-press]", has_text="date").first.click()
     until(lambda: shown.seeds()[0] == largest, "the new row")
     assert shown.row(0).locator("td").nth(4).evaluate("cell => cell.scrollWidth <= cell.clientWidth")
+    shown.row(0).click()
+    shown.page.keyboard.press("Delete")
+    shown.page.locator("button").get_by_text("Delete", exact=True).click()
+    until(lambda: shown.seeds()[0] == COUNT - 1, "the others alone")

@@ -26,6 +26,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterator
 
 
 def test_a_loop_shows_a_banner_that_ends_it_with_its_traceback(desk: Desk) -> None:
+    desk.tab("Run")
     provoke(desk.file, "evaluate", "loop")
     desk.button("Step").click()
     expect(desk.page.get_by_text("busy", exact=True)).to_be_visible()
@@ -46,6 +47,7 @@ def test_a_loop_shows_a_banner_that_ends_it_with_its_traceback(desk: Desk) -> No
 
 
 def test_restart_ends_what_cannot_be_interrupted(desk: Desk) -> None:
+    desk.tab("Run")
     provoke(desk.file, "evaluate", "native")
     desk.button("Step").click()
     desk.button("Interrupt").click()
@@ -58,6 +60,7 @@ def test_restart_ends_what_cannot_be_interrupted(desk: Desk) -> None:
 
 
 def test_the_log_shows_what_was_printed_and_forgets_it(desk: Desk) -> None:
+    desk.tab("Run")
     provoke(desk.file, "reset", "flood")
     desk.button("Reset all").click()
     desk.tab("Log")

@@ -55,6 +55,13 @@ class Desk:
     def timeline_says(self, text: str) -> None:
         expect(self.page.locator(".wb-timeline").get_by_text(re.compile(text)).first).to_be_visible()
 
+    def select_the_first_env(self) -> None:
+        timeline = self.page.locator(".wb-timeline")
+        expect(timeline).to_contain_text("env ")
+        while (now := re.search(r"env (\d+)", timeline.inner_text())) and now[1] != "0":
+            self.press("p")
+            expect(timeline).not_to_contain_text(f"env {now[1]}")
+
     def moments_kept(self) -> int:
         """Steps and resets that the timeline says it has."""
         found = re.search(r"MB, (\d+) steps", self.page.locator(".wb-timeline").inner_text())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from playwright.sync_api import FloatRect, Page
+from playwright.sync_api import FloatRect, Locator, Page
 
 from tests.drive.page import picture_of_view
 from tests.drive.waiting import until
@@ -15,8 +15,21 @@ VIEW: FloatRect = {"x": 40, "y": 0, "width": WIDTH - 390, "height": HEIGHT - 200
 
 
 def choose(page: Page, name: str) -> None:
-    page.locator("input[aria-haspopup=listbox]:visible").first.click()
-    page.get_by_role("option", name=name, exact=True).click()
+    """Among the cameras."""
+    _take(page, page.locator("input[aria-haspopup=listbox]:visible").first, name)
+
+
+def _take(page: Page, box: Locator, name: str) -> None:
+    """One of a dropdown's list, which closes by itself when what is above it changes its height at that moment."""
+    one = page.get_by_role("option", name=name, exact=True)
+
+    def opened() -> bool:
+        box.click()
+        page.wait_for_timeout(200)
+        return one.is_visible()
+
+    until(opened, f"the list with {name}")
+    one.click()
 
 
 def tool(page: Page, name: str) -> dict:
@@ -77,5 +90,4 @@ def field(page: Page, label: str, number: int = 1) -> str:
 
 
 def option(page: Page, label: str, name: str) -> None:
-    page.locator(field(page, label)).click()
-    page.get_by_role("option", name=name, exact=True).click()
+    _take(page, page.locator(field(page, label)), name)
