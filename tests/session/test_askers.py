@@ -21,7 +21,7 @@ from workbench.session.askers import Asker, Background
 from workbench.session.calls import Answer, Call, Progress
 from workbench.session.camera_messages import JudgeCamera
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
-from workbench.session.messages import Load, PlaceCamera, Request, Reset, TaskOptions
+from workbench.session.messages import Load, Request, Reset, TaskOptions
 
 BASE = ("sensor", "base_camera")
 PROBLEM = Problem("step", "it broke", None, None, None, "")
@@ -113,7 +113,7 @@ def a_job() -> Job:
 
 @pytest.fixture
 def background(child_process: None) -> Iterator[Background]:
-    process = Background("that judges", "to judge with")
+    process = Background()
     yield process
     process.end()
 
@@ -141,7 +141,7 @@ def test_a_process_that_sends_garbage_ends_its_job_and_the_next_can_have_another
             with pytest.raises(Stopped):
                 asked.result(timeout=30)
     else:
-        with pytest.raises(JobFailed, match="the process that judges sent what cannot be read"):
+        with pytest.raises(JobFailed, match="the process in the background sent what cannot be read"):
             ensure()
     assert background.pid is None and not any(pid is not None and psutil.pid_exists(pid) for pid in pids)
     calm(file)
@@ -160,7 +160,7 @@ def test_what_is_loaded_is_loaded_once_and_a_process_that_dies_ends_only_the_job
     job.tell = lambda done, total, what="": told.append(what)  # type: ignore[method-assign]
     with background.turn(job):
         assert background.ensure(job, load) == 2
-        assert told == ["starting a process to judge with", "building envs to judge with"]
+        assert told == ["starting a process in the background", "building envs in the background"]
         assert background.ensure(job, load) == 2 and len(told) == 2, "it is there already"
         step = background.ask(job.check, Reset((1,), 7))
         assert step.poses.shape[0] == 2
@@ -169,7 +169,7 @@ def test_what_is_loaded_is_loaded_once_and_a_process_that_dies_ends_only_the_job
         first = background.pid
         assert first is not None
         os.kill(first, signal.SIGKILL)
-        with pytest.raises(JobFailed, match="the process that judges was killed by SIGKILL"):
+        with pytest.raises(JobFailed, match="the process in the background was killed by SIGKILL"):
             background.ask(job.check, Reset((1,), 7))
     with background.turn(job):
         assert background.ensure(job, load) == 2 and background.pid not in (None, first)
@@ -177,11 +177,80 @@ def test_what_is_loaded_is_loaded_once_and_a_process_that_dies_ends_only_the_job
         provoke(file, "build", "ctrl_c")
         with pytest.raises(JobFailed, match="the task failed in the background") as failed:
             background.ensure(job, replace(load, level="rebuilt"))
-        assert failed.value.problem is not None and background.holds_task
+        assert failed.value.problem is not None and background.num_envs == 2
         other = Load(
             str(write_task(tmp_path / "other")), TaskOptions(1, env_kwargs={"render_backend": "none"})
         )
         assert background.ensure(job, replace(load, level="rebuilt"), or_else=other) == 1
-        # A camera that stands elsewhere cannot be put back to the file but in a new process.
-        second, placed = background.pid, (PlaceCamera(("human", "nothing"), None),)
-        assert background.ensure(job, other, placed) == 1 and background.pid != second
+
+
+def test_what_nobody_waits_for_gives_way_and_is_done_from_its_beginning_afterwards(
+    background: Background, tmp_path: Path
+) -> None:
+    load = Load(str(write_task(tmp_path)), TaskOptions(1, env_kwargs={"render_backend": "none"}))
+    done, under_way, seen = list[str](), threading.Event(), threading.Event()
+
+    def side_work(job: Job) -> None:
+        done.append("begins")
+        background.ensure(job, load)
+        while not seen.is_set():
+            background.ask(job.check, Reset((0,), 1))
+            under_way.set()
+        done.append("ends")
+
+    def somebody_waits(job: Job) -> None:
+        with background.turn(job):
+            background.ensure(job, load)
+            background.ask(job.check, Reset((0,), 2))
+            done.append("answered")
+            seen.set()
+
+    job = a_job()
+    with ThreadPoolExecutor(2) as threads:
+        # It would go on for ever if it did not give way.
+        aside = threads.submit(background.in_turns, job, lambda: side_work(job))
+        assert under_way.wait(90)
+        threads.submit(somebody_waits, a_job()).result(timeout=90)
+        aside.result(timeout=90)
+    assert done == ["begins", "answered", "begins", "ends"]
+
+
+def test_when_the_process_dies_only_the_job_that_has_it_fails_and_the_queue_goes_on_with_another(
+    background: Background, tmp_path: Path
+) -> None:
+    load = Load(str(write_task(tmp_path)), TaskOptions(1, env_kwargs={"render_backend": "none"}))
+    pids, has_it, killed = list[int | None](), threading.Event(), threading.Event()
+
+    def first(job: Job) -> None:
+        with background.turn(job):
+            background.ensure(job, load)
+            pids.append(background.pid)
+            has_it.set()
+            assert killed.wait(90)
+            background.ask(job.check, Reset((0,), 1))
+
+    def waiting(job: Job) -> None:
+        with background.turn(job):
+            background.ensure(job, load)
+            background.ask(job.check, Reset((0,), 1))
+            pids.append(background.pid)
+
+    stopped = a_job()
+    with ThreadPoolExecutor(5) as threads:
+        fails = threads.submit(first, a_job())
+        assert has_it.wait(90)
+        queue = [threads.submit(waiting, a_job()) for _ in range(2)]
+        aside = a_job()
+        queue.append(threads.submit(background.in_turns, aside, lambda: background.ensure(aside, load)))
+        given_up = threads.submit(waiting, stopped)
+        stopped.stopped = True
+        with pytest.raises(Stopped):
+            given_up.result(timeout=90)  # while another has its turn
+        assert pids[0] is not None
+        os.kill(pids[0], signal.SIGKILL)
+        killed.set()
+        with pytest.raises(JobFailed, match="the process in the background was killed by SIGKILL"):
+            fails.result(timeout=90)
+        for one in queue:
+            one.result(timeout=90)
+    assert pids[1] == pids[2] == background.pid != pids[0]

@@ -204,11 +204,13 @@ def test_a_judgement_that_loops_for_ever_can_be_stopped_and_the_next_one_runs(de
     desk.judged("judging")
     until(loops.exists, "the loop")
     desk.note()
-    process = desk.session._judge.pid
+    process = desk.session._background.pid
     desk.session.stop_judging()
     view = desk.judged("stopped")
     assert view.done < view.total and view.stopped_by is StoppedBy.HAND
-    wait_until(desk.session, lambda v: desk.session._judge.pid is None, "the end of the process that hangs")
+    wait_until(
+        desk.session, lambda v: desk.session._background.pid is None, "the end of the process that hangs"
+    )
     assert not Path(f"/proc/{process}").exists()
     desk.note()
     desk.edit(REWARD, f"{REWARD} * 2")
@@ -219,7 +221,7 @@ def test_a_judge_that_dies_is_told_and_the_next_judgement_has_another(desk: Desk
     slow = f"time.sleep(0.1 if {IN_THE_JUDGE} else 0)"
     desk.edit(REWARD, f"{slow}\n        {REWARD}")
     desk.judged("judging")
-    first = desk.session._judge.pid
+    first = desk.session._background.pid
     desk.note()
     os.kill(first, signal.SIGKILL)
     view = desk.judged("failed")
@@ -227,10 +229,39 @@ def test_a_judge_that_dies_is_told_and_the_next_judgement_has_another(desk: Desk
     desk.note()
     desk.edit(REWARD, f"{REWARD} * 2")
     desk.judged("done")
-    second = desk.session._judge.pid
+    second = desk.session._background.pid
     assert second not in (None, first)
     # The process is kept for the next time.
     desk.note()
     desk.edit(REWARD, f"{REWARD} * 3")
     desk.judged("stopped", "done")
-    assert desk.session._judge.pid == second
+    assert desk.session._background.pid == second
+
+
+def test_what_somebody_waits_for_and_a_save_in_the_middle_share_one_process_with_the_judgement(
+    desk: Desk, record
+) -> None:
+    """Keeping an episode goes first, and the judgement comes to what it comes to without it."""
+    slow = f"time.sleep(0.1 if {IN_THE_JUDGE} else 0)"
+    desk.edit(REWARD, f"{slow}\n        {REWARD} * 2")
+    desk.judged("judging")
+    process, session = desk.session._background.pid, desk.session
+    session.keep_past((0,), before=True)
+    wait_until(
+        session, lambda v: not v.recording.keeping.active and v.recording.keeping.said, "what was kept"
+    )
+    view = session.view()
+    assert view.recording.keeping.said.startswith("kept 1 episode") and not view.recording.keeping.failed
+    assert view.judgement.state == "judging", "it has not ended meanwhile"
+    desk.note()
+    assert desk.judged("judging").done < view.judgement.total
+    session.keep_past((1,), before=True)
+    desk.note()
+    desk.edit(REWARD, f"{REWARD} * 3")
+    rewards = np.array([moment.step.reward for moment in steps_of(record)])
+    assert desk.judged().stopped_by is None
+    wait_until(session, lambda v: not v.recording.keeping.active and v.recording.keeping.said, "the second")
+    assert not session.view().recording.keeping.failed
+    for env in range(N):
+        np.testing.assert_array_equal(session.judged_curve("reward", env).new, 3 * rewards[:, env])
+    assert session._background.pid == process

@@ -2,11 +2,11 @@
 
 The worker that plays has the envs that are on the screen, at their present moment. Judging the past, drawing it again
 and looking at cameras over many seeds take seconds or minutes, and put the envs wherever they like. So that is asked of
-a process of its own with a lower priority, which costs some seconds to start and some 0.75 GB: it is kept between jobs
-and ended when there was none in a while (`Lane`).
+a process of its own with a lower priority, which costs some seconds to start and some 0.75 GB. All jobs of an open task
+share one, in turns; it is ended when there was none in a while. What nobody waits for gives way in the middle.
 
-A worker answers in order. A job that is stopped leaves one answer owed, which is taken at the end of its turn, or the
-process is ended. One that dies ends the job that asked it, and the next starts another.
+A worker answers in order. A job that is stopped, or gives way, leaves one answer owed, which is taken at the end of its
+turn, or the process is ended. One that dies ends the job that asked it, and the next starts another.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from itertools import count
 from typing import Any, TypeVar
 
+from workbench.core.camera_settings import CameraKey
 from workbench.machine.family import describe_exit
 from workbench.session.calls import Answer, Call, Cancel, Progress, Question, fits
 from workbench.session.lane import Job, JobFailed
@@ -30,6 +31,8 @@ _LOOK = 0.05
 """Seconds between two looks at whether the job is to stop."""
 _NICENESS = 10
 """After the one that plays, where there are fewer cores than work."""
+IDLE_SECONDS = 300.0
+"""How long the process is kept without a job."""
 _PATIENCE = 3.0
 _LOAD_PATIENCE = 10.0
 """Seconds in which a process must answer what nobody waits for any more, or is ended."""
@@ -91,24 +94,35 @@ class Asker:
             return heard.popleft() if heard else None
 
 
-class Background(Asker):
-    """Asks a process in the background, one thing at a time. All but `pid` on one lane's thread, within a `turn`."""
+class GaveWay(Exception):
+    """Somebody who waits wants the process: what was asked is to be asked again, from a beginning, in another turn."""
 
-    def __init__(self, that: str, to: str, niceness: int = _NICENESS) -> None:
+
+class Background(Asker):
+    """Asks a process in the background, one thing at a time; all but `pid` and `has` within a turn.
+
+    The process ends with the thread that started it, which is that of the lane that came first.
+    """
+
+    def __init__(self, niceness: int = _NICENESS) -> None:
         """
         Args:
-            that: what it does, as in "the process *that judges* was killed by SIGKILL".
-            to: what for, as in "no process could be started *to judge with*".
             niceness: by how much other processes come first.
         """
         super().__init__(self._send_call)
-        self._that, self._to, self._niceness = that, to, niceness
+        self._niceness = niceness
+        self._turns = threading.Condition()
+        self._taken = self._gives_way = False
+        self._wanted = 0
+        """Jobs that wait for their turn and that somebody waits for."""
+        self._used = 0.0
         self._process: WorkerProcess | None = None
         self._owed: Call | None = None
-        self._has: tuple[Load, tuple[PlaceCamera, ...], int] | None = None
-        """What was loaded last, where its cameras were placed, and how many envs that made; None after a failure."""
-        self.holds_task = False
-        """Whether the process has any version open."""
+        self._loaded: Load | None = None
+        """What was loaded last; None after a failure."""
+        self._placed: dict[CameraKey, PlaceCamera] = {}
+        self.num_envs = 0
+        """Of the version that the process has open; 0 for none."""
 
     @property
     def pid(self) -> int | None:
@@ -117,12 +131,53 @@ class Background(Asker):
         return None if process is None else process.pid
 
     @contextmanager
-    def turn(self, job: Job) -> Iterator[None]:
-        """What a job asks is asked within this."""
+    def turn(self, job: Job, gives_way: bool = False) -> Iterator[None]:
+        """What a job asks is asked within this, which begins when nobody else has the process.
+
+        Args:
+            gives_way: nobody waits for this job: where another wants a turn, `ask` raises GaveWay.
+
+        Raises:
+            Stopped: the job is to stop.
+        """
+        self._take(job, gives_way)
         try:
             yield
         finally:
             self._settle(job)
+            with self._turns:
+                self._taken, self._used = False, time.monotonic()
+                self._turns.notify_all()
+
+    def in_turns(self, job: Job, work: Callable[[], None]) -> None:
+        """Do what nobody waits for, from its beginning as often as it has to give way."""
+        while True:
+            try:
+                with self.turn(job, gives_way=True):
+                    return work()
+            except GaveWay:
+                job.check()
+
+    def has(self, load: Load) -> bool:
+        """Whether it would not have to be loaded."""
+        return load.level == "auto" and self._loaded == load
+
+    def rest(self) -> None:
+        """End the process if nobody has asked for anything in a while."""
+        with self._turns:
+            if not self._taken and not self._wanted and time.monotonic() - self._used > 0.9 * IDLE_SECONDS:
+                self.end()
+
+    def _take(self, job: Job, gives_way: bool) -> None:
+        with self._turns:
+            self._wanted += not gives_way
+            try:
+                while self._taken or (gives_way and self._wanted):
+                    job.check()
+                    self._turns.wait(_LOOK)
+            finally:
+                self._wanted -= not gives_way
+            self._taken, self._gives_way = True, gives_way
 
     def start(self) -> None:
         """Have a process.
@@ -136,7 +191,7 @@ class Background(Asker):
             # What the author's code prints in it is heard of the worker that plays, and not said twice.
             self._process = WorkerProcess(lambda stream, piece: False, self._niceness)
         except OSError as error:
-            raise JobFailed(f"no process could be started {self._to}: {error}") from error
+            raise JobFailed(f"no process could be started in the background: {error}") from error
 
     def ensure(
         self, job: Job, load: Load, placed: tuple[PlaceCamera, ...] = (), or_else: Load | None = None
@@ -154,47 +209,64 @@ class Background(Asker):
             Stopped: the job is to stop.
             JobFailed: it cannot be had; with the problem, if the author's code raised.
         """
-        if self._has is not None and self._has[1] != placed:
-            self.end()  # a camera that was put back to the file would stay where it was placed
         if self._process is None:
-            job.tell(0, 0, f"starting a process {self._to}")
+            job.tell(0, 0, "starting a process in the background")
             self.start()
-        if self._has is not None and load.level == "auto" and self._has[0] == load:
-            return self._has[2]
-        self._has = None
-        job.tell(0, 0, f"building envs {self._to}")
-        try:
-            loaded = self.ask(job.check, load)
-        except JobFailed as failure:
-            if failure.problem is None:
-                raise
-            if or_else is None:
-                why = f"the task failed in the background: {failure.problem.message}"
-                raise JobFailed(why, failure.problem) from failure
-            loaded = self.ask(job.check, or_else)
-        self.holds_task = True
-        for request in placed:
-            self.ask(job.check, request)
-        self._has = load, placed, loaded.task.num_envs
-        return loaded.task.num_envs
+        if not self.has(load):
+            self._loaded = None
+            job.tell(0, 0, "building envs in the background")
+            try:
+                loaded = self.ask(job.check, load)
+            except JobFailed as failure:
+                if failure.problem is None:
+                    raise
+                if or_else is None:
+                    why = f"the task failed in the background: {failure.problem.message}"
+                    raise JobFailed(why, failure.problem) from failure
+                loaded = self.ask(job.check, or_else)
+            self._loaded, self.num_envs = load, loaded.task.num_envs
+            if loaded.reload is None or loaded.reload.level not in ("same", "patched"):
+                self._placed = {}
+        wanted = {request.key: request for request in placed}
+        # Those that are placed no more go back to where the file says.
+        for key in [key for key in self._placed if key not in wanted]:
+            self.ask(job.check, PlaceCamera(key, None))
+            del self._placed[key]
+        for key, request in wanted.items():
+            if self._placed.get(key) != request:
+                self.ask(job.check, request)
+                self._placed[key] = request
+        return self.num_envs
 
     def ask(
         self, check: Callable[[], None], question: Question[Value], on_progress: OnProgress = _ignore
     ) -> Value:
-        """As `Asker.ask`; JobFailed also where the process died."""
+        """As `Asker.ask`.
+
+        Raises:
+            JobFailed: it cannot be answered, or the process died.
+            GaveWay: the turn is one that gives way, and is wanted. A load is not left: who waits most likely needs it too.
+        """
+
+        def check_turn() -> None:
+            check()
+            if self._gives_way and self._wanted and not isinstance(question, Load):
+                raise GaveWay
+
+        check_turn()  # or who waits would wait for this too
         try:
-            return super().ask(check, question, on_progress)
+            return super().ask(check_turn, question, on_progress)
         except EOFError as error:
             why = self._why_gone(error)
             self.end()
             check()
-            raise JobFailed(f"the process {self._that} {why}") from None
+            raise JobFailed(f"the process in the background {why}") from None
 
     def end(self) -> None:
         """End it, if there is one. `pid` is its own until it has ended."""
         if self._process is not None:
             self._process.stop(grace=0.0)
-        self._process, self._owed, self._has, self.holds_task = None, None, None, False
+        self._process, self._owed, self._loaded, self._placed, self.num_envs = None, None, None, {}, 0
 
     def _settle(self, job: Job) -> None:
         """Take the answer that is still owed, or end the process that does not give it in time."""

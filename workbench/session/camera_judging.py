@@ -19,7 +19,7 @@ from workbench.core.camera_frames import compose
 from workbench.core.camera_report import CameraReport, join_reports
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.pictures import CameraInfo, Picture
-from workbench.session.askers import Asker, Background
+from workbench.session.askers import IDLE_SECONDS, Asker, Background
 from workbench.session.camera_messages import DrawCamera, JudgeCamera, SuggestCameras
 from workbench.session.history import Lived
 from workbench.session.lane import Job, Lane
@@ -30,7 +30,6 @@ FIRST_SEED = 10_000
 """The same seeds for every judgement, so that two can be compared; others than people begin with."""
 MOST_ENVS = 16
 """In the background: more are made of these by resetting them again."""
-_IDLE_SECONDS = 300.0
 _TELL_EVERY = 8
 """Steps after which what is known so far is shown."""
 
@@ -57,19 +56,19 @@ Case = tuple[int, NDArray[np.float32] | None, JudgedMoment | None]
 class CameraJudging:
     """Thread-safe; every method returns at once."""
 
-    def __init__(self, asker: Asker, on_change: Callable[[], None]) -> None:
+    def __init__(self, asker: Asker, background: Background, on_change: Callable[[], None]) -> None:
         """
         Args:
-            asker: asks the worker that plays.
+            asker, background: ask the worker that plays, and the one in the background.
             on_change: called, on any thread, when there is something new.
         """
         self._on_change = on_change
         self._lock = threading.Lock()
         self._looked = Looked()
-        self._live, self._background = asker, Background("that looks at the cameras", "to look with")
+        self._live, self._background = asker, background
         self._live_lane = Lane("studio-live", on_change, self._failed)
         self._background_lane = Lane(
-            "studio-background", on_change, self._failed, _IDLE_SECONDS, self._background.end
+            "studio-background", on_change, self._failed, IDLE_SECONDS, background.rest
         )
 
     # --- what is known -------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from workbench.core.camera_settings import (
 )
 from workbench.core.step import StepResult
 from workbench.session import camera_in_words
-from workbench.session.askers import Asker
+from workbench.session.askers import Asker, Background
 from workbench.session.camera_judging import CameraJudging, ShownMoment
 from workbench.session.history import Lived
 from workbench.session.messages import Load, PlaceCamera, Placed, ReloadLevel, Request, TaskDescription
@@ -48,6 +48,7 @@ class CameraStudio:
         self,
         send: Callable[[Request], None],
         asker: Asker,
+        background: Background,
         on_change: Callable[[], None],
         shown: Callable[[], ShownMoment],
         load: Callable[[], Load | None],
@@ -57,6 +58,7 @@ class CameraStudio:
         """
         Args:
             send, asker: tell and ask the worker that plays.
+            background: asks the other.
             on_change: called, on any thread, when `view` has something new.
             shown: what the page shows now.
             load: how another worker gets the version that runs; None before there is one.
@@ -71,7 +73,7 @@ class CameraStudio:
         self._asking = threading.Lock()
         """Held while placements are sent; taken before `_lock`."""
         self._serial = 0
-        self._judging = CameraJudging(asker, self._note)
+        self._judging = CameraJudging(asker, background, self._note)
         self._quick = Preview(asker, self._note, "The quick look failed")
         self._quick_scale = 1.0
         self._first = Preview(asker, self._note, "There is no picture of the new camera")

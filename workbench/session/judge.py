@@ -17,18 +17,17 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Literal
 
 from workbench.authoring.problem import Problem
-from workbench.session.askers import Background
+from workbench.session.askers import IDLE_SECONDS, Background
 from workbench.session.judgement import JudgedCurve, Judgement
 from workbench.session.judging import JudgedState, JudgedView, StoppedBy
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
 from workbench.session.messages import Load, Loaded, TaskDescription
 from workbench.session.moment_messages import JudgeMoments, MomentToJudge
 
-IDLE_SECONDS = 300.0
-"""How long the process is kept without a judgement."""
 _CHUNK_SECONDS = 0.1
 """About how long one answer takes: how soon progress is seen, and stopping heard."""
 _MOST_AT_ONCE = 64
@@ -68,28 +67,24 @@ class _Case:
 class Judge:
     """Judges one record at a time; a new one takes the place of the one before."""
 
-    def __init__(self, on_change: Callable[[], None]) -> None:
+    def __init__(self, on_change: Callable[[], None], process: Background) -> None:
         """
         Args:
             on_change: called on the judge's thread when `view` has something new.
+            process: in which it is judged. Whoever else wants it need not wait.
         """
         self._on_change = on_change
         self._lock = threading.Lock()
         self._case: _Case | None = None
         """What is shown: what is being judged, or was last."""
         self._view = JudgedView()
-        self._process = Background("that judges", "to judge with")
+        self._process = process
         # Changes and failures are told by `_tell`, with all that there is to them.
-        self._lane = Lane("judge", lambda: None, lambda why: None, IDLE_SECONDS, self._process.end)
+        self._lane = Lane("judge", lambda: None, lambda why: None, IDLE_SECONDS, process.rest)
 
     @property
     def view(self) -> JudgedView:
         return self._view
-
-    @property
-    def pid(self) -> int | None:
-        """Of the process that judges; None while there is none."""
-        return self._process.pid
 
     def curve(self, name: str, env: int) -> JudgedCurve | None:
         """See `Judgement.curve`; None also while nothing is judged."""
@@ -139,26 +134,26 @@ class Judge:
         with self._lock:
             job.check()  # stopped before it began: what was judged before stays to be seen
             self._case, self._view = case, JudgedView(serial=self._view.serial)
-        with self._process.turn(job):
-            try:
-                self._load(job, case)
-                for rows in case.judgement.runs():
-                    self._live_through(job, case, rows)
-                self._tell(case, "done")
-            except Stopped:
-                self._tell(case, "stopped")
-            except JobFailed as failure:
-                self._tell(case, "failed", str(failure), failure.problem)
-            except Exception as error:
-                why = f"it failed within the workbench ({type(error).__name__}: {error})"
-                self._tell(case, "failed", why)
-                raise
+        try:
+            self._tell(case, "loading")
+            for rows in case.judgement.runs():
+                self._process.in_turns(job, partial(self._judge_run, job, case, rows))
+            self._tell(case, "done")
+        except Stopped:
+            self._tell(case, "stopped")
+        except JobFailed as failure:
+            self._tell(case, "failed", str(failure), failure.problem)
+        except Exception as error:
+            self._tell(case, "failed", f"it failed within the workbench ({type(error).__name__}: {error})")
+            raise
         with self._lock:
             case.judgement.let_go()
 
     def _load(self, job: Job, case: _Case) -> None:
+        if self._process.has(case.load):
+            return
         self._tell(case, "loading")
-        if self._process.holds_task:
+        if self._process.num_envs == len(case.judgement.moment(case.judgement.runs()[0].start).step.reward):
             # A version is tried at the moment at which the env stands, which is where the judgement before
             # ended: there the new code may raise or loop though it runs from the beginnings in the record.
             begin = _to_judge(case.judgement, case.judgement.runs()[0].start)
@@ -169,6 +164,14 @@ class Judge:
             if failure.problem is None:
                 raise
             raise JobFailed("the new code could not be loaded to judge with", failure.problem) from failure
+
+    def _judge_run(self, job: Job, case: _Case, rows: range) -> None:
+        try:
+            self._load(job, case)
+            self._live_through(job, case, rows)
+        except Stopped:
+            self._tell(case, "stopped")  # before what the process still owes is waited for
+            raise
 
     def _live_through(self, job: Job, case: _Case, rows: range) -> None:
         at, count = rows.start, 2

@@ -23,7 +23,7 @@ import numpy as np
 from workbench.recording.columns import BatchPacker
 from workbench.recording.episode_writer import EpisodeWriter
 from workbench.recording.landing import RecordingError
-from workbench.session.askers import Background
+from workbench.session.askers import IDLE_SECONDS, Background
 from workbench.session.episode_files import EpisodeFinisher
 from workbench.session.episodes import GatheredEpisode, episode_info
 from workbench.session.keep_status import KeepStatus
@@ -32,8 +32,6 @@ from workbench.session.messages import Reset
 from workbench.session.moment_messages import CaptureMoment
 from workbench.session.past_episodes import PastEpisode, WhatToKeep, moments_of
 
-_IDLE_SECONDS = 60.0
-"""How long the process stays when nothing is kept: it holds some 0.75 GB."""
 _SAME_START = 1e-6
 """Metres and quaternion components."""
 
@@ -41,17 +39,19 @@ _SAME_START = 1e-6
 class PastKeeper:
     """Keeps episodes, one job at a time."""
 
-    def __init__(self, folder: Path, finisher: EpisodeFinisher, on_change: Callable[[], None]) -> None:
+    def __init__(
+        self, folder: Path, finisher: EpisodeFinisher, on_change: Callable[[], None], process: Background
+    ) -> None:
         self._folder, self._finisher, self._on_change = folder, finisher, on_change
         self._lock = threading.Lock()
         self._said, self._failed = "", False
-        self._process = Background("that draws it", "to draw it with")
-        self._lane = Lane("keep-past", on_change, self._fail, _IDLE_SECONDS, self._process.end)
+        self._process = process
+        self._lane = Lane("keep-past", on_change, self._fail, IDLE_SECONDS, process.rest)
 
     def keep(self, what: WhatToKeep) -> None:
         """Begin; what was under way is given up."""
         self._say("")
-        self._lane.start("starting a process to draw it with", lambda job: self._keep(job, what))
+        self._lane.start("waiting for other work in the background", lambda job: self._keep(job, what))
 
     def stop(self) -> None:
         """Give up; nothing of it is kept."""

@@ -59,7 +59,7 @@ class SceneProcess:
             on_end: called with its key, and the episode with a scene and what could not be put back, or why there is
                 none.
         """
-        process = Background("that makes the scene", "to make the scene with", niceness=0)
+        process = Background(niceness=0)
 
         def check() -> None:
             if stop():

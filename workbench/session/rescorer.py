@@ -2,7 +2,7 @@
 
 A lane's thread does all of it. It groups the episodes by the env that they are judged in, has the process load one after
 the other and judge its episodes, and gathers what it says. To stop is to end the process: what is known by then stays.
-Else it is kept for a while, since it takes seconds to start.
+It ends with the job: the code of recordings is not to stay.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from workbench.session.askers import Background
 from workbench.session.calls import Progress
 from workbench.session.clearance import Clearances, NotCleared
 from workbench.session.judging import RUNNING, JudgedView, StoppedBy
-from workbench.session.lane import Job, JobFailed, Lane, Stopped
+from workbench.session.lane import Job, JobFailed, Lane
 from workbench.session.messages import Load, TaskOptions
 from workbench.session.rescore import Group, group_episodes, hidden_in_words, not_judged, with_renderer
 from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored
@@ -27,8 +27,6 @@ from workbench.session.step_back import CannotStepIn, write_source
 
 MOST_AT_ONCE = 16
 """Envs."""
-IDLE_SECONDS = 300.0
-"""How long the process is kept without work."""
 MOST_NAMED = 3
 """Of the versions that are judged with, where there are many."""
 
@@ -55,9 +53,9 @@ class Rescorer:
         self._lock = threading.Lock()
         """Of `view`: what a job that was stopped still has to say is not heard."""
         self._view = JudgedView()
-        self._process = Background("that judges", "to judge with")
+        self._process = Background()
         # `_run` tells of failures itself, with what the code raised.
-        self._lane = Lane("rescore", lambda: None, lambda why: None, IDLE_SECONDS, self._process.end)
+        self._lane = Lane("rescore", lambda: None, lambda why: None)
 
     @property
     def view(self) -> JudgedView:
@@ -132,9 +130,6 @@ class Rescorer:
                     verdicts = self._view.verdicts
                     self._tell(job, verdicts=(*verdicts, *not_judged(group, verdicts, why)))
             self._tell(job, state="done")
-        except Stopped:
-            self._process.end()
-            raise
         except JobFailed as failure:
             self._tell(job, state="failed", why=str(failure), problem=failure.problem)
         except Exception as error:
@@ -142,6 +137,8 @@ class Rescorer:
                 job, state="failed", why=f"it failed within the workbench ({type(error).__name__}: {error})"
             )
             raise
+        finally:
+            self._process.end()  # with the code that the recordings named
 
     def _judge(self, job: Job, asked: _Asked, group: Group, reference: TaskName) -> None:
         process = self._process

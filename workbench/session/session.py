@@ -23,7 +23,7 @@ from workbench.authoring.reference import TaskName
 from workbench.core.inspection import Section
 from workbench.core.recorded_run import RecordedRun
 from workbench.machine.watched_thread import listen, stop_listening
-from workbench.session.askers import Asker
+from workbench.session.askers import Asker, Background
 from workbench.session.calls import Answer, Progress
 from workbench.session.camera_studio import CameraStudio
 from workbench.session.curves import TermCurves
@@ -120,8 +120,10 @@ class Session:
         self._recorder = LiveRecorder(
             recordings, self._note, lambda envs: self._send(SetCapture(envs, from_reset=True)), on_notice
         )
-        self._keeper = PastKeeper(recordings, self._recorder.finisher, self._note)
-        self._judge = Judge(self._note)
+        self._background = Background()
+        """The process that does all that is done beside playing."""
+        self._keeper = PastKeeper(recordings, self._recorder.finisher, self._note, self._background)
+        self._judge = Judge(self._note, self._background)
         self._policy_file = PolicyFile(self._on_policy_saved)
         self.past = TimeTravel(self._shared, self._send, self.pause)
         """What the batch lived through."""
@@ -129,6 +131,7 @@ class Session:
         self.studio = CameraStudio(
             self._send,
             self._asker,
+            self._background,
             self._note,
             self.past.shown_moment,
             self.versions.same_again,
@@ -354,6 +357,7 @@ class Session:
         self._judge.close()
         self.studio.close()
         self._keeper.close()
+        self._background.end()
         self._recorder.close()
 
     # --- what the worker says, on the session's thread -------------------------------------------
