@@ -149,12 +149,13 @@ class Background(Asker):
                 self._taken, self._used = False, time.monotonic()
                 self._turns.notify_all()
 
-    def in_turns(self, job: Job, work: Callable[[], None]) -> None:
+    def in_turns(self, job: Job, work: Callable[[], object]) -> None:
         """Do what nobody waits for, from its beginning as often as it has to give way."""
         while True:
             try:
                 with self.turn(job, gives_way=True):
-                    return work()
+                    work()
+                    return
             except GaveWay:
                 job.check()
 
