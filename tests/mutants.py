@@ -49,6 +49,8 @@ PROTECTED = {
     " authoring/test_named_modules.py",
     "authoring/source/text": "authoring/camera_source/test_which_camera.py authoring/camera_source/test_members.py"
     " authoring/camera_source/test_shapes.py",
+    "authoring/source/read_values": "authoring/source/test_read_values.py authoring/camera_source/test_shapes.py"
+    " authoring/camera_source/test_which_camera.py",
     "core/snapshot": "core/test_snapshot.py",
     "core/partial_reset": "core/test_partial_reset.py",
     "core/task_env": "core/test_task_env.py",

@@ -46,12 +46,13 @@ HOOKS = ("_default_sensor_configs", "_default_human_render_camera_configs", "_se
 
 
 @contextmanager
-def _modules(sources: Mapping[str, str]) -> Iterator[dict[str, Any]]:
-    """The sources executed as modules, whichever order they need."""
+def modules(sources: Mapping[str, str], **names: Any) -> Iterator[dict[str, Any]]:
+    """The sources executed as modules, with `names` in the first."""
     made = {PurePath(path).stem: types.ModuleType(PurePath(path).stem) for path in sources}
     for path in sources:
         made[PurePath(path).stem].__file__ = path
     before = {name: sys.modules.get(name) for name in made}
+    vars(made[PurePath(FILE).stem]).update(names)
     try:
         for path in sorted(sources, key=lambda path: path == FILE):
             name = PurePath(path).stem
@@ -68,7 +69,7 @@ def _modules(sources: Mapping[str, str]) -> Iterator[dict[str, Any]]:
 
 def real_configs(sources: Mapping[str, str], class_name: str = "Task") -> dict[tuple[str, str], CameraConfig]:
     """Every camera of the class, by hook and name, made by its own code."""
-    with _modules(sources) as names:
+    with modules(sources) as names:
         task = names[class_name]()
         return {
             (hook, name): config
@@ -81,7 +82,7 @@ def real_configs(sources: Mapping[str, str], class_name: str = "Task") -> dict[t
 def run_class(sources: Mapping[str, str], class_name: str = "Task") -> Ran:
     """As a worker runs the hooks of an env: of an object of the class, made by these texts."""
     try:
-        with noting_calls(sources) as noted, _modules(sources) as names:
+        with noting_calls(sources) as noted, modules(sources) as names:
             cls = names[class_name]
             task = cls.__new__(cls) if issubclass(cls, BaseEnv) else cls()
             configs: dict[CameraKey, CameraConfig] = {

@@ -6,6 +6,7 @@ calls them.
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from mani_skill.utils.structs.pose import Pose
 from transforms3d import euler
 
 from workbench.authoring.source.trace import Plain
+from workbench.core import seams
 
 
 @dataclass(frozen=True)
@@ -36,9 +38,11 @@ class Known:
 
 @cache
 def known_functions() -> dict[Callable[..., Any], Known]:
-    same, number = Known(same=True), Known()
+    seams.mark_camera_configs()  # puts a look_at of its own before ManiSkill's, which others may have imported before
+    same, number, look_at = Known(same=True), Known(), Known("look_at", ("eye", "target", "up", "device"))
     table: dict[Callable[..., Any], Known] = {
-        sapien_utils.look_at: Known("look_at", ("eye", "target", "up", "device")),
+        sapien_utils.look_at: look_at,
+        inspect.unwrap(sapien_utils.look_at): look_at,
         sapien.Pose: Known("pose", ("p", "q")),
         Pose.create_from_pq: Known("pose", ("p", "q", "device")),
         euler.euler2quat: Known("euler", ("ai", "aj", "ak", "axes")),

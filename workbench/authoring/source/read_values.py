@@ -216,9 +216,7 @@ class ValueReader:
 
     def _known(self, file: SourceFile, node: ast.Call) -> Known:
         """The function that it calls; Raises Unknown for any that is not known, and for arguments by ``*``."""
-        if not is_starred(node) and all(
-            isinstance(n, (ast.Name, ast.Attribute, ast.Load)) for n in ast.walk(node.func)
-        ):
+        if not is_starred(node) and _is_named(node.func):
             try:
                 found = known_functions().get(self._run(file, node.func))
             except Exception as exc:  # whatever the author's classes raise
@@ -365,10 +363,9 @@ class ValueReader:
 
     def _of_attribute(self, file: SourceFile, node: ast.Attribute) -> list[Binding]:
         """The bindings of ``self.NAME``, ``cls.NAME`` or ``Class.NAME``."""
-        try:
-            owner = self._run(file, node.value)
-        except Exception as exc:  # whatever the author's classes raise
-            raise self.computed(file, node) from exc
+        if not _is_named(node.value):
+            raise self.computed(file, node)  # it would be made again
+        owner = self._run(file, node.value)
         stores = self._project.attribute_stores(node.attr)
         own: list[Binding] = []
         for cls in (owner if isinstance(owner, type) else type(owner)).__mro__:
@@ -401,10 +398,9 @@ class ValueReader:
             raise Unknown(f"`{code}` depends on what only the running task knows") from exc
         where, base, others = file, node.value, None
         for _ in range(_DEPTH):
-            if not isinstance(base, _READ):
-                break
-            where, base, more = self._followed(where, base)
-            others = others or more
+            if isinstance(base, _READ):
+                where, base, more = self._followed(where, base)
+                others = others or more
         found = _entry(where, base, key)
         if found is None:
             raise Unknown(f"`{code}` is computed when the task runs")
@@ -424,6 +420,11 @@ def _entry(file: SourceFile, base: ast.expr, key: Plain) -> ast.expr | None:
     if any(name is None for name, _ in entries):
         return None
     return next((v for name, v in entries if isinstance(name, ast.Constant) and name.value == key), None)
+
+
+def _is_named(node: ast.AST) -> bool:
+    """A name, or one within another: nothing that does something when it is asked again."""
+    return all(isinstance(inner, (ast.Name, ast.Attribute, ast.Load)) for inner in ast.walk(node))
 
 
 def _is_number(node: ast.AST) -> bool:

@@ -1,0 +1,349 @@
+"""Where the values of a running call stand: each call is made by a text that really runs."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.authoring.camera_source.real_cameras import FILE, modules
+from workbench.authoring.source.names import Project
+from workbench.authoring.source.read_values import DEGREE, trace_call
+from workbench.authoring.source.trace import Part, Trace
+
+HEAD = """\
+import math
+import numpy as np
+import sapien
+import torch
+from mani_skill.utils import sapien_utils
+from mani_skill.utils.sapien_utils import look_at
+from mani_skill.utils.structs import Pose
+from transforms3d.euler import euler2quat
+"""
+PLACES = "/author/places.py"
+
+
+def traced(text: str, others: Mapping[str, str] | None = None, **instead: Any) -> tuple[Project, Trace]:
+    """Of the last call of ``note(a, b)`` that the text makes; `instead` is what it came to have in place of that."""
+    sources = {FILE: HEAD + text, **(others or {})}
+    project = Project(sources)
+    found: list[Trace | None] = []
+
+    def note(*given: Any, **named: Any) -> None:
+        values = {**dict(zip("ab", given, strict=False)), **named, **instead}
+        found.append(trace_call(project, sys._getframe(1), ("a", "b"), values))
+
+    with modules(sources, note=note):
+        pass
+    assert found[-1] is not None
+    return project, found[-1]
+
+
+def told(text: str, others: Mapping[str, str] | None = None, **instead: Any) -> str:
+    """What is said of the first argument: its text with what is changed in it, and the names that led there."""
+    project, trace = traced(text, others, **instead)
+    if "a" in trace.unknown:
+        assert "a" not in trace.parts
+        return trace.unknown["a"]
+    return said(project, trace.parts["a"])
+
+
+def said(project: Project, part: Part) -> str:
+    text = project.texts[part.at.file][part.at.start : part.at.end]
+    inside = ""
+    if "of" in part.parts:
+        per = "degrees" if part.slope == DEGREE else f"{part.slope:g}"
+        inside = f" {{{said(project, part.parts['of'])} times {per} plus {round(part.offset, 5) + 0:g}}}"
+    elif part.parts:
+        inside = f" {{{', '.join(said(project, item) for item in part.parts.values())}}}"
+    reads = [
+        project.texts[read.at.file][read.at.start : read.at.end]
+        + (f" ({read.others})" if read.others else "")
+        for read in part.reads
+    ]
+    return f"{part.function}{text}{inside}" + "".join(f" < {read}" for read in reads)
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("note(1.5)", "1.5"),
+        ("note(-2)", "-2"),
+        ("note((.5))", ".5"),
+        ("note('minimal')", "'minimal'"),
+        ("note(None)", "None"),
+        ("X = 1.5\nnote(X)", "1.5 < X"),
+        ("X: float = 1.5\nY = X\nnote(a=Y)", "1.5 < Y < X"),
+        ("X, (Y, Z) = 1.5, (2.5, 3.5)\nnote(Y)", "2.5 < Y"),
+        ("note([1, (2)])", "[1, (2)] {1, 2}"),
+        ("X = 2\nnote((1, X))", "(1, X) {1, 2 < X}"),
+        ("X = 2\nnote(Y := X)", "`Y := X` is computed when the task runs"),
+        # Numbers within an expression.
+        ("note(60 * np.pi / 180)", "60 * np.pi / 180 {60 times degrees plus 0}"),
+        ("note(np.pi / 180 * 60 + 1)", "np.pi / 180 * 60 + 1 {60 times degrees plus 1}"),
+        ("note(math.radians(30))", "math.radians(30) {30 times degrees plus 0}"),
+        ("A = 30\nnote(np.deg2rad(A))", "np.deg2rad(A) {30 < A times degrees plus 0}"),
+        ("H = 0.2\nnote(H + 0.25)", "H + 0.25 {0.25 times 1 plus 0.2}"),
+        ("H = 0.2\nnote(0.5 - H)", "0.5 - H {0.5 times 1 plus -0.2}"),
+        ("H = 0.2\nnote(H - 0.5)", "H - 0.5 {0.5 times -1 plus 0.2}"),
+        ("H = 0.2\nnote(H - 0.5 + 0.25)", "H - 0.5 + 0.25 {0.25 times 1 plus -0.3}"),
+        ("H = 0.2\nnote(1 + H * np.pi / 180)", "1 + H * np.pi / 180 {1 times 1 plus 0.00349}"),
+        ("H = 0.2\nnote(2 * H)", "2 * H"),
+        ("note(1.0 + 0.5)", "1.0 + 0.5"),
+        ("note(2 ** 3)", "2 ** 3"),
+        ("note(np.pi)", "np.pi"),
+        ("note(np.pi / 2)", "np.pi / 2"),
+        ("note(2 * np.arctan(0.5))", "2 * np.arctan(0.5)"),
+        ("note(np.sqrt(0.5))", "np.sqrt(0.5)"),
+        ("V = np.array([1, 2])\nnote(V + [0, 1])", "V + [0, 1]"),
+        # Functions that only hold what they are given.
+        ("note(float(2))", "2"),
+        ("note(float())", "float()"),
+        ("note(np.array([1, 2]))", "[1, 2] {1, 2}"),
+        ("V = [1, 2]\nnote(np.array(object=V))", "np.array(object=V) {1 < V, 2 < V}"),
+        ("V = [1, 2]\nnote(torch.tensor(V))", "torch.tensor(V) {1 < V, 2 < V}"),
+        ("note(Pose.create(sapien.Pose([1, 2, 3])))", "posesapien.Pose([1, 2, 3]) {[1, 2, 3] {1, 2, 3}}"),
+        (
+            "note(look_at([1, 0, 1], [0, 0, 0], device=None))",
+            "look_atlook_at([1, 0, 1], [0, 0, 0], device=None) {[1, 0, 1] {1, 0, 1}, [0, 0, 0] {0, 0, 0}}",
+        ),
+        ("note(euler2quat(0, 0, ak=1))", "eulereuler2quat(0, 0, ak=1) {0, 0, 1}"),
+        # Choices.
+        ("F = True\nnote(1.5 if F else 2.5)", "1.5"),
+        ("F, K = False, 'b'\nnote(1.5 if F or not K == 'b' else 2.5)", "2.5"),
+        ("F, K = False, 'b'\nX = 2.5 if not F and K != 'a' else 1.5\nnote(X)", "2.5 < X"),
+        # Elements.
+        ('D = {"x": 1, "eye": [1, 2]}\nnote(D["eye"])', '[1, 2] {1 < D["eye"], 2 < D["eye"]} < D["eye"]'),
+        ('D = dict(x=1, eye=2)\nnote(D["eye"])', '2 < D["eye"]'),
+        ("L = [[1, 2], [3, 4]]\nnote(L[1][0])", "3 < L[1][0]"),
+        ("L = (1, 2)\nM = L\nnote(M[-1])", "2 < M[-1]"),
+        ("L = (1, 2)\nnote(L[-2])", "1 < L[-2]"),
+        ("L, I = (1, 2), 1\nnote(L[I])", "2 < L[I]"),
+        ("note((1, 2)[0])", "1 < (1, 2)[0]"),
+    ],
+)
+def test_a_value_is_followed_to_where_it_is_written(text: str, what: str) -> None:
+    assert told(text) == what
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("note(True)", "`True` is computed when the task runs"),
+        ("note(b'1')", "`b'1'` is computed when the task runs"),
+        ("note(-True)", "`True` is computed when the task runs"),
+        ("note(~1)", "`~1` is computed when the task runs"),
+        ("note(f'{1}')", "`f'{1}'` is computed when the task runs"),
+        ("note([1, max(2, 3)])", "`max(2, 3)` is computed when the task runs"),
+        ("note(np.sqrt(max(2, 3)))", "`max(2, 3)` is computed when the task runs"),
+        ("note(1 + max(2, 3))", "`max(2, 3)` is computed when the task runs"),
+        ("note([max][0](2, 3))", "`[max][0](2, 3)` is computed when the task runs"),
+        ("note(np.sqrt(*[2]))", "`np.sqrt(*[2])` is computed when the task runs"),
+        (
+            "note(euler2quat(0, 0, 0, 'sxyz', **{}))",
+            "`euler2quat(0, 0, 0, 'sxyz', **{})` is computed when the task runs",
+        ),
+        ("note(1.5 if max(1, 2) else 2)", "`max(1, 2)` is computed when the task runs"),
+        ("note(*[1])", "`a` is given by * or **"),
+        ("note(**dict(a=1))", "`a` is given by * or **"),
+        ("import places\nnote(places)", "`places` comes from places, which is not one of your files"),
+        ("def f(x):\n    note(x)\nf(1)", "`x` cannot be read in the file: it is a parameter of f"),
+        ("(lambda x: note(x))(1)", "`x` cannot be read in the file: it is a parameter of a lambda"),
+        ("X = 1\nX += 1\nnote(X)", "`X` cannot be read in the file: it is computed"),
+        ("L = [1, 2]\nL[0] = 3\nnote(L)", "`L` cannot be read in the file: a part of it is set"),
+        ("[note(x) for x in (1,)]", "`x` cannot be read in the file: it changes in a comprehension"),
+        ("for x in (1,):\n    note(x)", "`x` cannot be read in the file: it changes in a loop"),
+        ("L = [*(1, 2), 3]\nnote(L[2])", "`L[2]` is computed when the task runs"),
+        ("L = [1, 2]\nnote(L[int(0)])", "`L[int(0)]` depends on what only the running task knows"),
+        ("L = list((1, 2))\nnote(L[0])", "`L[0]` is computed when the task runs"),
+        ('D = {**{"x": 1}, "y": 2}\nnote(D["y"])', '`D["y"]` is computed when the task runs'),
+        ('D = dict({"x": 1}, **{"z": 1}, y=2)\nnote(D["y"])', '`D["y"]` is computed when the task runs'),
+        (
+            'def dict_(**given):\n    return given\nD = dict_(y=2)\nnote(D["y"])',
+            '`D["y"]` is computed when the task runs',
+        ),
+        (
+            "class A(list):\n    def __eq__(self, other):\n        return self.pop() == other\n"
+            "X = A([1])\nnote(1.5 if X == 1 else 2.5)",
+            "`X == 1` is computed when the task runs",
+        ),
+        (
+            "X = iter((1.5, 2.5))\nnote(X.__next__)",
+            "where `X.__next__` gets its value cannot be read in the file",
+        ),
+        (
+            "for _ in range(2):\n    if _:\n        X = 1\n    else:\n        X = 1\n    note(X)",
+            "`X` is given the same values, and which of them holds cannot be told in lines 11 and 13",
+        ),
+    ],
+)
+def test_what_cannot_be_followed_is_unknown_with_the_reason(text: str, why: str) -> None:
+    assert told(text, {PLACES: ""}) == why
+
+
+def test_a_call_that_came_to_have_another_value_is_computed() -> None:
+    assert told("X = 1.5\nnote(X)", a=1.5000001) == "1.5 < X"
+    assert told("X = 1.5\nnote(X)", a=1.6) == "`X` is computed when the task runs"
+    assert told("X = [1, 2]\nnote(X)", a=[1, 2, 3]) == "`X` is computed when the task runs"
+    assert told("note('x')", a="y") == "`'x'` is computed when the task runs"
+    assert told("note(None)", a=0.0) == "`None` is computed when the task runs"
+    assert told("note(None)", a=np.zeros(1)) == "`None` is computed when the task runs"
+
+
+def test_arguments_that_are_not_given_are_not_spoken_of() -> None:
+    _, trace = traced("def f():\n    note(b=1.5)\nf()", a=2.5)
+    assert set(trace.parts) == {"b"} and not trace.unknown
+    assert trace.function == "f" and trace.parts["b"].literal
+    project, trace = traced("note(1.5, b=f'{1}')")
+    assert set(trace.parts) == {"a"} and set(trace.unknown) == {"b"}
+    assert project.texts[FILE][trace.at.start : trace.at.end] == "note(1.5, b=f'{1}')"
+    assert trace.function == "<module>"
+
+
+def test_names_defined_by_names_are_followed_forty_deep() -> None:
+    chain = [f"N{i} = N{i - 1}\n" for i in range(1, 41)]
+    assert told(f"N0 = 1.5\n{''.join(chain[:-1])}note(N39)").startswith("1.5 < N39 < N38")
+    assert told(f"N0 = 1.5\n{''.join(chain)}note(N40)") == "`1.5` is defined by itself"
+
+
+TASK = """\
+class Parent:
+    eye = 1.5
+    far = 9.0
+
+class Task(Parent):
+    eye = 2.5
+    near = 0.5
+    def __init__(self):
+        self.own = 3.5
+    def hook(self, more=1.0):
+        {}
+    @classmethod
+    def made(cls):
+        note(cls.near)
+    @property
+    def half(self):
+        return 0.5
+
+task = Task()
+task.hook()
+"""
+
+
+@pytest.mark.parametrize(
+    ("call", "what"),
+    [
+        ("note(self.eye)", "2.5 < self.eye"),
+        ("note(Task.eye)", "2.5 < Task.eye"),
+        ("note(Parent.eye)", "1.5 < Parent.eye"),
+        ("note(self.far)", "9.0 < self.far"),
+        ("note(self.own)", "3.5 < self.own"),
+        ("self.made()", "0.5 < cls.near"),
+        ("note(self.half)", "`self.half` cannot be read in the file: it is the file's own half"),
+        ("note(more)", "`more` cannot be read in the file: it is a parameter of hook"),
+        (
+            "self.own = 4.5; note(self.own)",
+            "`self.own` cannot be read in the file: it is set again at line 17",
+        ),
+        (
+            "self.far = 4.5; note(self.far)",
+            "`self.far` cannot be read in the file: it is set again at line 19",
+        ),
+        ("vars(self)['x'] = 1; note(self.x)", "where `self.x` gets its value cannot be read in the file"),
+    ],
+)
+def test_attributes_are_those_of_the_running_object(call: str, what: str) -> None:
+    assert told(TASK.format(call)) == what
+
+
+def test_a_call_whose_owner_is_made_anew_is_not_made_again() -> None:
+    text = """\
+made = []
+class Eye:
+    x = 1.5
+def eye():
+    made.append(1)
+    return Eye()
+note(eye().x)
+assert len(made) == 1
+"""
+    assert told(text) == "`eye().x` is computed when the task runs"
+
+
+@pytest.mark.parametrize(
+    ("text", "others", "what"),
+    [
+        ("import places\nnote(places.X)", "X = 1.5", "1.5 < places.X"),
+        ("from places import X\nnote(X)", "A = 0.5\nX = A + 0.25", "A + 0.25 {0.25 < X times 1 plus 0.5} < X"),
+        ("from places import X as Y\nnote(Y)", "X = 1.5", "1.5 < Y"),
+        ("from places import X\nnote([X, 1])", "A = 0.5\nX = A", "[X, 1] {0.5 < X < A, 1}"),
+        ("from places import X\nnote(X)", "from more import X", "1.5 < X (places.py, line 1)"),
+        ("import places\nnote(places.X)", "from more import X", "1.5 < places.X (places.py, line 1)"),
+        ("from places import *\nnote(X)", "X = 1.5", "X"),
+        ("import places\nnote(places.X)", "Y = X = 1.5", "1.5 < places.X (line 1 gives it to several names)"),
+        ("from math import pi\nnote(pi)", "", "pi"),
+        ("from math import *\nnote(pi / 180 * 5)", "", "pi / 180 * 5 {5 times degrees plus 0}"),
+        ("from places import X\nnote(X)", "X = max(1, 2)", "`max(1, 2)` is computed when the task runs"),
+        (
+            "from places import X\nnote(X)",
+            "X = 1\nX += 1",
+            "`X` is given other values than it has in lines 1 and 2",
+        ),
+        (
+            "from places import X\nnote(X)",
+            "vars()['X'] = 1",
+            "`X` comes from places.X, which is not one of your files",
+        ),
+        (
+            "import places\nnote(places.X)",
+            "X = 1.5\ndef f():\n    return X",
+            "1.5 < places.X (places.py, line 3)",
+        ),
+        ("from places import X\nnote(X)\nY = X", "X = 1.5", "1.5 < X (line 11)"),
+        (
+            "import places\nX = places.X\nnote(X)",
+            "Y = X = 1.5",
+            "1.5 < X (places.py, line 1) < places.X (line 10)",
+        ),
+    ],
+)
+def test_constants_of_files_beside_it_are_followed_there(text: str, others: str, what: str) -> None:
+    more = {"/author/more.py": "X = 1.5"} if "more" in others else {}
+    assert told(text, {**more, PLACES: others}) == what
+
+
+def test_an_import_from_the_same_package_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("pack", "pack.places"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
+    text = "import sys, places\nsys.modules['pack.places'] = places\n__package__ = 'pack'\n"
+    assert told(f"{text}from .places import X\nnote(X)", {PLACES: "X = 1.5"}) == "1.5 < X"
+    assert told(f"{text}from pack.places import X\nnote(X)", {PLACES: "X = 1.5"}) == "1.5 < X"
+
+
+def test_of_several_lines_the_one_with_the_running_value_is_meant() -> None:
+    text = "X = 1.5\ndef f():\n    note(X)\nif len('ab') > 1:\n    X = 2.5\nelse:\n    X = max(3, 4)\nf()"
+    assert told(text) == "2.5 < X"
+    text = text.removesuffix("f()") + "vars()['X'] = 7.5\nf()"
+    assert told(text) == "`X` is given other values than it has in lines 9 and 13 and 15"
+
+
+def test_values_within_a_function_are_those_of_its_frame() -> None:
+    text = """\
+X = 1.5
+def f(flag):
+    if flag:
+        X = 2.5
+    else:
+        X = 3.5
+    def g():
+        note([X, Y])
+    Y = 4.5
+    g()
+f(False)
+"""
+    assert told(text) == "[X, Y] {3.5 < X, 4.5 < Y}"
