@@ -60,10 +60,31 @@ def installed(tmp_path: Path) -> Path:
     return inner / "task.py"
 
 
-def test_imports_ids_and_its_own_place_are_said_otherwise_and_nothing_else(installed: Path) -> None:
-    text, ids = copied_text(installed, TEXT, 2)
-    assert text == COPIED
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_imports_ids_and_its_own_place_are_said_otherwise_and_nothing_else(installed: Path, end: str) -> None:
+    text, ids = copied_text(installed, TEXT.replace("\n", end), 2)
+    assert text == COPIED.replace("\n", end)
     assert ids == (("Näh-Task-v1", "MyNäh-Task2-v1"), ("Other", "MyOther2"))
+
+
+@pytest.mark.parametrize(
+    ("text", "copied"),
+    [
+        ("FOLDER = __file__\nimport os\n", "{}FOLDER = installed_task.__file__\nimport os\n"),
+        ('"""A task."""\n\nFOLDER = __file__\n', '"""A task."""\n\n{}FOLDER = installed_task.__file__\n'),
+        (
+            "#!/bin/python\n@at(__file__)\nclass A: ...\n",
+            "#!/bin/python\n{}@at(installed_task.__file__)\nclass A: ...\n",
+        ),
+        (
+            "from  .  import(x)\nfrom . \\\n deep import y",
+            "from pack.sub.inner import(x)\nfrom pack.sub.inner.deep import y",
+        ),
+    ],
+)
+def test_what_stands_before_all_else_stays_there(installed: Path, text: str, copied: str) -> None:
+    added = "import pack.sub.inner.task as installed_task  # its files lie there\n"
+    assert copied_text(installed, text) == (copied.format(added), ())
 
 
 @pytest.mark.parametrize(

@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 
 from tests.drive.session import start_over, step, wait_until
+from tests.drive.waiting import until
 from tests.session.studio import BASE, PEOPLE, camera, moved, said
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.session.messages import CameraRequest, TaskOptions
 from workbench.session.session import Session
+from workbench.session.studio_file import StudioFile
 from workbench.session.studio_view import StudioView, Wish
 from workbench.session.view import SessionView
 
@@ -199,23 +201,26 @@ def test_what_cannot_be_is_refused_in_words_and_changes_nothing(session: Session
 
 
 def test_a_placement_is_written_compared_and_taken_back(session: Session, task_file: Path) -> None:
-    studio, before = session.studio, task_file.read_text()
+    studio, saved = session.studio, task_file.read_bytes()
+    before = saved.replace(b"\n", b"\r\n")  # as an editor on Windows saves it
+    task_file.write_bytes(before)
     start = camera(session, BASE).now
     studio.place(BASE, replace(start, position=(0.31, 0.02, 0.55), fov=1.2))
     studio.plan(Wish("edit", BASE))
     view = wait_until(session, said(lambda s: s.writing.stage in ("planned", "refused")), "the plan")
     assert view.studio.writing.stage == "planned", view.studio.writing.message
-    assert task_file.read_text() == before and "+" in view.studio.writing.edit.diff
+    assert task_file.read_bytes() == before and "+" in view.studio.writing.edit.diff
     studio.file.write()
     view = wait_until(session, said(lambda s: s.writing.stage in ("checked", "mismatch")), "the check")
     assert view.studio.writing.stage == "checked", view.studio.writing.message
     assert view.reload.level == "cameras" and not moved(view)
     now = camera(session, BASE)
     assert now.now == now.info.settings and not differences(now.now, view.studio.writing.edit.settings)
-    assert task_file.read_text() == view.studio.writing.edit.new_text
+    assert task_file.read_bytes() == view.studio.writing.edit.new_text.encode()
     studio.file.undo_write()
     view = wait_until(session, said(lambda s: "as it was before." in s.writing.message), "the file of before")
-    assert task_file.read_text() == before
+    assert task_file.read_bytes() == before
+    task_file.write_bytes(saved)
     # Taken back is the placement too, and one step of undo brings it again.
     assert not moved(view) and view.studio.camera(BASE).now == view.studio.camera(BASE).info.settings == start
     assert view.studio.writing.message.endswith(
@@ -226,6 +231,35 @@ def test_a_placement_is_written_compared_and_taken_back(session: Session, task_f
     session.studio.undo()
     view = wait_until(session, lambda v: moved(v) == {BASE}, "the placement again")
     assert not differences(view.studio.camera(BASE).now, now.now)
+
+
+def test_a_hook_that_does_not_end_is_waited_for_so_long_and_the_next_plan_is_made(
+    session: Session, task_file: Path, tmp_path: Path
+) -> None:
+    good, waits = task_file.read_text(), tmp_path / "waits"
+    (hook,) = (line for line in good.splitlines(keepends=True) if "def _default_sensor_configs(" in line)
+    asks = f"        while __import__('os').path.exists({str(waits)!r}):\n            pass\n"
+    studio = session.studio
+    file = StudioFile(
+        studio._cameras, lambda: None, lambda *_: None, studio._asker, studio._load, patience=0.5
+    )
+    try:
+        task_file.write_text(good.replace(hook, hook + asks))
+        wait_until(session, lambda v: asks in v.task.source[str(task_file)], "the version with it")
+        studio.place(BASE, replace(camera(session, BASE).now, fov=1.2))
+        waits.touch()
+        file.plan_write(BASE)
+        until(lambda: file.view.stage == "refused", "the end of waiting")
+        assert "the task did not answer" in file.view.message
+        waits.unlink()
+        studio.file.plan_write(BASE)
+        wait_until(session, said(lambda v: v.writing.stage == "planned"), "the plan of who waits longer")
+        studio.file.drop_plan()
+    finally:
+        waits.unlink(missing_ok=True)
+        file.close()
+        task_file.write_text(good)
+    wait_until(session, lambda v: asks not in v.task.source[str(task_file)], "the version without it")
 
 
 def test_a_camera_that_was_taken_out_of_the_file_comes_back_where_it_was_placed(

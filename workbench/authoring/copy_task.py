@@ -11,21 +11,20 @@ from __future__ import annotations
 
 import ast
 import errno
-import io
+import importlib.util
 import os
 import re
 import tempfile
-import tokenize
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from workbench.authoring.modules import MOST_SOURCE_BYTES, decode, module_name
+from workbench.authoring.modules import MOST_SOURCE_BYTES, exact_text, module_name
+from workbench.authoring.source.text import Refused, Replacement, SourceFile
 from workbench.machine.regular_file import read_regular_file
 
 MOST_COPIES = 99
-_FROM = re.compile(r"from[\s\\]*\.(?:[\s\\]*\.)*")
 _VERSION = re.compile(r"-v\d+$")
 
 
@@ -40,13 +39,6 @@ class TaskCopy:
     """Each id that the task registers, and what its copy registers instead."""
 
 
-@dataclass(frozen=True)
-class _Replacement:
-    start: int
-    end: int
-    text: str
-
-
 def copy_task(source: Path, folder: Path) -> TaskCopy:
     """Write a copy of a task's file into a folder, under a name that is free there.
 
@@ -54,9 +46,7 @@ def copy_task(source: Path, folder: Path) -> TaskCopy:
         NoCopy: it cannot be copied; nothing was written.
     """
     try:
-        raw = read_regular_file(source, MOST_SOURCE_BYTES)
-        text = decode(str(source), raw)
-        encoding, _ = tokenize.detect_encoding(io.BytesIO(raw).readline)
+        text, encoding = exact_text(str(source), read_regular_file(source, MOST_SOURCE_BYTES))
     except (OSError, SyntaxError) as error:
         raise NoCopy(f"{source.name} cannot be read ({error})") from error
     if not folder.is_dir():
@@ -85,67 +75,47 @@ def copied_text(source: Path, text: str, number: int = 1) -> tuple[str, tuple[tu
         NoCopy: it cannot be copied.
     """
     try:
-        tree = ast.parse(text)
-    except (SyntaxError, ValueError) as error:
-        raise NoCopy(f"{source.name} is not valid Python as it stands: {error}") from error
-    offset = _offsets(text)
-    changes: list[_Replacement] = []
+        file = SourceFile(str(source), text)
+    except Refused as refused:
+        raise NoCopy(refused.reason) from refused
     package = module_name(source).name.split(".") if (source.parent / "__init__.py").is_file() else []
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node.level:
-            changes.append(_absolute(node, source, package, text, offset))
-    places = [n for n in ast.walk(tree) if isinstance(n, ast.Name) and n.id == "__file__"]
+    changes = [
+        _absolute(file, node, package)
+        for node in file.nodes
+        if isinstance(node, ast.ImportFrom) and node.level
+    ]
+    places = [node for node in file.nodes if isinstance(node, ast.Name) and node.id == "__file__"]
     if places:
+        first = f"line {file.line(places[0])} asks for the file's own place"
         if not package:
-            raise NoCopy(
-                f"line {places[0].lineno} asks for the file's own place, which the copy does not have"
-            )
+            raise NoCopy(f"{first}, which the copy does not have")
+        if any(text[slice(*file.inner_span(node))] != "__file__" for node in places):
+            raise NoCopy(f"{first} inside a text of several lines")
         name = _free_name("installed_task", text)
-        changes += [
-            _Replacement(
-                offset(n.lineno, n.col_offset), offset(n.lineno, n.col_offset) + 8, f"{name}.__file__"
-            )
-            for n in places
-        ]
-        if any(text[c.start : c.end] != "__file__" for c in changes[-len(places) :]):
-            raise NoCopy(
-                f"line {places[0].lineno} asks for the file's own place inside a text of several lines"
-            )
-        at = _after_the_head(tree, text, offset)
-        changes.append(_Replacement(at, at, f"import {'.'.join(package)} as {name}  # its files lie there\n"))
+        changes += [Replacement(*file.inner_span(node), f"{name}.__file__") for node in places]
+        at = file.import_place()
+        changes.append(Replacement(at, at, f"import {'.'.join(package)} as {name}  # its files lie there\n"))
     ids: list[tuple[str, str]] = []
-    for said in _registered_ids(tree):
+    for said in _registered_ids(file.module):
         new = _new_id(str(said.value), number)
-        start = offset(said.lineno, said.col_offset)
-        end = offset(said.end_lineno or said.lineno, said.end_col_offset or said.col_offset)
-        changes.append(_Replacement(start, end, f'"{new}"'))
+        changes.append(Replacement(*file.inner_span(said), f'"{new}"'))
         ids.append((str(said.value), new))
-    for change in sorted(changes, key=lambda change: change.start, reverse=True):
-        text = text[: change.start] + change.text + text[change.end :]
-    return text, tuple(ids)
+    return file.replaced(changes), tuple(ids)
 
 
-def _absolute(
-    node: ast.ImportFrom, source: Path, package: list[str], text: str, offset: Callable[[int, int], int]
-) -> _Replacement:
+def _absolute(file: SourceFile, node: ast.ImportFrom, package: list[str]) -> Replacement:
     """A relative import that names its package."""
     where = f"line {node.lineno} imports {'.' * node.level}{node.module or ''}"
-    # The module's own name is the last part; of a package's __init__ there is none.
-    inside = package if source.stem == "__init__" else package[:-1]
     if not package:
         raise NoCopy(f"{where}, which lies beside the file and not in a package: copy them together yourself")
-    if node.level > len(inside):
-        raise NoCopy(f"{where}, which is beyond its package")
-    start = offset(node.lineno, node.col_offset)
-    match = _FROM.match(text, start)
-    end = -1 if match is None else match.end()
-    if match is not None and node.module:
-        named = re.compile(rf"[\s\\]*{re.escape(node.module)}\b").match(text, end)
-        end = -1 if named is None else named.end()
-    if end < 0:
-        raise NoCopy(f"{where}, in a way that is not understood")
-    full = ".".join([*inside[: len(inside) - node.level + 1], *([node.module] if node.module else [])])
-    return _Replacement(start, end, f"from {full}")
+    # The module's own name is the last part; of a package's __init__ there is none.
+    inside = package if file.name == "__init__.py" else package[:-1]
+    try:
+        full = importlib.util.resolve_name("." * node.level + (node.module or ""), ".".join(inside))
+    except ImportError as error:
+        raise NoCopy(f"{where}, which is beyond its package") from error
+    start = file.inner_span(node)[0]
+    return Replacement(start, file.token_after(start, "import"), f"from {full} ")
 
 
 def _registered_ids(tree: ast.Module) -> Iterator[ast.Constant]:
@@ -174,33 +144,10 @@ def _new_id(env_id: str, number: int) -> str:
     )
 
 
-def _after_the_head(tree: ast.Module, text: str, offset: Callable[[int, int], int]) -> int:
-    """Behind the docstring and imports from ``__future__``, where the first other statement begins."""
-    for i, node in enumerate(tree.body):
-        docstring = i == 0 and isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
-        if not docstring and not (isinstance(node, ast.ImportFrom) and node.module == "__future__"):
-            first = min([node.lineno, *(d.lineno for d in getattr(node, "decorator_list", []))])
-            return offset(first, 0)
-    return len(text)
-
-
 def _free_name(name: str, text: str) -> str:
     while name in text:
         name += "_"
     return name
-
-
-def _offsets(text: str) -> Callable[[int, int], int]:
-    """From ast's lines and columns, which count bytes of UTF-8, to places in the text."""
-    lines = text.split("\n")
-    starts = [0]
-    for line in lines:
-        starts.append(starts[-1] + len(line) + 1)
-
-    def offset(line: int, column: int) -> int:
-        return starts[line - 1] + len(lines[line - 1].encode()[:column].decode())
-
-    return offset
 
 
 def _write_new(file: Path, text: bytes) -> bool:

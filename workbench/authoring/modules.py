@@ -18,10 +18,12 @@ from __future__ import annotations
 
 import importlib.machinery
 import importlib.util
+import io
 import linecache
 import os
 import re
 import sys
+import tokenize
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
@@ -31,6 +33,7 @@ from types import CodeType, ModuleType
 from typing import Any
 
 from workbench.authoring.library_names import files_named_like_libraries, is_library, is_own_file
+from workbench.authoring.source.text import plain_line_ends
 from workbench.machine.regular_file import read_regular_file
 
 MOST_SOURCE_BYTES = 16 * 2**20
@@ -235,13 +238,19 @@ def read_source(path: str | Path) -> str:
 
 
 def decode(path: str, raw: bytes) -> str:
-    """The text of a Python source file: its coding line or UTF-8, line ends as ``\\n``.
+    """The text of a Python source file, line ends as ``\\n``; see `exact_text`."""
+    return plain_line_ends(exact_text(path, raw)[0])
+
+
+def exact_text(path: str, raw: bytes) -> tuple[str, str]:
+    """The text of a Python source file with its own line ends, and its encoding: its coding line's or UTF-8.
 
     Raises SyntaxError, with `path` and line, where Python's own functions raise a
     UnicodeDecodeError that names neither.
     """
     try:
-        return importlib.util.decode_source(raw)
+        encoding, _ = tokenize.detect_encoding(io.BytesIO(raw).readline)
+        return raw.decode(encoding), encoding
     except (UnicodeDecodeError, SyntaxError) as exc:
         message, line = str(exc), 1
         try:

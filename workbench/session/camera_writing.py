@@ -18,9 +18,11 @@ from workbench.authoring import camera_source
 from workbench.authoring.camera_source import Refusal, SourceEdit
 from workbench.authoring.camera_source.cameras import Run
 from workbench.authoring.copy_task import NoCopy, copy_task
-from workbench.authoring.modules import read_source
+from workbench.authoring.modules import MOST_SOURCE_BYTES, exact_text
+from workbench.authoring.source.text import plain_line_ends
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.core.pictures import CameraInfo
+from workbench.machine.regular_file import read_regular_file
 from workbench.session.messages import TaskDescription
 from workbench.session.studio_view import Change, Wish, Writing, WritingStage
 
@@ -186,11 +188,11 @@ def _made(
 
 
 def _texts(task: TaskDescription) -> tuple[dict[str, str], str]:
-    """The author's files as they are on disk; and why one cannot be read."""
+    """The author's files as they are on disk, with the line ends that they have; and why one cannot be read."""
     texts: dict[str, str] = {}
     for path in task.source_files:
         try:
-            texts[path] = read_source(path)
+            texts[path], _ = exact_text(path, read_regular_file(path, MOST_SOURCE_BYTES))
         except OSError as error:
             return {}, f"{path} cannot be read: {error.strerror}"
         except SyntaxError as error:
@@ -293,7 +295,7 @@ class CameraWriting:
             return False
         written = self.view.stage == "written"
         return all(
-            task.source.get(change.file) == (change.new_text if written else change.old_text)
+            task.source.get(change.file) == plain_line_ends(change.new_text if written else change.old_text)
             for change in edit.changes
         )
 

@@ -13,6 +13,7 @@ from workbench.authoring.camera_source.run_hooks import run_hooks
 from workbench.authoring.load import LoadedTask, load_task, take_back
 from workbench.authoring.reference import class_beside
 from workbench.authoring.source.names import Project
+from workbench.authoring.source.text import plain_line_ends
 from workbench.core import seams
 from workbench.core.exchange import put_class, undone
 from workbench.session.camera_messages import RunCameras
@@ -69,7 +70,11 @@ def _set_otherwise(before: Mapping[str, str], after: Mapping[str, str], owner: A
     """
     old, new = Project(before), Project(after)
     found: dict[str, Any] = {}
-    for name in vars(owner).keys() if any(before.get(path) != text for path, text in after.items()) else ():
+    for name in (
+        vars(owner).keys()
+        if any(before.get(path) != plain_line_ends(text) for path, text in after.items())
+        else ()
+    ):
         was, stores = old.attribute_stores(name), new.attribute_stores(name)
         if len(was) != 1 or len(stores) != 1 or was[0].value is None or stores[0].value is None:
             continue

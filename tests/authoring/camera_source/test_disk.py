@@ -15,13 +15,14 @@ from tests.authoring.camera_source.real_cameras import FILE, real_settings, run_
 from tests.authoring.camera_source.shapes import WRITTEN
 from workbench.authoring.camera_source import Refusal, SourceEdit, apply, plan_edit, revert
 from workbench.authoring.camera_source.result import FileChange
-from workbench.authoring.modules import decode
+from workbench.authoring.modules import exact_text
+from workbench.authoring.source.text import plain_line_ends
 
 SOURCE = WRITTEN["an argument a line, with remarks"]
 
 
-def planned(path: Path, text: str | None = None) -> SourceEdit:
-    text = decode(str(path), path.read_bytes()) if text is None else text
+def planned(path: Path) -> SourceEdit:
+    text, _ = exact_text(str(path), path.read_bytes())
     before = real_settings({FILE: SOURCE}, "cam")
     after = dataclasses.replace(before, fov=0.9, near=0.05, shader_pack="default")
     plan = plan_edit({str(path): text}, ("sensor", "cam"), before, after, run_class)
@@ -39,8 +40,8 @@ def test_line_ends_encoding_and_mode_stay(tmp_path: Path, encoding: str, end: st
     path.chmod(0o640)
     edit = planned(path)
     assert apply(edit) is None
-    expected = edit.new_text.replace("\n", end).encode(encoding)
-    assert path.read_bytes() == expected != old
+    assert path.read_bytes() == edit.new_text.encode(encoding) != old
+    assert edit.new_text == plain_line_ends(edit.new_text).replace("\n", end)
     assert stat.S_IMODE(path.stat().st_mode) == 0o640
     assert revert(edit) is None
     assert path.read_bytes() == old
@@ -76,15 +77,6 @@ def test_mixed_line_ends_stay_where_they_are(tmp_path: Path) -> None:
     assert len(kept) == len(lines) - 2
     assert revert(edit) is None
     assert path.read_bytes() == old
-
-
-def test_text_as_it_is_on_disk_can_be_given_too(tmp_path: Path) -> None:
-    path = tmp_path / "task.py"
-    path.write_bytes(b"\xef\xbb\xbf" + SOURCE.replace("\n", "\r\n").encode())
-    edit = planned(path, path.read_bytes().decode())
-    assert "\r\n" in edit.new_text and "\n" not in edit.new_text.replace("\r\n", "")
-    assert apply(edit) is None
-    assert path.read_bytes() == edit.new_text.encode()
 
 
 def test_a_file_that_moved_on_is_left_as_it_is(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from workbench.authoring.camera_source import (
     SourceEdit,
     plan_add,
     plan_duplicate,
+    plan_edit,
     plan_remove,
     plan_rename,
 )
@@ -259,3 +260,25 @@ def test_tidy_text_comes_of_it() -> None:
     back = plan_remove({FILE: plan.new_text}, ("sensor", "cam"), run_class)
     assert isinstance(back, SourceEdit)
     assert 'return [\n            CameraConfig(\n                "top"' in back.new_text
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_file_of_windows_is_edited_as_any_other_and_keeps_its_line_ends(name: str) -> None:
+    sources = (WRITTEN[name], WRITTEN[name].replace("\n", "\r\n"))
+    now = cameras(sources[0])[next(key for key in cameras(sources[0]) if key[1] == "cam")]
+    after = dataclasses.replace(now, position=(0.1, 0.25, 1.1), width=320, shader_pack="default")
+    key = key_of(sources[0])
+    for plan in (
+        lambda source: plan_edit({FILE: source}, key, now, after, run_class),
+        lambda source: plan_add({FILE: source}, FILE, "Task", (key[0], "added"), NEW, run_class),
+        lambda source: plan_duplicate({FILE: source}, key, "copy", after, run_class),
+        lambda source: plan_rename({FILE: source}, key, "front", now, run_class),
+        lambda source: plan_remove({FILE: source}, key, run_class),
+    ):
+        one, other = (plan(source) for source in sources)
+        if isinstance(one, Refusal):
+            assert other == one
+        else:
+            assert isinstance(other, SourceEdit) and other.old_text == sources[1]
+            assert other.new_text == one.new_text.replace("\n", "\r\n")
+            assert (other.notes, other.settings) == (one.notes, one.settings)

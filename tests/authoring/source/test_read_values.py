@@ -279,7 +279,11 @@ assert len(made) == 1
     ("text", "others", "what"),
     [
         ("import places\nnote(places.X)", "X = 1.5", "1.5 < places.X"),
-        ("from places import X\nnote(X)", "A = 0.5\nX = A + 0.25", "A + 0.25 {0.25 < X times 1 plus 0.5} < X"),
+        (
+            "from places import X\nnote(X)",
+            "A = 0.5\nX = A + 0.25",
+            "A + 0.25 {0.25 < X times 1 plus 0.5} < X",
+        ),
         ("from places import X as Y\nnote(Y)", "X = 1.5", "1.5 < Y"),
         ("from places import X\nnote([X, 1])", "A = 0.5\nX = A", "[X, 1] {0.5 < X < A, 1}"),
         ("from places import X\nnote(X)", "from more import X", "1.5 < X (places.py, line 1)"),

@@ -10,23 +10,17 @@ stays as it was: line ends, encoding, byte order mark, permissions, a link that 
 
 from __future__ import annotations
 
-import difflib
-import io
 import os
-import re
 import stat
 import tempfile
-import tokenize
 from contextlib import suppress
 from pathlib import Path
 
 from workbench.authoring.camera_source.cameras import check_own
 from workbench.authoring.camera_source.result import FileChange, Refusal, SourceEdit
-from workbench.authoring.modules import MOST_SOURCE_BYTES
-from workbench.authoring.source.text import BOM, Refused
+from workbench.authoring.modules import MOST_SOURCE_BYTES, exact_text
+from workbench.authoring.source.text import Refused
 from workbench.machine.regular_file import read_regular_file
-
-_LINES = re.compile(r"[^\r\n]*(?:\r\n|\r|\n|$)")
 
 
 def apply(edit: SourceEdit) -> Refusal | None:
@@ -85,14 +79,12 @@ def _exchange(path: str, expected: str, wanted: str | None, since: str) -> Refus
     real = Path(path).resolve()
     try:
         raw = read_regular_file(real, MOST_SOURCE_BYTES)
-        encoding, _ = tokenize.detect_encoding(io.BytesIO(raw).readline)
-        text = raw.decode(encoding)
-        if _plain(text) != _plain(expected):
+        text, encoding = exact_text(str(real), raw)
+        if text != expected:
             return Refusal(f"{real.name} was edited {since}, so it is left as it is; ask again")
         if wanted is None:
             return None
-        new = _with_line_ends_of(text, wanted).encode(encoding)
-        if not _replace(real, raw, new):
+        if not _replace(real, raw, wanted.encode(encoding)):
             return Refusal(
                 f"{real.name} was saved by somebody else just now, so it is left as it is; ask again"
             )
@@ -122,33 +114,3 @@ def _replace(real: Path, old: bytes, new: bytes) -> bool:
     finally:
         with suppress(FileNotFoundError):
             os.unlink(name)
-
-
-def _plain(text: str) -> str:
-    """As Python reads it: one kind of line end, no mark at the start."""
-    return text.removeprefix(BOM).replace("\r\n", "\n").replace("\r", "\n")
-
-
-def _lines(text: str) -> list[str]:
-    return [line for line in _LINES.findall(text) if line]
-
-
-def _with_line_ends_of(text: str, wanted: str) -> str:
-    """`wanted` with the line ends that `text` has, line by line where a file mixes them."""
-    old = _lines(text)
-    new = _lines(_plain(wanted))
-    ends = [line[len(line.rstrip("\r\n")) :] for line in old]
-    common = max(("\n", "\r\n", "\r"), key=ends.count)
-    found: list[str] = []
-    matcher = difflib.SequenceMatcher(None, [_plain(line) for line in old], new, autojunk=False)
-    for tag, a, b, c, d in matcher.get_opcodes():
-        for index in range(c, d):
-            line = new[index]
-            if not line.endswith("\n"):
-                found.append(line)
-                continue
-            paired = a + index - c
-            same = tag == "equal" or (tag == "replace" and paired < b)
-            end = ends[paired] if same and ends[paired] else common
-            found.append(line[:-1] + end)
-    return "".join(found)

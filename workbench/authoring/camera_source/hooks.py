@@ -140,8 +140,6 @@ def at_end_of_class(
     if file.line_at(first) == file.line(cls):
         raise Refused(f"the class {cls.name} has no body to add {hook} to")
     indent = file.indent(first)
-    end = file.inner_span(cls.body[-1])[1]
-    end = file.text.find("\n", end)
-    at = len(file.text) if end < 0 else end + 1
-    lead = "\n" if end >= 0 else "\n\n"
+    at = file.line_start(file.line_at(file.inner_span(cls.body[-1])[1]) + 1)
+    lead = "\n" if file.text[:at].endswith(("\n", "\r")) else "\n\n"
     return Replacement(at, at, f"{lead}{text(indent)}")

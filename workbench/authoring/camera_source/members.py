@@ -229,7 +229,7 @@ def _renamed_text(call: CameraCall, new_uid: str) -> str:
     if uid is not None:
         a, b = file.span(uid)
         text = text[: a - start] + repr_text(new_uid) + text[b - start :]
-    return text.replace("\r\n", "\n")
+    return text
 
 
 # --- removing ------------------------------------------------------------------------------------

@@ -19,7 +19,6 @@ Scope = ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef | ast
 Span = tuple[int, int]
 """First character and the one behind the last."""
 LOOPS = (ast.For, ast.AsyncFor, ast.While, ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
-BOM = "\ufeff"
 
 _LINE_END = re.compile(r"\r\n?|\n")
 """Python's own idea of a line; str.splitlines has more."""
@@ -54,14 +53,12 @@ class SourceFile:
     def __init__(self, path: str, text: str) -> None:
         self.path = path
         self.text = text
-        # A mark at the start is part of the encoding; Python does not take it as source.
-        skipped = len(BOM) if text.startswith(BOM) else 0
         try:
-            self.module = ast.parse(text[skipped:])
+            self.module = ast.parse(text)
         except (SyntaxError, ValueError, RecursionError, MemoryError) as exc:
             said = f"line {exc.lineno}: {exc.msg}" if isinstance(exc, SyntaxError) else str(exc)
             raise Refused(f"{self.name} is not valid Python as it stands: {said}") from exc
-        self._starts = [skipped, *(m.end() for m in _LINE_END.finditer(text, skipped))]
+        self._starts = [0, *(m.end() for m in _LINE_END.finditer(text))]
         self.nodes = list(walk(self.module))
         """All, nearly in the order of the text."""
         self.parents = {child: node for node in self.nodes for child in ast.iter_child_nodes(node)}
@@ -114,12 +111,17 @@ class SourceFile:
 
     @cached_property
     def _tokens(self) -> list[tuple[int, int, str]]:
-        lines = io.StringIO(self.text[self._starts[0] :]).readline
+        lines = io.StringIO(plain_line_ends(self.text)).readline
         return [
             (self._starts[t.start[0] - 1] + t.start[1], self._starts[t.end[0] - 1] + t.end[1], t.string)
             for t in tokenize.generate_tokens(lines)
             if t.type not in _BLANK
         ]
+
+    def token_after(self, start: int, string: str) -> int:
+        """Where the first of these words or signs begins, from `start` on."""
+        following = self._tokens[bisect_left(self._tokens, (start,)) :]
+        return next(begin for begin, _, token in following if token == string)
 
     def after_comma(self, end: int) -> int | None:
         """Behind the comma that follows; None where none does."""
@@ -253,7 +255,7 @@ class SourceFile:
             if change.start < at:
                 raise Refused("two changes fall on the same place of the file")
             # The file's own line ends, whatever was composed here.
-            parts += [self.text[at : change.start], change.text.replace("\n", newline)]
+            parts += [self.text[at : change.start], plain_line_ends(change.text).replace("\n", newline)]
             at = change.end
         return "".join([*parts, self.text[at:]])
 
@@ -318,19 +320,18 @@ class SourceFile:
         return Replacement(items[index - 1][1] if index else start, end, "")
 
     def import_place(self) -> int:
-        """Where an import can be added: before the first one, after what has to come before any."""
-        place = 0
-        for index, statement in enumerate(self.module.body):
-            future = isinstance(statement, ast.ImportFrom) and statement.module == "__future__"
-            if isinstance(statement, (ast.Import, ast.ImportFrom)) and not future:
-                return self.line_start(self.line(statement))
-            if future or (index == 0 and ast.get_docstring(self.module, clean=False) is not None):
-                place = self.line_start(self.line_at(self.inner_span(statement)[1]) + 1)
-            elif index == 0:
-                # Above it may be lines that have to be the first: an interpreter's, an encoding's.
+        """Where an import can be added: before all that may use it, behind what has to come before any."""
+        documented = ast.get_docstring(self.module, clean=False) is not None
+        for statement in self.module.body[documented:]:
+            if not isinstance(statement, ast.ImportFrom) or statement.module != "__future__":
                 decorators = getattr(statement, "decorator_list", ())
-                place = self.line_start(self.line(decorators[0] if decorators else statement))
-        return place
+                return self.line_start(self.line(decorators[0] if decorators else statement))
+        return len(self.text)
+
+
+def plain_line_ends(text: str) -> str:
+    """As Python reads it: every line ends with ``\\n``."""
+    return _LINE_END.sub("\n", text)
 
 
 def arguments(call: ast.Call, parameters: Sequence[str]) -> dict[str, ast.expr]:
