@@ -241,18 +241,18 @@ def test_a_hook_that_does_not_end_is_waited_for_so_long_and_the_next_plan_is_mad
     asks = f"        while __import__('os').path.exists({str(waits)!r}):\n            pass\n"
     studio = session.studio
     file = StudioFile(
-        studio._cameras, lambda: None, lambda *_: None, studio._asker, studio._load, patience=0.5
+        studio._cameras, lambda: None, lambda *_: None, studio.file._asker, studio._load, patience=0.5
     )
     try:
         task_file.write_text(good.replace(hook, hook + asks))
         wait_until(session, lambda v: asks in v.task.source[str(task_file)], "the version with it")
         studio.place(BASE, replace(camera(session, BASE).now, fov=1.2))
         waits.touch()
-        file.plan_write(BASE)
+        file.plan(Wish("edit", BASE))
         until(lambda: file.view.stage == "refused", "the end of waiting")
         assert "the task did not answer" in file.view.message
         waits.unlink()
-        studio.file.plan_write(BASE)
+        studio.plan(Wish("edit", BASE))
         wait_until(session, said(lambda v: v.writing.stage == "planned"), "the plan of who waits longer")
         studio.file.drop_plan()
     finally:

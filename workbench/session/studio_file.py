@@ -26,9 +26,6 @@ from workbench.session.messages import Load, TaskDescription
 from workbench.session.studio_cameras import StudioCameras
 from workbench.session.studio_view import Wish, Writing
 
-_PATIENCE = 60.0
-"""Seconds in which the worker must have run the hooks: a question may be lost with a worker that ends."""
-
 
 class StudioFile:
     """Thread-safe; every method returns at once.
@@ -38,6 +35,7 @@ class StudioFile:
         open_copy: open this class of this file, in a folder of the user's, in place of the task.
         asker: asks the worker that plays.
         load: how the version that runs was loaded; None before there is one.
+        patience: seconds in which the worker must have run the hooks: one of them may not end.
     """
 
     def __init__(
@@ -47,11 +45,12 @@ class StudioFile:
         open_copy: Callable[[Path, str], None],
         asker: Asker,
         load: Callable[[], Load | None],
+        patience: float = 60.0,
     ) -> None:
         self._cameras, self._note, self._open_copy = cameras, on_change, open_copy
         self.folder = Path.cwd()
         """Where a copy of a task goes: where the program was started."""
-        self._asker, self._load = asker, load
+        self._asker, self._load, self._patience = asker, load, patience
         self._stopped = threading.Event()
         """Nobody waits any more for what is being asked."""
         self._writing = CameraWriting()
@@ -83,7 +82,7 @@ class StudioFile:
 
     def _run(self, texts: Mapping[str, str]) -> Ran:
         stopped = self._stopped = threading.Event()
-        load, deadline = self._load(), time.monotonic() + _PATIENCE
+        load, deadline = self._load(), time.monotonic() + self._patience
         if load is None or self._closing:
             raise Refused("no task is loaded")
 
