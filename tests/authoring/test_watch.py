@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from workbench.authoring import watch
 from workbench.authoring.watch import SourceWatcher
 
 PATIENCE = 20.0
@@ -47,9 +48,9 @@ def calls() -> Calls:
     return Calls()
 
 
-@pytest.fixture(params=["events", "polling"])
-def watcher(request: pytest.FixtureRequest, calls: Calls) -> Iterator[SourceWatcher]:
-    started = SourceWatcher(calls, force_polling=True if request.param == "polling" else None)
+@pytest.fixture
+def watcher(calls: Calls) -> Iterator[SourceWatcher]:
+    started = SourceWatcher(calls)
     yield started
     started.stop()
 
@@ -192,6 +193,17 @@ def test_files_in_several_folders_are_followed_and_left(
     two.write_text("a = 2\n")
     one.write_text("a = 2\n")
     assert calls.next() == {"one.py": "a = 2\n"}
+    assert calls.nothing_before(last)
+
+
+def test_a_save_that_a_file_system_says_nothing_of_is_seen_by_reading(
+    file: Path, last: Path, calls: Calls, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As a network mount that answers with what it was told some seconds ago.
+    monkeypatch.setattr(watch, "_status", lambda path: None)
+    for number in (1, 2):
+        file.write_text(f"a = {number}\n")
+        assert calls.next() == {"task.py": f"a = {number}\n"}
     assert calls.nothing_before(last)
 
 

@@ -2,48 +2,46 @@
 
 What a person calls one save is many things to the file system: truncate and write; write a
 temporary file and rename it over; delete and create; and formatters that do it all again 20 ms
-later. Watching the *files* loses them at the first rename, because the watch goes with the inode.
-So the folders are watched, events are gathered until it has been quiet for a moment, and then the
-files are read and compared with what was last known: only new text is a change, so a ``touch``, a
-``git checkout`` of the same content or a line-end conversion does not rebuild a scene.
+later. So the paths are looked at, 25 times a second: one ``stat`` each, which takes microseconds and follows
+whatever is there by now. When that has been the same for a moment the files are read and compared with what
+was last known: only new text is a change, so a ``touch``, a ``git checkout`` of the same content or a
+line-end conversion does not rebuild a scene.
 
 What is known at first can be given: between a load's reading of a file and `follow` an author can
 save, and that save must not be lost. A file that is gone or empty may be half of a save, so this
-is believed only when it lasts. Four times a second the files are compared without any event too:
-for file systems that send none (network mounts), for a folder that was deleted and made again, and
-for systems out of inotify watches, where watchfiles polls and sees no second save in one second.
+is believed only when it lasts. Four times a second the files are read whatever ``stat`` says of them: a
+network mount may be late with it, and two saves within one tick of a file system's clock look the same.
 """
 
 from __future__ import annotations
 
-import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
-import watchfiles
-from watchfiles import _rust_notify
-
 from workbench.authoring.modules import MOST_SOURCE_BYTES, decode
 from workbench.machine.regular_file import read_regular_file
 from workbench.machine.watched_thread import say_failure, watched_thread
 
-logger = logging.getLogger(__name__)
-
-QUIET_MS = 30
+LOOK_S = 0.04
+"""Time between two looks."""
+QUIET_S = 0.03
 """A burst is over when nothing has happened for this long."""
-BURST_MS = 200
-"""A burst that does not end is looked at after this long."""
-RECHECK_MS = 250
-"""How often the files are compared without any event."""
+BURST_S = 0.2
+"""A burst that does not end is read after this long."""
+READ_S = 0.25
+"""How often the files are read, also where they look the same."""
 GONE_S = 0.3
 """How long a file must be missing or empty before that counts as its new content."""
-POLL_MS = 50
-"""Time between two looks, where the system sends no events at all."""
+SHARE = 0.0015
+"""Of a core, what looking may take, and what reading may: of hundreds of files both are done less often."""
 
 Content = str | bytes | None
 """Text; bytes that are not text; or None for no file, or one that cannot be read: a device, a pipe, one that is too large."""
+Looks = dict[Path, tuple[int, ...] | None]
+"""What ``stat`` says of each file that changes with it; None for no file."""
 
 
 class SourceWatcher:
@@ -52,13 +50,13 @@ class SourceWatcher:
     `on_change` may call `follow` and `stop`. What it raises is said, and watching goes on.
     """
 
-    def __init__(self, on_change: Callable[[set[Path]], None], force_polling: bool | None = None) -> None:
+    def __init__(self, on_change: Callable[[set[Path]], None]) -> None:
         self._on_change = on_change
-        self._force_polling = force_polling
         self._lock = threading.Lock()
         self._known: dict[Path, Content] = {}
-        self._folders_changed = threading.Event()
-        self._stopped = False
+        self._seen: Looks = {}
+        """How the files looked when they were last read."""
+        self._stopped = threading.Event()
         self._thread = watched_thread("source-watcher", self._run)
         self._thread.start()
 
@@ -71,7 +69,6 @@ class SourceWatcher:
         texts = texts or {}
         followed = [Path(path).expanduser().resolve() for path in paths]
         with self._lock:
-            folders = {path.parent for path in self._known}
             self._known = {
                 path: texts[str(path)]
                 if str(path) in texts
@@ -80,79 +77,58 @@ class SourceWatcher:
                 else _read(path)
                 for path in followed
             }
-            if folders != {path.parent for path in self._known}:
-                self._folders_changed.set()
-        if texts:
-            # Something may have been saved since `texts` was read, before there was a watch.
-            self._folders_changed.set()
+            self._seen = {}  # something may have been saved since `texts` was read
 
     def stop(self) -> None:
         """Return when the thread has ended (at once, when called from `on_change`)."""
-        self._stopped = True
-        self._folders_changed.set()
+        self._stopped.set()
         if threading.current_thread() is not self._thread:
             self._thread.join()
 
     def _run(self) -> None:
-        while not self._stopped:
-            self._folders_changed.clear()
-            with self._lock:
-                folders = {path.parent for path in self._known}
-            present = {folder: _identity(folder) for folder in folders if _identity(folder) is not None}
-            if not present:
-                self._folders_changed.wait(RECHECK_MS / 1000 if folders else None)
-                self._compare()
+        pause = read_again = 0.0
+        while not self._stopped.wait(pause):
+            began = time.thread_time()
+            now = self._look()
+            pause = max(LOOK_S, (time.thread_time() - began) / SHARE)
+            if now != self._seen:
+                self._seen = self._settled(now)
+            elif time.monotonic() < read_again:
                 continue
-            self._watch(present)
+            began = time.thread_time()
+            changed = self._changes()
+            read_again = time.monotonic() + max(READ_S, (time.thread_time() - began) / SHARE)
+            if changed and not self._stopped.is_set():
+                try:
+                    self._on_change(changed)
+                except Exception as error:
+                    say_failure("What follows a saved file failed, and the file is watched further", error)
 
-    def _watch(self, folders: dict[Path, tuple[int, int] | None]) -> None:
-        """Compare at every burst, until the set of folders is another one."""
-        # For what was saved since the files were last read, when nothing was watching.
-        self._compare()
-        try:
-            for _ in watchfiles.watch(
-                *folders,
-                watch_filter=self._is_followed,
-                debounce=BURST_MS,
-                step=QUIET_MS,
-                stop_event=self._folders_changed,
-                rust_timeout=RECHECK_MS,
-                yield_on_timeout=True,
-                raise_interrupt=False,
-                force_polling=self._force_polling,
-                poll_delay_ms=POLL_MS,
-                recursive=False,
-            ):
-                self._compare()
-                if any(_identity(folder) != identity for folder, identity in folders.items()):
-                    return  # made anew: the watch is on the folder that was deleted
-        except (OSError, _rust_notify.WatchfilesRustInternalError) as exc:
-            if self._force_polling:
-                logger.warning(
-                    "Cannot watch %s: %s. Looking now and then.", ", ".join(map(str, folders)), exc
-                )
-                self._folders_changed.wait(RECHECK_MS / 1000)
-            else:
-                logger.warning("No file events to be had (%s): polling the folders instead.", exc)
-                self._force_polling = True
+    def _look(self) -> Looks:
+        with self._lock:
+            paths = list(self._known)
+        return {path: _status(path) for path in paths}
 
-    def _is_followed(self, change: watchfiles.Change, path: str) -> bool:
-        return Path(path) in self._known
+    def _settled(self, now: Looks) -> Looks:
+        """How the files look when a burst is over."""
+        before, deadline = None, time.monotonic() + BURST_S
+        while now != before and time.monotonic() < deadline:
+            self._stopped.wait(QUIET_S)
+            before, now = now, self._look()
+        return now
 
-    def _compare(self) -> None:
+    def _changes(self) -> set[Path]:
+        """Files whose content is not what was known, which it is from now on."""
         changed = self._take_changes(believe_gone=False)
         deadline = time.monotonic() + GONE_S
         while changed is None:
-            time.sleep(QUIET_MS / 1000)
+            if self._stopped.wait(QUIET_S):
+                return set()
             changed = self._take_changes(believe_gone=time.monotonic() > deadline)
-        if changed and not self._stopped:
-            try:
-                self._on_change(changed)
-            except Exception as error:
-                say_failure("What follows a saved file failed, and the file is watched further", error)
+        return changed
 
     def _take_changes(self, believe_gone: bool) -> set[Path] | None:
-        """Files whose content is not what was known, which it is from now on; None for "ask again"."""
+        """None for "ask again"."""
         with self._lock:
             now = {path: _read(path) for path in self._known}
             changed = {path for path, content in now.items() if content != self._known[path]}
@@ -160,6 +136,14 @@ class SourceWatcher:
                 return None
             self._known.update(now)
         return changed
+
+
+def _status(path: Path) -> tuple[int, ...] | None:
+    try:
+        found = os.stat(path)
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns
 
 
 def _read(path: Path) -> Content:
@@ -171,11 +155,3 @@ def _read(path: Path) -> Content:
         return decode(str(path), raw)
     except SyntaxError:
         return raw
-
-
-def _identity(folder: Path) -> tuple[int, int] | None:
-    try:
-        found = folder.stat()
-    except OSError:
-        return None
-    return found.st_dev, found.st_ino

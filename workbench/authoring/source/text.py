@@ -331,7 +331,7 @@ class SourceFile:
 
 def plain_line_ends(text: str) -> str:
     """As Python reads it: every line ends with ``\\n``."""
-    return _LINE_END.sub("\n", text)
+    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def arguments(call: ast.Call, parameters: Sequence[str]) -> dict[str, ast.expr]:
