@@ -59,6 +59,25 @@ def back_to_the_file(page: Page) -> None:
     expect(page.get_by_text(re.compile("^As push_cube.py has it"))).to_be_visible()
 
 
+COVERED = """() => [...document.querySelectorAll(".mantine-ScrollArea-scrollbar[data-state=visible]")]
+    .filter((bar) => bar.dataset.orientation === "vertical" && bar.offsetHeight)
+    .map((bar) => {
+        const boxes = [...bar.parentElement.querySelectorAll("*")].filter((box) => {
+            const style = getComputedStyle(box);
+            return parseFloat(style.borderRightWidth) > 0 && style.borderRightStyle !== "none" && box.offsetWidth > 20;
+        });
+        const right = Math.max(...boxes.map((box) => box.getBoundingClientRect().right));
+        return right - bar.getBoundingClientRect().left;
+    })"""
+"""By how many pixels each scrollbar lies over the boxes that it scrolls."""
+
+
+def test_the_scrollbar_covers_no_box(page: Page) -> None:
+    page.mouse.move(1100, 500)
+    until(lambda: bool(page.evaluate(COVERED)), "the scrollbar")
+    assert max(page.evaluate(COVERED)) <= 0
+
+
 def press(page: Page, name: str) -> None:
     page.get_by_role("button", name=name, exact=True).click()
 

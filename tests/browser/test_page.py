@@ -190,6 +190,27 @@ def test_a_broken_edit_shows_a_banner_and_the_last_good_version_stays_usable(cal
     expect(banner).to_have_count(0)
 
 
+LIES_BESIDE = """() => {
+    const view = document.querySelector("canvas[data-engine]").parentElement.getBoundingClientRect();
+    const floating = [...document.querySelectorAll(".mantine-Paper-root")]
+        .filter((panel) => panel.querySelector(".wb-banner, .wb-timeline"))
+        .map((panel) => panel.getBoundingClientRect()).filter((box) => box.width);
+    return [floating.length, floating.every((box) => box.left >= view.left - 1 && box.right <= view.right + 1)];
+}"""
+
+
+def test_banner_and_timeline_are_as_narrow_as_the_view_and_cover_no_control(calm: Desk) -> None:
+    page = calm.page
+    calm.file.write_text("raise ValueError('not now')\n")
+    expect(page.get_by_text("not now").first).to_be_visible()
+    before = page.viewport_size
+    assert before is not None
+    for width in (1280, 760, 1000):
+        page.set_viewport_size({"width": width, "height": before["height"]})
+        until(lambda: page.evaluate(LIES_BESIDE) == [2, True], f"both beside the controls at {width} pixels")
+    page.set_viewport_size(before)
+
+
 def test_a_message_with_markup_is_text_in_the_banner(calm: Desk) -> None:
     calm.file.write_text("raise ValueError('<img src=x onerror=window.hacked=1><b>bold</b>')\n")
     expect(calm.page.get_by_text("<b>bold</b>").first).to_be_visible()

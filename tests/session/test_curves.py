@@ -24,7 +24,7 @@ def test_a_row_is_a_step() -> None:
     for number in (1, 2, 3):
         recent.add(step(number))
     curves = recent.curves()
-    assert curves.serial == recent.count == 3 and curves.tick.tolist() == [0, 1, 2]
+    assert curves.serial == recent.count == 3 and curves.tick.tolist() == [1, 2, 3]
     assert curves.reward.tolist() == [[1.0] * N, [2.0] * N, [3.0] * N]
     assert curves.success.tolist() == [[0, 0, 0], [0, 0, 1], [0, 0, 0]]
 
@@ -42,7 +42,7 @@ def test_only_the_newest_are_kept_oldest_first(count: int) -> None:
         recent.add(step(number, reach=[number, -number, 0]))
     curves, terms = recent.curves(), recent.terms()
     kept = list(range(max(0, count - 1000), count))
-    assert curves.tick.tolist() == terms.tick.tolist() == kept
+    assert curves.tick.tolist() == terms.tick.tolist() == [number + 1 for number in kept]
     assert curves.reward[:, 1].tolist() == terms.terms["reach"][:, 0].tolist() == kept
     assert curves.serial == count
 
@@ -63,7 +63,7 @@ def test_terms_are_kept_by_their_name_and_other_entries_are_not() -> None:
     recent.add(step(1, reach=[1, 2, 0]))
     recent.add(step(2, reach=[3, 4, 0], push=[5, 6, 7]))
     curves = recent.terms()
-    assert curves.tick.tolist() == [0, 1]
+    assert curves.tick.tolist() == [1, 2]
     assert curves.terms.keys() == {"reach", "push"}
     assert curves.terms["reach"].tolist() == [[1, 2, 0], [3, 4, 0]]
     np.testing.assert_array_equal(curves.terms["push"], [[np.nan] * 3, [5, 6, 7]])

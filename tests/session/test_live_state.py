@@ -76,7 +76,7 @@ def test_nothing_is_shown_before_a_task_is_loaded_and_its_moments_from_then_on()
     shown = view(running())
     assert (shown.state, shown.activity, shown.playing) == ("running", "", True)
     assert (shown.timeline.last, shown.step_serial, shown.timeline.moments) == (3, 3, 4)
-    assert shown.curves is not None and shown.curves.tick.tolist() == [0, 1, 2]
+    assert shown.curves is not None and shown.curves.tick.tolist() == [1, 2, 3]
 
 
 def test_curves_are_copied_once_a_step_and_not_at_every_look() -> None:
@@ -86,7 +86,7 @@ def test_curves_are_copied_once_a_step_and_not_at_every_look() -> None:
     assert view(state).curves is first
     state.stepped(stepped(5))
     now = view(state).curves
-    assert now is not None and now.tick.tolist() == [0, 1, 2, 3]
+    assert now is not None and now.tick.tolist() == [1, 2, 3, 4]
 
 
 def test_a_version_on_the_same_scene_leaves_the_past_and_the_drawn_shapes() -> None:

@@ -201,8 +201,8 @@ def test_what_a_going_back_could_not_put_back_is_told_until_the_next_jump() -> N
 
 def test_the_view_is_of_the_moment_that_is_shown() -> None:
     timeline = played(4)
-    assert timeline.view(0, (EYE,)).tick == 3 and not timeline.view(0, (EYE,)).wants_pictures
+    assert timeline.view(0, (EYE,)).tick == 4 and not timeline.view(0, (EYE,)).wants_pictures
     timeline.seek(1)
     view = timeline.view(0, (EYE,))
-    assert (view.first, view.last, view.shown, view.tick, view.moments) == (0, 4, 1, 0, 5)
+    assert (view.first, view.last, view.shown, view.tick, view.moments) == (0, 4, 1, 1, 5)
     assert view.can_go_on and view.used == timeline.history.used and view.limit == 10**9

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from tests.ui.scenes import running
 from workbench.core.camera_frames import LookAt, axes_of, pose_from_look_at, with_pose
 from workbench.core.camera_report import ObjectToSee
-from workbench.ui.camera_writing import NEW
-from workbench.ui.first_place import first_place, objects_in
+from workbench.ui.camera_writing import NEW, first_place, objects_in
 
 metres = st.floats(-0.5, 0.5)
 places = st.lists(st.tuples(metres, metres, metres), min_size=1, max_size=9).map(np.array)

@@ -23,7 +23,7 @@ from workbench.session.session import Session
 from workbench.ui import deaf_clients
 from workbench.ui.door import Door, DoorOptions, open_door
 from workbench.ui.page import Page
-from workbench.ui.stage import Stage
+from workbench.ui.viewpoint import Stage
 
 
 @dataclass

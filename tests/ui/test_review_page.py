@@ -127,6 +127,15 @@ def test_two_recordings_are_compared_and_aligned(shown: Shown, monkeypatch: pyte
     assert shown.panels.control(SLIDER).min == -7
 
 
+def test_a_scene_is_framed_as_it_was_drawn_while_another_recording_comes(shown: Shown) -> None:
+    shown.open(1)
+    shown.review.open(tuple(row.id for row in shown.library.rows() if row.seed in (1, 2)))
+    until(lambda: len(shown.review.view().opened) == 2, "the other recording")
+    shown.panels.command("Frame what is shown")
+    shown.draw()
+    shown.panels.command("Frame what is shown")
+
+
 def test_pressing_a_row_of_the_comparison_goes_there(shown: Shown) -> None:
     shown.open(1, 2)
     assert re.search(r'data-press="[^"]+"', shown.panels.part("Compare").html())

@@ -5,7 +5,7 @@ import viser
 from tests.drive.panels import Panels
 from tests.ui.scenes import table_scene
 from workbench.ui.env_layout import lay_out
-from workbench.ui.stage import Stage
+from workbench.ui.viewpoint import Stage
 
 
 def test_bodies_and_light_outlive_a_page_and_nothing_else_does(panels: Panels) -> None:

@@ -82,9 +82,9 @@ class Curves:
     """The past of the batch, oldest first, bounded in length; kept over env selection."""
 
     serial: int
-    """Control steps so far, which is one past the tick of the newest row."""
+    """Control steps so far: the tick of the newest row."""
     tick: NDArray[np.int64]
-    """(T,) control steps since the task was loaded, counting up."""
+    """(T,) control steps since the task was loaded; the first is 1, as in a recording."""
     reward: NDArray[np.float32]
     """(T, N)"""
     success: NDArray[np.float32]
@@ -150,7 +150,7 @@ class RecentSteps:
 
     @property
     def _ticks(self) -> NDArray[np.int64]:
-        return np.arange(max(0, self.count - _LENGTH), self.count)
+        return np.arange(max(0, self.count - _LENGTH), self.count) + 1
 
     def _newest(self, name: str) -> NDArray[np.float32]:
         return self._columns.between(name, max(0, self.count - _LENGTH), self.count - 1)

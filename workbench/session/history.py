@@ -134,7 +134,7 @@ class History:
             step=stepped.step,
             jumped=stepped.reset_mask,
             seeds=stepped.seeds,
-            tick=max(0, self.steps.count - 1),
+            tick=self.steps.count,
             happened=self._events(stepped, rows),
             restored=restored,
             number=stepped.number,

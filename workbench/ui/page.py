@@ -36,14 +36,13 @@ from workbench.ui.redraw_loop import RedrawLoop, draw_apart
 from workbench.ui.rules_mark import RulesMark
 from workbench.ui.run_panel import RunPanel
 from workbench.ui.selection_mark import SelectionMark
-from workbench.ui.stage import Stage
 from workbench.ui.status_line import StatusLine
 from workbench.ui.studio_panel import StudioPanel
 from workbench.ui.timeline_panel import HEIGHT as TIMELINE_HEIGHT
 from workbench.ui.timeline_panel import TimelinePanel
 from workbench.ui.version_panel import VersionPanel
 from workbench.ui.view_panel import ViewPanel
-from workbench.ui.viewpoint import FOV, Viewpoint, frame_all, frame_one
+from workbench.ui.viewpoint import FOV, Stage, Viewpoint, frame_all, frame_one
 
 PANEL_WIDTH = 340
 ENVS_WIDTH = 520

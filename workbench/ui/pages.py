@@ -20,7 +20,7 @@ from typing import Literal, Protocol
 import viser
 
 from workbench.machine.watched_thread import watched_thread
-from workbench.ui.stage import Stage
+from workbench.ui.viewpoint import Stage
 
 log = logging.getLogger(__name__)
 

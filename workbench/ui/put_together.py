@@ -25,7 +25,7 @@ from workbench.session.review_rows import read_row
 from workbench.ui.commands import Command
 from workbench.ui.pages import Pages
 from workbench.ui.review_page import ReviewOffers, ReviewPage
-from workbench.ui.stage import Stage
+from workbench.ui.viewpoint import Stage
 
 if TYPE_CHECKING:
     # What a live env needs is not needed for looking at recordings.

@@ -36,8 +36,8 @@ from workbench.ui.review_curves import ReviewCurves, ReviewNumbers
 from workbench.ui.review_panel import ReviewPanel
 from workbench.ui.review_scene import COLOURS, ReviewIn3D, letter
 from workbench.ui.review_timeline import ReviewTimeline
-from workbench.ui.stage import Stage
 from workbench.ui.view_panel import ViewPanel
+from workbench.ui.viewpoint import Stage
 
 TOLD_EVERY = 0.1
 """Seconds, while it plays. Faster, numbers cannot be read."""

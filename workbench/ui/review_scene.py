@@ -25,9 +25,8 @@ from workbench.session.review_view import Opened, ReviewView
 from workbench.ui.camera_frustums import SMALL, CameraFrustums, without_the_viewpoint
 from workbench.ui.env_layout import EnvLayout, acting_box, env_under_ray, lay_out
 from workbench.ui.selection_mark import SelectionMark, ViewLabel
-from workbench.ui.stage import Stage
 from workbench.ui.timeline_panel import HEIGHT as TIMELINE_HEIGHT
-from workbench.ui.viewpoint import Viewpoint, frame_all, frame_one
+from workbench.ui.viewpoint import Stage, Viewpoint, frame_all, frame_one
 
 COLOURS = ("#228be6", "#f08c00", "#2f9e44", "#be4bdb")
 """Of the recordings that are compared, in legends, curves and the view."""
@@ -184,6 +183,8 @@ class ReviewIn3D:
         self._names = [ViewLabel(server, f"/names {index}", "top-center") for index in range(MOST_NAMED)]
         self._frustums = CameraFrustums(server)
         self._scene: ReviewScene | None = None
+        self._view = ReviewView()
+        """That the scene is of: another recording may be open since."""
         self._scene_of: object = None
         self._triangles = 0
         """How many the bodies were built for."""
@@ -209,7 +210,7 @@ class ReviewIn3D:
             self._scene_of = wanted
             self._scene = review_scene(view.opened, ghosts)
             self._triangles = 0
-        scene = self._scene
+        scene, self._view = self._scene, view
         if scene is None:
             self._draw_nothing(view)
             return
@@ -270,7 +271,7 @@ class ReviewIn3D:
                 label.draw(letter(index), front + layout.offsets[index])
 
     def _viewpoint(self, aspect: float, height: float) -> Viewpoint:
-        scene, view = self._scene, self._review.view()
+        scene, view = self._scene, self._view
         assert scene is not None, "asked only where a scene is drawn"
         covered = TIMELINE_HEIGHT / height
         if len(scene.layout.offsets) > 1 and not scene.ghosts:
@@ -284,7 +285,7 @@ class ReviewIn3D:
         return frame_one(scene.layout, None, aspect, covered, acting=acting)
 
     def _on_click(self, event: viser.SceneClickEvent) -> None:
-        scene, view = self._scene, self._review.view()
+        scene, view = self._scene, self._view
         if scene is None or scene.ghosts or len(view.opened) < 2:
             return
         index = env_under_ray(scene.layout, np.array(event.ray_origin), np.array(event.ray_direction))

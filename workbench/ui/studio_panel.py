@@ -37,7 +37,7 @@ from workbench.ui.camera_pick import CameraPick
 from workbench.ui.camera_suggest import CameraSuggest
 from workbench.ui.camera_verdict import CameraVerdict
 from workbench.ui.camera_writing import CameraWriting
-from workbench.ui.cameras_panel import KIND_NAMES
+from workbench.ui.cameras_panel import KIND_NAMES, StudioPicture
 from workbench.ui.commands import Command
 from workbench.ui.controls import Control, refusals_told
 from workbench.ui.fragments import render
@@ -45,7 +45,6 @@ from workbench.ui.look_through import LookThrough
 from workbench.ui.parts import Clock, Part
 from workbench.ui.placing import Placing
 from workbench.ui.presses import Presses
-from workbench.ui.studio_picture import StudioPicture
 
 NOBODY = "none"
 SNAPS = {"none": Snap(), "1 cm, 5°": Snap(0.01, 5.0), "5 cm, 15°": Snap(0.05, 15.0)}

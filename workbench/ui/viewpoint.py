@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 
 from workbench.core.pictures import Picture
 from workbench.ui.env_layout import EnvLayout, box_corners, rotate
+from workbench.ui.scene_view import NAMES as BODIES
+from workbench.ui.scene_view import SceneView
+from workbench.ui.viser_seam import remove_nodes_but
 
 FOV = 0.75
 """Vertical, radians. viser's own 75 degrees bends what stands at the edge of a grid."""
@@ -189,3 +192,43 @@ def aspect_of(client: viser.ClientHandle) -> float:
     if not camera.image_height or not camera.image_width:
         return USUAL_ASPECT
     return camera.image_width / camera.image_height
+
+
+def light(server: viser.ViserServer) -> None:
+    """Put the lights into the scene; once a server."""
+    server.scene.configure_default_lights(enabled=False, cast_shadow=False)
+    server.scene.configure_environment_map(None)
+    server.scene.add_light_hemisphere(
+        "/lights/sky", sky_color=(255, 255, 255), ground_color=(125, 125, 135), intensity=1.5
+    )
+    server.scene.add_light_directional(
+        "/lights/lamp", color=(255, 251, 244), intensity=1.5, position=(3.0, -2.0, 5.0), cast_shadow=False
+    )
+
+
+class Stage:
+    """Bodies, light and viewpoint on this server: what outlives the pages that draw into it.
+
+    The bodies stay in the browser while one page takes the other's place, so what looks as before is not sent again and
+    the view is never empty in between. Labels, frustums, marks and handles go with their page. viser's own lights burn
+    white plastic and textures out; an environment map or shadows would make a browser without a graphics card pay for
+    each pixel.
+    """
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        server.scene.set_up_direction("+z")
+        light(server)
+        server.initial_camera.fov = FOV
+        # Depth is 24 bit: with viser's near plane of a centimetre a goal that is painted a millimetre
+        # above a table flickers from a few metres on.
+        server.initial_camera.near = 0.05
+        server.initial_camera.far = 300.0
+        self.scene = SceneView(server)
+        self.framing = Framing(server)
+
+    def clear(self) -> None:
+        """Take away what a page has put up besides the bodies."""
+        # Callbacks first: a click that comes now is nobody's.
+        self._server.scene.remove_click_callback("all")
+        remove_nodes_but(self._server, (*BODIES, "/lights"))
