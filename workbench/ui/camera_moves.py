@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from viser.transforms import SO3
 
 from workbench.core.camera_frames import (
     LookAt,
@@ -160,10 +161,8 @@ def nudged(pose: ArrayLike, step: Sequence[float]) -> Floats:
 def panned(pose: ArrayLike, left: float, up: float) -> Floats:
     """(7,) turned in place: to the left about the vertical, and up, both in degrees."""
     p = np.asarray(pose, np.float64)
-    a, b = math.radians(left), -math.radians(up)
-    about_z = np.array([[math.cos(a), -math.sin(a), 0], [math.sin(a), math.cos(a), 0], [0, 0, 1]])
-    about_left = np.array([[math.cos(b), 0, math.sin(b)], [0, 1, 0], [-math.sin(b), 0, math.cos(b)]])
-    return make_pose(p[:3], quaternion_of(about_z @ rotation_matrix(p[3:]) @ about_left))
+    about_z, about_left = SO3.from_z_radians(math.radians(left)), SO3.from_y_radians(-math.radians(up))
+    return make_pose(p[:3], quaternion_of((about_z @ SO3(p[3:]) @ about_left).as_matrix()))
 
 
 def viewer_pose(position: ArrayLike, wxyz: ArrayLike) -> Floats:
@@ -208,13 +207,7 @@ def rounded(numbers: ArrayLike, digits: int) -> tuple[float, ...]:
 
 def _in_steps(rotation: Floats, step: float) -> Floats:
     """(3, 3) about the same axis, by a whole number of steps."""
-    cosine = min(1.0, max(-1.0, (float(np.trace(rotation)) - 1) / 2))
-    angle = math.acos(cosine)
+    turn = SO3(quaternion_of(rotation)).log()
+    angle = float(np.linalg.norm(turn))
     whole = round(angle / step) * step
-    if whole == 0 or angle < 1e-9:
-        return np.eye(3)
-    # Of the quaternion, since the antisymmetric part of the matrix vanishes at half a turn.
-    axis = quaternion_of(rotation)[1:]
-    axis = axis / np.linalg.norm(axis)
-    k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return np.eye(3) + math.sin(whole) * k + (1 - math.cos(whole)) * k @ k
+    return np.asarray(SO3.exp(turn * (whole / angle)).as_matrix(), np.float64) if whole else np.eye(3)
