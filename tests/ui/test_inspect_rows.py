@@ -7,9 +7,11 @@ import pytest
 
 from tests.ui.scenes import running
 from workbench.core.inspection import Inspection, JointReadings, Leaf, Touching
-from workbench.ui.force_arrows import LONGEST, METRES_AT_ONE_NEWTON, arrows_of
 from workbench.ui.inspect_panel import (
     CHOICES,
+    LONGEST,
+    METRES_AT_ONE_NEWTON,
+    arrows_of,
     contact_rows,
     inspect_html,
     joint_rows,

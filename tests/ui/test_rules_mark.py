@@ -6,7 +6,7 @@ import pytest
 
 from workbench.core.rules import Finding
 from workbench.session.messages import RulesBroken
-from workbench.ui.rules_mark import rules_html, times
+from workbench.ui.status_line import rules_html, times
 
 ROW = Finding(
     "not-applied",

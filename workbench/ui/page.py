@@ -24,19 +24,17 @@ from workbench.ui.commands import Command, register
 from workbench.ui.curves_panel import CurvesPanel
 from workbench.ui.env_layout import EnvLayout, acting_box, env_under_ray, lay_out
 from workbench.ui.env_panel import EnvPanel
-from workbench.ui.force_arrows import ForceArrows
 from workbench.ui.fragments import render
-from workbench.ui.inspect_panel import InspectPanel
+from workbench.ui.inspect_panel import ForceArrows, InspectPanel
 from workbench.ui.judgement_panel import JudgedAbove, JudgementPanel
 from workbench.ui.log_panel import LogPanel
 from workbench.ui.numbers_panel import NumbersPanel
 from workbench.ui.parts import Clock, Part, Parts
 from workbench.ui.record_panel import RecordPanel
 from workbench.ui.redraw_loop import RedrawLoop, draw_apart
-from workbench.ui.rules_mark import RulesMark
 from workbench.ui.run_panel import RunPanel
 from workbench.ui.selection_mark import SelectionMark
-from workbench.ui.status_line import StatusLine
+from workbench.ui.status_line import RulesMark, StatusLine
 from workbench.ui.studio_panel import StudioPanel
 from workbench.ui.timeline_panel import HEIGHT as TIMELINE_HEIGHT
 from workbench.ui.timeline_panel import TimelinePanel
