@@ -1,12 +1,16 @@
-"""How far runs are judged again, and what it came to: what a page shows, of the past and of recordings alike."""
+"""Runs judged again for a page, of the past or of recordings: in the background, with progress, and to be stopped."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any, Literal
 
 from workbench.authoring.problem import Problem
+from workbench.session.askers import Background
+from workbench.session.lane import Job, JobFailed, Lane, Stopped
 from workbench.session.verdict import Verdict
 
 
@@ -58,3 +62,66 @@ class JudgedView:
     def rate(self) -> float:
         """Control steps a second; 0 while that is not known."""
         return self.steps / self.seconds if self.seconds > 0.5 else 0.0
+
+
+class Judging:
+    """One job at a time; a new one takes the place of the one before. All methods but `close` return at once."""
+
+    def __init__(self, process: Background, lane: Lane, on_change: Callable[[], None] = lambda: None) -> None:
+        """
+        Args:
+            process: in which it is judged.
+            lane: whose thread does all of it.
+            on_change: called when `view` has something new.
+        """
+        self._on_change = on_change
+        self._lock = threading.Lock()
+        """Of `view`: what a job that was stopped still has to say is not heard."""
+        self._view = JudgedView()
+        self._process, self._lane = process, lane
+
+    @property
+    def view(self) -> JudgedView:
+        return self._view
+
+    def stop(self, why: StoppedBy = StoppedBy.HAND) -> None:
+        """Go no further with what is under way; what is known by now stays to be seen."""
+        with self._lock:
+            self._lane.stop()
+            if self._view.state not in RUNNING:
+                return
+            stopped = replace(self._view, state="stopped", stopped_by=why, why=why.value)
+            self._view = replace(stopped, serial=self._view.serial + 1)
+        self._on_change()
+
+    def close(self) -> None:
+        """End it all; returns when the thread has ended."""
+        self.stop(StoppedBy.CLOSING)
+        self._lane.close()
+
+    def _begin(self, view: JudgedView, work: Callable[[Job], None]) -> None:
+        with self._lock:
+            # Under the lock, or the job might tell how far it is before it is said that it begins.
+            self._lane.start("judging", lambda job: self._do(job, work))
+            self._view = replace(view, serial=self._view.serial + 1)
+        self._on_change()
+
+    def _do(self, job: Job, work: Callable[[Job], None]) -> None:
+        try:
+            work(job)
+            self._tell(job, state="done")
+        except Stopped:
+            raise
+        except JobFailed as failure:
+            self._tell(job, state="failed", why=str(failure), problem=failure.problem)
+        except Exception as error:
+            why = f"it failed within the workbench ({type(error).__name__}: {error})"
+            self._tell(job, state="failed", why=why)
+            raise
+
+    def _tell(self, job: Job, **values: Any) -> None:
+        with self._lock:
+            if job.stopped:
+                return
+            self._view = replace(self._view, serial=self._view.serial + 1, **values)
+        self._on_change()

@@ -6,12 +6,14 @@ The envs that live through them are in `rescore_run`, and the process that does 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from workbench.authoring.library_names import named_like_library
 from workbench.authoring.modules import hidden_by_libraries
+from workbench.authoring.problem import TaskError
 from workbench.authoring.reference import TaskName, named_file
 from workbench.recording.document import Document, WrongDocument, read_document
 from workbench.recording.episode import EpisodeInfo
@@ -19,11 +21,12 @@ from workbench.recording.made_here import made_here
 from workbench.recording.reading import find_trajectories
 from workbench.recording.side_files import side_files_in_words
 from workbench.recording.unreadable import UnreadableRecording
-from workbench.session.clearance import Wanted, recorded_content
+from workbench.session.clearance import NotCleared, Wanted, recorded_content
+from workbench.session.lane import JobFailed
 from workbench.session.messages import TaskOptions
 from workbench.session.recorded_text import NoText
 from workbench.session.rescore_messages import EpisodeFile
-from workbench.session.step_back import class_in, options_of, reference_of
+from workbench.session.step_back import CannotStepIn, class_in, options_of, recorded_source, reference_of
 from workbench.session.verdict import Verdict
 
 
@@ -125,6 +128,32 @@ def hidden_in_words(reference: TaskName) -> list[str]:
     """What lies beside the task's file and cannot be imported because a library has its name, in sentences."""
     file = named_file(reference)
     return [] if file is None else [named_like_library(hidden) for hidden in hidden_by_libraries(file)]
+
+
+def judge_each(
+    groups: Sequence[Group],
+    cleared: Sequence[TaskName | NotCleared],
+    judge: Callable[[Group, TaskName], None],
+    failed: Callable[[Group, JobFailed | TaskError | CannotStepIn], None],
+) -> None:
+    """Judge each of these with what was cleared for it, or with its recorded text; one that fails leaves the others.
+
+    Raises:
+        JobFailed, TaskError, CannotStepIn: of the first, where all fail.
+    """
+    failures: list[JobFailed | TaskError | CannotStepIn] = []
+    for group, reference in zip(groups, cleared, strict=True):
+        try:
+            if isinstance(reference, NotCleared):
+                raise CannotStepIn(str(reference)) from reference
+            text = recorded_source(group.info) if group.recorded_source else nullcontext(reference)
+            with text as opened:
+                judge(group, opened)
+        except (JobFailed, TaskError, CannotStepIn) as error:
+            failures.append(error)
+            failed(group, error)
+    if failures and len(failures) == len(groups):
+        raise failures[0]
 
 
 def not_judged(

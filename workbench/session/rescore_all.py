@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,12 +21,12 @@ from workbench.session.rescore import (
     find_episodes,
     group_episodes,
     hidden_in_words,
+    judge_each,
     not_judged,
     with_renderer,
 )
 from workbench.session.rescore_messages import EpisodeFile
 from workbench.session.rescore_run import rescore
-from workbench.session.step_back import CannotStepIn, write_source
 from workbench.session.verdict import Verdict
 
 
@@ -86,42 +85,31 @@ def rescore_all(
             told.add(finding.key)
             on_finding(finding)
 
-    failed: list[TaskError | CannotStepIn] = []
-    for group, reference in zip(groups, cleared):
-        folder: Path | None = None
+    def judge(group: Group, reference: TaskName) -> None:
+        nonlocal steps
+        for notice in hidden_in_words(reference):
+            if notice not in told:
+                told.add(notice)
+                on_notice(notice)
+        opened = _open(reference, group.options, on_activity, tell_once, here)
+        before = steps
+
+        def tell(now: int) -> None:
+            nonlocal steps
+            steps = before + now
+            on_progress(Progress(len(verdicts), len(files), steps))
+
         try:
-            if isinstance(reference, NotCleared):
-                raise CannotStepIn(str(reference)) from reference
-            if what.recorded_source:
-                folder, reference = write_source(group.info)
-            for notice in hidden_in_words(reference):
-                if notice not in told:
-                    told.add(notice)
-                    on_notice(notice)
-            opened = _open(reference, group.options, on_activity, tell_once, here)
-            before = steps
-
-            def tell(now: int, before: int = before) -> None:
-                nonlocal steps
-                steps = before + now
+            for verdict in rescore(opened, group.files, use_env_states=what.use_env_states, on_steps=tell):
+                verdicts.append(verdict)
                 on_progress(Progress(len(verdicts), len(files), steps))
-
-            try:
-                for verdict in rescore(
-                    opened, group.files, use_env_states=what.use_env_states, on_steps=tell
-                ):
-                    verdicts.append(verdict)
-                    on_progress(Progress(len(verdicts), len(files), steps))
-            finally:
-                opened.env.close()
-        except (TaskError, CannotStepIn) as error:
-            failed.append(error)
-            verdicts.extend(not_judged(group, verdicts, str(error)))
         finally:
-            if folder is not None:
-                shutil.rmtree(folder, ignore_errors=True)
-    if failed and len(failed) == len(groups):
-        raise failed[0]
+            opened.env.close()
+
+    def failed(group: Group, error: Exception) -> None:
+        verdicts.extend(not_judged(group, verdicts, str(error)))
+
+    judge_each(groups, cleared, judge, failed)
     place = {file.id: number for number, file in enumerate(files)}
     verdicts.sort(key=lambda verdict: place[verdict.of.id])
     return verdicts, tuple(dict.fromkeys(group.note for group in groups if group.note))

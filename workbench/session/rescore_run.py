@@ -21,7 +21,7 @@ from workbench.core.stand_still import only_these_move
 from workbench.core.step import StepResult
 from workbench.recording.read_episode import UnreadableRecording
 from workbench.session.open_task import OpenedTask, blamed, step_checked
-from workbench.session.relive import Beginning, begin_again, why_not_lived_through
+from workbench.session.relive import begin_again, why_not_lived_through
 from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored
 from workbench.session.step_back import run_of
 from workbench.session.verdict import Said, Verdict, compare, single_numbers
@@ -30,26 +30,16 @@ _TELL_EVERY = 0.2
 """Seconds."""
 
 
-@dataclass(frozen=True)
-class _Ready:
-    """An episode that can be judged."""
-
-    file: EpisodeFile
-    task: str
-    run: RecordedRun
-    unread: dict[str, str]
-    """Files of it that it has to do without, and why."""
-
-
 @dataclass
 class _Seat:
-    """An env with the episode that it lives through."""
+    """An episode that can be judged, and what is said of it in the env that lives through it."""
 
     file: EpisodeFile
     task: str
     run: RecordedRun
-    beginning: Beginning
-    unread: dict[str, str]
+    missed: dict[str, str]
+    """What of it cannot be read or be put into the env, and why."""
+    begins_otherwise: bool = False
     reward: list[float] = field(default_factory=list)
     """(T,) What the task says of it now, as the following."""
     evaluate: dict[str, list[float]] = field(default_factory=dict)
@@ -79,8 +69,8 @@ class _Seat:
             np.array(self.drift) if run.env_states else None,
             task=self.task,
             seed=run.seed,
-            begins_otherwise=self.beginning.otherwise,
-            missed=self.beginning.missed | self.unread,
+            begins_otherwise=self.begins_otherwise,
+            missed=self.missed,
         )
 
 
@@ -106,7 +96,7 @@ def rescore(
     steps = 0
     more = True
     while more or seats:
-        begun: dict[int, _Ready] = {}
+        begun: dict[int, _Seat] = {}
         while more and len(seats) + len(begun) < task.num_envs:
             file = next(waiting, None)
             if file is None:
@@ -119,7 +109,8 @@ def rescore(
                 env = next(i for i in range(task.num_envs) if i not in seats and i not in begun)
                 begun[env] = told
         if begun:
-            seats |= _begin(opened, begun)
+            _begin(opened, begun)
+            seats |= begun
         if not seats:
             continue
         _one_step(opened, seats, use_env_states)
@@ -159,7 +150,7 @@ def answer(opened: OpenedTask, request: Rescore, tell: Callable[[int, int, Resco
     return Rescored(tuple(ready), steps)
 
 
-def _ready(opened: OpenedTask, file: EpisodeFile, use_env_states: bool) -> _Ready | Verdict[EpisodeFile]:
+def _ready(opened: OpenedTask, file: EpisodeFile, use_env_states: bool) -> _Seat | Verdict[EpisodeFile]:
     try:
         episode = file.read()
     except (UnreadableRecording, OSError) as error:
@@ -173,20 +164,19 @@ def _ready(opened: OpenedTask, file: EpisodeFile, use_env_states: bool) -> _Read
     if why_not:
         why_not = ". ".join((why_not, *(broken.sentence for broken in episode.unread)))
         return Verdict(file, task=info.task, seed=info.seed, length=run.length, why_not=why_not)
-    return _Ready(file, info.task, run, {broken.file: broken.what for broken in episode.unread})
+    return _Seat(file, info.task, run, {broken.file: broken.what for broken in episode.unread})
 
 
-def _begin(opened: OpenedTask, begun: dict[int, _Ready]) -> dict[int, _Seat]:
+def _begin(opened: OpenedTask, seats: dict[int, _Seat]) -> None:
     task = opened.env
-    beginnings = begin_again(opened, {env: ready.run for env, ready in begun.items()})
+    beginnings = begin_again(opened, {env: seat.run for env, seat in seats.items()})
     with blamed("restore", opened.loaded, task):
         first = task.judge()
     now = read_states(task.env)
-    seats: dict[int, _Seat] = {}
-    for env, ready in begun.items():
-        seat = seats[env] = _Seat(ready.file, ready.task, ready.run, beginnings[env], ready.unread)
+    for env, seat in seats.items():
+        seat.begins_otherwise = beginnings[env].otherwise
+        seat.missed = beginnings[env].missed | seat.missed
         _hear(seat, first, env, now)
-    return seats
 
 
 def _one_step(opened: OpenedTask, seats: dict[int, _Seat], use_env_states: bool) -> None:
