@@ -15,7 +15,7 @@ from tests.session.studio import BASE, camera, moved, said
 from workbench.authoring.camera_source import Refusal, SourceEdit
 from workbench.authoring.camera_source.cameras import Run
 from workbench.core.camera_settings import CallSite, CameraKey, CameraSettings, differences
-from workbench.session.camera_writing import CameraWriting, copy, plan
+from workbench.session.camera_writing import CameraWriting, copy, not_as_written, plan
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
 from workbench.session.studio_view import Wish, Writing
@@ -369,3 +369,22 @@ def test_what_was_not_done_is_said_until_something_else_happens() -> None:
         assert "does not load" in writing.view.message and writing.view.refusal is None
         html = writing_html(writing.view, stale=False)
         assert "edited since" not in html and "does not load" in html
+
+
+def test_what_is_not_as_written_is_said_with_both_numbers() -> None:
+    wanted = CameraSettings((0, 0, 1), (1, 0, 0, 0), 0.5, None, 64, 48, 0.01, 10.0, "minimal")
+    other = CameraSettings(
+        (0, 0, 2), (0, 1, 0, 0), None, ((1, 0, 0), (0, 1, 0), (0, 0, 1)), 65, 49, 0.02, 9.0, "rt"
+    )
+    assert not_as_written(wanted, wanted) == ""
+    assert not_as_written(wanted, other).split("; ") == [
+        "position: (0, 0, 2), not (0, 0, 1)",
+        "orientation: (0, 1, 0, 0), not (1, 0, 0, 0)",
+        "fov: None, not 0.5",
+        "intrinsic: ((1, 0, 0), (0, 1, 0), (0, 0, 1)), not None",
+        "width: 65, not 64",
+        "height: 49, not 48",
+        "near: 0.02, not 0.01",
+        "far: 9, not 10",
+        "shader_pack: rt, not minimal",
+    ]

@@ -218,6 +218,7 @@ def test_files_beside_the_task_are_there_as_they_are_today_and_outlive_the_folde
 
 def test_its_env_is_made_with_its_own_robot_and_modes() -> None:
     kwargs = {"robot_uids": "panda_wristcam", "obs_mode": "rgb", "num_envs": 64, "sim_backend": "gpu"}
+    kwargs |= {"render_device": "cuda:1", "render_mode": "human", "render_backend": "gpu"}
     base = TaskOptions(rules="warn")
     options = options_of(replace(info(None, "PickCube-v1"), env_kwargs=kwargs), 2, base)
     assert options.rules == "warn"

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from mani_skill.envs.sapien_env import BaseEnv
+if TYPE_CHECKING:
+    from mani_skill.envs.sapien_env import BaseEnv  # the server reads what is below, and loads no torch
 
-_OF_THE_MACHINE = {"num_envs", "sim_backend", "render_backend", "render_device", "render_mode"}
+HOW_IT_IS_RUN = frozenset({"num_envs", "sim_backend", "render_backend", "render_device", "render_mode"})
+"""Keywords that say how an env is run, and not what it is."""
 
 
 def env_kwargs(env: BaseEnv, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -23,7 +25,7 @@ def env_kwargs(env: BaseEnv, given: Mapping[str, Any]) -> dict[str, Any]:
     if env.agent is not None and isinstance(env.control_mode, str):
         modes["control_mode"] = env.control_mode
     said = {**given, **modes}
-    return {name: said[name] for name in said if name not in _OF_THE_MACHINE and _is_json(said[name])}
+    return {name: said[name] for name in said if name not in HOW_IT_IS_RUN and _is_json(said[name])}
 
 
 def _is_json(value: Any) -> bool:

@@ -25,13 +25,12 @@ from workbench.core.camera_settings import (
     why_no_camera,
 )
 from workbench.core.step import StepResult
-from workbench.session import camera_in_words
 from workbench.session.askers import Asker, Background
 from workbench.session.camera_judging import CameraJudging, ShownMoment
 from workbench.session.history import Lived
 from workbench.session.messages import Load, PlaceCamera, Placed, ReloadLevel, Request, TaskDescription
 from workbench.session.preview import Preview, Sight
-from workbench.session.studio_cameras import StudioCameras
+from workbench.session.studio_cameras import StudioCameras, exported, imported
 from workbench.session.studio_file import StudioFile
 from workbench.session.studio_view import StudioCamera, StudioView, Wish
 
@@ -257,7 +256,7 @@ class CameraStudio:
         """
         with self._lock:
             cameras = [self._cameras.to_export(key) for key in keys]
-        return camera_in_words.exported(cameras, form)
+        return exported(cameras, form)
 
     def import_pose(
         self,
@@ -279,7 +278,7 @@ class CameraStudio:
             mount = None if info is None else self._cameras.mount_pose(info)
         if now is None or info is None:
             raise ValueError(f"there is no {key[0]} camera {key[1]} that can be placed")
-        pose = camera_in_words.imported(info, mount, text, direction, convention, metres_per_unit)
+        pose = imported(info, mount, text, direction, convention, metres_per_unit)
         self.place(key, with_pose(now, pose))
 
     # --- what the page reads ---------------------------------------------------------------------------

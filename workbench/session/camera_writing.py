@@ -361,28 +361,18 @@ def _mismatch(wish: Wish, infos: dict[CameraKey, CameraInfo], wanted: CameraSett
         return f"The new env has no {kind} camera {name}."
     if wish.what == "rename" and wish.key in infos:
         return f"The new env still has the {kind} camera {wish.key[1]}."
-    apart = () if wanted is None else differences(wanted, info.settings)
-    if not apart:
-        return ""
-    numbers = "; ".join(f"{what}: {_said(info.settings, what)}, not {_said(wanted, what)}" for what in apart)
-    return f"The new env's {name} is not what was written ({numbers})."
+    numbers = "" if wanted is None else not_as_written(wanted, info.settings)
+    return f"The new env's {name} is not what was written ({numbers})." if numbers else ""
 
 
-def _said(settings: CameraSettings | None, what: str) -> str:
-    if settings is None:
-        return "none"
-    values: dict[str, object] = {
-        "position": settings.position,
-        "orientation": settings.quaternion,
-        "fov": settings.fov,
-        "intrinsic": settings.intrinsic,
-        "width": settings.width,
-        "height": settings.height,
-        "near": settings.near,
-        "far": settings.far,
-        "shader_pack": settings.shader_pack,
-    }
-    value = values[what]
-    if isinstance(value, tuple):
-        return "(" + ", ".join(f"{v:.6g}" if isinstance(v, float) else str(v) for v in value) + ")"
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+def not_as_written(wanted: CameraSettings, now: CameraSettings) -> str:
+    """The numbers that are not as wanted, with both; empty where all are."""
+
+    def said(settings: CameraSettings, what: str) -> str:
+        value = vars(settings)["quaternion" if what == "orientation" else what]
+        if isinstance(value, tuple):
+            return "(" + ", ".join(f"{v:.6g}" if isinstance(v, float) else str(v) for v in value) + ")"
+        return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+    apart = differences(wanted, now)
+    return "; ".join(f"{what}: {said(now, what)}, not {said(wanted, what)}" for what in apart)

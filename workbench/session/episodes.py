@@ -53,6 +53,27 @@ class GatheredEpisode:
     begun: bool = False
     """Whether it has its first state."""
 
+    @classmethod
+    def of(
+        cls,
+        folder: Path,
+        task: TaskDescription,
+        env: int,
+        seed: int,
+        reset_options: Mapping[str, Any] | None = None,
+        acted_by: str = "",
+    ) -> GatheredEpisode:
+        """One that begins, with a writer of its own into `folder`. Raises RecordingError."""
+        writer = EpisodeWriter(
+            folder,
+            episode_info(task, env, seed, reset_options, acted_by),
+            task.geometry,
+            task.segmentation,
+            [dimension.name for dimension in task.actions],
+            task.cameras,
+        )
+        return cls(writer, env, seed, acted_by=acted_by)
+
     def acts(self, what: str) -> None:
         """What chooses the next action; empty for no news. Raises RecordingError."""
         if what and what != self.acted_by:
@@ -168,21 +189,12 @@ class EpisodeGatherer:
             episode.writer.discard()
 
     def _begin(self, env: int, stepped: Stepped) -> None:
-        task = self._task
         seed = int(stepped.seeds[env]) if stepped.seeds is not None else -1
-        writer = EpisodeWriter(
-            self._folder,
-            episode_info(task, env, seed, self.reset_options, self.acted_by),
-            task.geometry,
-            task.segmentation,
-            [dimension.name for dimension in task.actions],
-            task.cameras,
-        )
+        begun = GatheredEpisode.of(self._folder, self._task, env, seed, self.reset_options, self.acted_by)
         try:
-            begun = GatheredEpisode(writer, env, seed, acted_by=self.acted_by)
             begun.take(self._packer, stepped.step, env, stepped.columns, stepped.captured)
         except BaseException:
-            writer.discard()
+            begun.writer.discard()
             raise
         self._episodes[env] = begun
 

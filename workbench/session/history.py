@@ -18,7 +18,7 @@ from __future__ import annotations
 import pickle
 import sys
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import islice
 
@@ -31,7 +31,6 @@ from workbench.core.step import StepResult
 from workbench.session.curves import Columns, RecentSteps
 from workbench.session.env_table import KEPT_REWARDS, LOST_REWARD, EnvRows, EnvTable
 from workbench.session.messages import NO_MOMENT, PastPictures, Pictures, Restored, Stepped, WayBack
-from workbench.session.shared_parts import PartSet, SharedParts
 
 RESET, WENT_BACK, SUCCESS, FAIL, TRUNCATED, NOT_A_NUMBER = 1, 2, 4, 8, 16, 32
 """What may happen to an env at a moment. Success, failure and a reward that is none: the first in an episode."""
@@ -40,6 +39,63 @@ _OVERHEAD = 2500
 _PICTURES_SHARE = 0.5
 _RECENT = 200
 """Moments among which one is looked for that pictures belong to: they come some steps late."""
+
+
+@dataclass
+class PartSet:
+    """The parts of a snapshot, shared by all moments that have the same."""
+
+    keys: tuple[int, ...]
+    moments: int = 0
+    complete: bool = True
+
+
+class SharedParts:
+    """The parts of snapshots, kept once however many moments have them, and as long as one has.
+
+    A snapshot comes as a body and the keys of its parts (`core.snapshot_parts`), most of which are those of the moment
+    before. So moments point to a set of parts, sets count their moments, and parts count their sets.
+    """
+
+    def __init__(self) -> None:
+        self._parts: dict[int, bytes] = {}
+        self._references: dict[int, int] = {}
+        self._last = PartSet(())
+        self.used = 0
+        """Bytes."""
+
+    def take(self, keys: tuple[int, ...] | None, new_parts: Mapping[int, bytes]) -> PartSet:
+        """Those of the next moment; `keys` is None where they are those of the moment before."""
+        self._parts.update(new_parts)
+        if keys is None or keys == self._last.keys:
+            parts = self._last
+        else:
+            # A snapshot whose parts went to another history cannot be put back: it is none.
+            parts = self._last = PartSet(keys, complete=all(key in self._parts for key in keys))
+        if not parts.complete:
+            return parts
+        if parts.moments == 0:
+            for key in parts.keys:
+                self._references[key] = self._references.get(key, 0) + 1
+                if self._references[key] == 1:
+                    self.used += len(self._parts[key])
+        parts.moments += 1
+        return parts
+
+    def release(self, parts: PartSet) -> None:
+        """A moment that had them is gone."""
+        parts.moments -= 1
+        if parts.moments == 0 and parts.complete:
+            for key in parts.keys:
+                self._references[key] -= 1
+                if self._references[key] == 0:
+                    self.used -= len(self._parts[key])
+                    del self._references[key]
+                    # The worker will not send it again while the newest moment has it; that one is kept.
+                    del self._parts[key]
+
+    def of(self, parts: PartSet) -> tuple[bytes, ...]:
+        return tuple(self._parts[key] for key in parts.keys)
 
 
 @dataclass

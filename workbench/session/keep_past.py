@@ -21,16 +21,15 @@ from pathlib import Path
 import numpy as np
 
 from workbench.recording.columns import BatchPacker
-from workbench.recording.episode_writer import EpisodeWriter
 from workbench.recording.landing import RecordingError
 from workbench.session.askers import IDLE_SECONDS, Background
 from workbench.session.episode_files import EpisodeFinisher
-from workbench.session.episodes import GatheredEpisode, episode_info
-from workbench.session.keep_status import KeepStatus
+from workbench.session.episodes import GatheredEpisode
 from workbench.session.lane import Job, JobFailed, Lane
 from workbench.session.messages import Reset
 from workbench.session.moment_messages import CaptureMoment
 from workbench.session.past_episodes import PastEpisode, WhatToKeep, moments_of
+from workbench.session.view import KeepStatus
 
 _SAME_START = 1e-6
 """Metres and quaternion components."""
@@ -131,7 +130,6 @@ class PastKeeper:
         )
 
     def _capture_all(self, job: Job, what: WhatToKeep, writers: dict[int, GatheredEpisode]) -> None:
-        names = [dimension.name for dimension in what.task.actions]
         moments, packer = moments_of(what.episodes), BatchPacker()
         rows: dict[int, dict[int, list[tuple[PastEpisode, bool]]]] = {}
         for episode in what.episodes:
@@ -145,15 +143,9 @@ class PastKeeper:
             for env in envs:
                 for episode, is_first in rows[moment.serial][env]:
                     if is_first:
-                        writer = EpisodeWriter(
-                            self._folder,
-                            episode_info(what.task, episode.env, episode.seed),
-                            what.task.geometry,
-                            what.task.segmentation,
-                            names,
-                            what.task.cameras,
+                        writers[episode.env] = GatheredEpisode.of(
+                            self._folder, what.task, episode.env, episode.seed
                         )
-                        writers[episode.env] = GatheredEpisode(writer, episode.env, episode.seed)
                     else:
                         writers[episode.env].acts(moment.acted_by)
                     writers[episode.env].take(packer, step, env, columns, pictures)

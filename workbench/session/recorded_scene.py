@@ -14,17 +14,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from workbench.core.env_kwargs import HOW_IT_IS_RUN
 from workbench.recording.episode import Episode
 from workbench.session.askers import Background, OnProgress
 from workbench.session.clearance import files_named
 from workbench.session.lane import JobFailed, Stopped
 from workbench.session.make_scene import MakeScene, SceneMade
 
-_NOT_PASSED_ON = (
-    "num_envs", "obs_mode", "reward_mode", "render_mode", "sim_backend", "render_backend", "backend",
-    "parallel_in_single_scene", "sensor_configs", "human_render_camera_configs", "viewer_camera_configs",
-    "enable_shadow", "max_episode_steps",
-)  # fmt: skip
+_NOT_PASSED_ON = HOW_IT_IS_RUN | {
+    "obs_mode", "reward_mode", "backend", "parallel_in_single_scene", "sensor_configs",
+    "human_render_camera_configs", "viewer_camera_configs", "enable_shadow", "max_episode_steps",
+}  # fmt: skip
 """Keywords of ``gym.make`` that change nothing about where bodies are."""
 
 
@@ -33,7 +33,7 @@ class SceneError(RuntimeError):
 
 
 class SceneProcess:
-    """Makes scenes; see `workbench.session.review.SceneMaker`."""
+    """Makes the scenes of recordings that have none."""
 
     def __init__(self, files: Sequence[Path] = (), imports: tuple[str, ...] = ()) -> None:
         """

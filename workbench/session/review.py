@@ -21,7 +21,6 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
 
 from workbench.core.shared_shapes import SharedShapes
 from workbench.machine.process_tree import allocated_memory
@@ -29,7 +28,7 @@ from workbench.machine.watched_thread import say_failure
 from workbench.recording.episode import Episode
 from workbench.recording.unreadable import UnreadableRecording
 from workbench.session.memory_limit import in_words, total_memory
-from workbench.session.recorded_scene import SceneError
+from workbench.session.recorded_scene import SceneError, SceneProcess
 from workbench.session.review_events import happenings
 from workbench.session.review_rows import (
     Row,
@@ -59,18 +58,6 @@ _LOOK_EVERY = 2.0
 """Seconds between two looks at whether the files are still what was read."""
 
 
-class SceneMaker(Protocol):
-    """Makes the scenes of recordings that have none (`recorded_scene.SceneProcess`)."""
-
-    def __call__(
-        self,
-        episodes: Mapping[int, Episode],
-        stop: Callable[[], bool],
-        on_progress: Callable[[int, str], None],
-        on_end: Callable[[int, Episode | SceneError, tuple[str, ...]], None],
-    ) -> None: ...
-
-
 @dataclass
 class _Walk:
     """Where playing began."""
@@ -86,7 +73,7 @@ class Review:
         self,
         library: Rows,
         read: Callable[[Row, SharedShapes], Episode] = read_row,
-        make_scene: SceneMaker | None = None,
+        make_scene: SceneProcess | None = None,
         clock: Callable[[], float] = time.monotonic,
         most_bytes: int | None = None,
         memory: Callable[[], int] = lambda: allocated_memory(os.getpid()),

@@ -22,6 +22,7 @@ import numpy as np
 
 from workbench.authoring.reference import RecordedTask
 from workbench.authoring.task_content import CannotRead, read_text
+from workbench.core.env_kwargs import HOW_IT_IS_RUN
 from workbench.core.recorded_run import RecordedRun
 from workbench.recording.episode import Episode, EpisodeInfo
 from workbench.recording.side_files import folder_of, place_of
@@ -104,8 +105,8 @@ def options_of(info: EpisodeInfo, num_envs: int, base: TaskOptions | None = None
     kwargs = dict(info.env_kwargs)
     if info.control_mode is not None:
         kwargs.setdefault("control_mode", info.control_mode)
-    for name in ("num_envs", "sim_backend", "render_backend", "render_mode", "human_render_camera_configs"):
-        kwargs.pop(name, None)  # how it is run, and not what it is
+    for name in (*HOW_IT_IS_RUN, "human_render_camera_configs"):
+        kwargs.pop(name, None)
     base = base or TaskOptions()
     return replace(base, num_envs=num_envs, seed=max(info.seed, 0), env_kwargs=kwargs)
 

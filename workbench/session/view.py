@@ -16,7 +16,6 @@ from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.core.step import StepResult
 from workbench.session.curves import Curves
 from workbench.session.judging import JudgedView
-from workbench.session.keep_status import KeepStatus
 from workbench.session.kept_worker import Vitals
 from workbench.session.last_words import Busy
 from workbench.session.messages import ReloadReport, RulesBroken, Settings, TaskDescription
@@ -27,6 +26,20 @@ from workbench.session.timeline import TimelineView
 State = Literal["starting", "loading", "running", "paused", "error", "stopped"]
 """``starting``: the worker process is coming up. ``loading``: a task is being imported or built.
 ``error``: a problem stands (see `SessionView.problem`); ``stopped``: the worker is gone."""
+
+
+@dataclass(frozen=True)
+class KeepStatus:
+    active: bool = False
+    what: str = ""
+    """What is being done, while it is."""
+    done: int = 0
+    total: int = 0
+    """Moments; 0 while they are not counted yet."""
+    said: str = ""
+    """What came of the last one, once it has ended."""
+    failed: bool = False
+    """`said` is why it did not go well."""
 
 
 @dataclass(frozen=True)
