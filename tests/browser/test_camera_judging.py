@@ -54,9 +54,15 @@ def page(opened: Page) -> Page:
 
 
 def back_to_the_file(page: Page) -> None:
-    if "wb-off" not in tool(page, "Back to the file")["classes"]:
-        press_tool(page, "Back to the file")
-    expect(page.get_by_text(re.compile("^As push_cube.py has it"))).to_be_visible()
+    said = page.get_by_text(re.compile("^As push_cube.py has it"))
+
+    def back() -> bool:
+        # What has just come is brought into sight: a press that is under way then falls beside its pill.
+        if "wb-off" not in tool(page, "Back to the file")["classes"]:
+            press_tool(page, "Back to the file")
+        return said.is_visible()
+
+    until(back, "the camera as the file has it")
 
 
 COVERED = """() => [...document.querySelectorAll(".mantine-ScrollArea-scrollbar[data-state=visible]")]
