@@ -66,10 +66,12 @@ def test_each_item_is_done_once_with_the_same_result_whoever_does_it(
     processes: int, chunk: int, tmp_path: Path
 ) -> None:
     executor = Processes(chunk) if processes else Here()
+    folder = tmp_path / os.fsdecode(b"caf\xe9")
+    folder.mkdir()
     numbers = [*range(10), 12, 20]
-    done = Run([Setup(folder=tmp_path)] * max(1, processes), numbers).by(executor)
+    done = Run([Setup(folder=folder)] * max(1, processes), numbers).by(executor)
     assert sorted(done.results) == numbers and done.steps == len(numbers)
-    assert done.results[3] == Squared(3, 9, tmp_path / "3", done.results[3].pid)
+    assert done.results[3] == Squared(3, 9, folder / "3", done.results[3].pid)
     # Each keeps what it has opened.
     assert len(done.news) == max(1, processes)
     pids = {result.pid for result in done.results.values()}
@@ -141,9 +143,11 @@ def fails(how: str, says: str, error: type[Exception] = PoolError) -> Any:
         fails("bug", "a process that squares ended with exit code 1"),
         fails("task", "it broke", TaskError),
         fails("value", "not such a number"),
+        fails("no UTF-8", r"there is no .*caf\\udce9"),
         fails("garbage", "a process that squares sent what cannot be read"),
         fails("endless", "a process that squares sent what cannot be read"),
         fails("another type", "a process that squares sent what cannot be read"),
+        fails("no path", "a process that squares sent what cannot be read"),
         fails("another's", "a process that squares told of an item that it does not have"),
     ],
 )

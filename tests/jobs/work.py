@@ -60,6 +60,8 @@ def go_wrong(setup: Setup, share: Share) -> None:
         raise TaskError(PROBLEM)
     elif setup.how == "value":
         raise ValueError("not such a number")
+    elif setup.how == "no UTF-8":
+        raise FileNotFoundError("there is no " + os.fsdecode(b"caf\xe9"))
     elif setup.how == "bug":
         raise KeyError("nobody expects it")
     elif setup.how == "garbage":
@@ -68,6 +70,8 @@ def go_wrong(setup: Setup, share: Share) -> None:
         os.write(int(sys.argv[2]), b"\x7f\xff\xff\xff")
     elif setup.how == "another type":
         share.tell(setup.at, "a text")
+    elif setup.how == "no path":
+        share.tell(setup.at, {"number": setup.at, "square": 1.0, "path": "text", "pid": 1})
     elif setup.how == "another's":
         share.tell(10**6, Squared(0, 0, Path(), 0))
     elif setup.how == "hangs":

@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import socket
 import subprocess
+import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
@@ -34,7 +35,7 @@ _END_SECONDS = 120.0
 _EXIT_SECONDS = 10.0
 _MOST_BYTES = 1 << 26
 """Of one message."""
-_NO_LIMIT = 1 << 62
+_NO_LIMIT = sys.maxsize
 
 Setup = TypeVar("Setup")
 Result = TypeVar("Result")
@@ -196,14 +197,31 @@ class _Over(_Said):
     """Nothing is under way any more, and nothing comes after this."""
 
 
-_encode = msgspec.msgpack.Encoder(enc_hook=str).encode
+_encoder = msgspec.msgpack.Encoder(enc_hook=os.fsencode)
 _decode_said = msgspec.msgpack.Decoder(_Next | _Result | _News | _Failed | _Over).decode
 
 
+def _encode(value: Any) -> bytes:
+    try:
+        return _encoder.encode(value)
+    except UnicodeEncodeError:
+        plain = msgspec.to_builtins(value, builtin_types=(bytes,), enc_hook=os.fsencode)
+        return _encoder.encode(_as_utf8(plain))
+
+
+def _as_utf8(value: Any) -> Any:
+    """The same with `\\udcff` spelt out, as a name of a file that is no UTF-8 has it: an error may quote one."""
+    if isinstance(value, str):
+        return value.encode("utf-8", "backslashreplace").decode()
+    if isinstance(value, dict):
+        return {_as_utf8(key): _as_utf8(entry) for key, entry in value.items()}
+    return [_as_utf8(entry) for entry in value] if isinstance(value, list) else value
+
+
 def _path(kind: type, value: Any) -> Any:
-    if kind is Path and isinstance(value, str):
-        return Path(value)
-    raise NotImplementedError(f"{kind} does not cross between processes")
+    if kind is Path and isinstance(value, bytes):
+        return Path(os.fsdecode(value))
+    raise ValueError(f"{value!r:.100} is no {kind.__name__}")
 
 
 class _Pool:
@@ -385,9 +403,7 @@ def main(socket_fd: str) -> None:
             share.over()
         except TaskError as error:
             share.failed(str(error), error.problem)
-        except (EOFError, ConnectionError):
-            raise  # not a file that cannot be written: nobody is there to be told
         except (OSError, ValueError, RuntimeError) as error:
             share.failed(str(error), None)
-    except (EOFError, ConnectionError):
+    except (ConnectionError, EOFError):
         return  # the process that started this one is gone
