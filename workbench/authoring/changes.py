@@ -27,20 +27,17 @@ from dataclasses import dataclass
 from typing import Literal
 
 from workbench.authoring.kept_values import changed_while_running, written_attributes
+from workbench.authoring.problem import hooks_of
 from workbench.authoring.remembers import remembers, root_name
 from workbench.authoring.symbols import STATEMENTS, Key, file_name
 from workbench.authoring.two_versions import TwoVersions
 
 Level = Literal["same", "patched", "cameras", "rebuilt"]
 
-RESET_HOOKS = frozenset({"_initialize_episode"})
-STEP_HOOKS = frozenset(
-    "_before_control_step _after_control_step _before_simulation_step _after_simulation_step".split()
-)
-REWARD_HOOKS = frozenset({"compute_dense_reward", "compute_normalized_dense_reward", "compute_sparse_reward"})
-JUDGING_HOOKS = REWARD_HOOKS | frozenset(
-    "evaluate _get_obs_extra _get_obs_agent _get_obs_state_dict _get_obs_with_sensor_data".split()
-)
+RESET_HOOKS = frozenset(hooks_of("reset"))
+STEP_HOOKS = frozenset(hooks_of("step"))
+REWARD_HOOKS = frozenset(hooks_of("reward"))
+JUDGING_HOOKS = REWARD_HOOKS.union(hooks_of("evaluate"), hooks_of("observation"))
 """They run at every step and only look; `BaseEnv.__init__` calls some of them in its first reset."""
 CAMERA_HOOKS = frozenset(
     {

@@ -209,7 +209,7 @@ class _AuthorLoader(importlib.machinery.SourceFileLoader):
         # Before compile(): a SyntaxError's place must be looked up in the text that has it.
         self.finder.remember(path, text)
         if "\0" in text:
-            # Python 3.10 raises a ValueError here, which names no file.
+            # What Python raises here names neither file nor line.
             line = text[: text.index("\0")].count("\n") + 1
             raise SyntaxError("source code cannot contain null bytes", (path, line, 1, None))
         return compile(text, path, "exec", dont_inherit=True)

@@ -51,6 +51,13 @@ HOOK_STAGES: dict[str, str] = {
 """Method of `BaseEnv` to the stage that an author knows it as. `get_info`, `get_reward` and
 `_flatten_raw_obs` are ManiSkill's callers of the author's hooks: what they choke on is what a hook
 returned (``evaluate()`` giving None raises in `get_info`)."""
+_CALLERS = ("get_info", "get_reward", "_flatten_raw_obs")
+
+
+def hooks_of(stage: str) -> tuple[str, ...]:
+    """The author's hooks of a stage."""
+    return tuple(name for name, of in HOOK_STAGES.items() if of == stage and name not in _CALLERS)
+
 
 MESSAGE_LIMIT = 500
 TRACEBACK_LINE_LIMIT = 1000
@@ -273,14 +280,8 @@ def _stage_of(exc: BaseException, stage: str) -> str:
 
 
 def _hook_definition(cls: type, stage: str, own: Collection[str]) -> tuple[str, int] | None:
-    hooks = {
-        "reset": ("_initialize_episode",),
-        "evaluate": ("evaluate",),
-        "observation": ("_get_obs_extra", "_get_obs_agent"),
-        "reward": ("compute_dense_reward", "compute_normalized_dense_reward", "compute_sparse_reward"),
-    }
     paths = [Path(name) for name in own]
-    for name in hooks.get(stage, ()):
+    for name in () if stage in ("build", "step") else hooks_of(stage):
         place = hook_definition(cls, name, paths)
         if place is not None:
             return place

@@ -18,10 +18,10 @@ import linecache
 from collections.abc import Collection
 from pathlib import Path
 
-from workbench.authoring.problem import Problem, hook_definition
+from workbench.authoring.problem import Problem, hook_definition, hooks_of
 from workbench.core.returns import no_reward, wrong_evaluate
 
-_REWARD_HOOKS = ("compute_dense_reward", "compute_normalized_dense_reward", "compute_sparse_reward")
+_REWARD_HOOKS = hooks_of("reward")
 
 
 def check_step_returns(

@@ -410,12 +410,9 @@ def mark_camera_configs() -> None:
 
 def _place_of_call(frame: FrameType) -> CallSite:
     code = frame.f_code
-    line = frame.f_lineno
-    if sys.version_info >= (3, 11):
-        # Of a call over several lines `f_lineno` may be one within.
-        start = next(islice(code.co_positions(), frame.f_lasti // 2, None), (None,))[0]
-        line = line if start is None else start
-    return CallSite(code.co_filename, line, getattr(code, "co_qualname", code.co_name))
+    # Of a call over several lines `f_lineno` may be one within.
+    start = next(islice(code.co_positions(), frame.f_lasti // 2, None), (None,))[0]
+    return CallSite(code.co_filename, start or frame.f_lineno, code.co_qualname)
 
 
 def camera_site(config: Any) -> CallSite | None:

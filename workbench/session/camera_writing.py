@@ -17,6 +17,7 @@ from pathlib import Path
 from workbench.authoring import camera_source
 from workbench.authoring.camera_source import Refusal, SourceEdit
 from workbench.authoring.camera_source.cameras import Run
+from workbench.authoring.camera_source.hooks import HOOK_OF
 from workbench.authoring.copy_task import NoCopy, copy_task
 from workbench.authoring.modules import MOST_SOURCE_BYTES, exact_text
 from workbench.authoring.source.text import plain_line_ends
@@ -28,8 +29,6 @@ from workbench.session.studio_view import Change, Wish, Writing, WritingStage
 
 Plan = SourceEdit | Refusal
 
-PARENTS_HOOKS = ("_default_sensor_configs", "_default_human_render_camera_configs")
-"""What a task's class can take over from its parent."""
 MADE: tuple[WritingStage, ...] = ("written", "checked", "mismatch")
 """Stages in which the change is in the file."""
 
@@ -125,7 +124,7 @@ def _made_of_a_parents(
     link = (info.mount or "").partition("/")[2]
     robot = "self.robot" if _is_a_robots(info) else "self.agent.robot"
     more = [f'mount={robot}.links_map["{link}"]'] if link else []
-    if site.function.rpartition(".")[2] not in PARENTS_HOOKS:
+    if site.function.rpartition(".")[2] not in HOOK_OF.values():
         return camera_source.Refusal(elsewhere, camera_source.snippet(uid, wish.settings, more=more))
     whole = camera_source.override_text(kind, uid, wish.settings, more)
     if wish.what != "edit" or task.file is None or task.file not in texts:

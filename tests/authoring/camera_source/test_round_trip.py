@@ -104,20 +104,6 @@ def test_a_second_edit_goes_on_from_the_first() -> None:
     assert "q=[0.5, 0.5, 0.5, -0.5]" in source
 
 
-def test_a_point_that_the_camera_was_aimed_at_is_written() -> None:
-    source = WRITTEN["a list, positional to the end"]
-    before = real_settings({FILE: source}, "cam")
-    eye, aim = (0.5, 0.25, 0.75), (0.125, 0.0, 0.02)
-    after = dataclasses.replace(before, position=eye, quaternion=looking(eye, aim))
-    plan = plan_edit({FILE: source}, KEY, before, after, run_class, target=aim)
-    assert isinstance(plan, SourceEdit)
-    assert "look_at(eye=[0.5, 0.25, 0.75], target=[0.125, 0, 0.02])" in plan.new_text
-    # A point that it does not look at is none.
-    elsewhere = plan_edit({FILE: source}, KEY, before, after, run_class, target=(1.0, 1.0, 1.0))
-    assert isinstance(elsewhere, SourceEdit) and elsewhere.settings is not None
-    assert angle_between(elsewhere.settings.quaternion, after.quaternion) <= math.radians(0.01)
-
-
 @pytest.mark.parametrize("name", ["a list, positional to the end", "one config, positional"])
 def test_a_camera_that_is_turned_keeps_the_distance_of_what_it_looks_at(name: str) -> None:
     source = WRITTEN[name]

@@ -32,8 +32,6 @@ from workbench.authoring.source.numbers import matrix_text, number_text
 from workbench.authoring.source.text import Refused, Replacement
 from workbench.core.camera_settings import CameraKey, CameraSettings, why_no_camera
 
-Triple = tuple[float, float, float]
-
 
 def plan_edit(
     sources: Mapping[str, str],
@@ -41,12 +39,10 @@ def plan_edit(
     before: CameraSettings,
     after: CameraSettings,
     run: Run,
-    target: Triple | None = None,
 ) -> SourceEdit | Refusal:
     """The edit that turns a camera from `before`, which the running env has, into `after`.
 
-    `sources` are the author's files by path, as they are on disk. `target` is the point that the camera was aimed at,
-    in the frame of its position: a look_at gets it as long as `after` looks there. Nothing is written.
+    `sources` are the author's files by path, as they are on disk. Nothing is written.
     """
     why = why_no_camera(after)
     if why is not None:
@@ -61,7 +57,7 @@ def plan_edit(
         # Without its mount the pose of a copy is one of another frame.
         names = [name for name in ("entity_uid", "mount") if name in call.arguments]
         mount = [f"{name}={call.file.code(call.arguments[name])}" for name in names]
-        return _plan(project, call, ran, key, fields, before, after, run, target)
+        return _plan(project, call, ran, key, fields, before, after, run)
     except Refused as refused:
         return Refusal(refused.reason, snippet(key[1], after, more=mount))
 
@@ -75,7 +71,6 @@ def _plan(
     before: CameraSettings,
     after: CameraSettings,
     run: Run,
-    target: Triple | None,
 ) -> SourceEdit:
     if call.loop is not None:
         raise Refused(
@@ -97,7 +92,7 @@ def _plan(
         changes.note(
             f"the camera is made outside of a hook ({call.where}): whatever else uses it changes along"
         )
-    _write_fields(changes, project, call, fields, after, target)
+    _write_fields(changes, project, call, fields, after)
     for name in FIELDS:
         if name in call.trace.parts:
             changes.emit(call.trace.parts[name])
@@ -136,19 +131,14 @@ def _why_not(changes: Changes, call: CameraCall, name: str) -> str | None:
 
 
 def _write_fields(
-    changes: Changes,
-    project: Project,
-    call: CameraCall,
-    fields: list[str],
-    after: CameraSettings,
-    target: Triple | None,
+    changes: Changes, project: Project, call: CameraCall, fields: list[str], after: CameraSettings
 ) -> None:
     added: list[str] = []
     for name in fields:
         part = call.trace.parts.get(name)
         if name == "pose":
             assert part is not None
-            write_pose(changes, project, part, after, target)
+            write_pose(changes, project, part, after)
         elif name in ("fov", "intrinsic"):
             continue
         elif name == "shader_pack":

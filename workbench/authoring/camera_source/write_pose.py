@@ -67,12 +67,10 @@ def _is_vector(part: Part, length: int) -> bool:
     return isinstance(part.value, tuple) and len(part.value) == len(part.numbers) == length
 
 
-def write_pose(
-    changes: Changes, project: Project, pose: Part, after: CameraSettings, target: Triple | None
-) -> None:
-    """`target` is where the camera was aimed at, if somebody has said so."""
+def write_pose(changes: Changes, project: Project, pose: Part, after: CameraSettings) -> None:
+    """Change it in its form, or to one that can say where `after` stands."""
     if pose.function == "look_at":
-        if not _look_at(changes, pose, after, target):
+        if not _look_at(changes, pose, after):
             _as_quaternion(changes, project, pose, after)
         return
     _position(changes, pose, after.position)
@@ -125,7 +123,7 @@ def _settled(vector: Part, wanted: Sequence[float], decimals: int) -> tuple[floa
     return vector.numbers
 
 
-def _look_at(changes: Changes, pose: Part, after: CameraSettings, aim: Triple | None) -> bool:
+def _look_at(changes: Changes, pose: Part, after: CameraSettings) -> bool:
     """Write eye and target, if a look_at can say where the camera looks."""
     eye, target = pose.parts["eye"], pose.parts["target"]
     up = pose.parts["up"].numbers if "up" in pose.parts else (0.0, 0.0, 1.0)
@@ -138,15 +136,11 @@ def _look_at(changes: Changes, pose: Part, after: CameraSettings, aim: Triple | 
         quaternion = rotations.look_at(a, b, up)
         return math.inf if quaternion is None else rotations.angle_between(quaternion, after.quaternion)
 
-    for point in (aim, target.numbers):
-        if point is None or error(after.position, point) > _STILL_AT_TARGET:
-            continue
-        for decimals in _METRES:
-            rounded = _settled(eye, after.position, decimals), _settled(target, point, decimals)
-            if error(*rounded) <= ANGLE_STEP:
-                _vector(changes, eye, after.position, decimals)
-                _vector(changes, target, point, decimals)
-                return True
+    still = error(after.position, target.numbers) <= _STILL_AT_TARGET
+    for decimals in _METRES if still else ():
+        if error(_settled(eye, after.position, decimals), target.numbers) <= ANGLE_STEP:
+            _vector(changes, eye, after.position, decimals)
+            return True
     distance = max(_LEAST_DISTANCE, math.dist(pose.numbers[:3], target.numbers))
     for decimals in _METRES:
         from_eye = _settled(eye, after.position, decimals)
