@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-import pickle
 import re
 import shutil
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from tests.drive.session import TASKS
+from workbench.core.step import StepResult
 from workbench.session.messages import Stepped
+from workbench.session.wire import pack, pack_message
 
 _MISCHIEF = """
 import ctypes as _ctypes, os as _os, signal as _signal, sys as _sys, threading as _threading, time as _time
@@ -117,8 +121,10 @@ def hazard(place):
 
 """
 # As literals: code that imports pickle may reach anything, and a change to it is never patched in.
-for _place, _message in (("@WRONG@", {"not": "a message"}), ("@MISFIT@", Stepped(None, None))):  # type: ignore[arg-type]
-    _MISCHIEF = _MISCHIEF.replace(_place, repr(pickle.dumps(_message)))
+_NOTHING: Any = np.zeros(0)
+_MISFIT = Stepped(StepResult(_NOTHING, _NOTHING, _NOTHING, _NOTHING, {}, _NOTHING), _NOTHING)
+for _place, _message in (("@WRONG@", pack(("dict", None, {}))), ("@MISFIT@", pack_message(_MISFIT))):
+    _MISCHIEF = _MISCHIEF.replace(_place, repr(_message))
 _HOOKS = {
     "build": "        build_ground(self.scene)\n",
     "reset": '        self.agent.reset(self.agent.keyframes["rest"].qpos)\n',

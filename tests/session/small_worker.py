@@ -14,29 +14,34 @@ import sys
 import threading
 import time
 import types
-from typing import Any
+from typing import Any, get_args
 
+from tests.ui.scenes import description, step_of, table_scene
 from workbench.authoring.problem import Interrupted
 from workbench.session.calls import Answer, Call
+from workbench.session.camera_messages import RunCameras
 from workbench.session.interrupts import INTERRUPT_SIGNAL, Interrupts
 from workbench.session.messages import (
     DebuggerListens,
-    Inspect,
     ListenForDebugger,
     Load,
     Loaded,
     Loading,
     Quit,
+    Request,
 )
 from workbench.session.pulse import PulseWriter
+from workbench.session.server_line import QUESTIONS
+from workbench.session.wire import Unpacker, pack_message
 from workbench.session.worker_start import main
 
 
 class SmallWorker:
-    """Answers `Load` with a `Loading` of its name, and does what the section of an `Inspect` says."""
+    """Answers `Load` with a `Loading` of its name, and does what a `RunCameras` names as the task."""
 
     def __init__(self, line: multiprocessing.connection.Connection, pulse: PulseWriter) -> None:
         self.line, self.pulse = line, pulse
+        self.unpacker = Unpacker(get_args(Request), QUESTIONS)
         self.interrupts = Interrupts()
         self.interrupts.install()
         self.kept: Any = None
@@ -44,31 +49,32 @@ class SmallWorker:
     def run(self) -> None:
         while True:
             self.pulse.begin("idle")
-            request = self.line.recv()
+            request = self.unpacker.message(self.line.recv_bytes())
             if isinstance(request, Quit):
                 return
             if isinstance(request, ListenForDebugger):
-                self.line.send(DebuggerListens(request.port, request.wait))
-            if isinstance(request, Call):
-                self.line.send(Answer(request.number))
+                self.line.send_bytes(pack_message(DebuggerListens(request.port, request.wait)))
+            if isinstance(request, Call) and isinstance(request.request, RunCameras):
+                words = str(request.request.task).partition(" ")
+                try:
+                    self.interrupts.run(functools.partial(self.do, *words))
+                except Interrupted:
+                    self.line.send_bytes(pack_message(Loading("interrupted")))
+            elif isinstance(request, Call):
+                self.line.send_bytes(pack_message(Answer(request.number)))
             if isinstance(request, Load):
                 self.pulse.begin("loading")
-                self.line.send(Loading(str(request.task)))
-            if isinstance(request, Inspect):
-                try:
-                    self.interrupts.run(functools.partial(self.do, *request.sections[0].partition(" ")))
-                except Interrupted:
-                    self.line.send(Loading("interrupted"))
+                self.line.send_bytes(pack_message(Loading(str(request.task))))
 
     def do(self, what: str, _: str, argument: str) -> None:
         getattr(self, what)(argument)
 
     def say(self, text: str) -> None:
-        self.line.send(Loading(text))
+        self.line.send_bytes(pack_message(Loading(text)))
 
     def loaded(self, _: str) -> None:
-        nothing: Any = None
-        self.line.send(Loaded(nothing, nothing, {}))
+        geometry, poses = table_scene(1)
+        self.line.send_bytes(pack_message(Loaded(description(geometry, ()), step_of(poses), {})))
 
     def work(self, seconds: str) -> None:
         """Python that lasts so long, and that an interrupt leaves."""
@@ -93,7 +99,7 @@ class SmallWorker:
     def last_steps(self, count: str) -> None:
         """All at once, and then the kernel ends it."""
         for number in range(int(count)):
-            self.line.send(Loading(f"step {number}"))
+            self.line.send_bytes(pack_message(Loading(f"step {number}")))
         os.kill(os.getpid(), signal.SIGKILL)
 
     def leave(self, code: str) -> None:
@@ -104,7 +110,7 @@ class SmallWorker:
         self.kept = bytearray(int(megabytes) << 20)
 
     def nonsense(self, text: str) -> None:
-        self.line.send(text)
+        self.line.send_bytes(pack_message(text))
 
     def without_a_main_thread(self, seconds: str) -> None:
         threading.Thread(target=time.sleep, args=(float(seconds),), daemon=False).start()

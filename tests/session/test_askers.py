@@ -10,6 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from queue import Queue
+from typing import Any
 
 import psutil
 import pytest
@@ -21,7 +22,9 @@ from workbench.session.askers import Asker, Background
 from workbench.session.calls import Answer, Call, Progress
 from workbench.session.camera_messages import JudgeCamera
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
+from workbench.session.make_scene import MakeScene
 from workbench.session.messages import Load, Request, Reset, TaskOptions
+from workbench.session.wire import pack
 
 BASE = ("sensor", "base_camera")
 PROBLEM = Problem("step", "it broke", None, None, None, "")
@@ -61,18 +64,18 @@ def test_two_that_ask_at_once_each_hear_their_own_whatever_comes_first() -> None
 
 
 def test_progress_comes_in_order_before_the_answer_and_an_answer_brings_its_problem() -> None:
-    line, heard = Line(), list[Progress]()
-    asker = Asker(line.send)
+    line, heard = Line(), list[tuple[int, int, Any]]()
+    asker, scene = Asker(line.send), MakeScene("PushCube-v1", (), {}, 0, {}, {})
     with ThreadPoolExecutor(1) as threads:
-        asked = threads.submit(asker.ask, go_on, question(0), heard.append)
+        asked = threads.submit(asker.ask, go_on, scene, lambda *at: heard.append(at))
         number = line.calls.get(timeout=10).number
         for done in range(3):
-            asker.take(Progress(number, done, 3))
+            asker.take(Progress(number, done, 3, pack(f"state {done}")))
         asker.take(Answer(number, why="no such camera", problem=PROBLEM))
         with pytest.raises(JobFailed, match="no such camera") as failed:
             asked.result(timeout=10)
     assert failed.value.problem is PROBLEM
-    assert [at.done for at in heard] == [0, 1, 2]
+    assert heard == [(done, 3, f"state {done}") for done in range(3)]
 
 
 def test_an_answer_of_another_kind_is_none() -> None:
@@ -80,8 +83,8 @@ def test_an_answer_of_another_kind_is_none() -> None:
     asker = Asker(line.send)
     with ThreadPoolExecutor(1) as threads:
         asked = threads.submit(asker.ask, go_on, question(0))
-        asker.take(Answer(line.calls.get(timeout=10).number, ("no", "report")))
-        with pytest.raises(JobFailed, match="answered with a tuple"):
+        asker.take(Answer(line.calls.get(timeout=10).number, pack(("no", "report"))))
+        with pytest.raises(JobFailed, match="answered with what cannot be read"):
             asked.result(timeout=10)
 
 

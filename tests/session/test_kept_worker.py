@@ -16,12 +16,13 @@ from typing import Any
 import pytest
 
 from workbench.session import kept_worker, process
+from workbench.session.calls import Call
+from workbench.session.camera_messages import RunCameras
 from workbench.session.kept_worker import Death, KeptWorker, WorkerOptions
 from workbench.session.last_words import Busy
 from workbench.session.messages import (
     DebuggerListens,
     Event,
-    Inspect,
     Load,
     Loading,
     Request,
@@ -86,9 +87,9 @@ class Minded:
         return self.deaths[times - 1]
 
 
-def do(what: str) -> Inspect:
-    """A request that `small_worker` reads another way; none of it takes the place of another."""
-    return Inspect(0, (what,))  # type: ignore[arg-type]
+def do(what: str) -> Call:
+    """A question that `small_worker` reads another way; none of it takes the place of another."""
+    return Call(0, RunCameras(what, {}))
 
 
 def load(name: str) -> Load:

@@ -21,11 +21,11 @@ from typing import Any, TypeVar
 
 from workbench.core.camera_settings import CameraKey
 from workbench.machine.family import describe_exit
-from workbench.session.calls import Answer, Call, Cancel, Progress, Question, fits
+from workbench.session.calls import Answer, Call, Cancel, Progress, Question, value_type
 from workbench.session.lane import Job, JobFailed
-from workbench.session.message_reader import Unreadable
 from workbench.session.messages import Load, PlaceCamera, Request
 from workbench.session.process import WorkerProcess
+from workbench.session.wire import Unpacker, Unreadable
 
 _LOOK = 0.05
 """Seconds between two looks at whether the job is to stop."""
@@ -37,10 +37,11 @@ _PATIENCE = 3.0
 _LOAD_PATIENCE = 10.0
 """Seconds in which a process must answer what nobody waits for any more, or is ended."""
 Value = TypeVar("Value")
-OnProgress = Callable[[Progress], None]
+OnProgress = Callable[[int, int, Any], None]
+"""Gets how much is done, of how much, and the part of the answer that is new."""
 
 
-def _ignore(at: Progress) -> None:
+def _ignore(done: int, total: int, part: Any) -> None:
     pass
 
 
@@ -73,7 +74,8 @@ class Asker:
                 check()
                 event = self._next(number)
                 if isinstance(event, Progress):
-                    on_progress(event)
+                    part = _unpacked(event.part, question.part) if event.part else None
+                    on_progress(event.done, event.total, part)
                 elif event is not None:
                     return _value(event, question)
         finally:
@@ -308,6 +310,11 @@ class Background(Asker):
 def _value(answer: Answer, question: Question[Value]) -> Value:
     if answer.why:
         raise JobFailed(answer.why, answer.problem)
-    if not fits(answer.value, question):
-        raise JobFailed(f"the worker answered with a {type(answer.value).__name__}")
-    return answer.value
+    return _unpacked(answer.value, value_type(type(question)))
+
+
+def _unpacked(packed: bytes, kind: Any) -> Any:
+    try:
+        return Unpacker().unpack(packed, kind)
+    except Unreadable as error:
+        raise JobFailed(f"the worker answered with what cannot be read ({error})") from error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
-from typing import Any, ForwardRef, Generic, TypeVar, get_args, get_origin
+from typing import Any, ClassVar, ForwardRef, Generic, TypeVar, get_args
 
 from workbench.authoring.problem import Problem
 
@@ -13,6 +13,9 @@ Value = TypeVar("Value", covariant=True)
 
 class Question(Generic[Value]):
     """What a worker can be asked in a `Call`; its answer is a `Value`."""
+
+    part: ClassVar[Any] = None
+    """The type of `Progress.part`."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +38,8 @@ class Progress:
     number: int
     done: int
     total: int
-    part: Any = None
-    """What is known of the answer since the last one."""
+    part: bytes = b""
+    """What is known of the answer since the last one, packed; see `Question.part`."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,8 @@ class Answer:
     """The end of a `Call`."""
 
     number: int
-    value: Any = None
+    value: bytes = b""
+    """Packed (`wire`): only who asked knows of what kind it is to be."""
     why: str = ""
     """Why there is no value, for the reader; empty where there is one."""
     problem: Problem | None = None
@@ -55,10 +59,10 @@ class CannotAnswer(Exception):
     """In a worker: a question has no answer here; a sentence."""
 
 
-def fits(value: object, question: Question[Any]) -> bool:
-    """Whether it can be the answer: the author's code runs where it comes from."""
-    (base,) = type(question).__orig_bases__  # type: ignore[attr-defined]
+def value_type(question: type[Question[Any]]) -> Any:
+    """What its answer is to be."""
+    (base,) = question.__orig_bases__  # type: ignore[attr-defined]
     (kind,) = get_args(base)
     if isinstance(kind, ForwardRef):
-        kind = vars(sys.modules[type(question).__module__])[kind.__forward_arg__]
-    return isinstance(value, get_origin(kind) or kind)
+        kind = vars(sys.modules[question.__module__])[kind.__forward_arg__]
+    return kind

@@ -184,7 +184,7 @@ class CameraJudging:
                 job.tell(0, 0, what)
                 question = SuggestCameras(key, lens, objects, low, high, envs)
                 found = self._background.ask(
-                    job.check, question, lambda at: job.tell(at.done, at.total, what)
+                    job.check, question, lambda done, total, part: job.tell(done, total, what)
                 )
             problem = "" if found else f"no place in that box sees {' and '.join(objects)} in any env."
             self._know(suggestions=found, problem=problem)

@@ -22,7 +22,6 @@ from workbench.machine.family import describe_exit
 from workbench.machine.watched_thread import say_failure
 from workbench.session.last_words import Busy, busy_at, fatal_error
 from workbench.session.memory_limit import in_words
-from workbench.session.message_reader import Unreadable
 from workbench.session.messages import (
     Event,
     ListenForDebugger,
@@ -35,6 +34,7 @@ from workbench.session.messages import (
 from workbench.session.process import Output, WorkerProcess
 from workbench.session.pulse import Beat, Doing
 from workbench.session.spare import SpareWorker
+from workbench.session.wire import Unreadable
 
 _LOOK = 0.1
 """Seconds between two looks at the worker."""

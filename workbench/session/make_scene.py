@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +37,7 @@ class SceneMade:
 class MakeScene(Question[SceneMade]):
     """Have a worker that holds no task make a recording's env, and put it into each recorded state."""
 
+    part: ClassVar[Any] = str
     task: str
     """Registered id."""
     files: tuple[str, ...]

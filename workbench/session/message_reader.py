@@ -2,19 +2,20 @@
 
 The author's code runs in the process at the other end: it may write into any file descriptor, and end in the middle of a
 message. Framing is that of `multiprocessing.connection.Connection`: a length of four bytes (-1 and eight more where
-that is not enough), then a pickle.
+that is not enough), then what `wire` says.
 """
 
 from __future__ import annotations
 
 import os
-import pickle
 import select
 import socket
 import struct
 import time
-from types import UnionType
+from collections.abc import Sequence
 from typing import Any
+
+from workbench.session.wire import Unpacker, Unreadable
 
 MOST_BYTES = 1 << 30
 """Of one message. The largest of a healthy task are its meshes and the pictures of all envs: some 100 MB."""
@@ -23,36 +24,16 @@ _AT_ONCE = 1 << 24
 _SHORT, _LONG = struct.Struct("!i"), struct.Struct("!Q")
 
 
-class Unreadable(EOFError):
-    """What came is no message. Nothing that follows can be read, so the line is at its end; the text says why."""
-
-
-def message_from(raw: bytes | bytearray | memoryview, kinds: type | UnionType) -> Any:
-    """The object that was sent.
-
-    Raises:
-        Unreadable: it cannot be unpickled, or is none of `kinds`.
-    """
-    try:
-        message = pickle.loads(raw)
-    except (Exception, SystemExit) as error:
-        # Any of them: a pickle may name what does not exist, and call what raises whatever it likes.
-        raise Unreadable(f"{type(error).__name__}: {_line(error)}") from error
-    if not isinstance(message, kinds):
-        raise Unreadable(f"it was a {type(message).__name__}, which is no message")
-    return message
-
-
 class MessageReader:
     """The messages that come in on one socket. Used on one thread."""
 
-    def __init__(self, connection: socket.socket, kinds: type | UnionType) -> None:
+    def __init__(self, connection: socket.socket, kinds: Sequence[type]) -> None:
         """
         Args:
             connection: read from here only; it may be written to elsewhere.
             kinds: what may come.
         """
-        self._fd, self._kinds = connection.fileno(), kinds
+        self._fd, self._unpacker = connection.fileno(), Unpacker(kinds)
         self._poll = select.poll()  # not select(): a server with many pages has descriptors beyond 1024
         self._poll.register(self._fd, select.POLLIN)
         self._head = bytearray()
@@ -92,7 +73,7 @@ class MessageReader:
                 return None
         body, self._body = self._body, None
         self._head.clear()
-        return message_from(body, self._kinds)
+        return self._unpacker.message(body)
 
     def _head_size(self) -> int:
         long = len(self._head) >= _SHORT.size and _SHORT.unpack_from(self._head)[0] == -1
@@ -126,11 +107,3 @@ class MessageReader:
         if not piece:
             raise EOFError
         return piece
-
-
-def _line(error: BaseException) -> str:
-    try:
-        text = str(error)
-    except Exception as failure:  # its class may be one that the bytes named
-        text = f"its __str__ raised {type(failure).__name__}"
-    return " ".join(text[:2000].split())[:300] or "no reason given"

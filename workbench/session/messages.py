@@ -1,4 +1,5 @@
-"""The words that the server and its worker say to each other: plain dataclasses over one pipe.
+"""The words that the server and its worker say to each other: plain dataclasses over one pipe, read by their types
+(`wire`).
 
 The worker owns the env; the server owns the page. Requests go one way and are handled in order,
 between control steps; events come back. Nothing here may hold a torch tensor or a SAPIEN object:

@@ -24,6 +24,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from multiprocessing.connection import Connection
+from typing import get_args
 
 from workbench.machine.child_python import child_environment, python_command
 from workbench.machine.family import end_family
@@ -42,6 +43,7 @@ from workbench.session.messages import (
     is_a_step,
 )
 from workbench.session.pulse import Beat, PulseReader, make_pulse
+from workbench.session.wire import pack_message
 
 _WHOLE = (Load, Settings)
 """Of two of one kind that wait one behind the other only the second matters."""
@@ -100,7 +102,7 @@ class WorkerProcess:
             theirs.close()
             os.close(pulse)
         self._socket, self._connection = ours, Connection(os.dup(ours.fileno()))
-        self._reader = MessageReader(ours, Event)
+        self._reader = MessageReader(ours, get_args(Event))
         self._memory = FamilyMemory(self._process.pid)
         self._output = output
         self._waiting: deque[Request] = deque()
@@ -245,7 +247,7 @@ class WorkerProcess:
                     return
                 request = self._waiting.popleft()
             try:
-                self._connection.send(request)
+                self._connection.send_bytes(pack_message(request))
             except OSError:
                 return  # it is gone, and `receive` says so
             except Exception as error:

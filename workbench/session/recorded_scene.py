@@ -69,7 +69,9 @@ class SceneProcess:
             for key, episode in episodes.items():
                 on_progress(key, "making its scene")
                 try:
-                    made = self._one(process, episode, check, lambda at, k=key: on_progress(k, at.part))
+                    made = self._one(
+                        process, episode, check, lambda done, total, words, k=key: on_progress(k, words)
+                    )
                 except SceneError as error:
                     on_end(key, error, ())
                     continue

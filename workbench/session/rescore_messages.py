@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, ClassVar
 
 from workbench.authoring.problem import Problem
 from workbench.recording.episode import Episode
@@ -48,5 +49,6 @@ class Rescored:
 class Rescore(Question[Rescored]):
     """Have a worker with the task open judge these episodes; each `Progress.part` is a `Rescored`."""
 
+    part: ClassVar[Any] = Rescored
     files: tuple[EpisodeFile, ...]
     use_env_states: bool

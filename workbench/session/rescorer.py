@@ -118,7 +118,7 @@ class Rescorer(Judging):
             self._tell(job, verdicts=verdicts, steps=steps + now.steps, seconds=seconds)
 
         question = Rescore(group.files, use_env_states)
-        last = process.ask(job.check, question, lambda at: told(at.part))
+        last = process.ask(job.check, question, lambda done, total, now: told(now))
         told(last)
         if last.problem is not None:
             raise JobFailed(f"the code of {group.info.task} raised", last.problem)

@@ -8,9 +8,20 @@ from __future__ import annotations
 
 from collections import deque
 from multiprocessing.connection import Connection
+from typing import get_args
 
+from workbench.session.camera_messages import CameraQuestion
 from workbench.session.interrupts import Interrupts
-from workbench.session.messages import Event, Load, Request, is_a_step
+from workbench.session.make_scene import MakeScene
+from workbench.session.messages import Event, Load, PlaceCamera, Request, Reset, WarmUp, is_a_step
+from workbench.session.moment_messages import CaptureMoment, JudgeMoments
+from workbench.session.rescore_messages import Rescore
+from workbench.session.wire import Unpacker, Unreadable, pack_message
+
+QUESTIONS = (
+    Load, Reset, PlaceCamera, WarmUp, *get_args(CameraQuestion), JudgeMoments, CaptureMoment, Rescore, MakeScene
+)  # fmt: skip
+"""That come in a `Call`."""
 
 
 class ServerLine:
@@ -18,6 +29,7 @@ class ServerLine:
 
     def __init__(self, connection: Connection, interrupts: Interrupts) -> None:
         self._connection, self._interrupts = connection, interrupts
+        self._unpacker = Unpacker(get_args(Request), QUESTIONS)
         self._queue: deque[Request] = deque()
         """What has come and was not carried out."""
         self.closed = False
@@ -38,7 +50,7 @@ class ServerLine:
     def send(self, event: Event) -> None:
         try:
             with self._interrupts.shielded():
-                self._connection.send(event)
+                self._connection.send_bytes(pack_message(event))
         except (BrokenPipeError, OSError):
             self.closed = True
 
@@ -54,7 +66,9 @@ class ServerLine:
         requests: list[Request] = []
         try:
             while self._connection.poll(timeout if not requests else 0):
-                requests.append(self._connection.recv())
+                requests.append(self._unpacker.message(self._connection.recv_bytes()))
+        except Unreadable:
+            raise  # the server is believed: what it sent and cannot be read is a fault of ours
         except (EOFError, OSError):
             self.closed = True
         loads = [request for request in requests if isinstance(request, Load)]

@@ -77,6 +77,7 @@ from workbench.session.server_line import ServerLine
 from workbench.session.step_back_run import going_there, step_back
 from workbench.session.step_events import StepEvents
 from workbench.session.warm_up import warm_up
+from workbench.session.wire import pack
 from workbench.session.worker_cameras import WorkerCameras
 
 _STATUS_PERIOD = 0.25
@@ -164,10 +165,10 @@ class Worker:
 
     def _answer(self, call: Call) -> Answer:
         def tell(done: int, total: int, part: object = None) -> None:
-            self._line.send(Progress(call.number, done, total, part))
+            self._line.send(Progress(call.number, done, total, b"" if part is None else pack(part)))
 
         try:
-            return Answer(call.number, self._value(call.request, tell))
+            return Answer(call.number, pack(self._value(call.request, tell)))
         except CannotAnswer as error:
             return Answer(call.number, why=str(error))
         except TaskError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,11 @@ class Read:
     """Who else reads it there, in words; None if nobody does."""
 
 
-Plain = float | str | None | tuple["Plain", ...]
+if TYPE_CHECKING:
+    Plain = float | str | None | tuple["Plain", ...]
+else:  # what reads it off a line knows no type that names itself: numbers, vectors, matrices and lists of these
+    _One = float | str | None
+    Plain = _One | tuple[_One | tuple[_One | tuple[_One | tuple[_One, ...], ...], ...], ...]
 
 
 @dataclass(frozen=True, eq=False)

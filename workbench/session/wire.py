@@ -1,0 +1,218 @@
+"""Messages between the server and a worker as bytes: msgpack that is read by the types of the messages, never a pickle.
+
+The author's code runs in the worker and may write whatever it likes into its line, so what comes is data of the kinds
+that are awaited, or `Unreadable`. Arrays stand behind the message, one after the other; in the message is what they are.
+
+    4 bytes    length of the message
+    message    msgpack: name of the class, number of the call (or nil), fields
+    arrays     bytes, in the order in which the message names them
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, get_origin
+
+import msgspec
+import numpy as np
+
+from workbench.session.calls import Call
+
+_LENGTH = struct.Struct("!I")
+_ARRAY, _AGAIN = 1, 2
+"""Kinds of msgpack's extensions: the next array, or one that came before."""
+_NUMBERS = "biufcSU"
+"""Kinds of arrays: what holds objects is no data."""
+_LONGEST = 500
+"""Bytes of what is said of one array."""
+_Head = tuple[str, int | None, msgspec.Raw]
+
+
+class Unreadable(EOFError):
+    """What came is no message. Nothing that follows can be read, so the line is at its end; the text says why."""
+
+
+def pack(value: object) -> bytes:
+    """Of dataclasses, arrays and plain data.
+
+    Raises:
+        TypeError: something of it is neither.
+    """
+    arrays = _Written()
+    try:
+        message = msgspec.msgpack.Encoder(enc_hook=arrays.hook).encode(value)
+    except UnicodeEncodeError:  # half a character in the author's text, or in what it raised
+        arrays = _Written()
+        plain = msgspec.to_builtins(value, builtin_types=(bytes, np.ndarray, np.generic, Path))
+        message = msgspec.msgpack.Encoder(enc_hook=arrays.hook).encode(_can_be_written(plain))
+    return b"".join((_LENGTH.pack(len(message)), message, *arrays.parts))
+
+
+def pack_message(message: object) -> bytes:
+    """Of a request or an event; a `Call` goes by the name of its question."""
+    if isinstance(message, Call):
+        return pack((type(message.request).__name__, message.number, message.request))
+    return pack((type(message).__name__, None, message))
+
+
+class Unpacker:
+    """Reads what `pack` made. Used on one thread."""
+
+    def __init__(self, kinds: Sequence[type] = (), questions: Sequence[type] = ()) -> None:
+        """
+        Args:
+            kinds: of messages that may come.
+            questions: that may come in a `Call`.
+        """
+        self._kinds = {(kind.__name__, False): kind for kind in kinds}
+        self._kinds |= {(kind.__name__, True): kind for kind in questions}
+        self._decoders: dict[Any, msgspec.msgpack.Decoder[Any]] = {}
+        self._arrays = _Read(memoryview(b""))
+
+    def unpack(self, raw: bytes | bytearray | memoryview, kind: Any) -> Any:
+        """
+        Args:
+            kind: its type, as an annotation says it.
+
+        Raises:
+            Unreadable: it is not of this kind.
+        """
+        return self._guarded(lambda: self._decoder(kind).decode(self._begin(raw)))
+
+    def message(self, raw: bytes | bytearray | memoryview) -> Any:
+        """What `pack_message` was given.
+
+        Raises:
+            Unreadable: it is none of the kinds.
+        """
+        return self._guarded(lambda: self._message(raw))
+
+    def _message(self, raw: bytes | bytearray | memoryview) -> Any:
+        name, number, body = self._decoder(_Head).decode(self._begin(raw))
+        kind = self._kinds.get((name, number is not None))
+        if kind is None:
+            raise Unreadable(f"it was a {name[:100]}, which is no message")
+        message = self._decoder(kind).decode(body)
+        return message if number is None else Call(number, message)
+
+    def _begin(self, raw: bytes | bytearray | memoryview) -> memoryview:
+        whole = memoryview(raw)
+        end = _LENGTH.size + _LENGTH.unpack_from(whole)[0]
+        if end > len(whole):
+            raise ValueError("it says that it is longer than it is")
+        self._arrays = _Read(whole[end:])
+        return whole[_LENGTH.size : end]
+
+    def _decoder(self, kind: Any) -> msgspec.msgpack.Decoder[Any]:
+        if kind not in self._decoders:
+            self._decoders[kind] = msgspec.msgpack.Decoder(
+                kind, dec_hook=_checked, ext_hook=lambda code, data: self._arrays.take(code, data)
+            )
+        return self._decoders[kind]
+
+    def _guarded(self, read: Any) -> Any:
+        try:
+            return read()
+        except Unreadable:
+            raise
+        except Exception as error:
+            # Any of them: what comes may be made so that it breaks what reads it.
+            raise Unreadable(f"{type(error).__name__}: {_line(error)}") from error
+        finally:
+            self._arrays = _Read(memoryview(b""))
+
+
+class _Written:
+    """The arrays of a message that is written."""
+
+    def __init__(self) -> None:
+        self.parts: list[Any] = []
+        self._numbers: dict[int, int] = {}
+        self._alive: list[np.ndarray] = []
+        """Else another may get the number of one that is gone."""
+
+    def hook(self, value: object) -> object:
+        if isinstance(value, np.ndarray):
+            known = self._numbers.setdefault(id(value), len(self._numbers))
+            if known < len(self._alive):
+                return msgspec.msgpack.Ext(_AGAIN, str(known).encode())
+            said = _what_it_is(value.dtype, value.shape)
+            self._alive.append(value)
+            if value.size:
+                self.parts.append(np.ascontiguousarray(value).reshape(-1).view(np.uint8))
+            return said
+        if isinstance(value, np.generic):
+            return value.item()
+        if isinstance(value, Path):
+            return str(value)
+        if isinstance(value, Mapping):
+            return dict(value)
+        raise TypeError(f"a {type(value).__name__} cannot be sent")
+
+
+class _Read:
+    """The arrays of a message that is read."""
+
+    def __init__(self, rest: memoryview) -> None:
+        self._rest = rest
+        self._taken: list[np.ndarray] = []
+
+    def take(self, code: int, data: memoryview) -> np.ndarray:
+        if code == _AGAIN:
+            return self._taken[int(bytes(data))] if bytes(data).isdigit() else _refuse()
+        if code != _ARRAY or len(data) > _LONGEST:
+            _refuse()
+        dtype, shape, size = _described(bytes(data))
+        if size > len(self._rest):
+            raise ValueError("an array is longer than what came")
+        # A copy: who keeps one array must not keep the whole message.
+        array = np.zeros(0, dtype) if size == 0 else np.frombuffer(self._rest[:size], dtype).copy()
+        array = array.reshape(shape)
+        self._rest = self._rest[size:]
+        self._taken.append(array)
+        return array
+
+
+def _refuse() -> Any:
+    raise ValueError("something that is no array")
+
+
+@functools.lru_cache(1000)
+def _what_it_is(dtype: np.dtype, shape: tuple[int, ...]) -> msgspec.msgpack.Ext:
+    if dtype.kind not in _NUMBERS:
+        raise TypeError(f"an array of {dtype} cannot be sent")
+    return msgspec.msgpack.Ext(_ARRAY, msgspec.msgpack.encode((dtype.str, shape)))
+
+
+@functools.lru_cache(1000)
+def _described(data: bytes) -> tuple[np.dtype, tuple[int, ...], int]:
+    name, shape = msgspec.msgpack.decode(data, type=tuple[str, tuple[int, ...]])
+    dtype = np.dtype(name)
+    if dtype.kind not in _NUMBERS or dtype.itemsize == 0 or min(shape, default=0) < 0:
+        _refuse()
+    return dtype, shape, dtype.itemsize * math.prod(shape)
+
+
+def _checked(kind: Any, value: Any) -> Any:
+    """A value of a type that is not msgpack's own."""
+    if (get_origin(kind) or kind) is np.ndarray and isinstance(value, np.ndarray):
+        return value
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    raise ValueError(f"a {type(value).__name__} in place of a {getattr(kind, '__name__', kind)}")
+
+
+def _can_be_written(value: Any) -> Any:
+    if isinstance(value, str):
+        return value.encode("utf-8", "backslashreplace").decode()
+    if isinstance(value, dict):
+        return {_can_be_written(key): _can_be_written(one) for key, one in value.items()}
+    return [_can_be_written(one) for one in value] if isinstance(value, list | tuple) else value
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error)[:2000].split())[:300] or "no reason given"
