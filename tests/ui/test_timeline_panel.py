@@ -11,8 +11,10 @@ import pytest
 from tests.drive.panels import Clock, Panels
 from tests.drive.session import wait_until
 from tests.drive.waiting import until
+from tests.ui.scenes import running
 from workbench.session.session import Session
 from workbench.session.timeline import TimelineView
+from workbench.session.view import SessionView
 from workbench.ui import timeline_panel as panel
 from workbench.ui.controls import Control
 from workbench.ui.page import Page
@@ -123,6 +125,34 @@ def test_zoom_to_episode_takes_the_slider_to_where_the_episode_began(lived: Live
     lived.panels.choose("undo reset of all")
     view = wait_until(lived.session, lambda view: view.timeline.last == 9, "the episode before")
     assert view.step is not None and view.step.elapsed_steps.tolist() == [4, 4, 4]
+
+
+def test_the_ends_follow_at_once_what_is_shown_beyond_them_and_else_rarely(lived: Lived) -> None:
+    lived.step(4)
+    last = lived.past.last
+    lived.panels.command("Reset all envs")
+    wait_until(lived.session, lambda view: view.timeline.last > last, "the reset")
+    lived.step(2)
+    lived.panels.choose(panel.EPISODE)
+    lived.page.redraw()
+    assert lived.ends() == (-2, 0, 0)
+    lived.session.step()
+    wait_until(lived.session, lambda view: view.timeline.last == 8, "a step")
+    lived.session.past.seek(6)
+    lived.page.redraw()
+    assert lived.ends() == (-2, 0, -1), "within them: whoever holds the slider is not disturbed"
+    lived.session.past.seek(2)
+    lived.page.redraw()
+    assert lived.ends() == (-8, -4, -6), "the episode before"
+    lived.draw()
+    assert lived.ends() == (-8, -4, -6)
+
+
+def test_of_one_env_there_is_one_way_to_go_on() -> None:
+    assert panel.go_on_labels(running(1)) == ("Go on from here",)
+    assert panel.go_on_labels(SessionView()) == ("Go on from here",)
+    labels = panel.go_on_labels(running(3, selected_env=2))
+    assert labels == ("Go on from here: env 2", "all envs", "env 2 into all envs")
 
 
 def test_an_arrow_that_a_slider_took_is_not_taken_twice(lived: Lived) -> None:
