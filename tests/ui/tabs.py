@@ -42,8 +42,8 @@ def handshake(url: str) -> tuple[str, dict[str, Any]]:
     }
 
 
-def camera_message(position: Sequence[float] = (3.0, 3.0, 3.0)) -> bytes:
-    """What a page says when it has drawn itself for the first time: where it looks from."""
+def camera_message(position: Sequence[float] = (3.0, 3.0, 3.0), width: int = 800) -> bytes:
+    """What a page says when it has drawn itself for the first time: where it looks from, and how large its view is."""
     message = viser._messages.ViewerCameraMessage(
         wxyz=(1.0, 0.0, 0.0, 0.0),
         position=(position[0], position[1], position[2]),
@@ -51,7 +51,7 @@ def camera_message(position: Sequence[float] = (3.0, 3.0, 3.0)) -> bytes:
         near=0.05,
         far=300.0,
         image_height=720,
-        image_width=800,
+        image_width=width,
         look_at=(0.0, 0.0, 0.0),
         up_direction=(0.0, 0.0, 1.0),
     )

@@ -1,13 +1,17 @@
 from __future__ import annotations
 
 import numpy as np
+import viser
+import websockets.sync.client
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.drive.waiting import until
 from tests.ui.scenes import table_scene
+from tests.ui.tabs import camera_message, handshake
 from workbench.core.pictures import Picture
 from workbench.ui.env_layout import lay_out
-from workbench.ui.viewpoint import FOV, frame_all, frame_box, frame_one
+from workbench.ui.viewpoint import FOV, Framing, Viewpoint, frame_all, frame_box, frame_one
 
 
 @given(
@@ -66,3 +70,36 @@ def test_one_env_is_seen_through_the_task_s_own_human_camera() -> None:
     np.testing.assert_allclose(viewpoint.position, pose[:3], atol=1e-6)
     towards = viewpoint.look_at - viewpoint.position
     np.testing.assert_allclose(towards / np.linalg.norm(towards), [-1, 0, 0], atol=1e-6)
+
+
+def test_a_page_is_framed_for_each_shape_of_its_view_until_somebody_moves_it(
+    server: viser.ViserServer,
+) -> None:
+    framing = Framing(server)
+
+    def frame(aspect: float, height: float) -> Viewpoint:
+        return frame_box(np.full(3, -1.0), np.full(3, 1.0), aspect)
+
+    framing.frame(frame)
+    address, arguments = handshake(f"http://127.0.0.1:{server.get_port()}")
+    with websockets.sync.client.connect(address, **arguments) as page:
+
+        def shows(width: int, position: np.ndarray) -> np.ndarray:
+            """Where it looks from after it said that it is so wide."""
+            page.send(camera_message(position.tolist(), width))
+            until(
+                lambda: any(one.camera.image_width == width for one in server.get_clients().values()),
+                "its width",
+            )
+            framing.follow()
+            framing.frame_untouched(frame)
+            (client,) = server.get_clients().values()
+            return np.array(client.camera.position)
+
+        at = np.array(server.initial_camera.position)
+        for narrower in (600, 500, 400):
+            before, at = at, shows(narrower, at)
+            assert np.linalg.norm(at) != np.linalg.norm(before), narrower
+        assert np.allclose(at, frame(400 / 720, 720).position)
+        moved = at + 0.1
+        assert np.allclose(shows(300, moved), moved), "the view is the person's"

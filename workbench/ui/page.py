@@ -240,7 +240,7 @@ class Page:
             # The human camera's place comes with its first picture, after the scene.
             self._waits_for_human = False
             self.frame(view, untouched_only=True)
-        self._framing.frame_arrivals(lambda aspect, height: self._viewpoint(view, aspect, height))
+        self._framing.frame_untouched(lambda aspect, height: self._viewpoint(view, aspect, height))
 
     def frame(self, view: SessionView, untouched_only: bool = False) -> None:
         """Point every open page (or those whose view nobody has moved), and those to come, at the scene."""

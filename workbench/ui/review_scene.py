@@ -223,7 +223,7 @@ class ReviewIn3D:
         self._draw_names(view, scene if in_grid else None)
         self._draw_frustums(view, scene, cameras, pictures)
         self._frame_what_is_new(view, scene, in_grid)
-        self._framing.frame_arrivals(self._viewpoint)
+        self._framing.frame_untouched(self._viewpoint)
 
     def frame(self) -> None:
         """Point every open page, and those to come, at the scene."""

@@ -1,13 +1,12 @@
 """Where the page looks from when it first shows a scene; after that the view belongs to the person.
 
 It frames the whole grid (or the one env) by itself, and again only for a scene of another size or a choice that
-changes what is shown. A page says how large its view is some moments after it has come: it is framed for the usual
-shape first, and again when its own is known, unless somebody moved it meanwhile.
+changes what is shown. A page's panels take their places some moments after it has come, much later on a busy machine,
+and a person opens more: while nobody has moved the view it is framed for the shape that it has.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -115,9 +114,6 @@ def frame_one(
     return Viewpoint(position=look_at - forward * away, look_at=look_at)
 
 
-SETTLES = 4.0
-"""Seconds after a page has come in which its panels may still take their places."""
-
 Frame = Callable[[float, float], Viewpoint]
 """Gives the viewpoint for a view of this aspect (width over height) and height in pixels."""
 
@@ -125,7 +121,7 @@ Frame = Callable[[float, float], Viewpoint]
 class Framing:
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
-        self._arrivals: dict[int, float] = {}
+        self._followed: frozenset[int] = frozenset()
         self._pointed: dict[int, tuple[np.ndarray, float]] = {}
         self._framed: object = None
 
@@ -137,9 +133,8 @@ class Framing:
     def follow(self) -> int:
         """Note which pages are open, and return how many."""
         clients = self._server.get_clients()
-        if clients.keys() != self._arrivals.keys():
-            now = time.monotonic()
-            self._arrivals = {number: self._arrivals.get(number, now) for number in clients}
+        if clients.keys() != self._followed:
+            self._followed = frozenset(clients)
             self._pointed = {number: at for number, at in self._pointed.items() if number in clients}
         return len(clients)
 
@@ -151,7 +146,7 @@ class Framing:
     @property
     def followed(self) -> frozenset[int]:
         """The open pages, as they were at the last look."""
-        return frozenset(self._arrivals)
+        return self._followed
 
     def frame(self, frame: Frame, untouched_only: bool = False) -> None:
         """Point every open page (or those whose view nobody has moved), and those to come."""
@@ -162,11 +157,9 @@ class Framing:
             if not untouched_only or self._is_untouched(client):
                 self._point(client, frame)
 
-    def frame_arrivals(self, frame: Frame) -> None:
-        """Frame anew what has just come and turns out to have another shape than it was framed for."""
+    def frame_untouched(self, frame: Frame) -> None:
+        """Frame anew each page that nobody has moved and that has another shape than it was framed for."""
         for number, client in self._server.get_clients().items():
-            if time.monotonic() - self._arrivals.get(number, 0.0) > SETTLES:
-                continue
             _, aspect = self._pointed.get(number, (None, USUAL_ASPECT))
             # If it looks from somewhere else, it lost its connection and came back, or the person was quicker.
             if self._is_untouched(client) and abs(aspect_of(client) / aspect - 1) > 0.05:
