@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from tests.ui.scenes import step_of, table_scene
 from workbench.core.step import StepResult
-from workbench.session.env_table import KEPT_REWARDS, EnvTable, Outcome
+from workbench.session.env_table import KEPT_REWARDS, EnvRows, EnvTable, Outcome
 from workbench.session.history import FAIL, SUCCESS, History
 from workbench.session.messages import Restored, Stepped
 
@@ -308,3 +308,8 @@ def test_a_success_that_is_no_bool_counts_and_other_numbers_do_not() -> None:
     assert rows.first_true["success"].tolist() == [-1, 1, -1] and not {"distance", "each"} & {*rows.first}
     assert (moment.happened & SUCCESS > 0).tolist() == [False, True, False]
     assert rows.outcome.tolist() == [Outcome.RUNNING, Outcome.SUCCESS, Outcome.RUNNING]
+
+
+def test_outcomes_are_places_in_an_array_of_what_the_page_sorts_by() -> None:
+    assert [int(outcome) for outcome in Outcome] == [0, 1, 2, 3]
+    assert EnvRows.bytes_a_step(10) - EnvRows.bytes_a_step(9) == 8, "what a step adds is one array of returns"
