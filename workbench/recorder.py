@@ -33,8 +33,7 @@ from mani_skill.utils.gym_utils import find_max_episode_steps_value
 
 from workbench.authoring.load import task_of_class
 from workbench.core import actions
-from workbench.core.open_env import open_env
-from workbench.core.seams import draws_its_own_seeds, task_class
+from workbench.core.seams import draws_its_own_seeds, open_env, task_class
 from workbench.core.state_columns import read_state_columns
 from workbench.core.step import StepResult
 from workbench.core.step_pictures import step_pictures

@@ -19,6 +19,7 @@ from mani_skill.utils.structs.pose import Pose
 
 import workbench
 from tests.core.drawn_envs import batched
+from workbench.core.camera_report import join_reports
 from workbench.core.scene_index import read_poses, scene_index
 from workbench.core.step_pictures import step_pictures
 from workbench.core.take_pictures import take_pictures
@@ -133,7 +134,7 @@ def test_what_the_page_draws_of_it_agrees(hiding: Any) -> None:
         assert (on_cube.pose[2] > AWAY / 2) == (e == 1)
         (human,) = take_pictures(hiding, e, [HUMAN])
         np.testing.assert_array_equal(human.rgb, people[e])
-    report = judge_camera(hiding, ("sensor", "base_camera"), range(N))
+    report = join_reports([judge_camera(hiding, ("sensor", "base_camera"), e) for e in range(N)])
     cube = next(seen for seen in report.objects if seen.name == "cube")
     assert (cube.pixels > 0).tolist() == [True, False]
     observed = [step_pictures(_task(hiding, obs), e, [ON_CUBE])[0] for e in range(N)]

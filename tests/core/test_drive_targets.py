@@ -103,3 +103,15 @@ def test_maniskills_own_fault_in_a_partial_reset_is_named_with_the_way_round(vel
     task.reset(seed=0)
     task.reset(env_idx=[1, 2])
     task.close()
+
+
+@pytest.mark.parametrize("velocity", [True, False])
+def test_a_target_that_is_no_number_is_refused_with_the_name_and_the_env(velocity: bool) -> None:
+    task: Any = made()
+    task.reset(0)
+    set_targets = (
+        task.env.door.set_joint_drive_velocity_targets if velocity else task.env.door.set_joint_drive_targets
+    )
+    set_targets(torch.tensor([[0.1], [0.1], [torch.nan], [0.1]]), joints=[task.env.hinge])
+    with pytest.raises(ValueError, match="^door of env 2: .* NaN"):
+        task.env.scene._gpu_apply_all()

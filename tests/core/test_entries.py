@@ -22,7 +22,7 @@ from tests.drive.envs import CPU, batched
 from tests.session.odd_entries import write_task
 from workbench.authoring.load import load_task
 from workbench.core.entries import MOST_ENTRIES, MOST_LETTERS, split_entries
-from workbench.core.open_env import open_env
+from workbench.core.seams import open_env
 from workbench.core.task_env import TaskEnv
 
 N = 4

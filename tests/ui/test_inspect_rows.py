@@ -55,7 +55,6 @@ JOINTS = JointReadings(
     position=np.array([0.5, 9.0, 0.04], np.float32),
     velocity=np.zeros(3, np.float32),
     target=np.array([0.0, np.nan, 0.02], np.float32),
-    target_velocity=np.zeros(3, np.float32),
     low=np.array([-1, -np.inf, 0], np.float32),
     high=np.array([1, np.inf, 0.04], np.float32),
 )

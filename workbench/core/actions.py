@@ -19,6 +19,8 @@ from mani_skill.agents.controllers.pd_joint_pos import PDJointPosController
 from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
+from workbench.core.scene_index import once_a_scene
+
 _EE_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
@@ -35,6 +37,7 @@ class ActionPart:
     high: NDArray[np.float32]
 
 
+@once_a_scene
 def action_parts(env: BaseEnv) -> tuple[ActionPart, ...]:
     """The parts in the order of the flat action; empty for a task without a robot."""
     if env.agent is None:

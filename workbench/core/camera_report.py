@@ -15,7 +15,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.camera_settings import CameraKey
+from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.core.pictures import Picture
 
 DEPTH_EDGES: NDArray[np.float64] = np.geomspace(0.01, 100.0, 41)
 """Metres, (41,). Ten bins a decade, and the same for every camera, so that histograms can be laid over each other;
@@ -201,6 +202,23 @@ class CameraReport:
         return tuple(thing for thing in self.objects if thing.name in wanted)
 
 
+@dataclass(frozen=True)
+class OfferedPlacement:
+    """One of the best that `camera_search` found."""
+
+    settings: CameraSettings
+    """In the frame of the camera's mount, or the env's if it has none."""
+    target: tuple[float, float, float]
+    """A point on its line of sight, for a look-at."""
+    score: float
+    """0..1, higher is better; see `camera_search.score_of`."""
+    words: str
+    """What it sees, in a sentence."""
+    report: CameraReport
+    picture: Picture
+    """From there, of the env where it does worst."""
+
+
 _Part = TypeVar("_Part", ObjectSeen, DepthReport)
 
 
@@ -239,6 +257,25 @@ def _end_to_end(parts: Sequence[_Part]) -> _Part:
     return replace(
         first, **{name: np.concatenate([getattr(part, name) for part in parts]) for name in arrays}
     )
+
+
+def in_words(report: CameraReport, objects: tuple[str, ...]) -> str:
+    """What was measured of these objects, for a person: ``cube: in 8 of 8 envs, about 210 pixels``."""
+    told = []
+    for thing in report.wanted_objects(objects):
+        all_envs = thing.summary()
+        if not all_envs.present:
+            continue
+        seen = round(all_envs.seen * all_envs.present)
+        words = (
+            f"{thing.name}: in {seen} of {all_envs.present} envs, about {all_envs.median_pixels:.0f} pixels"
+        )
+        if all_envs.cut > 0:
+            words += f", cut by the border in {all_envs.cut:.0%}"
+        if all_envs.hidden > 0.005:
+            words += f", {all_envs.hidden:.0%} behind the robot"
+        told.append(words)
+    return "; ".join(told)
 
 
 def _least(values: NDArray[np.float32]) -> float | None:

@@ -4,8 +4,8 @@ The space of placements is small (an eye in a box, looking towards the objects) 
 object is behind the arm or it is not), so it is sampled: eyes spread over the box, each looking at a point near the
 objects. What makes that quick enough to wait for is that nearly all of a picture's cost is the robot's meshes: on a
 software driver 2 ms without them, 30 ms with them. So every sample is looked at without the robot, in all envs, which
-settles size, cutting and what else is in the way, and bounds the score from above; with the robot only those are
-looked at that may still beat what is found. Around the best a second, smaller sample is drawn, twice.
+settles size, cutting and what else is in the way, and bounds the score from above; with the robot only the best of
+those are looked at. Around the best a second, smaller sample is drawn, twice.
 
 A placement's score is the mean of its mark in the average env and its mark in the worst one: a camera that loses
 the cube in one env of eight is not nearly as good as one that does not. The five best are given that stand apart,
@@ -31,9 +31,10 @@ from workbench.core.camera_frames import (
     rotation_matrix,
     with_pose,
 )
-from workbench.core.camera_report import CameraReport, join_reports
+from workbench.core.camera_report import CameraReport, OfferedPlacement, in_words, join_reports
 from workbench.core.camera_settings import CameraKey, CameraSettings
-from workbench.core.pictures import CameraKind, Picture
+from workbench.core.env_numbers import require_env
+from workbench.core.pictures import CameraKind
 from workbench.core.scene_index import SceneIndex, read_poses, scene_index
 from workbench.core.temporary_camera import undrawn
 from workbench.core.visibility import (
@@ -100,50 +101,21 @@ class SearchSpace:
         intrinsic_of(self.lens)
 
 
-@dataclass(frozen=True)
-class SearchProgress:
-    """How far a search is."""
-
-    stage: str
-    """What is being done, in words."""
-    done: int
-    """Poses looked from, of `total`."""
-    total: int
-    """At most: what cannot be better than what is found is left out."""
-    best: float
-    """Score of the best placement so far, 0..1; NaN before there is one."""
-
-
-@dataclass(frozen=True)
-class Suggestion:
-    """One placement that is offered."""
-
-    settings: CameraSettings
-    """In the frame of the mount, or the env's if there is none."""
-    target: tuple[float, float, float]
-    """A point on its line of sight, for a look-at, in the same frame."""
-    score: float
-    """0..1; see `score_of`."""
-    report: CameraReport
-    picture: Picture
-    """Of the env where it does worst, with rgb, depth and segmentation."""
-
-
 def suggest_cameras(
     env: Any,
     space: SearchSpace,
     envs: Sequence[int],
     *,
-    progress: Callable[[SearchProgress], None] = lambda progress: None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
     cancelled: Callable[[], bool] = lambda: False,
-) -> tuple[Suggestion, ...]:
+) -> tuple[OfferedPlacement, ...]:
     """The best placements found for envs that are already reset, the best first; the envs are left as they are.
 
     Fewer than `SearchSpace.best` are given where no more of them stand apart or see anything, and those found until
     then where the search is cancelled.
 
     Args:
-        progress: called after each look, so it should do little.
+        progress: called after each look with how many were made and are to be made at most, so it should do little.
         cancelled: asked before each look.
 
     Raises:
@@ -180,13 +152,13 @@ class _Search:
         env: Any,
         space: SearchSpace,
         envs: list[int],
-        progress: Callable[[SearchProgress], None],
+        progress: Callable[[int, int], None],
         cancelled: Callable[[], bool],
     ) -> None:
         if not envs:
             raise ValueError("no env is named to search in")
-        if any(not 0 <= e < env.num_envs for e in envs):
-            raise IndexError(f"envs {envs} are out of range for {env.num_envs} envs")
+        for e in envs:
+            require_env(e, env.num_envs)
         self.env, self.space, self.envs, self.index = env, space, envs, scene_index(env)
         self.progress, self.cancelled = progress, cancelled
         every = list_objects(env)
@@ -209,12 +181,11 @@ class _Search:
         near = 8 * space.best
         self.total = len(envs) * (space.candidates + self.keep + ROUNDS * (near + 2 * space.best))
         self.done = 0
-        self.best = float("nan")
         self.found: list[tuple[float, _Candidate, CameraReport]] = []
 
-    def run(self) -> Iterator[Suggestion]:
+    def run(self) -> Iterator[OfferedPlacement]:
         drawn = [self._draw() for _ in range(self.space.candidates)]
-        self._look_at_best_of(drawn, self.keep, "looking for the objects")
+        self._look_at_best_of(drawn, self.keep)
         for round_ in range(ROUNDS):
             chosen = self._chosen()
             if len(chosen) == self.space.best and chosen[-1][0] >= GOOD_ENOUGH:
@@ -222,54 +193,27 @@ class _Search:
             centres = [candidate for _, candidate, _ in chosen]
             reach = 0.12 / (round_ + 1)
             near = [self._draw_near(centre, reach) for centre in centres for _ in range(8)]
-            self._look_at_best_of(near, 2 * len(centres), "trying beside the best")
-        self.progress(SearchProgress("taking pictures of the best", self.total, self.total, self.best))
+            self._look_at_best_of(near, 2 * len(centres))
+        self.progress(self.total, self.total)
         for score, candidate, report in self._chosen():
             yield self._suggestion(score, candidate, report)
 
-    def _look_at_best_of(self, candidates: list[_Candidate], keep: int, stage: str) -> None:
-        """Score all without the robot, and with it those of the best `keep` that may still be offered.
-
-        A robot only hides, so the score without it is a bound: who cannot beat what is found is not looked at again.
-        """
-        bare = self._measure(candidates, stage)
+    def _look_at_best_of(self, candidates: list[_Candidate], keep: int) -> None:
+        """Score all without the robot, which only hides and so bounds the score, and the best `keep` of them with it."""
+        bare = self._measure(candidates)
         scores = [score_of(join_reports(row), self.space.objects) for row in bare]
         order = np.argsort([-score for score in scores], kind="stable").tolist()
-        waiting = [i for i in order if scores[i] > 0][:keep]
-        while waiting and not self.cancelled():
-            chosen = self._chosen()
-            least = chosen[-1][0] if len(chosen) == self.space.best else 0.0
-            beaten = [(score, candidate) for score, candidate, _ in chosen]
-            waiting = [
-                i
-                for i in waiting
-                if scores[i] > least
-                and not any(score >= scores[i] and self._near(c, candidates[i]) for score, c in beaten)
-            ]
-            # Neighbours wait for what the better of them turns out to be.
-            now: list[int] = []
-            for i in waiting:
-                if len(now) < self.space.best and not any(
-                    self._near(candidates[i], candidates[j]) for j in now
-                ):
-                    now.append(i)
-            if not now:
-                break
-            waiting = [i for i in waiting if i not in now]
-            whole = self._measure(
-                [candidates[i] for i in now], "looking past the robot", [bare[i] for i in now]
-            )
-            for i, row in zip(now, whole, strict=False):
-                report = join_reports(row)
-                score = score_of(report, self.space.objects)
-                self.found.append((score, candidates[i], report))
-                self.best = max(score, self.best) if np.isfinite(self.best) else score
+        best = [i for i in order if scores[i] > 0][:keep]
+        whole = self._measure([candidates[i] for i in best], [bare[i] for i in best])
+        for i, row in zip(best, whole, strict=False):
+            report = join_reports(row)
+            self.found.append((score_of(report, self.space.objects), candidates[i], report))
 
     def _near(self, a: _Candidate, b: _Candidate) -> bool:
         return bool(np.linalg.norm(a[0] - b[0]) < self.apart)
 
     def _measure(
-        self, candidates: list[_Candidate], stage: str, bare: list[list[CameraReport]] | None = None
+        self, candidates: list[_Candidate], bare: list[list[CameraReport]] | None = None
     ) -> list[list[CameraReport]]:
         """Each candidate in each env: with the robot if `bare` is given, without it otherwise.
 
@@ -294,7 +238,7 @@ class _Search:
                         measure(view, pose, e, self.objects, self.index, key, self.space.lens, known)
                     )
                     self.done += 1
-                    self.progress(SearchProgress(stage, self.done, self.total, self.best))
+                    self.progress(self.done, self.total)
         return measured
 
     def _chosen(self) -> list[tuple[float, _Candidate, CameraReport]]:
@@ -372,16 +316,17 @@ class _Search:
             up = -self.up[0] * np.sign(forward @ up)
         return np.concatenate([eye, quaternion_from_axes(forward, up)])
 
-    def _suggestion(self, score: float, candidate: _Candidate, report: CameraReport) -> Suggestion:
+    def _suggestion(self, score: float, candidate: _Candidate, report: CameraReport) -> OfferedPlacement:
         settings = with_pose(self.space.lens, self._pose(candidate))
         worst = report.worst_first(self.space.objects)[0]
         e = report.envs[worst]
         placement = Placement(settings, self.space.kind, self.space.mount)
         target = candidate[1]
-        return Suggestion(
+        return OfferedPlacement(
             settings=settings,
             target=(float(target[0]), float(target[1]), float(target[2])),
             score=score,
+            words=in_words(report, self.space.objects),
             report=report,
             picture=picture_of(self.env, e, placement),
         )

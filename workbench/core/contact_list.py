@@ -22,7 +22,7 @@ import sapien.physx as physx
 from numpy.typing import NDArray
 
 from workbench.core import seams
-from workbench.core.open_env import open_env
+from workbench.core.env_numbers import require_env
 from workbench.core.scene_index import SceneIndex, scene_index
 
 
@@ -69,9 +69,8 @@ def list_contacts(env: Any, env_idx: int) -> tuple[Contact, ...]:
         IndexError: there is no such env.
         NotImplementedError: the env is simulated on the GPU.
     """
-    env, env_idx = open_env(env), operator.index(env_idx)
-    if not 0 <= env_idx < env.num_envs:
-        raise IndexError(f"env {env_idx} is out of range for {env.num_envs} envs")
+    env, env_idx = seams.open_env(env), operator.index(env_idx)
+    require_env(env_idx, env.num_envs)
     batched = seams.batched_system(env.scene)
     if batched is None and env.scene.gpu_sim_enabled:
         raise NotImplementedError(

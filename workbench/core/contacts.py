@@ -102,10 +102,6 @@ class ContactReader:
         self._cache = None
         self._carried = {env: touching for env, touching in self._carried.items() if env in but}
 
-    def counted(self) -> list[tuple[tuple[int, int], NDArray[np.float32]]]:
-        """The ids of the two bodies, and the impulse on the first, of every contact that a query counts."""
-        return self._contacts()
-
     def carry(self, system: int, contacts: list[tuple[tuple[int, int], NDArray[np.float32]]]) -> None:
         """Answer for one system with these, as `counted` gives them, until the next substep.
 
@@ -116,7 +112,7 @@ class ContactReader:
 
     def query_bodies(self, query: BodyImpulseQuery) -> None:
         total, rows = np.zeros((len(query.bodies), 3)), query.rows
-        for (first, second), impulse in self._contacts():
+        for (first, second), impulse in self.counted():
             for row in rows.get(first, ()):
                 total[row] += impulse
             # Not both: stock ManiSkill counts a contact for its first body only when the two are one.
@@ -126,7 +122,7 @@ class ContactReader:
 
     def query_pairs(self, query: PairImpulseQuery) -> None:
         total, rows = np.zeros((len(query.pairs), 3)), query.rows
-        for bodies, impulse in self._contacts():
+        for bodies, impulse in self.counted():
             for row, sign in rows.get(bodies, ()):
                 total[row] += impulse * sign
         query.cuda_impulses.torch().copy_(torch.from_numpy(total))
@@ -139,7 +135,7 @@ class ContactReader:
         self._wanted_pairs = {p for q in self._queries if isinstance(q, PairImpulseQuery) for p in q.rows}
         self._cache = None
 
-    def _contacts(self) -> list[tuple[tuple[int, int], NDArray[np.float32]]]:
+    def counted(self) -> list[tuple[tuple[int, int], NDArray[np.float32]]]:
         """The ids of the two bodies, and the impulse on the first, of every contact that a query counts."""
         if self._cache is None:
             found = self._cache = []

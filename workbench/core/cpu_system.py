@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -32,7 +33,6 @@ from numpy.typing import NDArray
 from workbench.core.contacts import BodyImpulseQuery, ContactReader, CpuArray, PairImpulseQuery
 from workbench.core.cpu_layout import Layout, check_layout, lay_out
 from workbench.core.drawn_poses import Places, TensorPoses
-from workbench.core.gpu_members import applies_everything, uncommon_member
 from workbench.core.mirrors import Group, Mirror, Mirrors, refuse_nan
 from workbench.core.stepping import Stepper
 
@@ -40,6 +40,39 @@ _TOO_EARLY = (
     "The simulation is not initialised yet: in _load_agent and _load_scene only initial poses "
     "may be set. Read and write state (poses, qpos, velocities) in _initialize_episode."
 )
+
+
+def _uncommon_member(name: str) -> Any:
+    """What a `BatchedCpuSystem` answers for a member that it does not define.
+
+    Raises:
+        NotImplementedError: SAPIEN has such a member.
+        AttributeError: there is no such member, in SAPIEN neither.
+    """
+    if hasattr(physx.PhysxGpuSystem, name):
+        raise NotImplementedError(
+            f"{name} is a member of SAPIEN's GPU system that the batched CPU simulation has not: here every env has its "
+            "own physics, at its own origin. What all of them share is asked of one: self.scene.px.systems[0]."
+        )
+    raise AttributeError(f"the batched CPU system has no '{name}'")
+
+
+def _applies_everything(apply: Callable[[Any], None]) -> Callable[..., None]:
+    """For ``gpu_apply_*``: refuse SAPIEN's optional buffer of indices in words.
+
+    Not needed here: what differs from the last fetch is applied, and nothing else is touched anyway.
+    """
+
+    @wraps(apply)
+    def checked(self: Any, index_buffer: Any = None) -> None:
+        if index_buffer is not None:
+            raise NotImplementedError(
+                f"{apply.__name__} takes no index buffer in the batched CPU simulation: call it without, "
+                "it applies the rows that were changed."
+            )
+        apply(self)
+
+    return checked
 
 
 class BatchedCpuSystem:
@@ -206,7 +239,7 @@ class BatchedCpuSystem:
         # The tensors exist from `gpu_init` on: a task that asks earlier is told what it did wrong.
         if name.startswith("cuda_") and self.__dict__.get("_layout") is None:
             raise RuntimeError(_TOO_EARLY)
-        return uncommon_member(name)
+        return _uncommon_member(name)
 
     def _setter(self, joint: Any, method: str) -> Callable[[float], None]:
         """What sets one kind of drive target of a joint."""
@@ -366,35 +399,35 @@ class BatchedCpuSystem:
         self._apply(self._mirrors.targets)
         self._apply(self._mirrors.velocity_targets)
 
-    @applies_everything
+    @_applies_everything
     def gpu_apply_rigid_dynamic_data(self) -> None:
         self._apply(self._mirrors.bodies)
 
-    @applies_everything
+    @_applies_everything
     def gpu_apply_articulation_root_pose(self) -> None:
         self._apply(self._mirrors.roots)
 
-    @applies_everything
+    @_applies_everything
     def gpu_apply_articulation_root_velocity(self) -> None:
         self._apply(self._mirrors.root_velocities)
 
-    @applies_everything
+    @_applies_everything
     def gpu_apply_articulation_qpos(self) -> None:
         self._apply(self._mirrors.qpos)
 
-    @applies_everything
+    @_applies_everything
     def gpu_apply_articulation_qvel(self) -> None:
         self._apply(self._mirrors.qvel)
 
-    @applies_everything
+    @_applies_everything
     def gpu_apply_articulation_qf(self) -> None:
         self._apply(self._mirrors.qf)
 
-    @applies_everything
+    @_applies_everything
     def gpu_apply_articulation_target_position(self) -> None:
         self._apply(self._mirrors.targets, keep_awake=True)
 
-    @applies_everything
+    @_applies_everything
     def gpu_apply_articulation_target_velocity(self) -> None:
         self._apply(self._mirrors.velocity_targets, keep_awake=True)
 

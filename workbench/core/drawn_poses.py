@@ -65,11 +65,8 @@ def drawn_at(places: Places, components: Iterable[Any] = ()) -> Iterator[Callabl
     Args:
         components: cameras that may be on one of them.
     """
-    was: list[tuple[Any, sapien.Pose]] = []
-    for component in components if places else ():
-        if id(component.entity) in places:
-            was.append((component, component.local_pose))
-            component.local_pose = component.entity.pose.inv() * camera_pose(component, places)
+    on_them = [c for c in components if id(c.entity) in places] if places else []
+    cameras = [(c, "local_pose", c.entity.pose.inv() * camera_pose(c, places)) for c in on_them]
 
     def move_bodies() -> None:
         for entity, pose in places.values():
@@ -78,11 +75,22 @@ def drawn_at(places: Places, components: Iterable[Any] = ()) -> Iterator[Callabl
                     drawn._internal_node.set_position(pose[:3])
                     drawn._internal_node.set_rotation(pose[3:])
 
-    try:
+    with temporarily(cameras):
         yield move_bodies
+
+
+@contextmanager
+def temporarily(changes: Iterable[tuple[Any, str, Any]]) -> Iterator[None]:
+    """Within this, attributes (owner, name, value) have other values."""
+    was: list[tuple[Any, str, Any]] = []
+    try:
+        for owner, name, value in changes:
+            was.append((owner, name, getattr(owner, name)))
+            setattr(owner, name, value)
+        yield
     finally:
-        for component, local_pose in was:
-            component.local_pose = local_pose
+        for owner, name, value in reversed(was):
+            setattr(owner, name, value)
 
 
 def camera_pose(component: Any, places: Places) -> sapien.Pose:

@@ -26,6 +26,12 @@ def env_numbers(env_idx: Any) -> list[int]:
         ) from error
 
 
+def require_env(env: int, num_envs: int) -> None:
+    """Raise IndexError where there is no such env."""
+    if not 0 <= env < num_envs:
+        raise IndexError(f"env {env} is out of range for {num_envs} envs")
+
+
 def envs_of_batch(env_idx: Any, num_envs: int) -> list[int]:
     """As `env_numbers`, each once and there.
 
@@ -35,8 +41,8 @@ def envs_of_batch(env_idx: Any, num_envs: int) -> list[int]:
     chosen = env_numbers(env_idx)
     if not chosen:
         raise ValueError("env_idx is empty: name the envs, or leave it out for all")
-    if any(not 0 <= i < num_envs for i in chosen):
-        raise IndexError(f"env_idx {chosen} is out of range for {num_envs} envs")
+    for i in chosen:
+        require_env(i, num_envs)
     if len(set(chosen)) < len(chosen):
         raise ValueError(f"env_idx {chosen} names an env twice")
     return chosen

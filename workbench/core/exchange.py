@@ -40,10 +40,8 @@ def put_class(env: BaseEnv, task: type[BaseEnv]) -> None:
 
 def can_exchange_cameras(env: BaseEnv) -> bool:
     """Whether `exchange_cameras` is possible: not in GPU simulation, whose camera groups cannot be undone."""
-    cameras = [*seams.sensors(env).values(), *seams.human_render_cameras(env).values()]
-    return seams.batched_system(env.scene) is not None and all(
-        seams.camera_components(camera) is not None for camera in cameras
-    )
+    plain = all(seams.camera_components(camera) for camera in seams.cameras(env).values())
+    return plain and seams.batched_system(env.scene) is not None
 
 
 def exchange_cameras(env: BaseEnv) -> None:
@@ -54,8 +52,8 @@ def exchange_cameras(env: BaseEnv) -> None:
     """
     if not env.scene.can_render():
         return
-    for camera in [*seams.sensors(env).values(), *seams.human_render_cameras(env).values()]:
-        for component in seams.camera_components(camera) or ():
+    for camera in seams.cameras(env).values():
+        for component in seams.camera_components(camera):
             # The entity stays, empty: with one fewer, SAPIEN would number the others anew in a scene that a
             # restored snapshot makes (see `fresh_physics`), and segmentation pictures name bodies by number.
             component.entity.remove_component(component)

@@ -77,9 +77,7 @@ def write_gpu_state(
             struct.set_state(state, torch.tensor(fitting, device=env.device))
             if word == "articulation":
                 _write_joints(env, struct, name, fitting, by_env)
-    env.scene._gpu_apply_all()
-    env.scene.px.gpu_update_articulation_kinematics()
-    env.scene._gpu_fetch_all()
+    seams.apply_and_fetch(env)
     return carried, missed
 
 

@@ -24,9 +24,10 @@ from numpy.typing import NDArray
 
 from workbench.core import seams
 from workbench.core.contact_list import Contact
+from workbench.core.env_numbers import require_env
 from workbench.core.inspection import Inspection, JointReadings, Leaf, Section, Touching
 from workbench.core.scene_index import scene_index
-from workbench.core.snapshot import restore_memory, take_memory
+from workbench.core.snapshot import remembering
 from workbench.core.task_env import TaskEnv, flat_entries, to_numpy
 
 MOST_VALUES = 64
@@ -41,8 +42,7 @@ def inspect_env(task: TaskEnv, env: int, sections: Collection[Section]) -> Inspe
     Raises:
         IndexError: there is no such env.
     """
-    if not 0 <= env < task.num_envs:
-        raise IndexError(f"env {env} is out of range for {task.num_envs} envs")
+    require_env(env, task.num_envs)
     readers: dict[Section, Callable[[TaskEnv, int], Any]] = {
         "observation": read_observation,
         "state": read_state,
@@ -124,7 +124,6 @@ def read_joints(task: TaskEnv, env: int) -> tuple[JointReadings, ...]:
         names = tuple(joint.name for joint in articulation.active_joints)
         limits = to_numpy(articulation.get_qlimits()[row])[:count]
         stiff = np.array([joint.stiffness > 0 for joint in joints])
-        damped = np.array([joint.damping > 0 for joint in joints])
         found.append(
             JointReadings(
                 articulation=name,
@@ -133,9 +132,6 @@ def read_joints(task: TaskEnv, env: int) -> tuple[JointReadings, ...]:
                 position=_floats(articulation.get_qpos()[row])[:count],
                 velocity=_floats(articulation.get_qvel()[row])[:count],
                 target=np.where(stiff, _floats(articulation.get_drive_targets()[row])[:count], np.nan),
-                target_velocity=np.where(
-                    damped, _floats(articulation.get_drive_velocities()[row])[:count], np.nan
-                ),
                 low=limits[:, 0].astype(np.float32),
                 high=limits[:, 1].astype(np.float32),
             )
@@ -208,12 +204,8 @@ def names_of_flat(task: TaskEnv, flat: Any) -> list[tuple[str, tuple[int, ...], 
 
 def _find_names(task: TaskEnv, width: int) -> list[tuple[str, tuple[int, ...], str]] | None:
     env = task.env
-    every = list(range(task.num_envs))
-    memory = take_memory(env, every)
-    try:
+    with remembering(env):
         obs = seams.unflattened_state(env, env.get_info())
-    finally:
-        restore_memory(env, memory, every, every, whole=True)
     parts = []
     for name, value in flat_entries(obs):
         if isinstance(value, torch.Tensor) and value.nelement():

@@ -46,8 +46,6 @@ class JointReadings:
     """(J,) a second."""
     target: NDArray[np.float32]
     """(J,) of the position drive; NaN for a joint that has none (no stiffness)."""
-    target_velocity: NDArray[np.float32]
-    """(J,) of the velocity drive; NaN for a joint that has none (no damping)."""
     low: NDArray[np.float32]
     """(J,) limits; infinite where there are none."""
     high: NDArray[np.float32]

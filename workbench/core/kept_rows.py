@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from types import FrameType
 from typing import Any, Literal
@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 
+from workbench.core import seams
 from workbench.core.broken_rule import Frame, frames_of_the_task, is_installed
 from workbench.core.task_buffers import is_per_env, look_over_env, version_of
 from workbench.core.task_members import Walk
@@ -64,7 +65,7 @@ class KeptRows:
         self._elsewhere = np.setdiff1d(np.arange(env.num_envs), np.asarray(chosen, dtype=np.int64))
         self._single, self._groups = _paths(look_over_env(env), env.num_envs)
         self._before = {path: _copy(value) for path, value in self._read().items()}
-        self._lines = _Lines(self, _files_of(env)) if lines and self._before else None
+        self._lines = _Lines(self, seams.files_of_task(env)) if lines and self._before else None
 
     @property
     def others(self) -> int:
@@ -209,18 +210,10 @@ def _same(a: Any, b: Any) -> bool:
 # --- lines -------------------------------------------------------------------------------------------
 
 
-def _files_of(env: BaseEnv) -> frozenset[str]:
-    """Installed files whose lines are the task's too."""
-    task: Any = getattr(env, "_workbench_task", type(env))
-    classes = [c for c in task.__mro__ if issubclass(c, BaseEnv) and c is not BaseEnv]
-    functions = [v for c in classes for v in vars(c).values() if hasattr(v, "__code__")]
-    return frozenset(function.__code__.co_filename for function in functions)
-
-
 class _Lines:
     """Looks at the rows after each line of the author's, and remembers after which they were others."""
 
-    def __init__(self, rows: KeptRows, files: frozenset[str]) -> None:
+    def __init__(self, rows: KeptRows, files: Collection[str]) -> None:
         self._rows, self._files = rows, files
         self._left = MOST_LINES
         self._seen: dict[str, tuple[Any, int, bool]] = {}

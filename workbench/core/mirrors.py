@@ -52,7 +52,7 @@ class Mirror:
         self.names = names
         self.now, self.seen = whole
         self.rows = np.arange(len(self.now)) if rows is None else rows
-        self.at: Any = columns if rows is None else rows if columns == slice(None) else (rows, columns)
+        self.at: Any = columns if rows is None else (rows, columns)
         self.sources, self._owners, self._put = sources, owners, put
 
     def differs(self) -> NDArray[np.bool_]:
@@ -84,7 +84,7 @@ class Mirror:
         at, read = self.sources[0]
         return np.abs(self.now[at] - read()) > _MOVED
 
-    def apply(self, keep_awake: bool = False) -> None:
+    def apply(self, keep_awake: bool) -> None:
         """Set what differs, and nothing else.
 
         Raises:
@@ -124,7 +124,7 @@ class DriveTargets(Mirror):
         self._setters, self._later = setters, later
         self._of_env = {int(env): np.flatnonzero(self.envs == env).tolist() for env in np.unique(self.envs)}
 
-    def apply(self, keep_awake: bool = False) -> None:
+    def apply(self, keep_awake: bool) -> None:
         """Take what was written.
 
         Args:

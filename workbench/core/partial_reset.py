@@ -34,7 +34,7 @@ from workbench.core.assignments import find_assignment
 from workbench.core.broken_rule import BrokenRule
 from workbench.core.env_numbers import env_numbers, envs_of_batch
 from workbench.core.kept_rows import rows_of_tensors
-from workbench.core.seams import agents, drawing_from, set_episode_seeds, task_class
+from workbench.core.seams import agents, drawing_from, files_of_task, set_episode_seeds, task_class
 
 _CORE = str(Path(__file__).parent)
 
@@ -166,7 +166,7 @@ def _note(env: BaseEnv, untouched: list[int], line: traceback.FrameSummary | Non
 
 def _line_of_the_task(error: Exception, env: BaseEnv) -> traceback.FrameSummary | None:
     """The innermost line in a file of the task's classes; None where the core broke below it."""
-    files = _files_of_task(env)
+    files = files_of_task(env)
     found, below = None, False
     for frame in traceback.extract_tb(error.__traceback__):
         if frame.filename in files:
@@ -174,9 +174,3 @@ def _line_of_the_task(error: Exception, env: BaseEnv) -> traceback.FrameSummary 
         below |= frame.filename.startswith(_CORE)
     # A ValueError is how the core refuses what it is given; anything else from there may be its own mistake.
     return None if below and not isinstance(error, ValueError) else found
-
-
-def _files_of_task(env: BaseEnv) -> set[str]:
-    classes = [c for c in type(env).__mro__ if issubclass(c, BaseEnv) and c is not BaseEnv]
-    functions = [v for c in classes for v in vars(c).values() if hasattr(v, "__code__")]
-    return {function.__code__.co_filename for function in functions}

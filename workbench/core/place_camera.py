@@ -69,7 +69,7 @@ class PlacedCameras:
             self._placed.pop(key, None)
             return known is not None and _set(env, key, camera, known.config, known.poses)
         config = camera.config if known is None else known.config
-        poses = [c.local_pose for c in _components(camera)] if known is None else known.poses
+        poses = [c.local_pose for c in seams.camera_components(camera)] if known is None else known.poses
         changed = _set(env, key, camera, _config(config, settings), [_pose(settings)] * len(poses))
         self._placed[key] = _Placed(camera, config, poses, settings)
         return changed
@@ -77,35 +77,25 @@ class PlacedCameras:
     def put_back(self, env: Any) -> None:
         """Place cameras again that were made anew, by a reset that built the scene anew or a failed exchange."""
         for key, placed in list(self._placed.items()):
-            cameras = _cameras(env, key)
-            if key[1] not in cameras:
+            camera = seams.cameras(env).get(key)
+            if camera is None:
                 del self._placed[key]
-            elif cameras[key[1]] is not placed.camera:
+            elif camera is not placed.camera:
                 self.place(env, key, placed.settings)
-
-
-def _cameras(env: Any, key: CameraKey) -> dict[str, Any]:
-    return seams.sensors(env) if key[0] == "sensor" else seams.human_render_cameras(env)
 
 
 def _camera(env: Any, key: CameraKey) -> Any:
     kind, name = key
-    camera = _cameras(env, key).get(name)
+    camera = seams.cameras(env).get(key)
     if camera is None:
         raise ValueError(f"there is no {kind} camera {name!r}")
-    if seams.camera_components(camera) is None:
+    if not seams.camera_components(camera):
         raise ValueError(f"{name!r} is no plain camera, and only those can be placed")
     if env.scene.gpu_sim_enabled and seams.batched_system(env.scene) is None:
         raise ValueError(
             "in GPU simulation cameras cannot be moved; open the task with --backend cpu to place them"
         )
     return camera
-
-
-def _components(camera: Any) -> list[Any]:
-    components = seams.camera_components(camera)
-    assert components is not None, "`_camera` gives only cameras that have them"
-    return components
 
 
 def _pose(settings: CameraSettings) -> sapien.Pose:
@@ -134,7 +124,7 @@ def _config(config: Any, settings: CameraSettings) -> Any:
 
 def _set(env: Any, key: CameraKey, camera: Any, config: Any, poses: list[sapien.Pose]) -> bool:
     before = camera.config
-    old = _components(camera)
+    old = seams.camera_components(camera)
     reshaped = (old[0].width, old[0].height) != (config.width, config.height)
     exchanged = reshaped or before.shader_config is not config.shader_config
     components = _exchanged(config, old) if exchanged else old

@@ -68,7 +68,7 @@ def write_states(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:
         if rows:
             values = torch.as_tensor(np.stack([*rows.values()]).astype(np.float32), device=env.device)
             struct.set_state(values, torch.tensor([*rows], device=env.device))
-    _apply(env)
+    seams.apply_and_fetch(env)
     _write_controllers(env, states)
 
 
@@ -88,7 +88,7 @@ def settle_robot(env: Any, env_idx: Sequence[int]) -> None:
         rows = seams.data_rows_of_articulation(agent.robot)[chosen].long()
         targets[rows, : qpos.shape[1]] = qpos[chosen]
         velocities[rows] = 0.0
-    _apply(env)
+    seams.apply_and_fetch(env)
 
 
 def new_physics(env: Any, env_idx: Sequence[int]) -> None:
@@ -138,12 +138,6 @@ def same_state(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> bool:
 
 def _width(struct: Any) -> int:
     return _FIXED + 2 * int(getattr(struct, "max_dof", 0))
-
-
-def _apply(env: Any) -> None:
-    env.scene._gpu_apply_all()
-    env.scene.px.gpu_update_articulation_kinematics()
-    env.scene._gpu_fetch_all()
 
 
 def _write_controllers(env: Any, states: Mapping[int, Mapping[str, NDArray]]) -> None:

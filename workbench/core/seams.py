@@ -41,7 +41,7 @@ from mani_skill.utils.structs.render_camera import RenderCamera
 from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
 from numpy.typing import NDArray
 
-from workbench.core.camera_settings import CallSite, CameraKey
+from workbench.core.camera_settings import CallSite, CameraKey, CameraKind
 from workbench.core.cpu_system import BatchedCpuSystem
 
 _installed = False
@@ -240,9 +240,38 @@ def last_observation(env: BaseEnv) -> Any:
     return env._last_obs
 
 
+def open_env(env: Any) -> BaseEnv:
+    """The env under its wrappers: ``base_env`` of ManiSkillVectorEnv, ``unwrapped`` of all others.
+
+    Raises:
+        TypeError: there is no ManiSkill env.
+        RuntimeError: it was closed.
+    """
+    env = getattr(getattr(env, "base_env", env), "unwrapped", env)
+    if not isinstance(env, BaseEnv):
+        raise TypeError(f"a ManiSkill env is wanted, not {type(env).__name__}")
+    if env.scene is None:
+        raise RuntimeError("this env was closed: there is no simulation any more")
+    return env
+
+
 def task_class(env: BaseEnv) -> type[BaseEnv]:
     """The author's class, without what the CPU core puts in front of it."""
     return getattr(type(env), "_workbench_task", type(env))
+
+
+def apply_and_fetch(env: BaseEnv) -> None:
+    """Let the simulation have what was written to its tensors, and the tensors what comes of it."""
+    env.scene._gpu_apply_all()
+    env.scene.px.gpu_update_articulation_kinematics()  # type: ignore[union-attr]
+    env.scene._gpu_fetch_all()
+
+
+def files_of_task(env: BaseEnv) -> set[str]:
+    """Where the methods of the author's class, and of those that it inherits of below BaseEnv, are written."""
+    classes = [c for c in task_class(env).__mro__ if issubclass(c, BaseEnv) and c is not BaseEnv]
+    functions = [v for c in classes for v in vars(c).values() if hasattr(v, "__code__")]
+    return {function.__code__.co_filename for function in functions}
 
 
 def episode_generators(env: BaseEnv) -> dict[str, list[np.random.RandomState]]:
@@ -306,14 +335,10 @@ def unflattened_state(env: BaseEnv, info: dict[str, Any]) -> dict[str, Any]:
     return env._get_obs_state_dict(info)
 
 
-def sensors(env: Any) -> dict[str, Any]:
-    """``_sensors``; an env made without a render device has no such attribute."""
-    return getattr(env, "_sensors", {})
-
-
-def human_render_cameras(env: Any) -> dict[str, Any]:
-    """``_human_render_cameras``; an env made without a render device has no such attribute."""
-    return getattr(env, "_human_render_cameras", {})
+def cameras(env: Any) -> dict[CameraKey, Any]:
+    """``_sensors``, tactile ones too, then ``_human_render_cameras``; an env without a render device has neither."""
+    lists: tuple[tuple[CameraKind, str], ...] = (("sensor", "_sensors"), ("human", "_human_render_cameras"))
+    return {(kind, name): c for kind, held in lists for name, c in getattr(env, held, {}).items()}
 
 
 def forget_cameras(env: Any) -> None:
@@ -338,14 +363,14 @@ def to_cpu(obs: Any) -> Any:
     return common.to_cpu_tensor(obs)
 
 
-def camera_components(camera: Any) -> list[Any] | None:
+def camera_components(camera: Any) -> list[Any]:
     """The ``RenderCameraComponent`` of every env behind a ManiSkill camera: ``camera._render_cameras``.
 
-    None for what is no plain camera: tactile sensors, or the stereo depth camera (which ManiSkill
+    Empty for what is no plain camera: tactile sensors, or the stereo depth camera (which ManiSkill
     3.0.1 cannot build: its constructor wants an argument that BaseEnv does not pass).
     """
     inner = getattr(camera, "camera", None)
-    return inner._render_cameras if isinstance(inner, RenderCamera) else None
+    return inner._render_cameras if isinstance(inner, RenderCamera) else []
 
 
 # --- what placing a camera writes ------------------------------------------------------------------

@@ -21,7 +21,8 @@ the moment to the last bit. The session goes back so (`session.go_back`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -40,7 +41,6 @@ from workbench.core.cpu_state import (
 from workbench.core.env_numbers import env_numbers, envs_of_batch
 from workbench.core.episode_rng import RngReader, RngState, SharedRng, read_shared_rng, write_shared_rng
 from workbench.core.gpu_state import GpuEnvState, read_gpu_state, write_gpu_state
-from workbench.core.open_env import open_env
 from workbench.core.task_buffers import TaskState, read_task_state, write_task_state
 
 
@@ -95,7 +95,7 @@ def take_snapshot(env: Any, env_idx: Sequence[int] | int | None = None) -> Snaps
         IndexError, ValueError: `env_idx` names envs that are not there, one twice, or none.
         NotImplementedError: a stock CPU env.
     """
-    env = open_env(env)
+    env = seams.open_env(env)
     chosen = envs_of_batch(range(env.num_envs) if env_idx is None else env_idx, env.num_envs)
     px = seams.batched_system(env.scene)
     if px is not None:
@@ -139,7 +139,7 @@ def restore_snapshot(
         IndexError, ValueError: `env_idx` or `source` names envs that are not there, or the numbers differ.
         TypeError: a GPU env's snapshot for a CPU env, or the other way round.
     """
-    env = open_env(env)
+    env = seams.open_env(env)
     if not isinstance(snapshot, Snapshot):
         raise TypeError(f"a Snapshot is wanted, as take_snapshot gives it, not {type(snapshot).__name__}")
     targets, positions = _pairs(env, snapshot, env_idx, source)
@@ -170,7 +170,7 @@ def begin_anew(env: Any, env_idx: list[int]) -> None:
     Args:
         env: batched on the CPU and reset at least once; wrappers are looked through.
     """
-    begin_cpu_state_anew(open_env(env), env_idx)
+    begin_cpu_state_anew(seams.open_env(env), env_idx)
 
 
 def in_this_state(env: Any, env_idx: int, snapshot: Snapshot, source: int) -> bool:
@@ -199,6 +199,17 @@ def take_memory(env: BaseEnv, env_idx: list[int]) -> Memory:
         task=read_task_state(env, env_idx),
         shared_rng=read_shared_rng(env.device),
     )
+
+
+@contextmanager
+def remembering(env: BaseEnv) -> Iterator[None]:
+    """Afterwards the task remembers what it did: its hooks may count and draw, and must not do so twice in a step."""
+    every = list(range(env.num_envs))
+    memory = take_memory(env, every)
+    try:
+        yield
+    finally:
+        restore_memory(env, memory, every, every, whole=True)
 
 
 def restore_memory(

@@ -45,14 +45,12 @@ def _observed(task: TaskEnv, env_index: int, request: Request) -> Picture | None
     depth = rows.get("depth")
     if depth is not None and (depth.dtype != np.int16 or depth.min() < 0):
         return None
-    components = seams.camera_components(camera)
-    assert components is not None, "`cameras_of` names no others"
     scene: Any = task.env.scene
     if scene.gpu_sim_enabled:
         scene.px.sync_poses_gpu_to_cpu()
     px = seams.batched_system(scene)
     elsewhere = {} if px is None else px.elsewhere([env_index])
-    pose = camera_pose(components[env_index], elsewhere.get(env_index, NOWHERE_ELSE))
+    pose = camera_pose(seams.camera_components(camera)[env_index], elsewhere.get(env_index, NOWHERE_ELSE))
     segmentation = rows.get("segmentation")
     return Picture(
         camera=name,

@@ -26,7 +26,9 @@ from numpy.typing import NDArray
 
 from workbench.core import seams
 from workbench.core.camera_configs import rows_of_pose, settings_of, target_of
-from workbench.core.drawn_poses import NOWHERE_ELSE, Places, drawn_at
+from workbench.core.camera_settings import CameraKey
+from workbench.core.drawn_poses import NOWHERE_ELSE, Places, drawn_at, temporarily
+from workbench.core.env_numbers import require_env
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.core.scene_index import hidden_poses, scene_index
 
@@ -46,7 +48,7 @@ def list_cameras(env: Any) -> tuple[CameraInfo, ...]:
     """
     infos = []
     for (kind, name), camera in cameras_of(env).items():
-        components = _components(camera)
+        components = seams.camera_components(camera)
         component = components[0]
         gives = {m for modalities in camera.config.shader_config.texture_names.values() for m in modalities}
         infos.append(
@@ -138,8 +140,7 @@ def begin_pictures(
     Raises:
         As `take_pictures`.
     """
-    if not 0 <= env_index < env.num_envs:
-        raise IndexError(f"env {env_index} is out of range for {env.num_envs} envs")
+    require_env(env_index, env.num_envs)
     kinds = {kind for _, kind, _ in requests}
     if len(kinds) > 1:
         raise ValueError("pictures of sensors and of human cameras cannot be begun together")
@@ -153,7 +154,7 @@ def begin_pictures(
         scene.px.sync_poses_gpu_to_cpu()
     sub_scene = scene.sub_scenes[env_index]
     taken = []
-    components = [_components(cameras[kind, name])[env_index] for name, kind, _ in requests]
+    components = [seams.camera_components(cameras[kind, name])[env_index] for name, kind, _ in requests]
     places = places_to_draw(env, env_index, poses)
     with (
         hidden_objects(env, env_index, shown=kinds == {"human"}),
@@ -182,21 +183,9 @@ def places_to_draw(env: Any, env_index: int, poses: NDArray[np.float32] | None) 
     return NOWHERE_ELSE if px is None else px.elsewhere([env_index]).get(env_index, NOWHERE_ELSE)
 
 
-def cameras_of(env: Any) -> dict[tuple[CameraKind, str], Any]:
-    found: dict[tuple[CameraKind, str], Any] = {}
-    for name, sensor in seams.sensors(env).items():
-        if seams.camera_components(sensor) is not None:
-            found["sensor", name] = sensor
-    for name, camera in seams.human_render_cameras(env).items():
-        if seams.camera_components(camera) is not None:
-            found["human", name] = camera
-    return found
-
-
-def _components(camera: Any) -> list[Any]:
-    components = seams.camera_components(camera)
-    assert components is not None, "only cameras that `cameras_of` found come here"
-    return components
+def cameras_of(env: Any) -> dict[CameraKey, Any]:
+    """The plain ones."""
+    return {key: camera for key, camera in seams.cameras(env).items() if seams.camera_components(camera)}
 
 
 def _varies(config: Any, components: Sequence[Any]) -> bool:
@@ -212,9 +201,7 @@ def mount_of(env: Any, camera: Any) -> str | None:
     return None if mount is None else scene_index(env).name_of(seams.objects_of(mount)[0])
 
 
-def _check(
-    name: str, kind: str, modalities: Sequence[str], cameras: dict[tuple[CameraKind, str], Any]
-) -> None:
+def _check(name: str, kind: str, modalities: Sequence[str], cameras: dict[CameraKey, Any]) -> None:
     camera = cameras.get((kind, name))  # type: ignore[call-overload]
     if camera is None:
         there = ", ".join(f"{n} ({k})" for k, n in cameras) or "none"
@@ -231,31 +218,23 @@ def _check(
 @contextmanager
 def hidden_objects(env: Any, env_index: int, shown: bool) -> Iterator[None]:
     """Draw the task's hidden objects in this env, or do not, and put everything back afterwards."""
-    was_visible: list[tuple[Any, float]] = []
-    was_at: list[tuple[Any, sapien.Pose]] = []
     slot_of = scene_index(env).slot_of
     true = (
         {slot: pose for rows in hidden_poses(env) for slot, pose in zip(*rows, strict=True)} if shown else {}
     )
-    try:
-        for actor in seams.hidden_objects(env):
-            for entity, env_of in zip(seams.objects_of(actor), seams.envs_of(actor), strict=True):
-                body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
-                if env_of != env_index or body is None:
-                    continue
-                was_visible.append((body, body.visibility))
-                # A ghost of visibility 0.3 stays one; only what is switched off is switched on.
-                body.visibility = (body.visibility or 1.0) if shown else 0.0
-                pose = true.get(slot_of[id(entity)]) if id(entity) in slot_of else None
-                if pose is not None:
-                    was_at.append((entity, entity.pose))
-                    entity.pose = sapien.Pose(pose[:3], pose[3:])
+    changes: list[tuple[Any, str, Any]] = []
+    for actor in seams.hidden_objects(env):
+        for entity, env_of in zip(seams.objects_of(actor), seams.envs_of(actor), strict=True):
+            body = entity.find_component_by_type(sapien.render.RenderBodyComponent)
+            if env_of != env_index or body is None:
+                continue
+            # A ghost of visibility 0.3 stays one; only what is switched off is switched on.
+            changes.append((body, "visibility", (body.visibility or 1.0) if shown else 0.0))
+            pose = true.get(slot_of[id(entity)]) if id(entity) in slot_of else None
+            if pose is not None:
+                changes.append((entity, "pose", sapien.Pose(pose[:3], pose[3:])))
+    with temporarily(changes):
         yield
-    finally:
-        for body, visibility in reversed(was_visible):
-            body.visibility = visibility
-        for entity, pose in reversed(was_at):
-            entity.pose = pose
 
 
 def _read(
@@ -266,7 +245,7 @@ def _read(
     modalities: tuple[str, ...],
     pose: NDArray[np.float32],
 ) -> Picture:
-    component = _components(camera)[env_index]
+    component = seams.camera_components(camera)[env_index]
     config = camera.config.shader_config
     made: dict[str, torch.Tensor] = {}
     depth = None

@@ -39,9 +39,8 @@ from workbench.core.seams import (
 from workbench.core.snapshot import (
     RestoreReport,
     Snapshot,
-    restore_memory,
+    remembering,
     restore_snapshot,
-    take_memory,
     take_snapshot,
 )
 from workbench.core.step import StepResult
@@ -147,7 +146,7 @@ class TaskEnv:
         env: BaseEnv,
         max_episode_steps: int | None = None,
         check: Callable[[Mapping[str, Any], Any], None] | None = None,
-        like: TaskEnv | None = None,
+        obs: Any = None,
     ) -> None:
         """
         Args:
@@ -155,19 +154,21 @@ class TaskEnv:
             max_episode_steps: the time limit that ``gym.make``'s wrapper would apply.
             check: called with what ``evaluate`` and the reward returned, before either is converted;
                 raises if the task broke its contract.
-            like: of the same env and scene; what it found out of them is taken over.
+            obs: the last observation of an env that goes on, as its ``obs_mode`` gives it.
         """
         self.env = env
         self.max_episode_steps = max_episode_steps
-        self.parts = actions.action_parts(env) if like is None else like.parts
-        self._scene = env.scene if like is None else like._scene
-        self.obs: Any = None if like is None else like.obs
+        self.obs: Any = obs
         """The last observation, as the task's ``obs_mode`` gives it."""
         self._check = check
 
     @property
     def num_envs(self) -> int:
         return self.env.num_envs
+
+    @property
+    def parts(self) -> tuple[actions.ActionPart, ...]:
+        return actions.action_parts(self.env)
 
     @property
     def control_dt(self) -> float:
@@ -200,10 +201,9 @@ class TaskEnv:
         else:
             self.obs, info = self._partial_reset(chosen, seeds, options or {})
         info = {key: value for key, value in info.items() if key != "reconfigure"}
-        self._refresh_if_rebuilt()
         if self._check is not None:
             self._check(info, None)
-        return self._result(info, np.zeros(self.num_envs, np.float32), self._terminated(info), None)
+        return self._result(info, np.zeros(self.num_envs), None)
 
     def _partial_reset(
         self, chosen: list[int], seeds: list[int] | None, further: Mapping[str, Any]
@@ -221,9 +221,7 @@ class TaskEnv:
         self.obs, reward, terminated, _, info = self.env.step(env_action)
         if self._check is not None:
             self._check(info, reward)
-        count = self.num_envs
-        rewards = _batch(to_numpy(reward).astype(np.float32), count)
-        return self._result(info, rewards, _batch(to_numpy(terminated), count), action)
+        return self._result(info, reward, action, terminated)
 
     def snapshot(self, env_idx: Sequence[int] | None = None) -> Snapshot:
         """Everything that decides how the episodes of these envs (None: of all) go on; see `snapshot`."""
@@ -250,26 +248,19 @@ class TaskEnv:
             action: (N, A) that led here, which the reward may ask for; None gives rewards of zero, as after a
                 reset: a reward is for an action, and none was made.
         """
-        # `evaluate` may count and draw, and asks about all envs: that must not happen to them twice.
-        every = list(range(self.num_envs))
-        memory = take_memory(self.env, every)
-        reward = np.zeros(self.num_envs, np.float32)
-        try:
+        reward: Any = None
+        with remembering(self.env):
             info = self.env.get_info()
             obs = self.env.get_obs(info, unflattened=True)
-            given = None
             if action is not None:
                 flat = actions.to_env_action(self.env, self.parts, action)
                 made: Any = common.to_tensor(flat, device=self.env.device) if self.parts else None
-                given = self.env.get_reward(obs=obs, action=made, info=info)
-                reward = _batch(to_numpy(given).astype(np.float32), self.num_envs)
+                reward = self.env.get_reward(obs=obs, action=made, info=info)
             self.obs = flatten_observation(self.env, obs)
             keep_observation(self.env, self.obs)
-        finally:
-            restore_memory(self.env, memory, every, every, whole=True)
         if self._check is not None:
-            self._check(info, given)
-        return self._result(info, reward, self._terminated(info), action)
+            self._check(info, reward)
+        return self._result(info, np.zeros(self.num_envs) if reward is None else reward, action)
 
     def result_of(
         self,
@@ -280,20 +271,8 @@ class TaskEnv:
         action: NDArray[np.float32] | None,
     ) -> StepResult:
         """What somebody else's ``env.step`` (or ``env.reset``: no action) gave, who went past this object."""
-        self._refresh_if_rebuilt()
         self.obs = last_observation(self.env)
-        count = self.num_envs
-        evaluate, others = split_entries(info, count)
-        return StepResult(
-            elapsed_steps=to_numpy(self.env.elapsed_steps).astype(np.int32),
-            reward=_batch(to_numpy(reward).astype(np.float32), count),
-            terminated=_batch(to_numpy(terminated).astype(bool), count),
-            truncated=_batch(to_numpy(truncated).astype(bool), count),
-            evaluate=evaluate,
-            others=others,
-            poses=read_poses(self.env),
-            action=action,
-        )
+        return self._result(info, reward, action, terminated, truncated)
 
     @property
     def observes_pictures(self) -> bool:
@@ -317,37 +296,33 @@ class TaskEnv:
     def close(self) -> None:
         self.env.close()
 
-    def _refresh_if_rebuilt(self) -> None:
-        # With `reconfiguration_freq` a reset may replace the scene, and with it every robot.
-        if self._scene is not self.env.scene:
-            self._scene = self.env.scene
-            self.parts = actions.action_parts(self.env)
-
-    def _terminated(self, info: Mapping[str, Any]) -> NDArray[np.bool_]:
-        flags = [_batch(to_numpy(info[key]).astype(bool), self.num_envs) for key in FLAGS if key in info]
-        return np.logical_or.reduce(flags) if flags else np.zeros(self.num_envs, bool)
-
     def _result(
         self,
         info: Mapping[str, Any],
-        reward: NDArray[np.float32],
-        terminated: NDArray[np.bool_],
+        reward: Any,
         action: NDArray[np.float32] | None,
+        terminated: Any = None,
+        truncated: Any = None,
     ) -> StepResult:
+        """Where it is not said which episodes ended, `info` and the time limit say it."""
+        count = self.num_envs
         elapsed = to_numpy(self.env.elapsed_steps).astype(np.int32)
-        limit = self.max_episode_steps
-        truncated = np.zeros(self.num_envs, bool) if limit is None else elapsed >= limit
-        evaluate, others = split_entries(info, self.num_envs)
+        if terminated is None:
+            flags = [_batch(to_numpy(info[key]).astype(bool), count) for key in FLAGS if key in info]
+            terminated = np.logical_or.reduce(flags) if flags else False
+        if truncated is None:
+            truncated = self.max_episode_steps is not None and elapsed >= self.max_episode_steps
+        evaluate, others = split_entries(info, count)
         return StepResult(
             elapsed_steps=elapsed,
-            reward=reward,
-            terminated=terminated,
-            truncated=truncated,
+            reward=_batch(to_numpy(reward).astype(np.float32), count),
+            terminated=_batch(to_numpy(terminated).astype(bool), count),
+            truncated=_batch(to_numpy(truncated).astype(bool), count),
             evaluate=evaluate,
             others=others,
             poses=read_poses(self.env),
             action=None if action is None else np.array(action, dtype=np.float32),
-            sound_obs=_sound(self.obs, self.num_envs),
+            sound_obs=_sound(self.obs, count),
         )
 
 

@@ -24,6 +24,8 @@ from mani_skill.agents.controllers.base_controller import BaseController
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs.pose import Pose
 
+from workbench.core.seams import task_class
+
 PLAIN = (bool, int, float, complex, str, bytes, type(None), np.generic)
 """Values that cannot change, so that keeping them is a copy."""
 _ENTERED = (
@@ -82,8 +84,7 @@ def look_over(env: BaseEnv, built: dict[str, dict[str, Any]]) -> Walk:
     Args:
         built: plain attributes that need no look if they are still the same, by the path of their owner.
     """
-    task: Any = getattr(env, "_workbench_task", type(env))
-    walk = Walk(env, task.__module__, built=built)
+    walk = Walk(env, task_class(env).__module__, built=built)
     walk.entered[id(env)] = env
     walk.simulation = frozenset(
         array.torch().untyped_storage().data_ptr()

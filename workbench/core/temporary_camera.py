@@ -21,11 +21,11 @@ import sapien.render
 from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
 from numpy.typing import ArrayLike, NDArray
 
-from workbench.core import seams
 from workbench.core.camera_frames import checked_intrinsic
-from workbench.core.drawn_poses import drawn_at
+from workbench.core.drawn_poses import drawn_at, temporarily
+from workbench.core.env_numbers import require_env
 from workbench.core.pictures import CameraKind
-from workbench.core.take_pictures import depth_in_metres, hidden_objects, places_to_draw
+from workbench.core.take_pictures import cameras_of, depth_in_metres, hidden_objects, places_to_draw
 
 _SHADER = PREBUILT_SHADER_CONFIGS["minimal"]
 _TEXTURE = "PositionSegmentation"
@@ -80,8 +80,7 @@ def temporary_camera(
         ValueError: the lens cannot be rendered.
         RuntimeError: the env was made without a render device, or the renderer failed.
     """
-    if not 0 <= env_index < env.num_envs:
-        raise IndexError(f"env {env_index} is out of range for {env.num_envs} envs")
+    require_env(env_index, env.num_envs)
     k = checked_intrinsic(intrinsic)
     if not 0 < near < far:
         raise ValueError(f"the near plane must lie before the far plane, and both ahead: {near} m, {far} m")
@@ -112,8 +111,7 @@ def temporary_camera(
 @contextmanager
 def _minimal_shader(env: Any) -> Iterator[None]:
     """SAPIEN makes every camera with the shader that was named last in the process."""
-    cameras = [*seams.sensors(env).values(), *seams.human_render_cameras(env).values()]
-    last = [camera for camera in cameras if seams.camera_components(camera) is not None][-1:]
+    last = [*cameras_of(env).values()][-1:]
     set_shader_pack(_SHADER)
     try:
         yield
@@ -125,14 +123,7 @@ def _minimal_shader(env: Any) -> Iterator[None]:
 @contextmanager
 def undrawn(entities: Sequence[Any]) -> Iterator[None]:
     """Do not draw these entities (None among them is passed over); afterwards they are as visible as before."""
-    was_visible: list[tuple[Any, float]] = []
-    try:
-        for entity in entities:
-            for body in [] if entity is None else entity.components:
-                if isinstance(body, sapien.render.RenderBodyComponent):
-                    was_visible.append((body, body.visibility))
-                    body.visibility = 0.0
+    bodies = [body for entity in entities if entity is not None for body in entity.components]
+    drawn = [body for body in bodies if isinstance(body, sapien.render.RenderBodyComponent)]
+    with temporarily((body, "visibility", 0.0) for body in drawn):
         yield
-    finally:
-        for body, visibility in reversed(was_visible):
-            body.visibility = visibility

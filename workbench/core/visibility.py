@@ -15,7 +15,7 @@ as never drawn, and one that is part of the scene counts like any object.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,9 +33,9 @@ from workbench.core.camera_report import (
     DepthReport,
     ObjectSeen,
     ObjectToSee,
-    join_reports,
 )
 from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.core.env_numbers import require_env
 from workbench.core.pictures import CameraKind, Picture
 from workbench.core.scene_index import SceneIndex, read_poses, scene_index
 from workbench.core.take_pictures import cameras_of, mount_of
@@ -150,23 +150,21 @@ def _is_drawn(entity: Any) -> bool:
 def judge_camera(
     env: Any,
     camera: CameraKey,
-    envs: Sequence[int],
+    e: int,
     *,
     settings: CameraSettings | None = None,
     size: tuple[int, int] | None = None,
     poses: NDArray[np.float32] | None = None,
-    cancelled: Callable[[], bool] = lambda: False,
 ) -> CameraReport:
-    """Judge a camera of the env, as it stands or as `settings` would have it, in some envs at their present moment.
+    """Judge a camera of the env, as it stands or as `settings` would have it, in one env at its present moment.
 
     Args:
-        settings: in the frame of the camera's mount, the same in all envs; None for each env's own camera.
+        settings: in the frame of the camera's mount; None for the env's own camera.
         size: of the pictures that are judged, None for the camera's own; the view stays the same (`small_size`).
-        poses: (N, B, 7) where to draw the bodies, as `read_poses` gives them; None for where the tensors have them.
-        cancelled: asked before each env; when it says yes, the report is of the envs that were judged until then.
+        poses: (B, 7) where to draw the bodies, as `read_poses` gives them; None for where the tensors have them.
 
     Raises:
-        ValueError: there is no such camera, or no such lens, or no env is named.
+        ValueError: there is no such camera, or no such lens.
         IndexError: there is no such env.
         RuntimeError: the renderer failed.
     """
@@ -174,31 +172,31 @@ def judge_camera(
     if camera not in cameras:
         there = ", ".join(f"{name} ({kind})" for kind, name in cameras) or "none"
         raise ValueError(f"there is no {camera[0]} camera {camera[1]!r} to judge; there are: {there}")
-    there = cameras[camera]
-    mount = mount_of(env, there)
-
-    def placement(e: int) -> Placement:
-        return Placement(settings or settings_of(there, e), camera[0], mount)
-
-    return _judge(env, camera, placement, envs, size, poses, cancelled)
+    require_env(e, env.num_envs)
+    placement = Placement(
+        settings or settings_of(cameras[camera], e), camera[0], mount_of(env, cameras[camera])
+    )
+    return judge_placement(env, e, placement, poses, size, camera[1])
 
 
 def judge_placement(
     env: Any,
+    e: int,
     placement: Placement,
-    envs: Sequence[int],
-    *,
-    name: str = "suggested",
-    size: tuple[int, int] | None = None,
     poses: NDArray[np.float32] | None = None,
-    cancelled: Callable[[], bool] = lambda: False,
+    size: tuple[int, int] | None = None,
+    name: str = "suggested",
 ) -> CameraReport:
-    """Judge a camera that does not exist; arguments and errors as `judge_camera`'s.
+    """Judge a camera that need not exist; arguments and errors as `judge_camera`'s.
 
     Raises:
         ValueError: also where no body is called as the mount.
     """
-    return _judge(env, (placement.kind, name), lambda e: placement, envs, size, poses, cancelled)
+    index = scene_index(env)
+    pose = pose_in_env(placement, read_poses(env)[e] if poses is None else poses, index)
+    with placed_camera(env, e, placement, size, poses) as view:
+        camera = placement.kind, name
+        return measure(view, pose, e, list_objects(env), index, camera, placement.settings)
 
 
 def picture_of(
@@ -221,9 +219,7 @@ def settings_of(camera: Any, env_index: int) -> CameraSettings:
 
     Its lens is always said as an intrinsic matrix, which is what the renderer has.
     """
-    components = seams.camera_components(camera)
-    assert components is not None, "only cameras that `cameras_of` found come here"
-    component = components[env_index]
+    component = seams.camera_components(camera)[env_index]
     local = component.local_pose
     px, py, pz = map(float, local.p)
     qw, qx, qy, qz = map(float, local.q)
@@ -247,33 +243,6 @@ def small_size(width: int, height: int, shorter: int = SMALL) -> tuple[int, int]
 
 
 # --- measuring ---------------------------------------------------------------------------------------------------
-
-
-def _judge(
-    env: Any,
-    camera: CameraKey,
-    placement_in: Callable[[int], Placement],
-    envs: Sequence[int],
-    size: tuple[int, int] | None,
-    poses: NDArray[np.float32] | None,
-    cancelled: Callable[[], bool],
-) -> CameraReport:
-    began = time.perf_counter()
-    if not len(envs):
-        raise ValueError("no env is named to judge the camera in")
-    if any(not 0 <= e < env.num_envs for e in envs):
-        raise IndexError(f"envs {list(envs)} are out of range for {env.num_envs} envs")
-    objects, index = list_objects(env), scene_index(env)
-    bodies = read_poses(env) if poses is None else poses
-    measured: list[CameraReport] = []
-    for e in envs:
-        if measured and cancelled():
-            break
-        placement = placement_in(e)
-        with placed_camera(env, e, placement, size, None if poses is None else poses[e]) as view:
-            pose = pose_in_env(placement, bodies[e], index)
-            measured.append(measure(view, pose, e, objects, index, camera, placement.settings))
-    return replace(join_reports(measured), milliseconds=1000 * (time.perf_counter() - began))
 
 
 def placed_camera(

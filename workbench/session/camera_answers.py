@@ -6,11 +6,8 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-import numpy as np
-
-from workbench.core.camera_report import CameraReport
-from workbench.core.camera_search import SearchProgress, SearchSpace, suggest_cameras
-from workbench.core.camera_suggestion import OfferedPlacement, in_words
+from workbench.core.camera_report import CameraReport, OfferedPlacement
+from workbench.core.camera_search import SearchSpace, suggest_cameras
 from workbench.core.pictures import Picture
 from workbench.core.place_camera import PlacedCameras
 from workbench.core.take_pictures import take_pictures
@@ -97,14 +94,10 @@ def _judged(opened: OpenedTask, question: JudgeCamera) -> CameraReport:
     width, height = (128, 128) if info is None else (info.width, info.height)
     if question.settings is not None:
         width, height = question.settings.width, question.settings.height
-    poses = question.poses
+    size = small_size(width, height, JUDGED_SIDE)
+    env = opened.env.env
     return judge_camera(
-        opened.env.env,
-        question.key,
-        (question.env,),
-        settings=question.settings,
-        size=small_size(width, height, JUDGED_SIDE),
-        poses=None if poses is None else np.broadcast_to(poses, (question.env + 1, *poses.shape)),
+        env, question.key, question.env, settings=question.settings, size=size, poses=question.poses
     )
 
 
@@ -117,13 +110,13 @@ def _suggested(
     told = 0.0
     info = next((info for info in opened.description.cameras if info.key == question.key), None)
 
-    def progress(at: SearchProgress) -> None:
+    def progress(done: int, total: int) -> None:
         nonlocal told
         if time.monotonic() - told > _TELL_EVERY:
             told = time.monotonic()
-            tell(at.done, at.total)
+            tell(done, total)
 
-    found = suggest_cameras(
+    return suggest_cameras(
         opened.env.env,
         SearchSpace(
             question.objects,
@@ -136,10 +129,4 @@ def _suggested(
         question.envs,
         progress=progress,
         cancelled=cancelled,
-    )
-    return tuple(
-        OfferedPlacement(
-            s.settings, s.target, s.score, in_words(s.report, question.objects), s.report, s.picture
-        )
-        for s in found
     )

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from workbench.authoring.camera_source.cameras import Ran
 from workbench.authoring.reference import TaskName
-from workbench.core.camera_report import CameraReport
+from workbench.core.camera_report import CameraReport, OfferedPlacement
 from workbench.core.camera_settings import CameraKey, CameraSettings
-from workbench.core.camera_suggestion import OfferedPlacement
 from workbench.core.pictures import Picture
 from workbench.session.calls import Question
 

@@ -249,7 +249,10 @@ def _exchange(
         if change.level != "same":
             rules.edited(lambda row: _place_now(row, opened.loaded, loaded))
         task = TaskEnv(
-            env, loaded.max_episode_steps, check=returns_check(loaded, opened.env.num_envs), like=opened.env
+            env,
+            loaded.max_episode_steps,
+            check=returns_check(loaded, opened.env.num_envs),
+            obs=opened.env.obs,
         )
         if change.level == "cameras":
             with blamed("build", loaded, task):

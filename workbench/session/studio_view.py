@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.camera_report import CameraReport
+from workbench.core.camera_report import CameraReport, OfferedPlacement
 from workbench.core.camera_settings import CameraKey, CameraSettings
-from workbench.core.camera_suggestion import OfferedPlacement
 from workbench.core.pictures import CameraInfo, Picture
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ import viser
 from numpy.typing import NDArray
 
 from workbench.core.camera_frames import rotation_matrix, triple
+from workbench.core.camera_report import OfferedPlacement
 from workbench.core.camera_settings import CameraKey
-from workbench.core.camera_suggestion import OfferedPlacement
 from workbench.core.pictures import CameraKind
 from workbench.session.messages import TaskDescription
 from workbench.session.session import Session
