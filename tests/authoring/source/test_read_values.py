@@ -100,6 +100,11 @@ def said(project: Project, part: Part) -> str:
         ("note(np.pi / 2)", "np.pi / 2"),
         ("note(2 * np.arctan(0.5))", "2 * np.arctan(0.5)"),
         ("note(np.sqrt(0.5))", "np.sqrt(0.5)"),
+        *(
+            (f"note(math.{name}(0.5))", f"math.{name}(0.5)")
+            for name in ("atan", "asin", "acos", "tan", "sqrt")
+        ),
+        *((f"note(np.arc{name}(0.5))", f"np.arc{name}(0.5)") for name in ("tan", "sin", "cos")),
         ("V = np.array([1, 2])\nnote(V + [0, 1])", "V + [0, 1]"),
         # Functions that only hold what they are given.
         ("note(float(2))", "2"),
