@@ -8,16 +8,16 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from workbench.recording.sources import Source
 from workbench.rescore_command import print_verdicts
-from workbench.session.rescore_messages import EpisodeFile
 from workbench.session.verdict import Verdict
 
 NAME = "WorkbenchPushCube-v1_seed626610453_env00_2026-11-22T01-07-22"
 VERDICTS = [
     Verdict(
-        EpisodeFile("a", NAME, Path("a.json")), seed=626610453, length=30, returns=(3.268, 4.902), metres=0.0
+        Source(Path("a.json"), None, "a", NAME), seed=626610453, length=30, returns=(3.268, 4.902), metres=0.0
     ),
-    Verdict(EpisodeFile("b", NAME + "-2", Path("b.json")), why_not="it does not hold the text of its task"),
+    Verdict(Source(Path("b.json"), None, "b", NAME + "-2"), why_not="it does not hold the text of its task"),
 ]
 
 

@@ -19,10 +19,10 @@ from workbench.core.rules import Finding
 from workbench.exit_codes import Exit
 from workbench.machine.current_folder import CurrentFolder
 from workbench.machine.terminal_text import plain_text
+from workbench.recording.sources import Source
 from workbench.session import rescore_words as words
 from workbench.session.clearance import Clearances
 from workbench.session.rescore_all import Progress, RescoreOptions, rescore_all
-from workbench.session.rescore_messages import EpisodeFile
 from workbench.session.verdict import Verdict
 from workbench.trust_prompt import TerminalPrompt, can_ask
 
@@ -83,7 +83,7 @@ def run_rescore(
     return Exit.DONE
 
 
-def print_verdicts(verdicts: list[Verdict[EpisodeFile]], out: Console) -> None:
+def print_verdicts(verdicts: list[Verdict[Source]], out: Console) -> None:
     """The table, and a sentence over all of it.
 
     Names of recordings take 55 characters. Where that leaves no room for the rest, as in a terminal of 80 columns, a
@@ -102,7 +102,7 @@ def print_verdicts(verdicts: list[Verdict[EpisodeFile]], out: Console) -> None:
     out.print(escape(words.summary(verdicts)), soft_wrap=True)
 
 
-def _cells(verdict: Verdict[EpisodeFile]) -> list[str]:
+def _cells(verdict: Verdict[Source]) -> list[str]:
     judged = not verdict.why_not
     cells = [
         verdict.of.name,
@@ -115,7 +115,7 @@ def _cells(verdict: Verdict[EpisodeFile]) -> list[str]:
     return [plain_text(cell) for cell in cells]
 
 
-def _print_lines(verdict: Verdict[EpisodeFile], out: Console) -> None:
+def _print_lines(verdict: Verdict[Source], out: Console) -> None:
     name, seed, steps, total, changed, drift = _cells(verdict)
     out.print(escape(name), style=_style(verdict), soft_wrap=True)
     named = (("seed", seed), ("steps", steps), ("return", total), ("drift", drift))
@@ -125,5 +125,5 @@ def _print_lines(verdict: Verdict[EpisodeFile], out: Console) -> None:
             out.print(Padding(escape(line), (0, 0, 0, 4)), style=_style(verdict))
 
 
-def _style(verdict: Verdict[EpisodeFile]) -> str:
+def _style(verdict: Verdict[Source]) -> str:
     return "yellow" if verdict.why_not else "bold" if verdict.differs else "dim"

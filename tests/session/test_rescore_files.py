@@ -131,7 +131,7 @@ def test_another_file_can_be_judged_with(author: Path, tmp_path: Path) -> None:
 
 def test_what_record_episode_wrote_is_judged_by_the_env_that_it_names(foreign: Path) -> None:
     found = find_episodes((foreign,))
-    assert [file.trajectory for file in found] == ["traj_0", "traj_1"]
+    assert [source.part for source in found] == ["traj_0", "traj_1"]
     for use_env_states in (False, True):
         verdicts, _ = rescore_all(RescoreOptions((foreign.parent,), use_env_states=use_env_states))
         assert [verdict.seed for verdict in verdicts] == [6, 9]
@@ -163,12 +163,12 @@ def test_a_recording_of_ours_is_gone_into_to_the_last_bit(author: Path) -> None:
 
 
 def test_what_is_no_recording_is_said(author: Path, tmp_path: Path) -> None:
-    with pytest.raises(UnreadableRecording, match="no file or folder"):
+    with pytest.raises(UnreadableRecording, match="nothing at"):
         find_episodes((tmp_path / "gone",))
-    with pytest.raises(UnreadableRecording, match="no recorded episode"):
+    with pytest.raises(UnreadableRecording, match="no recording in"):
         find_episodes((tmp_path,))
     (tmp_path / "x.json").write_text("{}")
-    with pytest.raises(UnreadableRecording, match="no recording"):
+    with pytest.raises(UnreadableRecording, match="no recording in"):
         find_episodes((tmp_path / "x.json",))
 
 
@@ -232,7 +232,7 @@ def test_wrong_arguments_are_refused_in_a_sentence(author: Path, capsys: pytest.
     code, _, err = run([recordings, "--csv", str(author / "no" / "where.csv")], capsys)
     assert code == 2 and "there is no folder" in err
     code, _, err = run([str(author / "nothing")], capsys)
-    assert code == 2 and "no file or folder" in err
+    assert code == 2 and "There is nothing at" in err
 
 
 # --- for a page ----------------------------------------------------------------------------------------

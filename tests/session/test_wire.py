@@ -19,9 +19,10 @@ from msgspec import inspect
 from tests.ui.scenes import camera, description, step_of, table_scene
 from workbench.core.inspection import Inspection
 from workbench.core.rules import Finding
+from workbench.recording.sources import Source
 from workbench.session.calls import Answer, Call, value_type
 from workbench.session.messages import Event, Failed, Load, Loaded, Loading, Status, Stepped, TaskOptions
-from workbench.session.rescore_messages import EpisodeFile, Rescore
+from workbench.session.rescore_messages import Rescore
 from workbench.session.server_line import QUESTIONS
 from workbench.session.wire import Unpacker, Unreadable, pack, pack_message
 
@@ -174,7 +175,7 @@ def messages() -> list[Any]:
         Inspection(1, 2, refused=(("state", "no"),)),
         Answer(3, pack(step)),
         Call(4, Load("file.py", TaskOptions(2, env_kwargs={"a": [1, None, 2.5]}), source={"f": "text"})),
-        Call(5, Rescore((EpisodeFile("1", "one", Path("/a/b.rrd")),), True)),
+        Call(5, Rescore((Source(Path("/a/b.rrd"), None, "1", "one"),), True)),
     ]
 
 

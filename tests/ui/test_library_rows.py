@@ -166,3 +166,22 @@ def test_a_return_that_is_nan_is_said_and_comes_last_whichever_way_it_is_sorted(
     assert kept == clean_facts(replace(kept, total_reward=float("nan")))
     assert cells(lost, {}, NOW)["total"] == "NaN"
     assert {ids(ordered((*ROWS[:2], lost), "return", down))[-1] for down in (True, False)} == {"n"}
+
+
+def test_a_row_is_read_from_the_file_that_holds_it() -> None:
+    ours = row("a", paths=(Path("x/a.json"), Path("x/a.h5"))).source
+    theirs = row("b", kind="maniskill", trajectory="traj_1", paths=(Path("x/b.json"), Path("x/b.h5"))).source
+    dataset = row("c", kind="lerobot", trajectory="3", paths=(Path("x/set/meta/info.json"),)).source
+    assert (ours.kind, ours.path, ours.part, ours.stem) == ("ours", Path("x/a.json"), None, "a")
+    assert (theirs.kind, theirs.path, theirs.part, theirs.stem) == (
+        "maniskill",
+        Path("x/b.h5"),
+        "traj_1",
+        "b_traj_1",
+    )
+    assert (dataset.kind, dataset.path, dataset.part, dataset.stem) == (
+        "lerobot",
+        Path("x/set"),
+        "3",
+        "set_3",
+    )

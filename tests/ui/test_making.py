@@ -91,7 +91,7 @@ def test_a_sheet_is_made_and_a_second_one_says_why_not(recordings: Path, tmp_pat
     assert not told.making.start(Wanted("sheet", (source,), tmp_path)), "two at a time"
     view = told.wait(lambda view: not view.running)
     assert view.problem == ""
-    assert [path.name for path in view.made[0].paths] == [f"{source.name}.sheet.png"]
+    assert [path.name for path in view.made[0].paths] == [f"{source.stem}.sheet.png"]
     assert told.making.start(Wanted("sheet", (source,), tmp_path))
     view = told.wait(lambda view: not view.running)
     assert "not written over" in view.problem and len(view.made) == 1

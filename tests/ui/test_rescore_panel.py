@@ -15,9 +15,9 @@ from tests.drive.panels import Clock, Panels
 from tests.drive.waiting import until
 from workbench.authoring.problem import Problem
 from workbench.recording.library import Library
+from workbench.recording.sources import Source
 from workbench.session import rescore_words as words
 from workbench.session.judging import JudgedView
-from workbench.session.rescore_messages import EpisodeFile
 from workbench.session.review import Review
 from workbench.session.verdict import Verdict
 from workbench.ui.judged_panel import MOST_ROWS, status_html
@@ -26,7 +26,7 @@ from workbench.ui.step_in import episode_files
 
 
 def verdict(id: str = "a", **changes: Any) -> Verdict:
-    plain = Verdict(EpisodeFile(id, f"push_{id}", Path(f"{id}.json")), "Push-v1", 3, 5)
+    plain = Verdict(Source(Path(f"{id}.json"), None, id, f"push_{id}"), "Push-v1", 3, 5)
     reward = np.arange(5, dtype=np.float32)
     return replace(
         plain,

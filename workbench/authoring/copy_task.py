@@ -10,18 +10,15 @@ file that is in no package) is refused with the reason.
 from __future__ import annotations
 
 import ast
-import errno
 import importlib.util
-import os
 import re
-import tempfile
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from workbench.authoring.modules import MOST_SOURCE_BYTES, exact_text, module_name
 from workbench.authoring.source.text import Refused, Replacement, SourceFile
+from workbench.machine.atomic_files import create_file
 from workbench.machine.regular_file import read_regular_file
 
 MOST_COPIES = 99
@@ -57,7 +54,7 @@ def copy_task(source: Path, folder: Path) -> TaskCopy:
             continue
         copied, ids = copied_text(source, text, number)
         try:
-            if _write_new(file, copied.encode(encoding)):
+            if create_file(file, copied.encode(encoding)):
                 return TaskCopy(file, ids)
         except OSError as error:
             raise NoCopy(f"{file} cannot be written: {error.strerror}") from error
@@ -148,35 +145,3 @@ def _free_name(name: str, text: str) -> str:
     while name in text:
         name += "_"
     return name
-
-
-def _write_new(file: Path, text: bytes) -> bool:
-    """Write a file that is not there yet, whole or not at all; False if somebody made one of that name meanwhile."""
-    handle, temporary = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.", suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as out:
-            out.write(text)
-            out.flush()
-            os.fsync(out.fileno())
-        os.chmod(temporary, 0o644)
-        try:
-            os.link(temporary, file)  # unlike a rename it is never over another
-        except FileExistsError:
-            return False
-        except OSError as error:
-            if error.errno not in (errno.EPERM, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK):
-                raise
-            # A filesystem without hard links: claim the name, then replace it.
-            try:
-                file.touch(exist_ok=False)
-            except FileExistsError:
-                return False
-            try:
-                os.replace(temporary, file)
-            except OSError:
-                file.unlink(missing_ok=True)
-                raise
-        return True
-    finally:
-        with suppress(FileNotFoundError):
-            os.unlink(temporary)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import fcntl
 import os
 import stat
-import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import platformdirs
+
+from workbench.machine.atomic_files import create_file, written_beside
 
 MOST_BYTES = 16 << 20
 
@@ -66,11 +67,8 @@ def write_private(name: str, content: bytes) -> None:
         OSError: it cannot be written; the file is as it was.
     """
     path = _made() / name
-    temporary = _temporary(path, content)
-    try:
+    with written_beside(path, content, 0o600) as temporary:
         os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def create_private(name: str, content: bytes) -> bool:
@@ -79,15 +77,7 @@ def create_private(name: str, content: bytes) -> bool:
     Raises:
         OSError: it cannot be written.
     """
-    path = _made() / name
-    temporary = _temporary(path, content)
-    try:
-        os.link(temporary, path)
-    except FileExistsError:
-        return False
-    finally:
-        temporary.unlink(missing_ok=True)
-    return True
+    return create_file(_made() / name, content, 0o600)
 
 
 def set_aside(name: str) -> Path:
@@ -123,20 +113,6 @@ def _made() -> Path:
     folder.mkdir(mode=0o700, exist_ok=True)
     _check_private(folder, folder.stat())
     return folder
-
-
-def _temporary(path: Path, content: bytes) -> Path:
-    temporary = path.with_name(f".{uuid.uuid4().hex}.part")
-    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-    try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(descriptor)
-    except BaseException:  # a full disk, say: what is left of it would stay for good
-        temporary.unlink(missing_ok=True)
-        raise
-    return temporary
 
 
 def _check_private(path: Path, status: os.stat_result) -> None:

@@ -16,10 +16,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from workbench.machine.atomic_files import replace_file
 from workbench.machine.regular_file import open_regular_file
 from workbench.recording.document import Document, read_json
 from workbench.recording.library_row import clean_note, clean_tags
-from workbench.recording.replace_file import replace_file
 
 MOST_NOTES_BYTES = 16 << 20
 """Of a ``.notes``, and of the ``.json`` of a recording of ours, which holds its task's source and one small picture."""

@@ -16,7 +16,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-_NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EACCES}
+from workbench.machine.atomic_files import give_name
 
 
 class RecordingError(OSError):
@@ -72,7 +72,7 @@ def publish(temporaries: Sequence[Path], folder: Path, stem: str) -> list[Path]:
         done: list[Path] = []
         try:
             for temporary, path in zip(temporaries, paths):
-                _name(temporary, path)
+                give_name(temporary, path)
                 done.append(path)
             sync_folder(folder)
         except FileExistsError:
@@ -92,23 +92,6 @@ def candidates(stem: str) -> Iterator[str]:
     while True:
         yield f"{stem}_{number}"
         number += 1
-
-
-def _name(temporary: Path, path: Path) -> None:
-    try:
-        os.link(temporary, path)
-    except FileExistsError:
-        raise
-    except OSError as error:
-        if error.errno not in _NO_LINKS:
-            raise
-        # A filesystem without hard links (FAT, some network drives): claim the name, then replace it.
-        path.touch(exist_ok=False)
-        try:
-            os.replace(temporary, path)
-        except BaseException:
-            _remove([path])
-            raise
 
 
 def _remove(paths: Sequence[Path]) -> None:

@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from workbench.recording.sources import Source
+
 Kind = Literal["workbench", "maniskill", "rrd only", "lerobot"]
 LONGEST_TAG = 40
 LONGEST_NOTE = 1000
@@ -72,6 +74,14 @@ class LibraryRow:
     size: int
     """Bytes of `paths` together."""
     facts: Facts
+
+    @property
+    def source(self) -> Source:
+        """What it is read from."""
+        path = self.paths[0]
+        if self.facts.trajectory is not None:
+            path = path.parents[1] if self.facts.kind == "lerobot" else path.with_suffix(".h5")
+        return Source(path, self.facts.trajectory, self.id, self.name)
 
     @property
     def kind(self) -> Kind:

@@ -18,7 +18,7 @@ import imageio_ffmpeg
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.recording.new_file import new_file
+from workbench.machine.atomic_files import new_file
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,6 @@ from workbench.recording.reader.requests import (
     EpisodeRead,
     Failed,
     ForRerun,
-    Kind,
     Open,
     PictureAt,
     PictureRead,
@@ -46,6 +45,7 @@ from workbench.recording.reader.requests import (
     ToldRerun,
 )
 from workbench.recording.reader.wire import ArrayReader, Garbled, bytes_of, path_of
+from workbench.recording.sources import Kind, Source
 from workbench.recording.unreadable import UnreadableRecording
 
 ROW_SECONDS = 30.0
@@ -134,14 +134,14 @@ def read_recording(
     return episode
 
 
-def find_sources(path: Path) -> list[tuple[Path, str | None]]:
-    """Path and part of the recordings that a file is or a folder holds. Raises as `read_recording`."""
+def find_sources(path: Path) -> list[Source]:
+    """The recordings that a file is or a folder holds. Raises as `read_recording`."""
     return _found(path, trajectories=False)
 
 
 def find_trajectories(path: Path) -> list[str]:
     """Names of the episodes in an ``.h5`` of ManiSkill's, in the order of their numbers. Raises as `read_recording`."""
-    return [part for _, part in _found(path, trajectories=True) if part is not None]
+    return [source.part for source in _found(path, trajectories=True) if source.part is not None]
 
 
 def told_rerun(path: Path) -> tuple[str | None, bytes | None]:
@@ -155,14 +155,17 @@ def told_rerun(path: Path) -> tuple[str | None, bytes | None]:
     return answer.store, answer.blueprint
 
 
-def _found(path: Path, trajectories: bool) -> list[tuple[Path, str | None]]:
+def _found(path: Path, trajectories: bool) -> list[Source]:
     path = Path(path).absolute()
     reader = _reader(path if path.is_dir() else path.parent, episodes=True)
     reader.allow(_beyond([path]))
     answer = _asked(reader, Sources(bytes_of(path), trajectories), path.name).answer
     if not isinstance(answer, SourcesFound):
         raise UnreadableRecording(f"{path.name} gave {type(answer).__name__}.")
-    return [(path_of(found), part) for found, part in answer.sources]
+    return [
+        Source(path_of(found), part, text(id, 8192), text(name, 400))
+        for found, part, id, name in answer.sources
+    ]
 
 
 def _reader(folder: Path, episodes: bool) -> Reader:

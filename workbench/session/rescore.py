@@ -6,7 +6,7 @@ The envs that live through them are in `rescore_run`, and the process that does 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,17 +15,16 @@ from workbench.authoring.library_names import named_like_library
 from workbench.authoring.modules import hidden_by_libraries
 from workbench.authoring.problem import TaskError
 from workbench.authoring.reference import TaskName, named_file
-from workbench.recording.document import Document, WrongDocument, read_document
+from workbench.recording.document import WrongDocument, read_document
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.made_here import made_here
-from workbench.recording.reading import find_trajectories
 from workbench.recording.side_files import side_files_in_words
+from workbench.recording.sources import Source, sources_among
 from workbench.recording.unreadable import UnreadableRecording
 from workbench.session.clearance import NotCleared, Wanted, recorded_content
 from workbench.session.lane import JobFailed
 from workbench.session.messages import TaskOptions
 from workbench.session.recorded_text import NoText
-from workbench.session.rescore_messages import EpisodeFile
 from workbench.session.step_back import CannotStepIn, class_in, options_of, recorded_source, reference_of
 from workbench.session.verdict import Verdict
 
@@ -39,7 +38,7 @@ class Group:
     options: TaskOptions
     info: EpisodeInfo
     """Of the first of them."""
-    files: tuple[EpisodeFile, ...]
+    files: tuple[Source, ...]
     note: str = ""
     """What is not as it was recorded, on purpose."""
     recorded_source: bool = False
@@ -50,44 +49,30 @@ class Group:
         return Wanted(self.reference, self.info, self.recorded_source)
 
 
-def find_episodes(places: Sequence[Path]) -> list[EpisodeFile]:
+def find_episodes(places: Sequence[Path]) -> list[Source]:
     """The episodes of these files and folders, each once: ours, and those in files of ManiSkill's RecordEpisode.
 
     Raises:
-        UnreadableRecording: a place is not there, or a file that is named holds no episode.
+        UnreadableRecording: a place is not there, a file that is named holds no episode, or there is none at all.
     """
-    found: dict[str, EpisodeFile] = {}
-    for place in places:
-        if place.is_dir():
-            names = sorted(p for p in place.rglob("*") if p.suffix in (".json", ".h5", ".rrd"))
-            files = [p for p in names if not any(part.startswith(".") for part in p.relative_to(place).parts)]
-        elif place.is_file():
-            files = [place]
-        else:
-            raise UnreadableRecording(f"There is no file or folder {place}.")
-        for file in files:
-            try:
-                episodes = list(_episodes_in(file))
-            except UnreadableRecording:
-                if file is place:
-                    raise
-                continue  # of a folder what is no recording is passed over
-            for episode in episodes:
-                found.setdefault(episode.id, episode)
+    try:
+        found = [source for source in sources_among(places) if source.kind != "lerobot"]
+    except OSError as error:
+        raise UnreadableRecording(str(error)) from error
     if not found:
-        raise UnreadableRecording(f"There is no recorded episode in {', '.join(map(str, places))}.")
-    return [*found.values()]
+        raise UnreadableRecording(f"A LeRobot dataset cannot be judged again: {', '.join(map(str, places))}.")
+    return found
 
 
 def group_episodes(
-    files: Sequence[EpisodeFile],
+    files: Sequence[Source],
     num_envs: int,
     base: TaskOptions | None = None,
     *,
     task: str | None = None,
     file: Path | None = None,
     recorded_source: bool = False,
-) -> tuple[list[Group], list[Verdict[EpisodeFile]]]:
+) -> tuple[list[Group], list[Verdict[Source]]]:
     """Which env each episode is judged in; and those that cannot be read, with the reason.
 
     Args:
@@ -97,7 +82,7 @@ def group_episodes(
         recorded_source: each is judged by the text that it was recorded with.
     """
     groups: dict[str, Group] = {}
-    unread: list[Verdict[EpisodeFile]] = []
+    unread: list[Verdict[Source]] = []
     for episode in files:
         try:
             info = _info_of(episode)
@@ -156,9 +141,7 @@ def judge_each(
         raise failures[0]
 
 
-def not_judged(
-    group: Group, verdicts: Iterable[Verdict[EpisodeFile]], why_not: str
-) -> list[Verdict[EpisodeFile]]:
+def not_judged(group: Group, verdicts: Iterable[Verdict[Source]], why_not: str) -> list[Verdict[Source]]:
     """Of those of the group that have no verdict: a folder holds recordings of many tasks, and one of them may be gone."""
     judged = {verdict.of.id for verdict in verdicts}
     missing = [file for file in group.files if file.id not in judged]
@@ -181,32 +164,9 @@ def with_renderer(options: TaskOptions) -> TaskOptions:
     return replace(options, env_kwargs={k: v for k, v in options.env_kwargs.items() if k != "render_backend"})
 
 
-def _episodes_in(file: Path) -> Iterator[EpisodeFile]:
-    document = _document(file)
-    if document.is_ours:
-        id = str(document.said["workbench"].get("id") or file.with_suffix("").resolve())
-        yield EpisodeFile(id, file.stem, file.with_suffix(".json"))
-    elif document.is_maniskills and file.with_suffix(".h5").is_file():
-        data = file.with_suffix(".h5")
-        for name in find_trajectories(data):
-            yield EpisodeFile(f"{data.resolve()}#{name}", f"{file.stem}#{name}", data, name)
-    elif file.suffix == ".rrd":
-        yield EpisodeFile(str(file.resolve()), file.stem, file)
-    else:
-        raise UnreadableRecording(f"{file} is no recording of an episode.")
-
-
-def _document(file: Path) -> Document:
-    """The one beside `file`; where there is none, one that says nothing."""
+def _info_of(source: Source) -> EpisodeInfo:
+    """Raises as `Source.read`, which it spares where it can: pictures and meshes need not be read for it."""
     try:
-        return read_document(file.with_suffix(".json"))
+        return read_document(source.path.with_suffix(".json")).description().info(source.path.parent)
     except (OSError, WrongDocument):
-        return Document({})
-
-
-def _info_of(file: EpisodeFile) -> EpisodeInfo:
-    """Raises as `EpisodeFile.read`, which it spares where it can: pictures and meshes need not be read for it."""
-    try:
-        return _document(file.path).description().info(file.path.parent)
-    except WrongDocument:
-        return file.read().info
+        return source.read().info

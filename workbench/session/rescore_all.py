@@ -13,6 +13,7 @@ from workbench.authoring.reference import TaskName
 from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
 from workbench.machine.current_folder import CurrentFolder
+from workbench.recording.sources import Source
 from workbench.session.clearance import Clearances, NotCleared, NotTrusted
 from workbench.session.messages import TaskOptions
 from workbench.session.open_task import OpenedTask, open_task
@@ -25,7 +26,6 @@ from workbench.session.rescore import (
     not_judged,
     with_renderer,
 )
-from workbench.session.rescore_messages import EpisodeFile
 from workbench.session.rescore_run import rescore
 from workbench.session.verdict import Verdict
 
@@ -57,7 +57,7 @@ def rescore_all(
     on_finding: Callable[[Finding], None] = warn_of,
     clearances: Clearances | None = None,
     on_notice: Callable[[str], None] = lambda notice: None,
-) -> tuple[list[Verdict[EpisodeFile]], tuple[str, ...]]:
+) -> tuple[list[Verdict[Source]], tuple[str, ...]]:
     """The verdicts, in the order of the files; and what is not as it was recorded on purpose, in words.
 
     Args:

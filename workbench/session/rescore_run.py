@@ -20,9 +20,10 @@ from workbench.core.recorded_state import apart, read_states, write_states
 from workbench.core.stand_still import only_these_move
 from workbench.core.step import StepResult
 from workbench.recording.read_episode import UnreadableRecording
+from workbench.recording.sources import Source
 from workbench.session.open_task import OpenedTask, blamed, step_checked
 from workbench.session.relive import begin_again, why_not_lived_through
-from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored
+from workbench.session.rescore_messages import Rescore, Rescored
 from workbench.session.step_back import run_of
 from workbench.session.verdict import Said, Verdict, compare, single_numbers
 
@@ -34,7 +35,7 @@ _TELL_EVERY = 0.2
 class _Seat:
     """An episode that can be judged, and what is said of it in the env that lives through it."""
 
-    file: EpisodeFile
+    file: Source
     task: str
     run: RecordedRun
     missed: dict[str, str]
@@ -52,7 +53,7 @@ class _Seat:
         """The state that it is in."""
         return len(self.reward)
 
-    def verdict(self) -> Verdict[EpisodeFile]:
+    def verdict(self) -> Verdict[Source]:
         run = self.run
         # A recording of somebody else's that holds no rewards: there is nothing to compare with.
         old = np.zeros(0) if np.isnan(run.reward).all() else run.reward
@@ -76,11 +77,11 @@ class _Seat:
 
 def rescore(
     opened: OpenedTask,
-    files: Iterable[EpisodeFile],
+    files: Iterable[Source],
     *,
     use_env_states: bool = False,
     on_steps: Callable[[int], None] = lambda steps: None,
-) -> Iterator[Verdict[EpisodeFile]]:
+) -> Iterator[Verdict[Source]]:
     """Judge these episodes with the code that is open; a verdict for each, in the order in which they end.
 
     Args:
@@ -130,7 +131,7 @@ def answer(opened: OpenedTask, request: Rescore, tell: Callable[[int, int, Resco
         what is new since then.
     """
     told, steps = time.monotonic(), 0
-    ready: list[Verdict[EpisodeFile]] = []
+    ready: list[Verdict[Source]] = []
 
     def on_steps(now: int) -> None:
         nonlocal told, steps
@@ -150,7 +151,7 @@ def answer(opened: OpenedTask, request: Rescore, tell: Callable[[int, int, Resco
     return Rescored(tuple(ready), steps)
 
 
-def _ready(opened: OpenedTask, file: EpisodeFile, use_env_states: bool) -> _Seat | Verdict[EpisodeFile]:
+def _ready(opened: OpenedTask, file: Source, use_env_states: bool) -> _Seat | Verdict[Source]:
     try:
         episode = file.read()
     except (UnreadableRecording, OSError) as error:

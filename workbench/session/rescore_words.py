@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from workbench.recording.replace_file import replace_file
+from workbench.machine.atomic_files import replace_file
+from workbench.recording.sources import Source
 from workbench.session.lengths import length
 from workbench.session.number_text import mean_text, number_text
-from workbench.session.rescore_messages import EpisodeFile
 from workbench.session.verdict import FLAGS, Verdict
 
 PUT_IN = " With the recorded states put in at every step nothing drifts."
@@ -142,13 +142,13 @@ def not_carried(verdicts: Sequence[Verdict[Any]]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(f"{what}: {why}" for v in verdicts for what, why in v.missed.items()))
 
 
-def as_rows(verdicts: Sequence[Verdict[EpisodeFile]]) -> list[dict[str, Any]]:
+def as_rows(verdicts: Sequence[Verdict[Source]]) -> list[dict[str, Any]]:
     """One flat dict an episode, as JSON can say it."""
     return [
         {
             "episode": verdict.of.name,
             "file": str(verdict.of.path),
-            "trajectory": verdict.of.trajectory,
+            "trajectory": verdict.of.part,
             "task": verdict.task,
             "seed": verdict.seed if verdict.seed >= 0 else None,
             "length": verdict.length,
@@ -172,7 +172,7 @@ def as_rows(verdicts: Sequence[Verdict[EpisodeFile]]) -> list[dict[str, Any]]:
     ]
 
 
-def as_csv(verdicts: Sequence[Verdict[EpisodeFile]]) -> str:
+def as_csv(verdicts: Sequence[Verdict[Source]]) -> str:
     rows = as_rows(verdicts)
     text = io.StringIO()
     writer = csv.DictWriter(text, [*rows[0]] if rows else [], lineterminator="\n")
@@ -181,7 +181,7 @@ def as_csv(verdicts: Sequence[Verdict[EpisodeFile]]) -> str:
     return text.getvalue()
 
 
-def as_json(verdicts: Sequence[Verdict[EpisodeFile]]) -> str:
+def as_json(verdicts: Sequence[Verdict[Source]]) -> str:
     """With ``NaN`` and infinities as null, which JSON has not."""
     rows = [{key: _finite(value) for key, value in row.items()} for row in as_rows(verdicts)]
     return json.dumps(rows, indent=1) + "\n"

@@ -15,6 +15,7 @@ from typing import Any
 
 from workbench.authoring.problem import TaskError
 from workbench.authoring.reference import TaskName, named_file
+from workbench.recording.sources import Source
 from workbench.session.askers import Background
 from workbench.session.clearance import Clearances
 from workbench.session.judging import JudgedView, Judging
@@ -28,7 +29,7 @@ from workbench.session.rescore import (
     not_judged,
     with_renderer,
 )
-from workbench.session.rescore_messages import EpisodeFile, Rescore, Rescored
+from workbench.session.rescore_messages import Rescore, Rescored
 from workbench.session.step_back import CannotStepIn
 
 MOST_AT_ONCE = 16
@@ -53,7 +54,7 @@ class Rescorer(Judging):
 
     def start(
         self,
-        files: Sequence[EpisodeFile],
+        files: Sequence[Source],
         *,
         file: Path | None = None,
         recorded_source: bool = False,

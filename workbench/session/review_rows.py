@@ -15,7 +15,7 @@ from typing import Protocol
 
 from workbench.core.shared_shapes import SharedShapes
 from workbench.recording.episode import Episode
-from workbench.recording.reading import read_recording
+from workbench.recording.sources import Source
 
 
 class Row(Protocol):
@@ -28,9 +28,7 @@ class Row(Protocol):
     @property
     def paths(self) -> tuple[Path, ...]: ...
     @property
-    def kind(self) -> str: ...
-    @property
-    def trajectory(self) -> str | None: ...
+    def source(self) -> Source: ...
     @property
     def date(self) -> datetime.datetime | None: ...
 
@@ -53,12 +51,7 @@ class Stamp:
 
 def read_row(row: Row, shapes: SharedShapes | None = None, folder: Path | None = None) -> Episode:
     """The recording of a row, with those shapes where it looks the same; `folder` is the library's. Raises as `read_recording`."""
-    if row.kind == "lerobot" and row.trajectory is not None:
-        return read_recording("lerobot", row.paths[0].parents[1], row.trajectory, shapes, folder)
-    if row.trajectory is not None:
-        # The library opens it by its .json, which is where the words are.
-        return read_recording("maniskill", row.paths[0].with_suffix(".h5"), row.trajectory, shapes, folder)
-    return read_recording("ours", row.paths[0], "", shapes, folder)
+    return row.source.read(shapes, folder)
 
 
 def shared(episode: Episode, shapes: SharedShapes) -> Episode:

@@ -14,12 +14,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from workbench.machine.atomic_files import new_file
 from workbench.recording.camera_pictures import camera_of, cameras_by_name, enlarged, frames
 from workbench.recording.contact_sheet import contact_sheet
 from workbench.recording.episode import Episode
 from workbench.recording.lerobot_export import ExportOptions, export_lerobot
 from workbench.recording.mp4 import write_mp4
-from workbench.recording.new_file import new_file
 from workbench.recording.scene_eye import Eye
 from workbench.recording.scene_film import scene_frames
 from workbench.recording.sources import Source
@@ -78,11 +78,11 @@ def make(wanted: Wanted, on_progress: OnProgress = lambda done, doing: None) -> 
         def part_done(done: float, doing: str, number: int = number) -> None:
             on_progress((number + done) / len(wanted.sources), doing)
 
-        part_done(0.0, source.name)
+        part_done(0.0, source.stem)
         try:
             paths += _of_readable(wanted, source, part_done)
         except ValueError as error:
-            not_made.append(str(error) if source.name in str(error) else f"{source.name}: {error}")
+            not_made.append(str(error) if source.stem in str(error) else f"{source.stem}: {error}")
     if not paths:
         raise ValueError("\n".join(not_made))
     on_progress(1.0, "done")
@@ -111,7 +111,7 @@ def _of_readable(wanted: Wanted, source: Source, on_progress: OnProgress) -> lis
 
 
 def _of_one(wanted: Wanted, source: Source, episode: Episode, on_progress: OnProgress) -> list[Path]:
-    name, fps = source.name, _rate(episode)
+    name, fps = source.stem, _rate(episode)
     if wanted.what == "film":
         cameras = [wanted.camera] if wanted.camera != EVERY_CAMERA else list(cameras_by_name(episode))
         if not cameras:
@@ -144,7 +144,7 @@ def _of_one(wanted: Wanted, source: Source, episode: Episode, on_progress: OnPro
 def _dataset(wanted: Wanted, on_progress: OnProgress) -> Made:
     count = len(wanted.sources)
     made = export_lerobot(
-        [(source.name, source.read) for source in wanted.sources],
+        [(source.stem, source.read) for source in wanted.sources],
         wanted.folder,
         wanted.export,
         lambda done, doing: on_progress(done / max(count, 1), doing),

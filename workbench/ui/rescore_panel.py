@@ -16,10 +16,10 @@ import viser
 
 from workbench.authoring.reference import RecordedTask, named_file
 from workbench.recording.episode import EpisodeInfo
+from workbench.recording.sources import Source
 from workbench.session import rescore_words as words
 from workbench.session.judging import RUNNING
 from workbench.session.recorded_text import version_of
-from workbench.session.rescore_messages import EpisodeFile
 from workbench.session.rescorer import Rescorer
 from workbench.session.review import Review
 from workbench.session.review_view import ReviewView
@@ -101,7 +101,7 @@ class RescoreChoices:
     """Asked before the files that the recordings name."""
 
 
-class RescorePanel(JudgedPanel[ReviewView, EpisodeFile]):
+class RescorePanel(JudgedPanel[ReviewView, Source]):
     """The panel in the present container.
 
     Args:
@@ -120,7 +120,7 @@ class RescorePanel(JudgedPanel[ReviewView, EpisodeFile]):
         server: viser.ViserServer,
         rescorer: Rescorer,
         review: Review,
-        find: Callable[[Sequence[str]], list[EpisodeFile]],
+        find: Callable[[Sequence[str]], list[Source]],
         choices: RescoreChoices,
         known: Callable[[], Sequence[Path]] = tuple,
     ) -> None:
@@ -208,7 +208,7 @@ class RescorePanel(JudgedPanel[ReviewView, EpisodeFile]):
         self._code.value = chosen.label
         self._told.content = render("note", text=chosen.told)
 
-    def _of_row(self, verdict: Verdict[EpisodeFile]) -> dict[str, Any]:
+    def _of_row(self, verdict: Verdict[Source]) -> dict[str, Any]:
         at = verdict.first_difference
         return {
             **self._letter_of(verdict),
@@ -218,7 +218,7 @@ class RescorePanel(JudgedPanel[ReviewView, EpisodeFile]):
             "selected": verdict.of.id == self._selected,
         }
 
-    def _letter_of(self, verdict: Verdict[EpisodeFile]) -> dict[str, str]:
+    def _letter_of(self, verdict: Verdict[Source]) -> dict[str, str]:
         """As it is drawn with, if it is one of several that are open."""
         opened = [one.id for one in self._review.view().opened]
         if len(opened) < 2 or verdict.of.id not in opened:
@@ -226,7 +226,7 @@ class RescorePanel(JudgedPanel[ReviewView, EpisodeFile]):
         index = opened.index(verdict.of.id)
         return {"letter": letter(index), "colour": COLOURS[index % len(COLOURS)]}
 
-    def _show(self, verdict: Verdict[EpisodeFile]) -> None:
+    def _show(self, verdict: Verdict[Source]) -> None:
         self._selected = verdict.of.id
         view = self._review.view()
         opened = next((k for k, one in enumerate(view.opened) if one.id == verdict.of.id), None)

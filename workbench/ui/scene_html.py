@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 import viser
 
+from workbench.machine.atomic_files import new_file
 from workbench.recording.episode import Episode
-from workbench.recording.new_file import new_file
 from workbench.recording.scene_eye import Eye, usual_eye
 from workbench.session.review_events import success_words
 from workbench.ui.door import DoorOptions, open_door

@@ -118,7 +118,7 @@ class SharePanel:
         if now == self._drawn:
             return
         self._drawn = now
-        names = [source.name for source in chosen.sources]
+        names = [source.stem for source in chosen.sources]
         self._about.content = render(
             "share_about",
             count=len(names),
@@ -193,7 +193,7 @@ class SharePanel:
 def will_make(what: What, chosen: Chosen, camera: str, folder: Path) -> dict[str, Any]:
     """What a press on *Make* makes, as far as it is known before the recordings are read: in words, its files, how many
     `more` there are, and the folder ``where`` they go; empty for files that the page offers to save."""
-    names = [source.name for source in chosen.sources]
+    names = [source.stem for source in chosen.sources]
     of = "of it" if len(names) == 1 else f"of these {len(names)} recordings"
     if what == "lerobot":
         where = f"{folder / 'datasets'}/lerobot_\u2039date and time\u203a"
@@ -277,20 +277,11 @@ class SharePart(Part[ReviewView]):
         cameras = {name: None for row in rows if row.id in opened for name in cameras_by_name(opened[row.id])}
         alone = len(rows) == 1 and len(view.opened) == 1 and rows[0].id in opened
         self._share.draw(
-            Chosen(tuple(map(source_of, rows)), tuple(cameras), selected=bool(ids), in_view=alone)
+            Chosen(tuple(row.source for row in rows), tuple(cameras), selected=bool(ids), in_view=alone)
         )
         states = {one.id: state for one, state in zip(view.opened, view.states)}
         moments = {path: states[row.id] for row in rows if row.id in states for path in rerun_files((row,))}
         self._rerun.draw(rerun_files(rows), len(rows), moments)
-
-
-def source_of(row: LibraryRow) -> Source:
-    """What a row of the library is read from."""
-    if row.kind == "lerobot" and row.trajectory is not None:
-        return Source(row.paths[0].parents[1], row.trajectory)
-    if row.trajectory is not None:
-        return Source(row.paths[0].with_suffix(".h5"), row.trajectory)
-    return Source(row.paths[0])
 
 
 def rerun_files(rows: Sequence[LibraryRow]) -> tuple[Path, ...]:

@@ -21,9 +21,9 @@ from workbench.core.recorded_run import RecordedRun
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.library import Library
 from workbench.recording.side_files import side_files_in_words
+from workbench.recording.sources import Source
 from workbench.session.clearance import Clearances, NotCleared, Wanted
 from workbench.session.messages import TaskOptions
-from workbench.session.rescore_messages import EpisodeFile
 from workbench.session.rescorer import Rescorer
 from workbench.session.review_view import ReviewView
 from workbench.session.session import Session
@@ -372,14 +372,10 @@ class Judging:
         self.rescorer.close()
 
 
-def episode_files(library: Library, ids: Sequence[str]) -> list[EpisodeFile]:
+def episode_files(library: Library, ids: Sequence[str]) -> list[Source]:
     """Where these recordings are; those that are gone, or cannot be read, are left out."""
     rows = {row.id: row for row in library.rows()}
-    return [
-        EpisodeFile(row.id, row.name, row.paths[0], row.trajectory)
-        for row in (rows[id] for id in dict.fromkeys(ids) if id in rows)
-        if row.paths
-    ]
+    return [row.source for row in (rows[id] for id in dict.fromkeys(ids) if id in rows) if row.paths]
 
 
 def _sentence(why: str) -> str:

@@ -12,14 +12,13 @@ from __future__ import annotations
 
 import os
 import stat
-import tempfile
-from contextlib import suppress
 from pathlib import Path
 
 from workbench.authoring.camera_source.cameras import check_own
 from workbench.authoring.camera_source.result import FileChange, Refusal, SourceEdit
 from workbench.authoring.modules import MOST_SOURCE_BYTES, exact_text
 from workbench.authoring.source.text import Refused
+from workbench.machine.atomic_files import replace_file
 from workbench.machine.regular_file import read_regular_file
 
 
@@ -84,7 +83,7 @@ def _exchange(path: str, expected: str, wanted: str | None, since: str) -> Refus
             return Refusal(f"{real.name} was edited {since}, so it is left as it is; ask again")
         if wanted is None:
             return None
-        if not _replace(real, raw, wanted.encode(encoding)):
+        if not replace_file(real, wanted.encode(encoding), raw):
             return Refusal(
                 f"{real.name} was saved by somebody else just now, so it is left as it is; ask again"
             )
@@ -93,24 +92,3 @@ def _exchange(path: str, expected: str, wanted: str | None, since: str) -> Refus
     except OSError as exc:
         return Refusal(f"{real.name} cannot be written: {exc.strerror}")
     return None
-
-
-def _replace(real: Path, old: bytes, new: bytes) -> bool:
-    """Rename a new file over `real`, unless that is no longer `old`."""
-    handle, name = tempfile.mkstemp(dir=real.parent, prefix=f".{real.name}.", suffix=".tmp")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(new)
-            file.flush()
-            os.fsync(file.fileno())
-        status = real.stat()
-        os.chmod(name, stat.S_IMODE(status.st_mode))
-        with suppress(PermissionError):  # a group's file that somebody else in the group owns
-            os.chown(name, status.st_uid, status.st_gid)
-        if read_regular_file(real, MOST_SOURCE_BYTES) != old:
-            return False
-        os.replace(name, real)
-        return True
-    finally:
-        with suppress(FileNotFoundError):
-            os.unlink(name)

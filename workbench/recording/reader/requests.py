@@ -11,9 +11,8 @@ from workbench.recording.encoded_pictures import Modality
 from workbench.recording.episode import EpisodeInfo, Unread
 from workbench.recording.library_row import Facts
 from workbench.recording.reader.wire import ArrayRef
+from workbench.recording.sources import Kind
 
-Kind = Literal["ours", "maniskill", "lerobot"]
-"""Who made a recording: which of the three ways to read it."""
 PathBytes = bytes
 """A path as the system has it, which need not be text."""
 
@@ -138,7 +137,8 @@ class PictureRead(msgspec.Struct, frozen=True, tag=True):
 
 
 class SourcesFound(msgspec.Struct, frozen=True, tag=True):
-    sources: list[tuple[PathBytes, str | None]]
+    sources: list[tuple[PathBytes, str | None, str, str]]
+    """Path, part, id and name of each."""
 
 
 class ToldRerun(msgspec.Struct, frozen=True, tag=True):

@@ -135,10 +135,16 @@ class _Reader:
 def _sources(wanted: Sources) -> SourcesFound:
     from workbench.recording.read_maniskill import trajectories
     from workbench.recording.source_files import sources_in
+    from workbench.recording.sources import Source
 
     path = path_of(wanted.path)
-    found = ((path, name) for name in trajectories(path)) if wanted.trajectories else sources_in(path)
-    return SourcesFound([(bytes_of(path), part) for path, part in found])
+    if wanted.trajectories:
+        found = (Source(path, name) for name in trajectories(path))
+    else:
+        found = sources_in(path)
+    return SourcesFound(
+        [(bytes_of(one.path), one.part, text(one.id, 8192), text(one.name, 400)) for one in found]
+    )
 
 
 def _told_rerun(wanted: ForRerun) -> ToldRerun:

@@ -1,0 +1,136 @@
+"""Files that are there whole or not at all, whoever reads, dies or fills the disk meanwhile."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import stat
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from workbench.machine.regular_file import read_regular_file
+
+MOST_BYTES = 64 << 20
+"""Of what is expected to be there."""
+_NO_LINKS = {errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK, errno.EACCES}
+
+
+@contextmanager
+def written_beside(path: Path, content: bytes, mode: int = 0o666) -> Iterator[Path]:
+    """A file in the folder of `path` that holds `content` and is on the disk; gone after the block, if it is still there.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    temporary = path.with_name(f".{uuid.uuid4().hex}{path.suffix}.part")
+    try:
+        with open(temporary, "xb", opener=lambda name, how: os.open(name, how, mode)) as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        yield temporary
+    finally:
+        with contextlib.suppress(OSError):  # what is to be told is why it was not written
+            temporary.unlink(missing_ok=True)
+
+
+def give_name(temporary: Path, path: Path) -> None:
+    """Let `path`, which must be free, be the file that is whole at `temporary`; that one may be gone then.
+
+    Raises:
+        FileExistsError: it is taken.
+        OSError: it cannot be done.
+    """
+    try:
+        os.link(temporary, path)  # unlike a rename it is never over another
+    except FileExistsError:
+        raise
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        # A filesystem without hard links (FAT, some network drives): claim the name, then replace it.
+        path.touch(exist_ok=False)
+        try:
+            os.replace(temporary, path)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+            raise
+
+
+def create_file(path: Path, content: bytes, mode: int = 0o666) -> bool:
+    """Write a file that must not be there yet; False, and nothing done, if it is. Raises OSError."""
+    with written_beside(path, content, mode) as temporary:
+        try:
+            give_name(temporary, path)
+        except FileExistsError:
+            return False
+    return True
+
+
+def replace_file(path: Path, content: bytes, expected: bytes | None = None) -> bool:
+    """Let `path`, whether or not it is there yet, hold `content`; False, and nothing done, if it no longer holds what is `expected`.
+
+    A link stays one; mode and owner stay as they are.
+
+    Raises:
+        OSError: it cannot be written; it holds what it held before.
+    """
+    path = path.resolve()
+    with written_beside(path, content) as temporary:
+        with contextlib.suppress(FileNotFoundError):  # a new file has no mode to keep
+            status = path.stat()
+            with contextlib.suppress(PermissionError):  # a group's file that somebody else in the group owns
+                os.chown(temporary, status.st_uid, status.st_gid)
+            with contextlib.suppress(PermissionError):  # a drive that knows no modes
+                os.chmod(temporary, stat.S_IMODE(status.st_mode))
+        if expected is not None and read_regular_file(path, MOST_BYTES) != expected:
+            return False
+        os.replace(temporary, path)
+    return True
+
+
+@contextmanager
+def new_file(path: Path) -> Iterator[Path]:
+    """A name beside `path` to write to; what was written has the name `path` after the block, unless it raised.
+
+    Raises:
+        FileExistsError: there is something at `path`; the message says what to do.
+        OSError: the folder cannot be written to, or the disk is full; the message names the file.
+    """
+    path = Path(path)
+    if path.exists():
+        raise _taken(path)
+    temporary = path.parent / f".{uuid.uuid4().hex}.part"
+    try:
+        _make_folder(path.parent)
+        yield temporary
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
+        give_name(temporary, path)
+    except FileExistsError:
+        raise _taken(path) from None
+    except OSError as error:
+        if error.errno is None:
+            raise
+        raise OSError(error.errno, f"Cannot write {path}: {os.strerror(error.errno)}.") from error
+    finally:
+        # The other name is there by now, or it is to be told why it is not.
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except FileExistsError as error:  # which would be taken for one of the file's own name
+        raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), os.fspath(path)) from error
+
+
+def _taken(path: Path) -> FileExistsError:
+    return FileExistsError(
+        f"There is a file {path} already, and it is not written over: move it, or name another folder."
+    )
