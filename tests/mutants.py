@@ -64,6 +64,8 @@ PROTECTED = {
     "session/history": "session/test_history.py session/test_env_table.py",
     "session/env_table": "session/test_env_table.py session/test_outlier_watch.py",
     "session/curves": "session/test_curves.py",
+    "session/verdict": "session/test_verdict.py",
+    "session/judgement": "session/test_judgement.py",
     "session/outliers": "session/test_outlier_watch.py",
     "session/kept_worker": "session/test_kept_worker.py",
     "ui/gate": "ui/test_gate.py",

@@ -16,6 +16,7 @@ from workbench.session.verdict import (
     Said,
     Verdict,
     compare,
+    gap,
     in_order,
     single_numbers,
 )
@@ -34,7 +35,9 @@ def test_what_is_the_same_differs_nowhere() -> None:
     assert found.of == "it" and found.length == 4 and not found.differs and found.differing == ()
     assert found.returns == (6, 6) and found.largest == 0 and found.has_success
     assert found.success == found.fail == (None, None) and found.look_at is None
-    assert found.metres is None and not found.drifted and words.what_changed(found) == "as it was"
+    assert (found.metres, found.radians, found.drift_at) == (None, 0, None) and not found.drifted
+    assert (found.task, found.seed, found.begins_otherwise, found.missed) == ("", -1, False, {})
+    assert words.what_changed(found) == "as it was"
 
 
 @pytest.mark.parametrize(("share", "differs"), [(0.9e-5, False), (1.1e-5, True)])
@@ -86,13 +89,42 @@ def test_other_entries_that_both_have_are_named_and_are_no_difference() -> None:
     assert words.what_changed(found) == "as it was, but for height"
 
 
+def test_what_is_known_of_the_run_is_in_its_verdict() -> None:
+    found = compare(
+        0,
+        said(),
+        said(success=[0] * 5),
+        task="Push-v1",
+        seed=7,
+        begins_otherwise=True,
+        missed={"cube": "gone"},
+    )
+    assert (found.task, found.seed, found.begins_otherwise, found.missed) == (
+        "Push-v1",
+        7,
+        True,
+        {"cube": "gone"},
+    )
+    assert found.has_success and compare(0, said(success=[0] * 5), said()).has_success
+    assert words.not_carried([found, found]) == ("cube: gone",)
+
+
+def test_one_that_was_not_judged_says_nothing_else() -> None:
+    found = Verdict("it", why_not="it has no step")
+    assert (found.seed, found.length, found.returns, found.largest, found.differing) == (-1, 0, (0, 0), 0, ())
+    assert len(found.old_reward) == len(found.new_reward) == 0 and found.metres is None
+    assert words.what_changed(found) == "not judged: it has no step"
+
+
 def test_a_number_that_is_lost_or_found_is_a_difference_but_for_a_state_that_a_file_says_nothing_of() -> None:
     nan = np.nan
     old = said(a=[nan, 1, 1, 1, 1], b=[1, 1, 1, nan, 1], c=[1, 1, 1, 1, 1], success=[nan, 0, 0, 0, 0])
     found = compare(0, old, said(a=[5, 1, 1, 1, 1], b=[1, 1, 1, 1, 1], c=[nan, 1, 1, 1, 1], success=[0] * 5))
     assert found.differing == ("b", "c")
+    assert compare(0, old, said(a=[5, 2, 1, 1, 1])).differing == ("a",)
     inf = compare(0, said([np.inf, 1, 1, 1]), said([np.inf, 1, 1, 1]))
     assert not inf.differs and inf.largest == 0
+    assert gap(np.array([nan, np.inf, 1, 1]), np.array([nan, np.inf, 1, nan])).tolist() == [0, 0, 0, np.inf]
     lost = compare(0, said(), said([0.0, nan, 2.0, 3.0]))
     assert (
         lost.look_at == lost.first_difference == 2
@@ -123,6 +155,8 @@ def test_drift_is_that_of_the_state_that_is_furthest() -> None:
         (FAR_METRES, FAR_RADIANS, False),
         (2 * FAR_METRES, 0.0, True),
         (0.0, 2 * FAR_RADIANS, True),
+        (0.0, 0.02, True),
+        (0.002, 0.0, True),
         (float("nan"), 0.0, True),
         (None, 1.0, False),
     ):

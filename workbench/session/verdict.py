@@ -127,7 +127,11 @@ def compare(
     for then, now in (turned["fail"], turned["success"]):
         if then != now:
             look_at = then if now is None else now
-    far = None if drift is None or not len(drift) else int(np.argmax(drift[:, 0]))
+    metres, radians, drift_at = None, 0.0, None
+    if drift is not None:
+        far = int(np.argmax(drift[:, 0]))
+        metres, radians = float(drift[far, 0]), float(drift[:, 1].max())
+        drift_at = begin + far if metres else None
     return Verdict(
         of=of,
         task=task,
@@ -141,9 +145,9 @@ def compare(
         first_difference=first,
         look_at=look_at,
         differing=tuple(name for name in dict.fromkeys((*_MAIN, *others)) if len(others[name])),
-        metres=None if far is None or drift is None else float(drift[far, 0]),
-        radians=0.0 if far is None or drift is None else float(drift[:, 1].max()),
-        drift_at=None if far is None or drift is None or not drift[far, 0] else begin + far,
+        metres=metres,
+        radians=radians,
+        drift_at=drift_at,
         begins_otherwise=begins_otherwise,
         missed=dict(missed or {}),
         old_reward=was.astype(np.float32),
