@@ -19,6 +19,8 @@ from itertools import islice
 from types import FrameType, ModuleType, SimpleNamespace
 from typing import Any
 
+import numpy as np
+
 from workbench.authoring.source.library import Known, known_functions, plain
 from workbench.authoring.source.names import Binding, Project, reaching
 from workbench.authoring.source.text import FUNCTIONS, Scope, SourceFile, arguments, is_starred
@@ -209,7 +211,11 @@ class ValueReader:
 
     def _with(self, file: SourceFile, node: ast.expr, leaf: ast.expr, value: float) -> float:
         """What the expression is with another number in place of `leaf`."""
-        found = plain(self._run(file, _put(node, leaf, value), node))
+        try:
+            with np.errstate(all="ignore"):
+                found = plain(self._run(file, _put(node, leaf, value), node))
+        except (ValueError, ArithmeticError):  # math.acos(1.5)
+            return math.nan
         return found if isinstance(found, float) else math.nan
 
     # --- calls --------------------------------------------------------------------------------------
