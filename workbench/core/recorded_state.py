@@ -113,10 +113,11 @@ def apart(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tuple[float
     both = [
         (value, was[name])
         for name, value in now.items()
-        # An env that lacks it has NaN throughout.
-        if name in was
+        # A controller's state is no pose, however many numbers it has.
+        if name.startswith(("actors/", "articulations/"))
+        and name in was
         and was[name].shape == value.shape
-        and len(value) >= _FIXED
+        # An env that lacks it has NaN throughout.
         and not np.isnan(value).all()
         and not np.isnan(was[name]).all()
     ]
