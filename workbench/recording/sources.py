@@ -69,6 +69,8 @@ def sources_among(paths: Sequence[Path]) -> tuple[Source, ...]:
             raise _none_in([path])
         for source in some:
             found.setdefault(source.id, source)
+    if not paths:
+        raise UnreadableRecording("No recording is named: give recordings, or folders of them.")
     if not found:
         raise _none_in(paths)
     return tuple(found.values())

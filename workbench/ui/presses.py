@@ -23,6 +23,7 @@ person whose finger is still on the button. A touch counts as a click, or scroll
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Callable, Hashable
 
 import viser
@@ -99,9 +100,11 @@ class Presses:
                 number = self._server.gui.add_number("·", 0, min=0)
             name_control(number, _in_words(key))
 
-            def typed(event: viser.GuiEvent[viser.GuiNumberHandle[int]]) -> None:
+            async def typed(event: viser.GuiEvent[viser.GuiNumberHandle[int]]) -> None:
+                # The value is read with its own message: two callbacks of viser's pool of threads may both see the later
+                # one, and a recording that is pressed twice is selected and opened by three messages.
                 if event.client is not None:
-                    take(event.target.value, event.client)
+                    await asyncio.to_thread(take, event.target.value, event.client)
 
             number.on_update(typed)
             self._ids[key] = element_id(number)
