@@ -146,7 +146,7 @@ def test_of_two_processes_of_a_page_one_is_killed(jobs: list[Judging | Filming],
     assert not killed.ended() and not other.ended()
     os.kill(held[which], signal.SIGKILL)
     until(killed.ended, "the end of the killed one")
-    assert killed.told().lower().startswith("the process that ") and "was killed by SIGKILL" in killed.told()
+    assert killed.told().lower().startswith("the process ") and "was killed by SIGKILL" in killed.told()
     assert not other.ended()
     os.kill(held[1 - which], signal.SIGCONT)
     until(other.ended, "the end of the other")

@@ -107,9 +107,9 @@ def test_rows_are_selected_by_mouse_and_keys_and_opened(shown: Shown) -> None:
     expect(shown.row(5)).to_have_css("background-color", "rgba(34, 139, 230, 0.22)")
     expect(shown.row(4)).not_to_have_css("background-color", "rgba(34, 139, 230, 0.22)")
     shown.page.keyboard.press("Enter")
-    until(lambda: shown.opened == [("id58", "id56", "id54")], "opened")
+    until(lambda: shown.opened == [("id58", "id56", "id54")], "opened", seen=lambda: shown.opened)
     shown.row(0).dblclick()
-    until(lambda: shown.opened[1:] == [("id59",)], "opened by pressing twice")
+    until(lambda: shown.opened[1:] == [("id59",)], "opened by pressing twice", seen=lambda: shown.opened)
 
 
 def test_keys_walk_down_and_the_page_scrolls_along(shown: Shown) -> None:

@@ -55,7 +55,7 @@ def test_a_disk_that_is_full_at_any_byte_is_an_error_of_the_disk(
     whole = size_with_room(1 << 30)
     before = len(os.listdir("/proc/self/fd"))
     # Where what is compressed says when it was written, two files differ by some bytes.
-    for room in [*range(0, whole - 64, whole // 80), *range(whole - 64, whole - 16, 8)]:
+    for room in [*range(0, whole - 128, whole // 80), *range(whole - 128, whole - 64, 8)]:
         with pytest.raises(OSError) as raised:
             size_with_room(room)
         assert raised.value.errno == errno.EFBIG, room
