@@ -67,7 +67,7 @@ def opened(tmp_path_factory: pytest.TempPathFactory, browser: Browser) -> Iterat
     drawing.start()
     with page_at(browser, "about:blank") as (page, errors):
         page.set_default_timeout(15_000)
-        for script in ("pressed.js", "library_keys.js", "typed_first.js"):
+        for script in ("typed_first.js", "pressed.js", "library_keys.js"):
             page.add_init_script(path=web_assets_folder() / script)
         page.goto(f"http://127.0.0.1:{server.get_port()}")
         page.add_style_tag(path=web_assets_folder() / "panels" / "page.css")
@@ -110,6 +110,23 @@ def test_rows_are_selected_by_mouse_and_keys_and_opened(shown: Shown) -> None:
     until(lambda: shown.opened == [("id58", "id56", "id54")], "opened", seen=lambda: shown.opened)
     shown.row(0).dblclick()
     until(lambda: shown.opened[1:] == [("id59",)], "opened by pressing twice", seen=lambda: shown.opened)
+
+
+def test_a_key_right_after_a_press_is_about_what_was_pressed(shown: Shown) -> None:
+    """Both within one task of the page, which is as fast as a page that was busy hears of them."""
+    for k in range(12):
+        shown.page.evaluate(
+            """(k) => {
+                const as = { bubbles: true, button: 0, pointerType: "mouse" };
+                const cell = (row) => document.querySelectorAll(".wb-library [data-row]")[row].querySelector("td:last-child");
+                cell(k + 1).dispatchEvent(new PointerEvent("pointerdown", as));
+                cell(k).dispatchEvent(new PointerEvent("pointerdown", as));
+            }""",
+            k,
+        )
+        shown.page.keyboard.press("Enter")
+        until(lambda k=k: len(shown.opened) == k + 1, "opened")
+    assert shown.opened == [(f"id{COUNT - 1 - k}",) for k in range(12)]
 
 
 def test_keys_walk_down_and_the_page_scrolls_along(shown: Shown) -> None:

@@ -48,7 +48,8 @@ def test_code_of_a_recording_from_elsewhere_runs_when_a_person_says_so(
         # Enter is pressed on what has the focus, and opens nothing behind the window.
         page.keyboard.press("Enter")
         expect(window).to_be_hidden(timeout=PATIENT)
-        expect(page.get_by_text("is not trusted").first).to_be_visible(timeout=PATIENT)
+        said = page.locator(".wb-bad-text").filter(has_text="is not trusted")
+        expect(said.first).to_be_visible(timeout=PATIENT)
 
         page.get_by_role("tab", name="Review").click()
         live.click()

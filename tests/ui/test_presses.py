@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
+import threading
+import time
 
 import pytest
 from hypothesis import given
@@ -10,7 +13,7 @@ from hypothesis import strategies as st
 
 from tests.drive.panels import Panels
 from workbench.ui.fragments import render
-from workbench.ui.presses import NUMBERS, PARTS, Presses, place_of
+from workbench.ui.presses import NUMBERS, PARTS, Presses, in_turn, place_of
 
 
 def test_a_part_that_can_be_pressed_is_a_stop_of_the_tab_key_and_its_id_stays_an_id() -> None:
@@ -49,3 +52,48 @@ def test_a_number_comes_back_whatever_the_running_part(panels: Panels, number: i
     Presses(panels.server).number_id("number", lambda sent, client: came.append(sent))
     panels.claim("number", float(running * NUMBERS + number))
     assert came == [number]
+
+
+class Page:
+    """Who asks."""
+
+
+def test_what_a_page_asks_for_is_done_in_the_order_in_which_it_came() -> None:
+    came: list[tuple[str, int]] = []
+    one, other = Page(), Page()
+
+    def slower_first(name: str, number: int) -> None:
+        time.sleep(0.005 * (10 - number))
+        came.append((name, number))
+
+    async def ask_all() -> None:
+        asked = [
+            in_turn(page, lambda name=name, k=k: slower_first(name, k))
+            for k in range(10)
+            for page, name in ((one, "one"), (other, "other"))
+        ]
+        await asyncio.gather(*asked)
+
+    asyncio.run(ask_all())
+    for name in ("one", "other"):
+        assert [number for who, number in came if who == name] == list(range(10))
+
+
+def test_what_fails_or_takes_long_does_not_keep_the_page_waiting() -> None:
+    page, long = Page(), threading.Event()
+    came: list[str] = []
+
+    def fail() -> None:
+        raise LookupError("of a test")
+
+    async def ask_all() -> None:
+        asked = [in_turn(page, fail), in_turn(page, lambda: came.append("after the failure"))]
+        ended = await asyncio.gather(*asked, return_exceptions=True)
+        assert isinstance(ended[0], LookupError) and ended[1] is None
+        first = asyncio.create_task(in_turn(page, lambda: came.append(str(long.wait(60)))))
+        await asyncio.wait_for(in_turn(page, lambda: came.append("beside it")), 30)
+        long.set()
+        await first
+
+    asyncio.run(ask_all())
+    assert came == ["after the failure", "beside it", "True"]

@@ -7,11 +7,14 @@ the help that is made from it cannot disagree.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import viser
 from viser._messages import HotkeyKey, KeyModifier  # the types of add_command's arguments (viser 1.1.1)
+
+from workbench.ui.presses import in_turn
 
 _NAMES = {
     "space": "Space",
@@ -58,10 +61,13 @@ def register(server: viser.ViserServer, commands: Sequence[Command]) -> None:
             hotkey=command.key,
             modifier=command.modifier,
         )
-        handle.on_trigger(_without_event(command.run))
+        handle.on_trigger(_triggered(command.run))
         if command.registered is not None:
             command.registered(handle)
 
 
-def _without_event(run: Callable[[], None]) -> Callable[[object], None]:
-    return lambda _event: run()
+def _triggered(run: Callable[[], None]) -> Callable[[viser.CommandEvent], Coroutine[Any, Any, None]]:
+    async def triggered(event: viser.CommandEvent) -> None:
+        await in_turn(event.client, run)
+
+    return triggered

@@ -24,7 +24,9 @@ person whose finger is still on the button. A touch counts as a click, or scroll
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Callable, Hashable
+from weakref import WeakKeyDictionary
 
 import viser
 
@@ -36,8 +38,30 @@ PARTS = 10_000
 """Steps from one border of a picture to the other, as ``placeable.html`` counts them."""
 NUMBERS = 10**8
 """What ``choosable.html`` sends is below this."""
+MOST_SECONDS_BEFORE = 0.5
+"""For which what a page asks for waits for what it asked for before."""
 _LAST = 1e6
 """viser's order of elements: the hidden ones come after all others of their container."""
+_asked_last: WeakKeyDictionary[object, asyncio.Event] = WeakKeyDictionary()
+"""Of each page: set once it is done. Of the loop of its server alone."""
+
+
+async def in_turn(client: object, do: Callable[[], None]) -> None:
+    """Do on a thread what a page asks for, after what the same page asked for before.
+
+    viser's own threads take presses and keys in any order: Enter right after a press on a row opened what had been
+    selected before. To be awaited by what viser calls on its loop, which is in the order of the messages.
+    """
+    before, done = _asked_last.get(client), asyncio.Event()
+    _asked_last[client] = done
+    try:
+        if before is not None:
+            # What takes longer does not keep the page waiting.
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(before.wait(), MOST_SECONDS_BEFORE)
+        await asyncio.to_thread(do)
+    finally:
+        done.set()
 
 
 class Presses:
@@ -54,13 +78,17 @@ class Presses:
         """The id to put into ``data-press``; the same key is the same button for good.
 
         Args:
-            pressed: called with the page that did it, on a thread of viser's.
+            pressed: called with the page that did it, on a thread, in turn.
         """
         if key not in self._ids:
             with self._folder:
                 button = self._server.gui.add_button("·")
             name_control(button, _in_words(key))
-            button.on_click(lambda event: pressed(event.client))
+
+            async def clicked(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
+                await in_turn(event.client, lambda: pressed(event.client))
+
+            button.on_click(clicked)
             self._ids[key] = element_id(button)
         return self._ids[key]
 
@@ -68,7 +96,7 @@ class Presses:
         """Call this whenever the panel that the container is in comes into a page: by viser's own buttons too.
 
         Args:
-            unfolded: called on a thread of viser's, once a page; `unfolded.js` says how.
+            unfolded: called on a thread, in turn, once a page; `unfolded.js` says how.
         """
         pressed = self.id_of("unfolded", lambda _: unfolded())
         self._server.gui.add_html(render("unfolded", id=pressed), order=_LAST + 2)
@@ -89,7 +117,7 @@ class Presses:
 
         Args:
             pressed: called with the place in the picture, 0, 0 at its upper left corner and 1, 1 at its lower right
-                one, and the page that did it, on a thread of viser's.
+                one, and the page that did it, on a thread, in turn.
         """
         return self._typed(key, lambda sent, client: pressed(*place_of(sent), client))
 
@@ -101,10 +129,10 @@ class Presses:
             name_control(number, _in_words(key))
 
             async def typed(event: viser.GuiEvent[viser.GuiNumberHandle[int]]) -> None:
-                # The value is read with its own message: two callbacks of viser's pool of threads may both see the later
-                # one, and a recording that is pressed twice is selected and opened by three messages.
-                if event.client is not None:
-                    await asyncio.to_thread(take, event.target.value, event.client)
+                # Read with its own message: a recording that is pressed twice is selected and opened by three.
+                sent, client = event.target.value, event.client
+                if client is not None:
+                    await in_turn(client, lambda: take(sent, client))
 
             number.on_update(typed)
             self._ids[key] = element_id(number)

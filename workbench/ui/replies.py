@@ -35,6 +35,7 @@ of its own, so it may read files."""
 SCRIPTS = (
     "no_eval.js",
     "let_in.js",
+    "typed_first.js",
     "pressed.js",
     "keys.js",
     "pressed_by_key.js",
@@ -42,7 +43,6 @@ SCRIPTS = (
     "library_keys.js",
     "view_width.js",
     "unfolded.js",
-    "typed_first.js",
     "typed_numbers.js",
     "steady_resolution.js",
     "tab_title.js",
