@@ -26,6 +26,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
+from rich.style import Style
 from rich.table import Table
 from rich.text import Text
 
@@ -35,9 +36,8 @@ from tests.ui.tabs import handshake
 from workbench import terminal
 from workbench.authoring.problem import Problem
 from workbench.machine.guarded_terminal import SafeStream, guard_terminal
-from workbench.machine.terminal_text import Run, Style
 from workbench.recording.library import Library
-from workbench.session.printed import PrintedLine
+from workbench.session.printed import PrintedLine, Run
 from workbench.terminal import SafeConsole, print_line, print_problem, refuse, say, warn
 from workbench.ui.library_rows import cells
 
@@ -196,7 +196,7 @@ def test_all_that_the_commands_say_is_text() -> None:
         refuse(f"there is no file {EVIL}")
         warn(EVIL)
         print_problem(Problem("import", EVIL, f"/{EVIL}.py", 3, EVIL, f"Traceback\n  {EVIL}\n"))
-        print_line(PrintedLine("stdout", "plain", (Run("plain", Style(1)),)))
+        print_line(PrintedLine("stdout", "plain", (Run("plain", Style(color="color(1)")),)))
     said = streams.getvalue()
     assert harmful(said) == set() and "\\x1b]0;owned\\x07" in said
     assert "  | plain\n" in said, "no colours where there is no terminal"

@@ -16,7 +16,7 @@ from rich.segment import Segment
 
 from workbench.exit_codes import Exit
 from workbench.machine.guarded_terminal import SafeStream
-from workbench.machine.terminal_text import for_terminal, plain_text
+from workbench.machine.terminal_text import plain_text
 
 if TYPE_CHECKING:
     from workbench.authoring.problem import Problem
@@ -130,5 +130,7 @@ def print_event(event: Event) -> None:
 
 def print_line(line: PrintedLine) -> None:
     """What the author's code printed, told apart from the workbench's own lines."""
+    from workbench.session.printed import for_terminal
+
     coloured = line.runs and out.color_system is not None and not out.no_color
     print(f"  | {for_terminal(line.runs) if coloured else line.text}", flush=True)

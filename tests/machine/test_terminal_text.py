@@ -6,16 +6,10 @@ import unicodedata
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
+from rich.style import Style
 
-from workbench.machine.terminal_text import (
-    PLAIN,
-    Run,
-    Style,
-    coloured_runs,
-    for_terminal,
-    only_colours,
-    plain_text,
-)
+from workbench.machine.terminal_text import only_colours, plain_text
+from workbench.session.printed import PLAIN, Run, coloured_runs, for_terminal
 
 COLOURS = re.compile("\x1b\\[[0-9;:]*m")
 DIRECTIONS = {"LRE", "RLE", "LRO", "RLO", "PDF", "LRI", "RLI", "FSI", "PDI"}
@@ -122,20 +116,23 @@ def test_controls_are_shown_as_python_writes_them(text: str, shown: str) -> None
     [
         ("", PLAIN),
         ("0", PLAIN),
-        ("31", Style(1)),
-        ("1;32", Style(2, bold=True)),
-        ("94;103", Style(12, 11)),
-        ("38;5;9", Style(9)),
-        ("38;5;208", Style((255, 135, 0))),
-        ("48;5;244", Style(background=(128, 128, 128))),
-        ("38;2;1;2;3;4", Style((1, 2, 3), underline=True)),
-        ("38:2::1:2:3", Style((1, 2, 3))),
-        ("38:2:1:2:3", Style((1, 2, 3))),
-        ("38;2;999;2;3", Style((255, 2, 3))),
+        ("31", Style(color="color(1)")),
+        ("1;32", Style(color="color(2)", bold=True)),
+        ("94;103", Style(color="color(12)", bgcolor="color(11)")),
+        ("38;5;9", Style(color="color(9)")),
+        ("38;5;208", Style(color="color(208)")),
+        ("48;5;244", Style(bgcolor="color(244)")),
+        ("38;2;1;2;3;4", Style(color="#010203", underline=True)),
+        ("38:2::1:2:3", Style(color="#010203")),
+        ("38:2:1:2:3", Style(color="#010203")),
+        ("38;2;999;2;3", Style(color="#ff0203")),
         ("38;9;1", Style(bold=True)),
         ("38", PLAIN),
         ("8", PLAIN),
+        ("31;8", Style(color="color(1)")),
+        ("31:8", Style(color="color(1)")),
         ("31;39", PLAIN),
+        ("41;49", PLAIN),
         ("1;2;3;4;7;9;22;23;24;27;29", PLAIN),
         ("4:3", Style(underline=True)),
         ("4:0", PLAIN),
@@ -149,6 +146,6 @@ def test_colours_are_read_as_terminals_do(numbers: str, style: Style) -> None:
 def test_a_style_goes_on_over_lines_and_text_that_is_hidden_is_not_hidden() -> None:
     first, style = coloured_runs("\x1b[31mone")
     second, _ = coloured_runs("two\x1b[0m three", style)
-    assert first == [Run("one", Style(1))]
-    assert second == [Run("two", Style(1)), Run(" three", PLAIN)]
+    assert first == [Run("one", Style(color="color(1)"))]
+    assert second == [Run("two", Style(color="color(1)")), Run(" three", PLAIN)]
     assert only_colours("\x1b[31;8msecret\x1b[0m") == "\\x1b[31;8msecret\x1b[0m"

@@ -4,9 +4,10 @@ import unicodedata
 
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.style import Style
 
-from workbench.machine.terminal_text import Run, Style, plain_text
-from workbench.session.printed import PrintedLine, PrintedLog
+from workbench.machine.terminal_text import plain_text
+from workbench.session.printed import PrintedLine, PrintedLog, Run
 
 
 def a_log() -> tuple[PrintedLog, list[PrintedLine]]:
@@ -100,7 +101,12 @@ def test_colours_stand_beside_the_text_and_go_on_to_the_next_line_of_that_stream
     log.feed("stdout", b"three\x1b[0m\nfour\n")
     lines = log.view().lines
     assert [line.text for line in lines] == ["one", "two", "three", "four"]
-    assert [line.runs for line in lines] == [(Run("one", Style(1)),), (), (Run("three", Style(1)),), ()]
+    assert [line.runs for line in lines] == [
+        (Run("one", Style(color="color(1)")),),
+        (),
+        (Run("three", Style(color="color(1)")),),
+        (),
+    ]
 
 
 def test_an_end_of_the_stream_ends_its_colours() -> None:

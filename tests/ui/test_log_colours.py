@@ -6,9 +6,10 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.color import Color
+from rich.style import Style
 
-from workbench.machine.terminal_text import Run, Style, coloured_runs
-from workbench.session.printed import Printed, PrintedLine, PrintedLog
+from workbench.session.printed import Printed, PrintedLine, PrintedLog, Run, coloured_runs
 from workbench.ui.log_panel import (
     DARK_PAGE,
     LIGHT_PAGE,
@@ -68,8 +69,8 @@ def test_the_sixteen_colours_of_the_page_can_be_read(scheme: str, page: tuple[in
 @given(
     st.builds(
         Style,
-        st.one_of(st.none(), st.integers(0, 15)),
-        st.one_of(st.integers(0, 15), st.tuples(BYTE, BYTE, BYTE)),
+        color=st.one_of(st.none(), st.builds(Color.from_ansi, st.integers(0, 15))),
+        bgcolor=st.one_of(st.builds(Color.from_ansi, BYTE), st.builds(Color.from_rgb, BYTE, BYTE, BYTE)),
     )
 )
 def test_text_can_be_seen_on_any_background(style: Style) -> None:

@@ -13,10 +13,18 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
-from workbench.machine.terminal_text import PLAIN, Run, Style, coloured_runs
+from rich.ansi import AnsiDecoder
+from rich.style import Style
+
+from workbench.machine.terminal_text import COLOURS, HARMLESS, colour_codes, plain_text
+
+PLAIN = Style.null()
+SWITCHES = ("bold", "dim", "italic", "underline", "reverse", "strike")
 
 _LONGEST_LINE = 2000
 _LINES_KEPT = 1000
@@ -26,6 +34,13 @@ _BAR_TOLD_EVERY = 0.1
 """Seconds."""
 _KEPT_OF_PIECE = 16_384
 """Bytes at the end of a piece that are looked at when the piece is one of a flood."""
+
+
+class Run(NamedTuple):
+    """Characters of one style, none of them a control."""
+
+    text: str
+    style: Style
 
 
 @dataclass(frozen=True)
@@ -165,3 +180,50 @@ def _read(stream: str, raw: bytes, style: Style) -> tuple[PrintedLine, Style]:
     runs, after = coloured_runs(cut.decode(errors="replace"), style)
     text = "".join(run.text for run in runs)
     return PrintedLine(stream, text, tuple(runs) if any(run.style != PLAIN for run in runs) else ()), after
+
+
+def coloured_runs(text: str, style: Style = PLAIN) -> tuple[list[Run], Style]:
+    """One line as runs, and the style that the next line begins with.
+
+    Args:
+        style: the one that the line before ended with.
+    """
+    runs: list[Run] = []
+    end = 0
+    for found in COLOURS.finditer(text):
+        _add(runs, text[end : found.start()], style)
+        style = _changed(style, found[1])
+        end = found.end()
+    _add(runs, text[end:], style)
+    return runs, style
+
+
+def for_terminal(runs: Iterable[Run]) -> str:
+    """These runs for a terminal that has colours; it is plain again after them."""
+    return "".join(run.style.render(run.text) for run in runs)
+
+
+def _add(runs: list[Run], text: str, style: Style) -> None:
+    if not text:
+        return
+    text = plain_text(text, "\t")
+    if runs and runs[-1].style == style:
+        text = runs.pop().text + text
+    runs.append(Run(text, style))
+
+
+@lru_cache(4096)
+def _changed(style: Style, numbers: str) -> Style:
+    """After the numbers of an ``ESC [ numbers m``."""
+    decoder = AnsiDecoder()
+    decoder.style = style
+    for first, *more in colour_codes(numbers):
+        if first in (38, 48):
+            decoder.decode_line(f"\x1b[{';'.join(map(str, (first, *more)))}m")
+        elif first in HARMLESS:
+            decoder.decode_line(f"\x1b[{24 if (first, more) == (4, [0]) else first}m")
+    found = decoder.style
+    # What was switched off looks as what never was on.
+    colour, background = (None if c is None or c.is_default else c for c in (found.color, found.bgcolor))
+    on = Style.parse(" ".join(name for name in SWITCHES if getattr(found, name)))
+    return Style(color=colour, bgcolor=background) + on

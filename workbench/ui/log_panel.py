@@ -12,16 +12,18 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import viser
+from rich.color import Color, ColorType
+from rich.style import Style
 
-from workbench.machine.terminal_text import PLAIN, Colour, Rgb, Run, Style
 from workbench.session.kept_worker import Vitals
 from workbench.session.memory_limit import in_words
-from workbench.session.printed import Printed
+from workbench.session.printed import PLAIN, SWITCHES, Printed, Run
 from workbench.session.view import SessionView
 from workbench.ui.control_values import limit_text
 from workbench.ui.fragments import render
 from workbench.ui.parts import Part
 
+Rgb = tuple[int, int, int]
 LIGHT_PAGE: Rgb = (241, 243, 245)
 DARK_PAGE: Rgb = (66, 66, 66)
 """The Log's background, or a little nearer to the text than that."""
@@ -62,24 +64,23 @@ def _span(run: Run) -> Span:
 @lru_cache(maxsize=4096)
 def _look(style: Style) -> tuple[str, str]:
     """Classes and inline style."""
-    switches = ("bold", "dim", "italic", "underline", "strike")
-    classes = [f"wb-ansi-{name}" for name in switches if getattr(style, name)]
-    colour, background = style.colour, style.background
+    classes = [f"wb-ansi-{name}" for name in SWITCHES if getattr(style, name) and name != "reverse"]
+    colour, background = style.color, style.bgcolor
     if style.reverse:
         if colour is None and background is None:
             return " ".join((*classes, "wb-ansi-reverse")), ""
-        colour, background = background, colour if colour is not None else 7
+        colour, background = background, colour or Color.from_ansi(7)
     if background is not None:
         behind = _rgb(background)
         text = _rgb(colour) if colour is not None else _plain_on(behind)
         if contrast(text, behind) < READABLE / 2:
             text = _plain_on(behind)
         return " ".join(classes), f"color:{_hex(text)};background:{_hex(behind)}"
-    if isinstance(colour, int):
-        classes.append(f"wb-ansi-{colour}")
+    if colour is not None and colour.type is ColorType.STANDARD:
+        classes.append(f"wb-ansi-{colour.number}")
     elif colour is not None:
         classes.append("wb-ansi-rgb")
-        light, dark = readable_on(colour, LIGHT_PAGE), readable_on(colour, DARK_PAGE)
+        light, dark = (readable_on(_rgb(colour), page) for page in (LIGHT_PAGE, DARK_PAGE))
         return " ".join(classes), f"--on-light:{_hex(light)};--on-dark:{_hex(dark)}"
     return " ".join(classes), ""
 
@@ -112,8 +113,11 @@ def _plain_on(behind: Rgb) -> Rgb:
     return (0, 0, 0) if contrast((0, 0, 0), behind) >= contrast((255, 255, 255), behind) else (255, 255, 255)
 
 
-def _rgb(colour: Colour) -> Rgb:
-    return SIXTEEN[colour] if isinstance(colour, int) else colour
+def _rgb(colour: Color) -> Rgb:
+    if colour.type is ColorType.STANDARD:
+        return SIXTEEN[colour.number or 0]
+    red, green, blue = colour.get_truecolor()
+    return red, green, blue
 
 
 def _hex(colour: Rgb) -> str:
