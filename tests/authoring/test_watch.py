@@ -200,11 +200,56 @@ def test_a_save_that_a_file_system_says_nothing_of_is_seen_by_reading(
     file: Path, last: Path, calls: Calls, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # As a network mount that answers with what it was told some seconds ago.
-    monkeypatch.setattr(watch, "_status", lambda path: None)
+    monkeypatch.setattr(watch, "_status", lambda path: ())
     for number in (1, 2):
         file.write_text(f"a = {number}\n")
         assert calls.next() == {"task.py": f"a = {number}\n"}
     assert calls.nothing_before(last)
+
+
+Many = Callable[[int, int], list[Path]]
+
+
+@pytest.fixture
+def many(watcher: SourceWatcher, tmp_path: Path, calls: Calls, monkeypatch: pytest.MonkeyPatch) -> Many:
+    """Follow files in several folders, the first one saved last, of which so many are looked at each time. None is read
+    unless a look says so."""
+
+    def follow(newest: int, turn: int) -> list[Path]:
+        for name, value in (("READ_S", 1e6), ("NEWEST", newest), ("TURN", turn)):
+            monkeypatch.setattr(watch, name, value)
+        files = [tmp_path / f"folder_{number % 3}" / f"file_{number}.py" for number in range(12)]
+        for number, file in enumerate(files):
+            file.parent.mkdir(exist_ok=True)
+            file.write_text("a = 0\n")
+            os.utime(file, (100 - number, 100 - number))
+        watcher.follow(files, {str(files[0]): "a = 1\n"})
+        assert calls.next() == {files[0].name: "a = 0\n"}
+        return files
+
+    return follow
+
+
+def test_of_many_files_each_comes_to_its_turn(many: Many, calls: Calls) -> None:
+    for number, file in enumerate(many(0, 5)):
+        file.write_text(f"a = 2{number}\n")
+        assert calls.next() == {file.name: f"a = 2{number}\n"}
+
+
+def test_of_many_files_those_saved_last_are_looked_at_each_time(many: Many, calls: Calls) -> None:
+    first, second, *_ = many(2, 0)
+    for number, file in enumerate([first, second, first, second, second]):
+        file.write_text(f"a = 2{number}\n")
+        assert calls.next() == {file.name: f"a = 2{number}\n"}
+
+
+@pytest.mark.parametrize("save", [rename_over, backup_and_create, delete_and_create])
+def test_of_many_files_one_that_was_renamed_or_made_is_seen_by_its_folder(
+    save: Callable[[Path, str], None], many: Many, calls: Calls
+) -> None:
+    for number, file in enumerate(many(0, 0)):
+        save(file, f"a = 2{number}\n")
+        assert calls.next() == {file.name: f"a = 2{number}\n"}
 
 
 def test_a_call_that_raises_is_logged_and_the_next_save_is_seen(
