@@ -72,14 +72,14 @@ def impulse_on(pile: Pile, body: object, by: object = None) -> np.ndarray:
 def net(reader: ContactReader, *bodies: physx.PhysxRigidBaseComponent) -> np.ndarray:
     query = reader.create_body_query(bodies)
     assert query.cuda_impulses.shape == (len(bodies), 3)
-    reader.query_bodies(query)
+    reader.answer(query)
     return query.cuda_impulses.torch().numpy().copy()
 
 
 def between(reader: ContactReader, *pairs: tuple) -> np.ndarray:
     query = reader.create_pair_query(pairs)
     assert query.cuda_impulses.shape == (len(pairs), 3)
-    reader.query_pairs(query)
+    reader.answer(query)
     return query.cuda_impulses.torch().numpy().copy()
 
 
@@ -122,8 +122,8 @@ def test_a_query_is_answered_anew_and_not_added_to(piles: list[Pile]) -> None:
         piles[0].system.step()
         reader.stepped()
         for _ in range(2):
-            reader.query_bodies(query)
-            reader.query_pairs(pairs)
+            reader.answer(query)
+            reader.answer(pairs)
         expected = np.float32(impulse_on(piles[0], piles[0].high))
         assert np.array_equal(query.cuda_impulses.torch()[0].numpy(), expected)
         assert np.array_equal(pairs.cuda_impulses.torch()[0].numpy(), expected)
@@ -147,7 +147,7 @@ def test_only_contacts_that_a_query_counts_are_read(piles: list[Pile]) -> None:
 def test_a_new_query_counts_what_was_not_read_before_it(piles: list[Pile]) -> None:
     reader, first = reader_of(piles), piles[0]
     lower = reader.create_pair_query([(first.low, first.ground)])
-    reader.query_pairs(lower)
+    reader.answer(lower)
     assert np.array_equal(net(reader, first.high)[0], np.float32(impulse_on(first, first.high)))
 
 
@@ -155,11 +155,11 @@ def test_a_step_is_noticed_once_it_is_told(piles: list[Pile]) -> None:
     for tell in (ContactReader.invalidate, ContactReader.stepped):
         reader, first = reader_of(piles), piles[0]
         query = reader.create_body_query([first.high])
-        reader.query_bodies(query)
+        reader.answer(query)
         first.high.set_linear_velocity([0, 0, 5])
         first.system.step()
         tell(reader)
-        reader.query_bodies(query)
+        reader.answer(query)
         assert not query.cuda_impulses.torch().any(), "nothing holds it up any more"
 
 
@@ -171,7 +171,7 @@ def test_what_is_carried_stands_for_one_systems_list_until_its_next_step(piles: 
     query = reader.create_body_query([first.high, first.low, second.high])
 
     def asked() -> list[list[float]]:
-        reader.query_bodies(query)
+        reader.answer(query)
         return query.cuda_impulses.torch().tolist()
 
     held = own[1].tolist()
@@ -199,5 +199,5 @@ def test_an_answer_stays_where_the_task_keeps_it(piles: list[Pile]) -> None:
     reader = reader_of(piles)
     query = reader.create_body_query([piles[0].high])
     kept = query.cuda_impulses.torch()
-    reader.query_bodies(query)
+    reader.answer(query)
     assert kept is query.cuda_impulses.torch() and bool(kept.any()) and kept.dtype == torch.float32

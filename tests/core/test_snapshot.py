@@ -23,8 +23,9 @@ from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 import workbench
 from tests.drive.envs import CPU, PICK_CUBE, batched, stock
-from workbench.core.cpu_state import CpuEnvState, plan_cpu_state
+from workbench.core.cpu_state import CpuState, plan_cpu_state
 from workbench.core.fresh_physics import renew_physics
+from workbench.core.gpu_state import read_gpu_state, write_gpu_state
 from workbench.core.snapshot import begin_anew, in_this_state, restore_snapshot, take_snapshot
 from workbench.core.task_env import TaskEnv
 
@@ -433,11 +434,11 @@ def test_whatever_physx_lets_sleep_is_said_to_sleep(env_id: str) -> None:
         if step % 7 == 3:
             bodies[step % len(bodies)].put_to_sleep()
             env.scene.px.note_change()
-        states = take_snapshot(env).simulation
-        for state, sleepers in zip(states, plan.sleepers, strict=True):
+        state = take_snapshot(env).simulation
+        assert isinstance(state, CpuState)
+        for said, sleepers in zip(state.asleep, plan.sleepers, strict=True):
             truth = {part: asleep() for part, asleep, _ in sleepers}
-            assert isinstance(state, CpuEnvState)
-            assert {part: state.asleep[part] for part in truth} == truth
+            assert {part: said[part] for part in truth} == truth
             slept += sum(truth.values())
     assert slept
     env.close()
@@ -588,3 +589,37 @@ def test_wrappers_are_looked_through_and_what_is_no_env_is_refused(pick: BaseEnv
         take_snapshot({})
     with pytest.raises(TypeError, match="a Snapshot is wanted"):
         restore_snapshot(pick, {})
+
+
+def test_a_state_in_gpu_simulation_is_read_and_written_by_the_tensors(pick: BaseEnv) -> None:
+    """Here those of the CPU core, which are the same; what PhysX keeps beside them is not in it."""
+    pick.reset(seed=list(range(N)))
+    for _ in range(3):
+        pick.step(pick.action_space.sample())
+    state, before = read_gpu_state(pick, [1, 3]), read_gpu_state(pick, list(range(N)))
+    targets = pick.scene.px.cuda_articulation_target_qpos.torch().clone()
+    for _ in range(3):
+        pick.step(pick.action_space.sample())
+    now = read_gpu_state(pick, list(range(N)))
+    carried, missed = write_gpu_state(pick, [3, 0], state, [0, 1])
+    there = {"actor cube", "actor goal_site", "actor table-workspace", "articulation panda"}
+    assert (set(carried), missed) == (there, {})
+    found = read_gpu_state(pick, list(range(N)))
+    for name, rows in found.states.items():
+        for env, source, was in [(3, 1, before), (0, 3, before), (1, 1, now), (2, 2, now)]:
+            np.testing.assert_allclose(rows[env], was.states[name][source], rtol=0, atol=1e-6)
+    assert torch.equal(pick.scene.px.cuda_articulation_target_qpos.torch()[[3, 0]], targets[[1, 3]])
+
+
+def test_what_a_gpu_state_has_not_is_left_and_told(pick: BaseEnv) -> None:
+    pick.reset(seed=list(range(N)))
+    kept = read_gpu_state(pick, [0])
+    panda, cube = kept.states.pop("articulations/panda"), kept.states.pop("actors/cube")
+    kept.states.update(
+        {"articulations/panda": panda[:, :-1], "actors/box": cube, "actors/goal_site": cube + np.nan}
+    )
+    carried, missed = write_gpu_state(pick, [2], kept, [0])
+    assert carried == {"actor table-workspace": None}
+    left = "the snapshot has none of this name and shape: left as it is"
+    there = ("actor cube", "actor goal_site", "articulation panda")
+    assert missed == {"actor box": "this env has none of this name", **dict.fromkeys(there, left)}

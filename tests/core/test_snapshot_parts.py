@@ -17,7 +17,7 @@ import torch
 
 from tests.drive.envs import batched
 from workbench.core import actions
-from workbench.core.cpu_state import CpuEnvState
+from workbench.core.cpu_state import CpuState
 from workbench.core.snapshot import Snapshot
 from workbench.core.snapshot_bytes import WholeSnapshot
 from workbench.core.snapshot_parts import PackedSnapshot, SnapshotPacker, unpack_snapshot
@@ -105,21 +105,17 @@ def test_a_grasp_and_what_it_touches_come_back(task: TaskEnv) -> None:
 def test_what_touches_and_sleeps_is_of_its_own_env(task: TaskEnv) -> None:
     """As it is where envs differ: one holds, one pushes two things, and one sleeps."""
     snapshot = task.snapshot()
-    touches = [
-        (),
-        (
-            ("cube", "panda/panda_leftfinger", np.array([1, 2, 3], np.float32)),
-            ("cube", "table", np.array([4, 5, 6], np.float32)),
-        ),
-        (),
-        (("cube", "table", np.array([7, 8, 9], np.float32)),),
+    state = snapshot.simulation
+    assert isinstance(state, CpuState)
+    asleep = [
+        tuple((part + env) % 3 == 0 for part in range(len(contents)))
+        for env, contents in enumerate(state.contents)
     ]
-    simulation = []
-    for env, state in enumerate(snapshot.simulation):
-        assert isinstance(state, CpuEnvState)
-        asleep = tuple((part + env) % 3 == 0 for part in range(len(state.contents)))
-        simulation.append(state._replace(touching=touches[env], asleep=asleep))
-    other = replace(snapshot, simulation=tuple(simulation))
+    touching = (1, "cube", "panda/panda_leftfinger"), (1, "cube", "table"), (3, "cube", "table")
+    impulses = np.arange(9, dtype=np.float32).reshape(3, 3)
+    other = replace(
+        snapshot, simulation=replace(state, asleep=tuple(asleep), touching=touching, impulses=impulses)
+    )
     packed = SnapshotPacker().pack(other)
     assert same(unpack_snapshot(packed.body, Receiver().take(packed)), other)
 

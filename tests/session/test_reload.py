@@ -98,7 +98,7 @@ def good_version(request: pytest.FixtureRequest) -> Iterator[None]:
 
 
 def state_of(task: TaskEnv) -> list[bytes]:
-    return [state.packed for state in task.snapshot().simulation]  # type: ignore[union-attr]
+    return [*task.snapshot().simulation.packed]  # type: ignore[union-attr]
 
 
 def test_a_registration_that_comes_and_goes_is_said(desk: Desk) -> None:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import sys
 import weakref
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import sapien
@@ -56,7 +57,6 @@ GUARDED_METHODS: dict[type, dict[str, str]] = {
 
 _strict_systems: weakref.WeakSet[StrictCpuSystem] = weakref.WeakSet()
 """Asked for their scenes each time, since a restored snapshot gives an env another scene."""
-_installed = False
 
 
 def guard_scenes(system: StrictCpuSystem) -> None:
@@ -65,10 +65,8 @@ def guard_scenes(system: StrictCpuSystem) -> None:
     _strict_systems.add(system)
 
 
+@cache
 def _install() -> None:
-    global _installed
-    if _installed:
-        return
     for owner, names in GUARDED.items():
         for name, instead in names.items():
             stock: property = owner.__dict__[name]
@@ -82,7 +80,6 @@ def _install() -> None:
     for owner, names in GUARDED_METHODS.items():
         for name, instead in names.items():
             setattr(owner, name, _guarded(owner.__dict__[name], f"{owner.__name__}.{name}()", instead))
-    _installed = True
 
 
 def _guarded(stock: Any, called: str, instead: str) -> Callable[..., Any]:

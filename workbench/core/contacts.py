@@ -23,6 +23,9 @@ import sapien.physx as physx
 import torch
 from numpy.typing import NDArray
 
+_Key = int | tuple[int, int]
+"""The ``id`` of a body, or those of two."""
+
 
 class CpuArray:
     """Stands where SAPIEN's ``CudaArray`` stands on the GPU: something with ``.torch()``."""
@@ -39,26 +42,15 @@ class CpuArray:
 
 
 @dataclass(eq=False)
-class BodyImpulseQuery:
-    """Net contact impulse of each body; the sign is that of an impulse on the body itself."""
+class ImpulseQuery:
+    """Net contact impulse of each of some bodies; or of each of some pairs, on the first body by the second."""
 
-    bodies: Sequence[physx.PhysxRigidBaseComponent]
-    """Held, because pybind11 gives one Python object a body only while it is alive: see `rows`."""
+    held: Sequence[Any]
+    """The bodies or pairs, because pybind11 gives one Python object a body only while it is alive: see `rows`."""
     cuda_impulses: CpuArray
-    """(len(bodies), 3) newton seconds of the last substep."""
-    rows: Mapping[int, Sequence[int]]
-    """Where each body stands in `bodies`, by its ``id``."""
-
-
-@dataclass(eq=False)
-class PairImpulseQuery:
-    """Impulse on the first body of each pair by the second."""
-
-    pairs: Sequence[tuple[physx.PhysxRigidBaseComponent, physx.PhysxRigidBaseComponent]]
-    cuda_impulses: CpuArray
-    """(len(pairs), 3) newton seconds of the last substep."""
-    rows: Mapping[tuple[int, int], Sequence[tuple[int, int]]]
-    """Row and sign (1 or -1) of each pair, in both orders, by the ``id`` of its bodies."""
+    """(len(held), 3) newton seconds of the last substep."""
+    rows: Mapping[_Key, Sequence[tuple[int, int]]]
+    """Row of each body, and the sign 1; or row and sign (1 or -1) of each pair, in both orders."""
 
 
 @dataclass
@@ -66,32 +58,31 @@ class ContactReader:
     """Answers queries about the last substep of the systems; `invalidate` after each substep."""
 
     systems: Sequence[physx.PhysxCpuSystem]
-    _queries: weakref.WeakSet[Any] = field(default_factory=weakref.WeakSet)
-    _wanted_bodies: set[int] = field(default_factory=set)
-    _wanted_pairs: set[tuple[int, int]] = field(default_factory=set)
+    _queries: weakref.WeakSet[ImpulseQuery] = field(default_factory=weakref.WeakSet)
+    _wanted: set[_Key] = field(default_factory=set)
     _cache: list[tuple[tuple[int, int], NDArray[np.float32]]] | None = None
     _carried: dict[int, list[tuple[tuple[int, int], NDArray[np.float32]]]] = field(default_factory=dict)
     """What stands for the list of a system whose state was restored; see `carry`."""
 
-    def create_body_query(self, bodies: Sequence[physx.PhysxRigidBaseComponent]) -> BodyImpulseQuery:
-        bodies = list(bodies)
-        rows: dict[int, list[int]] = {}
-        for i, body in enumerate(bodies):
-            rows.setdefault(id(body), []).append(i)
-        query = BodyImpulseQuery(bodies, CpuArray(torch.zeros((len(bodies), 3))), rows)
-        self._want(query)
-        return query
+    def create_body_query(self, bodies: Sequence[physx.PhysxRigidBaseComponent]) -> ImpulseQuery:
+        return self._create([*bodies], [(i, id(body), 1) for i, body in enumerate(bodies)])
 
     def create_pair_query(
         self, pairs: Sequence[tuple[physx.PhysxRigidBaseComponent, physx.PhysxRigidBaseComponent]]
-    ) -> PairImpulseQuery:
-        pairs = list(pairs)
-        rows: dict[tuple[int, int], list[tuple[int, int]]] = {}
-        for i, (a, b) in enumerate(pairs):
-            rows.setdefault((id(a), id(b)), []).append((i, 1))
-            rows.setdefault((id(b), id(a)), []).append((i, -1))
-        query = PairImpulseQuery(pairs, CpuArray(torch.zeros((len(pairs), 3))), rows)
-        self._want(query)
+    ) -> ImpulseQuery:
+        both = [((i, (id(a), id(b)), 1), (i, (id(b), id(a)), -1)) for i, (a, b) in enumerate(pairs)]
+        return self._create([*pairs], [row for rows in both for row in rows])
+
+    def _create(self, held: list[Any], what: Sequence[tuple[int, _Key, int]]) -> ImpulseQuery:
+        rows: dict[_Key, list[tuple[int, int]]] = {}
+        for row, key, sign in what:
+            rows.setdefault(key, []).append((row, sign))
+        query = ImpulseQuery(held, CpuArray(torch.zeros((len(held), 3))), rows)
+        # Weakly held, and the wants gathered anew: a task that asks about other objects after every
+        # reset makes new queries each time, and those that it dropped must cost nothing.
+        self._queries.add(query)
+        self._wanted = {key for query in self._queries for key in query.rows}
+        self._cache = None
         return query
 
     def invalidate(self) -> None:
@@ -110,36 +101,23 @@ class ContactReader:
         self._carried[system] = contacts
         self._cache = None
 
-    def query_bodies(self, query: BodyImpulseQuery) -> None:
-        total, rows = np.zeros((len(query.bodies), 3)), query.rows
-        for (first, second), impulse in self.counted():
-            for row in rows.get(first, ()):
-                total[row] += impulse
+    def answer(self, query: ImpulseQuery) -> None:
+        total, rows = np.zeros((len(query.held), 3)), query.rows
+        for pair, impulse in self.counted():
+            first, second = pair
+            for key in (pair, first):
+                for row, sign in rows.get(key, ()):
+                    total[row] += impulse * sign
             # Not both: stock ManiSkill counts a contact for its first body only when the two are one.
-            for row in rows.get(second, ()) if second != first else ():
+            for row, _ in rows.get(second, ()) if second != first else ():
                 total[row] -= impulse
         query.cuda_impulses.torch().copy_(torch.from_numpy(total))
-
-    def query_pairs(self, query: PairImpulseQuery) -> None:
-        total, rows = np.zeros((len(query.pairs), 3)), query.rows
-        for bodies, impulse in self.counted():
-            for row, sign in rows.get(bodies, ()):
-                total[row] += impulse * sign
-        query.cuda_impulses.torch().copy_(torch.from_numpy(total))
-
-    def _want(self, query: BodyImpulseQuery | PairImpulseQuery) -> None:
-        # Weakly held, and the wants gathered anew: a task that asks about other objects after every
-        # reset makes new queries each time, and those that it dropped must cost nothing.
-        self._queries.add(query)
-        self._wanted_bodies = {i for q in self._queries if isinstance(q, BodyImpulseQuery) for i in q.rows}
-        self._wanted_pairs = {p for q in self._queries if isinstance(q, PairImpulseQuery) for p in q.rows}
-        self._cache = None
 
     def counted(self) -> list[tuple[tuple[int, int], NDArray[np.float32]]]:
         """The ids of the two bodies, and the impulse on the first, of every contact that a query counts."""
         if self._cache is None:
             found = self._cache = []
-            bodies, pairs = self._wanted_bodies, self._wanted_pairs
+            wanted = self._wanted
             for index, system in enumerate(self.systems):
                 if index in self._carried:
                     found += self._carried[index]
@@ -147,7 +125,7 @@ class ContactReader:
                 for contact in system.get_contacts():
                     a, b = contact.bodies
                     first, second = pair = id(a), id(b)
-                    if pair in pairs or first in bodies or second in bodies:
+                    if pair in wanted or first in wanted or second in wanted:
                         # What np.sum does, without its three wrappers.
                         impulse = np.add.reduce([point.impulse for point in contact.points], axis=0)
                         found.append((pair, impulse))

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 BODY = 13
 """Floats of a body in ``pack()``: quaternion wxyz, position, linear and angular velocity."""
-_FROM_PACKEDBODY = np.array([4, 5, 6, 0, 1, 2, 3, 7, 8, 9, 10, 11, 12])
+_FROM_PACKED_BODY = np.array([4, 5, 6, 0, 1, 2, 3, 7, 8, 9, 10, 11, 12])
 """Where ManiSkill's row [p, q, v, w] finds its columns in a packed body [q, p, v, w]."""
 _IN_ENV = re.compile(r"^scene-\d+[-_]")
 _FROM_PACKED_POSE = np.array([4, 5, 6, 0, 1, 2, 3])
@@ -65,83 +65,61 @@ class Layout:
 
 
 def lay_out(systems: Sequence[physx.PhysxCpuSystem], scenes: Sequence[sapien.Scene]) -> Layout:
-    bodies: list[Any] = []
-    links: list[Any] = []
-    articulations: list[Any] = []
-    body_rows, link_rows, root_rows, dofs = [], [], [], []
-    body_at, root_at, pose_at = [], [], []
-    row_entities: list[Any] = []
-    env_of_row: list[int] = []
-    joint_at: list[tuple[int, int]] = []
-    row = packed = 0
+    rows: list[Any] = []  # the component of each
+    entity_at, env_of_row, body_at, joints_at = [], [], [], []
+    roots: dict[int, tuple[int, Any]] = {}  # row and articulation of the first link of each
+    packed = 0
     for env, (system, scene) in enumerate(zip(systems, scenes, strict=True)):
         entities = scene.entities  # held, because an id is unique only among objects that are alive
-        entity_at = {id(entity): 7 * i for i, entity in enumerate(entities)}
-        for body in system.rigid_dynamic_components:
-            bodies.append(body)
-            body_rows.append(row)
-            row_entities.append(body.entity)
-            pose_at.append(entity_at[id(body.entity)] + _FROM_PACKED_POSE)
-            env_of_row.append(env)
-            body_at.append(packed + _FROM_PACKEDBODY)
-            row, packed = row + 1, packed + BODY
-        seen: set[int] = set()
-        env_articulations = []
-        for link in system.articulation_link_components:
-            links.append(link)
-            link_rows.append(row)
-            row_entities.append(link.entity)
-            pose_at.append(entity_at[id(link.entity)] + _FROM_PACKED_POSE)
-            env_of_row.append(env)
-            articulation = link.articulation
-            if id(articulation) not in seen:
-                seen.add(id(articulation))
-                env_articulations.append(articulation)
-                articulations.append(articulation)
-                root_rows.append(row)
-                dofs.append(articulation.dof)
-            row += 1
-        for articulation in env_articulations:
-            root_at.append(packed + _FROM_PACKEDBODY)
-            packed += BODY
-            joint_at.append((packed, articulation.dof))
-            packed += 4 * articulation.dof
-    width = max(dofs, default=0)
-    nothing = packed  # one zero behind all packs: what the padding of shorter articulations reads
+        where = {id(entity): 7 * i for i, entity in enumerate(entities)}
+        bodies, links = system.rigid_dynamic_components, system.articulation_link_components
+        body_at += [packed + BODY * i for i in range(len(bodies))]
+        packed += BODY * len(bodies)
+        before = len(roots)
+        for row, link in enumerate(links, len(rows) + len(bodies)):
+            roots.setdefault(id(link.articulation), (row, link.articulation))
+        for _, articulation in [*roots.values()][before:]:
+            joints_at.append(packed + BODY)
+            packed += BODY + 4 * articulation.dof
+        rows += [*bodies, *links]
+        entity_at += [where[id(component.entity)] for component in (*bodies, *links)]
+        env_of_row += [env] * (len(bodies) + len(links))
+    is_link = np.array([isinstance(c, physx.PhysxArticulationLinkComponent) for c in rows], dtype=bool)
+    articulations = [articulation for _, articulation in roots.values()]
+    dofs = _numbers([articulation.dof for articulation in articulations])
+    start, each, dof = _numbers(joints_at)[:, None], np.arange(dofs.max(initial=0)), dofs[:, None]
 
-    def joint_columns(offset: Callable[[int, int], NDArray[np.int64]]) -> NDArray[np.int64]:
-        columns = np.full((len(joint_at), width), nothing, dtype=np.int64)
-        for i, (start, dof) in enumerate(joint_at):
-            columns[i, :dof] = offset(start, dof)
-        return columns
+    def joint_columns(at: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.where(each < dof, start + at, packed)  # one zero behind all packs, which the padding reads
 
-    def stacked(rows: list[NDArray[np.int64]], columns: int) -> NDArray[np.int64]:
-        return np.stack(rows) if rows else np.zeros((0, columns), dtype=np.int64)
-
-    every_body = bodies + links
+    entities = [component.entity for component in rows]
     return Layout(
-        bodies=bodies,
-        body_rows=np.array(body_rows, dtype=np.int64),
-        links=links,
-        link_rows=np.array(link_rows, dtype=np.int64),
+        bodies=[rows[row] for row in np.flatnonzero(~is_link)],
+        body_rows=np.flatnonzero(~is_link),
+        links=[rows[row] for row in np.flatnonzero(is_link)],
+        link_rows=np.flatnonzero(is_link),
         articulations=articulations,
-        root_rows=np.array(root_rows, dtype=np.int64),
-        dofs=np.array(dofs, dtype=np.int64),
-        body_at=stacked(body_at, BODY),
-        root_at=stacked(root_at, BODY),
-        qpos_at=joint_columns(lambda start, dof: start + np.arange(dof)),
-        qvel_at=joint_columns(lambda start, dof: start + dof + np.arange(dof)),
-        target_qpos_at=joint_columns(lambda start, dof: start + 2 * dof + 2 * np.arange(dof)),
-        target_qvel_at=joint_columns(lambda start, dof: start + 2 * dof + 2 * np.arange(dof) + 1),
-        entities=row_entities,
-        pose_at=stacked(pose_at, 7),
-        env_of_row=np.array(env_of_row, dtype=np.int64),
-        names=[_IN_ENV.sub("", entity.name) for entity in row_entities],
+        root_rows=_numbers([row for row, _ in roots.values()]),
+        dofs=dofs,
+        body_at=_numbers(body_at)[:, None] + _FROM_PACKED_BODY,
+        root_at=start - BODY + _FROM_PACKED_BODY,
+        qpos_at=joint_columns(each),
+        qvel_at=joint_columns(dof + each),
+        target_qpos_at=joint_columns(2 * dof + 2 * each),
+        target_qvel_at=joint_columns(2 * dof + 2 * each + 1),
+        entities=entities,
+        pose_at=_numbers(entity_at)[:, None] + _FROM_PACKED_POSE,
+        env_of_row=_numbers(env_of_row),
+        names=[_IN_ENV.sub("", entity.name) for entity in entities],
         articulation_names=[_IN_ENV.sub("", articulation.name) for articulation in articulations],
-        row_of={id(b): r for b, r in zip(every_body, [*body_rows, *link_rows], strict=True)},
+        row_of={id(component): row for row, component in enumerate(rows)},
         index_of={id(a): i for i, a in enumerate(articulations)},
-        row_count=row,
+        row_count=len(rows),
     )
+
+
+def _numbers(values: list[int]) -> NDArray[np.int64]:
+    return np.array(values, dtype=np.int64)
 
 
 def check_layout(

@@ -21,10 +21,10 @@ is described in `snapshot` and `fresh_physics`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import sapien
@@ -66,23 +66,40 @@ class Part:
 Contents = tuple[Part, ...]
 """What the packed state of one env holds, in its order: bodies, then articulations."""
 
-Touch = tuple[str, str, NDArray[np.float32]]
-"""A contact that a query counts: the names of two bodies, and the impulse (3,) in N s on the first."""
 
+@dataclass(frozen=True)
+class CpuState:
+    """The simulation state of n envs, as columns."""
 
-class CpuEnvState(NamedTuple):
-    """The simulation state of one env. A tuple, since hundreds are made at once."""
-
-    contents: Contents
-    packed: bytes
-    """As ``PhysxCpuSystem.pack()`` gives it; hidden actors where they really are."""
-    asleep: tuple[bool, ...]
-    """One for each of `contents`."""
+    contents: tuple[Contents, ...]
+    """(n,)"""
+    packed: tuple[bytes, ...]
+    """(n,) as ``PhysxCpuSystem.pack()`` gives it; hidden actors where they really are."""
+    asleep: tuple[tuple[bool, ...], ...]
+    """(n,) one for each of its `contents`."""
     qf: NDArray[np.float32]
-    """(articulations, D) joint forces, padded with zeros."""
+    """(A, D) joint forces of their articulations, env after env, padded with zeros."""
     driven: NDArray[np.bool_]
-    """(2, articulations) whether position and velocity targets were ever set."""
-    touching: tuple[Touch, ...]
+    """(2, A) whether position and velocity targets were ever set."""
+    touching: tuple[tuple[int, str, str], ...]
+    """(T,) contacts that a query counts: which of the n envs, and the names of two bodies."""
+    impulses: NDArray[np.float32]
+    """(T, 3) N s on the first body of each."""
+
+    def articulations(self, k: int) -> slice:
+        """Which of `qf` are env k's."""
+        first = sum(_articulations(contents) for contents in self.contents[:k])
+        return slice(first, first + _articulations(self.contents[k]))
+
+    def essence(self, k: int) -> tuple[Any, ...]:
+        """What is equal where PhysX would say the same of env k."""
+        rows = self.articulations(k)
+        numbers = self.qf[rows].tobytes(), self.driven[:, rows].tobytes()
+        return self.contents[k], self.packed[k], self.asleep[k], *numbers
+
+
+def _articulations(contents: Contents) -> int:
+    return sum(part.joints is not None for part in contents)
 
 
 @dataclass
@@ -93,7 +110,7 @@ class CpuStatePlan:
     """Of each env; envs that are alike share one object."""
     sleepers: list[list[tuple[int, Callable[[], bool], Any]]]
     """Of each env: index into its contents, whether it sleeps, the component that can be put to sleep."""
-    articulations: list[slice]
+    articulations: list[range]
     """Of each env: its rows in the (A, D) tensors."""
     names: dict[int, tuple[int, str]]
     """Env and name of a body, by the ``id`` of its component."""
@@ -146,7 +163,7 @@ def plan_cpu_state(env: Any) -> CpuStatePlan:
         contents = tuple(parts)
         plan.contents.append(alike.setdefault(contents, contents))
         plan.sleepers.append(sleepers)
-        plan.articulations.append(slice(first_articulation, first_articulation + len(roots)))
+        plan.articulations.append(range(first_articulation, first_articulation + len(roots)))
         first_articulation += len(roots)
     return plan
 
@@ -156,36 +173,39 @@ def _getter(component: Any, name: str) -> Callable[[], bool]:
     return partial(getattr(type(component), name).fget, component)
 
 
-def read_cpu_state(env: Any, env_idx: list[int]) -> list[CpuEnvState]:
-    """The simulation state of the envs in `env_idx`, one each."""
+def read_cpu_state(env: Any, env_idx: list[int]) -> CpuState:
+    """The simulation state of the envs in `env_idx`."""
     px: BatchedCpuSystem = env.scene.px
     plan = plan_cpu_state(env)
-    packs = px.packs()
-    hidden = _hidden(env, plan)
-    qf = px.cuda_articulation_qf.torch().numpy().copy()
-    driven = np.stack(px.drive_flags)
-    touching = _touching(px, plan)
+    packs = [*px.packs()]
+    for i, hidden in _hidden(env, plan).items():
+        numbers = np.frombuffer(packs[i], dtype=np.float32).copy()
+        for offset, pose in hidden:
+            numbers[offset : offset + 7] = pose[[3, 4, 5, 6, 0, 1, 2]]
+        packs[i] = numbers.tobytes()
     awake = {len(contents): (False,) * len(contents) for contents in plan.contents}
-    states = []
+    asleep = []
     for i in env_idx:
-        packed, contents, rows = packs[i], plan.contents[i], plan.articulations[i]
-        if i in hidden:
-            numbers = np.frombuffer(packed, dtype=np.float32).copy()
-            for offset, pose in hidden[i]:
-                numbers[offset : offset + 7] = pose[[3, 4, 5, 6, 0, 1, 2]]
-            packed = numbers.tobytes()
-        sleeping = [part for part, is_asleep, _ in plan.sleepers[i] if is_asleep()]
-        asleep = (
-            tuple([part in sleeping for part in range(len(contents))]) if sleeping else awake[len(contents)]
-        )
-        states.append(CpuEnvState(contents, packed, asleep, qf[rows], driven[:, rows], touching.get(i, ())))
-    return states
+        sleeping = {part for part, is_asleep, _ in plan.sleepers[i] if is_asleep()}
+        parts = len(plan.contents[i])
+        asleep.append(tuple([part in sleeping for part in range(parts)]) if sleeping else awake[parts])
+    rows = [row for i in env_idx for row in plan.articulations[i]]
+    touches = _touching(px, plan, env_idx)
+    return CpuState(
+        contents=tuple([plan.contents[i] for i in env_idx]),
+        packed=tuple([packs[i] for i in env_idx]),
+        asleep=tuple(asleep),
+        qf=px.cuda_articulation_qf.torch().numpy()[rows],
+        driven=np.stack(px.drive_flags)[:, rows],
+        touching=tuple([touch for touch, _ in touches]),
+        impulses=np.array([impulse for _, impulse in touches], np.float32).reshape(-1, 3),
+    )
 
 
 def write_cpu_state(
-    env: Any, env_idx: list[int], states: list[CpuEnvState], fresh_physics: bool
+    env: Any, env_idx: list[int], state: CpuState, positions: list[int], fresh_physics: bool
 ) -> tuple[dict[str, None], dict[str, str]]:
-    """Put ``states[k]`` into env ``env_idx[k]``; the other envs are not touched. The tensors are fetched.
+    """Put env ``positions[j]`` of `state` into env ``env_idx[j]``; the other envs are not touched. The tensors are fetched.
 
     Returns:
         What was carried, and what was not with the reason, each by the words that name it.
@@ -205,35 +225,30 @@ def write_cpu_state(
             missed[f"fresh physics of env {i}"] = "entities were removed from its scene since it was built"
     hidden = _hidden(env, plan)
     packed: dict[int, bytes] = {}
-    matches: dict[int, list[int | None]] = {}
+    matches: dict[int, Sequence[int | None]] = {}
     alike: dict[int, Contents] = {}
-    for i, state in zip(env_idx, states, strict=True):
-        packed[i] = state.packed
-        if state.contents == plan.contents[i]:
-            alike[id(plan.contents[i])] = plan.contents[i]
+    for i, k in zip(env_idx, positions, strict=True):
+        contents, packed[i] = plan.contents[i], state.packed[k]
+        if state.contents[k] == contents:
+            alike[id(contents)], matches[i] = contents, range(len(contents))
         else:
-            packed[i], matches[i] = _joined(plan.contents[i], own[i], state, carried, missed)
+            packed[i], matches[i] = _joined(contents, own[i], state, k, carried, missed)
         if i in hidden:
             packed[i] = _hide(packed[i], hidden[i])
     _unpack(px, plan, packed)
-    _write_joint_forces(px, plan, dict(zip(env_idx, states, strict=True)), matches, fresh_physics)
-    for i, state in zip(env_idx, states, strict=True):
-        if any(state.asleep):
-            slept = {part.name for part, asleep in zip(state.contents, state.asleep, strict=True) if asleep}
-            for part, _, component in plan.sleepers[i]:
-                if plan.contents[i][part].name in slept:
-                    component.put_to_sleep()
+    _write_joint_forces(px, plan, dict(zip(env_idx, positions, strict=True)), state, matches, fresh_physics)
+    touches: dict[int, list[tuple[str, str, Any]]] = {}
+    for (k, first, second), impulse in zip(state.touching, state.impulses, strict=True):
+        touches.setdefault(k, []).append((first, second, impulse))
+    for i, k in zip(env_idx, positions, strict=True):
+        slept = {part.name for part, asleep in zip(state.contents[k], state.asleep[k], strict=True) if asleep}
+        for part, _, component in plan.sleepers[i] if slept else ():
+            if plan.contents[i][part].name in slept:
+                component.put_to_sleep()
+        ids = plan.bodies[i]
+        known = [touch for touch in touches.get(k, ()) if touch[0] in ids and touch[1] in ids]
+        px.contacts.carry(i, [((ids[a], ids[b]), impulse) for a, b, impulse in known])
     env.scene._gpu_fetch_all()
-    for i, state in zip(env_idx, states, strict=True):
-        known = plan.bodies[i]
-        px.contacts.carry(
-            i,
-            [
-                ((known[a], known[b]), impulse)
-                for a, b, impulse in state.touching
-                if a in known and b in known
-            ],
-        )
     carried.update({str(part): None for contents in alike.values() for part in contents})
     return carried, missed
 
@@ -244,28 +259,28 @@ def begin_cpu_state_anew(env: Any, env_idx: list[int]) -> None:
     What follows can then be had again to the last bit, from a snapshot of now and the same actions. A root of an
     articulation that PhysX does not give back as it is set is moved by some last bits, to where it does.
     """
-    left, states, dice = env_idx, read_cpu_state(env, env_idx), np.random.default_rng(0)
+    left, state, dice = env_idx, read_cpu_state(env, env_idx), np.random.default_rng(0)
+    positions = list(range(len(env_idx)))
     for attempt in range(_TRIES):
-        write_cpu_state(env, left, states, fresh_physics=True)
+        write_cpu_state(env, left, state, positions, fresh_physics=True)
         found = read_cpu_state(env, left)
-        other = [
-            k for k, (now, was) in enumerate(zip(found, states, strict=True)) if now.packed != was.packed
-        ]
+        other = [j for j, k in enumerate(positions) if found.packed[j] != state.packed[k]]
         if not other:
             return
-        left, states = [left[k] for k in other], [found[k] for k in other]
+        left, state, positions = [left[j] for j in other], found, other
         if attempt > 0:
-            states = [_nudged(state, dice) for state in states]
+            moved = {k: _nudged(found.contents[k], found.packed[k], dice) for k in other}
+            state = replace(found, packed=tuple(moved.get(k, was) for k, was in enumerate(found.packed)))
 
 
-def _nudged(state: CpuEnvState, dice: np.random.Generator) -> CpuEnvState:
-    numbers = np.frombuffer(state.packed, dtype=np.float32).copy()
+def _nudged(contents: Contents, packed: bytes, dice: np.random.Generator) -> bytes:
+    numbers = np.frombuffer(packed, dtype=np.float32).copy()
     at = 0
-    for part in state.contents:
+    for part in contents:
         if part.joints is not None:
             numbers[at : at + 7] += _LAST_BIT * dice.integers(-2, 3, 7).astype(np.float32)
         at += part.size
-    return state._replace(packed=numbers.tobytes())
+    return numbers.tobytes()
 
 
 def _unpack(px: BatchedCpuSystem, plan: CpuStatePlan, packed: dict[int, bytes]) -> None:
@@ -284,38 +299,30 @@ def _unpack(px: BatchedCpuSystem, plan: CpuStatePlan, packed: dict[int, bytes]) 
 def _write_joint_forces(
     px: BatchedCpuSystem,
     plan: CpuStatePlan,
-    states: dict[int, CpuEnvState],
-    matches: dict[int, list[int | None]],
+    sources: dict[int, int],
+    state: CpuState,
+    matches: dict[int, Sequence[int | None]],
     fresh_physics: bool,
 ) -> None:
-    """Put ``set_qf``'s forces and the drives' flags back, by env; `matches` as of `_joined`, where envs differ."""
+    """Put ``set_qf``'s forces and the drives' flags back into each env; `matches` as of `_joined`."""
+    rows, theirs = [], []
+    for i, k in sources.items():
+        bodies, their_bodies = (len(c) - _articulations(c) for c in (plan.contents[i], state.contents[k]))
+        first = state.articulations(k).start - their_bodies
+        for row, match in zip(plan.articulations[i], matches[i][bodies:], strict=True):
+            if match is not None:
+                rows.append(row)
+                theirs.append(first + match)
     qf = px.cuda_articulation_qf.torch().numpy()
-    for i, state in states.items():
-        rows = plan.articulations[i]
-        if i not in matches and state.qf.shape[1] == qf.shape[1]:
-            qf[rows] = state.qf
-            for flags, was in zip(px.drive_flags, state.driven, strict=True):
-                flags[rows] = was
-            continue
-        contents = plan.contents[i]
-        bodies, their_bodies = (sum(p.joints is None for p in c) for c in (contents, state.contents))
-        for part in range(bodies, len(contents)):
-            source = matches[i][part] if i in matches else part
-            if source is not None:
-                row, theirs, dof = (
-                    rows.start + part - bodies,
-                    source - their_bodies,
-                    len(contents[part].joints or ()),
-                )
-                qf[row, :dof] = state.qf[theirs, :dof]
-                for flags, was in zip(px.drive_flags, state.driven, strict=True):
-                    flags[row] = was[theirs]
+    width = min(qf.shape[1], state.qf.shape[1])
+    qf[rows, :width] = state.qf[theirs, :width]
+    for flags, was in zip(px.drive_flags, state.driven, strict=True):
+        flags[rows] = was[theirs]
     px.gpu_apply_articulation_qf()
     if fresh_physics and qf.any():
-        for i in states:
-            for row in range(plan.articulations[i].start, plan.articulations[i].stop):
-                if qf[row].any():  # a new scene has none, though the tensor may not have changed
-                    px.articulation(row).set_qf(qf[row, : px.articulation(row).dof])
+        for row in (row for i in sources for row in plan.articulations[i]):
+            if qf[row].any():  # a new scene has none, though the tensor may not have changed
+                px.articulation(row).set_qf(qf[row, : px.articulation(row).dof])
 
 
 def _asked_for(plan: CpuStatePlan, env: int, packed: bytes) -> bytes:
@@ -360,22 +367,23 @@ def _packed_pose(pose: sapien.Pose) -> NDArray[np.float32]:
 def _joined(
     contents: Contents,
     own: bytes,
-    state: CpuEnvState,
+    state: CpuState,
+    k: int,
     carried: dict[str, None],
     missed: dict[str, str],
 ) -> tuple[bytes, list[int | None]]:
-    """The bytes for an env that is built otherwise, and for each of its parts the source's index."""
+    """The bytes for an env that is built otherwise than env k of `state`, and for each of its parts the source's index."""
     numbers = np.frombuffer(own, dtype=np.float32).copy()
-    theirs = np.frombuffer(state.packed, dtype=np.float32)
-    starts = np.cumsum([0, *(part.size for part in state.contents)])
-    index_of = {(part.name, part.joints is None): k for k, part in enumerate(state.contents)}
+    parts, theirs = state.contents[k], np.frombuffer(state.packed[k], dtype=np.float32)
+    starts = np.cumsum([0, *(part.size for part in parts)])
+    index_of = {(part.name, part.joints is None): k for k, part in enumerate(parts)}
     matches: list[int | None] = []
     at = 0
     for part in contents:
         source = index_of.pop((part.name, part.joints is None), None)
         if source is None:
             missed[str(part)] = "the snapshot has none of this name: left as it is"
-        elif state.contents[source].joints != part.joints:
+        elif parts[source].joints != part.joints:
             missed[str(part)] = "its joints are others than in the snapshot: left as it is"
             source = None
         else:
@@ -383,19 +391,22 @@ def _joined(
             carried[str(part)] = None
         matches.append(source)
         at += part.size
-    for k in index_of.values():
-        missed[str(state.contents[k])] = "this env has none of this name"
+    for source in index_of.values():
+        missed[str(parts[source])] = "this env has none of this name"
     return numbers.tobytes(), matches
 
 
-def _touching(px: BatchedCpuSystem, plan: CpuStatePlan) -> dict[int, tuple[Touch, ...]]:
-    found: dict[int, list[Touch]] = {}
+def _touching(
+    px: BatchedCpuSystem, plan: CpuStatePlan, env_idx: list[int]
+) -> list[tuple[tuple[int, str, str], NDArray[np.float32]]]:
+    position = {i: k for k, i in enumerate(env_idx)}
+    found = []
     for (first, second), impulse in px.contacts.counted():
         # Only bodies of this scene have names; ManiSkill's queries know no others.
-        if first in plan.names and second in plan.names:
+        if first in plan.names and second in plan.names and plan.names[first][0] in position:
             index, name = plan.names[first]
-            found.setdefault(index, []).append((name, plan.names[second][1], impulse))
-    return {index: tuple(touches) for index, touches in found.items()}
+            found.append(((position[index], name, plan.names[second][1]), impulse))
+    return found
 
 
 def _hidden(env: Any, plan: CpuStatePlan) -> dict[int, list[tuple[int, NDArray[np.float32]]]]:

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
-from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -30,7 +29,7 @@ import sapien.physx as physx
 import torch
 from numpy.typing import NDArray
 
-from workbench.core.contacts import BodyImpulseQuery, ContactReader, CpuArray, PairImpulseQuery
+from workbench.core.contacts import ContactReader, CpuArray, ImpulseQuery
 from workbench.core.cpu_layout import Layout, check_layout, lay_out
 from workbench.core.drawn_poses import Places, TensorPoses
 from workbench.core.mirrors import Group, Mirror, Mirrors, refuse_nan
@@ -57,22 +56,22 @@ def _uncommon_member(name: str) -> Any:
     raise AttributeError(f"the batched CPU system has no '{name}'")
 
 
-def _applies_everything(apply: Callable[[Any], None]) -> Callable[..., None]:
-    """For ``gpu_apply_*``: refuse SAPIEN's optional buffer of indices in words.
+def _applies(mirror: str, keep_awake: bool = False) -> Callable[..., None]:
+    """A ``gpu_apply_*``, of the one of `Mirrors` with this name.
 
-    Not needed here: what differs from the last fetch is applied, and nothing else is touched anyway.
+    Refuses SAPIEN's optional buffer of indices in words: not needed here, where what differs from the last fetch is
+    applied, and nothing else is touched anyway.
     """
 
-    @wraps(apply)
-    def checked(self: Any, index_buffer: Any = None) -> None:
+    def apply(self: BatchedCpuSystem, index_buffer: Any = None) -> None:
         if index_buffer is not None:
             raise NotImplementedError(
-                f"{apply.__name__} takes no index buffer in the batched CPU simulation: call it without, "
-                "it applies the rows that were changed."
+                "gpu_apply_... takes no index buffer in the batched CPU simulation: call it without, it applies the "
+                "rows that were changed."
             )
-        apply(self)
+        self._apply(getattr(self._mirrors, mirror), keep_awake)
 
-    return checked
+    return apply
 
 
 class BatchedCpuSystem:
@@ -390,46 +389,26 @@ class BatchedCpuSystem:
 
     def apply_changes(self) -> None:
         """Everything that ``ManiSkillScene._gpu_apply_all`` applies, but only what differs."""
-        self.gpu_apply_rigid_dynamic_data()
-        self.gpu_apply_articulation_qpos()
-        self.gpu_apply_articulation_qvel()
-        self.gpu_apply_articulation_qf()
-        self.gpu_apply_articulation_root_pose()
-        self.gpu_apply_articulation_root_velocity()
-        self._apply(self._mirrors.targets)
-        self._apply(self._mirrors.velocity_targets)
+        own = self._mirrors
+        for mirror in (
+            own.bodies,
+            own.qpos,
+            own.qvel,
+            own.qf,
+            own.roots,
+            own.root_velocities,
+            *own.of["targets"],
+        ):
+            self._apply(mirror)
 
-    @_applies_everything
-    def gpu_apply_rigid_dynamic_data(self) -> None:
-        self._apply(self._mirrors.bodies)
-
-    @_applies_everything
-    def gpu_apply_articulation_root_pose(self) -> None:
-        self._apply(self._mirrors.roots)
-
-    @_applies_everything
-    def gpu_apply_articulation_root_velocity(self) -> None:
-        self._apply(self._mirrors.root_velocities)
-
-    @_applies_everything
-    def gpu_apply_articulation_qpos(self) -> None:
-        self._apply(self._mirrors.qpos)
-
-    @_applies_everything
-    def gpu_apply_articulation_qvel(self) -> None:
-        self._apply(self._mirrors.qvel)
-
-    @_applies_everything
-    def gpu_apply_articulation_qf(self) -> None:
-        self._apply(self._mirrors.qf)
-
-    @_applies_everything
-    def gpu_apply_articulation_target_position(self) -> None:
-        self._apply(self._mirrors.targets, keep_awake=True)
-
-    @_applies_everything
-    def gpu_apply_articulation_target_velocity(self) -> None:
-        self._apply(self._mirrors.velocity_targets, keep_awake=True)
+    gpu_apply_rigid_dynamic_data = _applies("bodies")
+    gpu_apply_articulation_root_pose = _applies("roots")
+    gpu_apply_articulation_root_velocity = _applies("root_velocities")
+    gpu_apply_articulation_qpos = _applies("qpos")
+    gpu_apply_articulation_qvel = _applies("qvel")
+    gpu_apply_articulation_qf = _applies("qf")
+    gpu_apply_articulation_target_position = _applies("targets", keep_awake=True)
+    gpu_apply_articulation_target_velocity = _applies("velocity_targets", keep_awake=True)
 
     def gpu_apply_rigid_dynamic_force(self) -> None:
         self._apply_forces(self._force, "force")
@@ -457,19 +436,17 @@ class BatchedCpuSystem:
 
     # --- contacts ----------------------------------------------------------------------------------
 
-    def gpu_create_contact_body_impulse_query(self, bodies: Sequence[Any]) -> BodyImpulseQuery:
+    def gpu_create_contact_body_impulse_query(self, bodies: Sequence[Any]) -> ImpulseQuery:
         return self.contacts.create_body_query(bodies)
 
-    def gpu_create_contact_pair_impulse_query(self, body_pairs: Sequence[Any]) -> PairImpulseQuery:
+    def gpu_create_contact_pair_impulse_query(self, body_pairs: Sequence[Any]) -> ImpulseQuery:
         return self.contacts.create_pair_query(body_pairs)
 
-    def gpu_query_contact_body_impulses(self, query: BodyImpulseQuery) -> None:
+    def gpu_query_contact_body_impulses(self, query: ImpulseQuery) -> None:
         self._catch_up()
-        self.contacts.query_bodies(query)
+        self.contacts.answer(query)
 
-    def gpu_query_contact_pair_impulses(self, query: PairImpulseQuery) -> None:
-        self._catch_up()
-        self.contacts.query_pairs(query)
+    gpu_query_contact_pair_impulses = gpu_query_contact_body_impulses
 
 
 def _array(values: NDArray[np.float32]) -> CpuArray:

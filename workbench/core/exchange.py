@@ -16,7 +16,6 @@ from mani_skill.envs.sapien_env import BaseEnv
 
 from workbench.core import seams
 from workbench.core.cpu_scene import BatchedCpuMixin, batched_class
-from workbench.core.cpu_state import CpuEnvState
 from workbench.core.snapshot import Snapshot, restore_memory, restore_snapshot, take_snapshot
 from workbench.core.strict import StrictMixin
 
@@ -110,12 +109,9 @@ def undone(env: BaseEnv, do: Callable[[], None]) -> dict[str, str]:
     return missed
 
 
-def _simulation(snapshot: Snapshot) -> list[tuple[bytes, bytes, bytes]]:
-    return [
-        (state.packed, state.qf.tobytes(), state.driven.tobytes())
-        for state in snapshot.simulation
-        if isinstance(state, CpuEnvState)
-    ]
+def _simulation(snapshot: Snapshot) -> tuple[tuple[bytes, ...], bytes, bytes]:
+    state: Any = snapshot.simulation
+    return state.packed, state.qf.tobytes(), state.driven.tobytes()
 
 
 def keep_observation_space(env: BaseEnv, obs: Any) -> None:

@@ -16,80 +16,78 @@ import torch
 from numpy.typing import NDArray
 
 from workbench.core import seams
+from workbench.core.scene_index import in_every_env, present_states, scene_index
 
+_FIXED = 13
+"""Numbers of an actor's or a root's state."""
 _JOINT_TENSORS = ("qf", "target_qpos", "target_qvel")
 """Of an articulation, beside what its ``get_state()`` has: ``px.cuda_articulation_NAME``."""
 
 
 @dataclass(frozen=True)
-class GpuEnvState:
-    """The simulation state of one env."""
+class GpuState:
+    """The simulation state of n envs."""
 
-    actors: dict[str, NDArray[np.float32]]
-    """(13,) each: position, quaternion wxyz, linear and angular velocity."""
-    articulations: dict[str, NDArray[np.float32]]
-    """The same of the root, then qpos and qvel."""
-    joints: dict[str, NDArray[np.float32]]
-    """(3, D) joint forces, target positions and target velocities of each articulation."""
+    states: dict[str, NDArray[np.float32]]
+    """(n, 13) of each actor: position, quaternion wxyz, linear and angular velocity; (n, 13 + 5 D) of each articulation:
+    the same of the root, then qpos, qvel, and `_JOINT_TENSORS`. By the names of `SceneIndex.states`; NaN where an env
+    lacks it."""
 
 
-def read_gpu_state(env: Any, env_idx: list[int]) -> list[GpuEnvState]:
-    """The simulation state of the envs in `env_idx`, one each."""
-    states = {i: GpuEnvState({}, {}, {}) for i in env_idx}
-    for name, actor in env.scene.actors.items():
-        if actor.px_body_type != "static":
-            rows = actor.get_state().cpu().numpy()
-            for i, row in zip(seams.envs_of(actor), rows, strict=True):
-                if i in states:
-                    states[i].actors[name] = row.copy()
-    for name, articulation in env.scene.articulations.items():
-        rows = articulation.get_state().cpu().numpy()
-        joints = np.stack([t[articulation._data_index.long()].cpu().numpy() for t in _joint_tensors(env)], 1)
-        for i, row, joint in zip(seams.envs_of(articulation), rows, joints, strict=True):
-            if i in states:
-                states[i].articulations[name] = row.copy()
-                states[i].joints[name] = joint.copy()
-    return [states[i] for i in env_idx]
+def read_gpu_state(env: Any, env_idx: list[int]) -> GpuState:
+    """The simulation state of the envs in `env_idx`."""
+    states, structs = present_states(env), scene_index(env).states
+    for name, state in states.items():
+        width = _joints(structs[name])
+        tensors = _joint_tensors(env) if width else ()
+        rows = [t[seams.data_rows_of_articulation(structs[name]).long(), :width] for t in tensors]
+        every = [torch.as_tensor(state), *(in_every_env(env, structs[name], row) for row in rows)]
+        states[name] = torch.hstack(every).cpu().numpy()[env_idx]
+    return GpuState(states)
 
 
 def write_gpu_state(
-    env: Any, env_idx: list[int], states: list[GpuEnvState]
+    env: Any, env_idx: list[int], state: GpuState, positions: list[int]
 ) -> tuple[dict[str, None], dict[str, str]]:
-    """Put ``states[k]`` into env ``env_idx[k]``; as `cpu_state.write_cpu_state`, but applied and fetched."""
+    """Put env ``positions[j]`` of `state` into env ``env_idx[j]``; as `cpu_state.write_cpu_state`, but applied and
+    fetched."""
     carried: dict[str, None] = {}
     missed: dict[str, str] = {}
-    by_env = dict(zip(env_idx, states, strict=True))
-    moving = {n: a for n, a in env.scene.actors.items() if a.px_body_type != "static"}
-    for word, structs in (("actor", moving), ("articulation", env.scene.articulations)):
-        kept = {name for state in states for name in getattr(state, f"{word}s")}
-        missed |= {f"{word} {name}": "this env has none of this name" for name in kept - set(structs)}
-        for name, struct in structs.items():
-            targets = [int(i) for i in seams.envs_of(struct) if i in by_env]
-            rows = {i: getattr(by_env[i], f"{word}s").get(name) for i in targets}
-            width = struct.get_state().shape[1]
-            fitting = [i for i in targets if rows[i] is not None and len(rows[i]) == width]
-            if len(fitting) < len(targets):
-                missed[f"{word} {name}"] = "the snapshot has none of this name and shape: left as it is"
-            if not fitting:
-                continue
-            carried[f"{word} {name}"] = None
-            state = torch.from_numpy(np.stack([rows[i] for i in fitting])).to(env.device)
-            struct.set_state(state, torch.tensor(fitting, device=env.device))
-            if word == "articulation":
-                _write_joints(env, struct, name, fitting, by_env)
+    position, structs = dict(zip(env_idx, positions, strict=True)), scene_index(env).states
+    for name, rows in state.states.items():
+        if name not in structs and not np.isnan(rows[positions]).all():
+            missed[_words(name)] = "this env has none of this name"
+    for name, struct in structs.items():
+        width = _joints(struct)
+        kept = state.states.get(name, np.zeros((0, 0), np.float32))
+        # Lowest env first, as ManiSkill's setters give the rows out.
+        targets = [i for i in seams.envs_of(struct).tolist() if i in position]
+        fits = kept.shape[1] == _FIXED + (2 + len(_JOINT_TENSORS)) * width
+        fitting = [i for i in targets if fits and not np.isnan(kept[position[i]]).any()]
+        if len(fitting) < len(targets):
+            missed[_words(name)] = "the snapshot has none of this name and shape: left as it is"
+        if not fitting:
+            continue
+        carried[_words(name)] = None
+        values = torch.from_numpy(kept[[position[i] for i in fitting]]).to(env.device)
+        struct.set_state(values[:, : _FIXED + 2 * width], torch.tensor(fitting, device=env.device))
+        if width:
+            own = np.flatnonzero(np.isin(seams.envs_of(struct), fitting)).tolist()
+            index = seams.data_rows_of_articulation(struct).long()[own]
+            parts = values[:, _FIXED + 2 * width :].split(width, dim=1)
+            for tensor, part in zip(_joint_tensors(env), parts, strict=True):
+                tensor[index, :width] = part
     seams.apply_and_fetch(env)
     return carried, missed
 
 
-def _write_joints(
-    env: Any, struct: Any, name: str, fitting: list[int], by_env: dict[int, GpuEnvState]
-) -> None:
-    row_of = dict(zip(seams.envs_of(struct).tolist(), struct._data_index.tolist(), strict=True))
-    index = torch.tensor([row_of[i] for i in fitting], device=env.device)
-    for k, tensor in enumerate(_joint_tensors(env)):
-        rows = np.stack([by_env[i].joints[name][k] for i in fitting])
-        width = min(rows.shape[1], tensor.shape[1])  # padded to the widest articulation of its scene
-        tensor[index, :width] = torch.from_numpy(rows[:, :width]).to(env.device)
+def _words(name: str) -> str:
+    kind, _, own = name.partition("/")
+    return f"{kind.removesuffix('s')} {own}"
+
+
+def _joints(struct: Any) -> int:
+    return int(getattr(struct, "max_dof", 0))
 
 
 def _joint_tensors(env: Any) -> list[torch.Tensor]:

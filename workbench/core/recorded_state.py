@@ -23,7 +23,7 @@ from workbench.core import seams
 from workbench.core.fresh_physics import renew_physics
 from workbench.core.partial_reset import active_controllers
 from workbench.core.recorded_run import pose_distances
-from workbench.core.scene_index import in_every_env, scene_index
+from workbench.core.scene_index import present_states, scene_index
 from workbench.core.task_env import flat_entries, to_numpy
 
 _POSE = 7
@@ -99,8 +99,7 @@ def new_physics(env: Any, env_idx: Sequence[int]) -> None:
 
 def read_states(env: Any) -> dict[str, NDArray[np.float32]]:
     """(N, D) of every actor and articulation of the env, by the names of a recording; NaN in envs without it."""
-    states = scene_index(env).states
-    return {name: to_numpy(in_every_env(env, struct, struct.get_state())) for name, struct in states.items()}
+    return {name: to_numpy(state) for name, state in present_states(env).items()}
 
 
 def apart(now: Mapping[str, NDArray], was: Mapping[str, NDArray]) -> tuple[float, float]:

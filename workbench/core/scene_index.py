@@ -175,6 +175,57 @@ def hidden_poses(env: Any) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float
             yield slots, kept.cpu().numpy()
 
 
+def present_states(env: Any) -> dict[str, Any]:
+    """(N, D) of each of `SceneIndex.states`, as its ``get_state()`` lays it out; NaN in the envs without it.
+
+    Of a batched env. Tensors, or on the CPU arrays; copies of the simulation's own.
+    """
+    rows, still, places = _places_of_states(env)
+    px = env.scene.px
+    arrays = px.cuda_rigid_body_data, px.cuda_articulation_qpos, px.cuda_articulation_qvel
+    # numpy's calls on a few hundred numbers take a quarter of torch's.
+    data, qpos, qvel = (t.numpy() if t.device.type == "cpu" else t for t in (a.torch() for a in arrays))
+    data = data[rows]
+    if still:
+        data[:, still, 7:] = 0.0
+    join: Any = np.hstack if isinstance(data, np.ndarray) else torch.hstack
+    states: dict[str, Any] = {}
+    for name, (struct, column, joints, dof) in places.items():
+        if column is None or (joints is None and struct.hidden):
+            states[name] = in_every_env(env, struct, struct.get_state())
+        elif joints is None:
+            states[name] = data[:, column]
+        else:
+            states[name] = join([data[:, column], qpos[joints, :dof], qvel[joints, :dof]])
+    return states
+
+
+@once_a_scene
+def _places_of_states(env: Any) -> tuple[Any, list[int], dict[str, tuple[Any, int | None, Any, int]]]:
+    """Rows (N, B) of ``cuda_rigid_body_data``; which of the B are moved by the task and have no velocity; of each state
+    its struct and, if all envs have it, which of the B it is, and of an articulation its rows (N,) and joints."""
+    every, rows, still = np.arange(env.num_envs), [], []
+    places: dict[str, tuple[Any, int | None, Any, int]] = {}
+    for name, struct in scene_index(env).states.items():
+        if not np.array_equal(seams.envs_of(struct), every):
+            places[name] = struct, None, None, 0
+            continue
+        if name.startswith("actors/"):
+            if struct.px_body_type != "dynamic":
+                still.append(len(rows))
+            places[name], body = (struct, len(rows), None, 0), struct
+        else:
+            joints = _index(seams.data_rows_of_articulation(struct))
+            places[name], body = (struct, len(rows), joints, int(struct.max_dof)), struct.root
+        rows.append(seams.data_rows_of(body).long())
+    none = torch.zeros((env.num_envs, 0), dtype=torch.long, device=env.device)
+    return _index(torch.stack(rows, dim=1) if rows else none), still, places
+
+
+def _index(rows: torch.Tensor) -> Any:
+    return rows.long().numpy() if rows.device.type == "cpu" else rows.long()
+
+
 def in_every_env(env: Any, struct: Any, value: Any) -> Any:
     """(N, ...) of what a struct gives for the envs that have it, NaN in the others; all NaN where there is no such
     struct that could say which envs they are."""

@@ -16,7 +16,7 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cached_property, wraps
+from functools import cache, cached_property, wraps
 from itertools import islice
 from types import FrameType
 from typing import Any
@@ -44,8 +44,6 @@ from numpy.typing import NDArray
 from workbench.core.camera_settings import CallSite, CameraKey, CameraKind
 from workbench.core.cpu_system import BatchedCpuSystem
 
-_installed = False
-
 
 def batched_system(scene: Any) -> BatchedCpuSystem | None:
     """The batched CPU system of a ManiSkillScene, or None for any other scene.
@@ -55,11 +53,9 @@ def batched_system(scene: Any) -> BatchedCpuSystem | None:
     return scene.px if issubclass(type(scene.px), BatchedCpuSystem) else None
 
 
+@cache
 def install_index_seams() -> None:
     """Let ManiSkill's structs find their rows in a batched CPU system. Safe to call again."""
-    global _installed
-    if _installed:
-        return
     stock_body_index = PhysxRigidBodyComponentStruct.__dict__["_body_data_index"].func
     stock_body_data = PhysxRigidBodyComponentStruct.__dict__["_body_data"].fget
     stock_articulation_index = Articulation.__dict__["_data_index"].func
@@ -105,7 +101,6 @@ def install_index_seams() -> None:
     _replace(ArticulationJoint, "_data_index", cached_property(joint_index))
     Link._body_data = property(link_data)  # type: ignore[method-assign,assignment]
     PDEEPosController.set_action = set_ee_action  # type: ignore[method-assign]
-    _installed = True
 
 
 def _set_ee_action_of_each_env(controller: Any, action: torch.Tensor) -> None:

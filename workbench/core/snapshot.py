@@ -33,14 +33,14 @@ from numpy.typing import NDArray
 
 from workbench.core import seams
 from workbench.core.cpu_state import (
-    CpuEnvState,
+    CpuState,
     begin_cpu_state_anew,
     read_cpu_state,
     write_cpu_state,
 )
 from workbench.core.env_numbers import env_numbers, envs_of_batch
 from workbench.core.episode_rng import RngReader, RngState, SharedRng, read_shared_rng, write_shared_rng
-from workbench.core.gpu_state import GpuEnvState, read_gpu_state, write_gpu_state
+from workbench.core.gpu_state import GpuState, read_gpu_state, write_gpu_state
 from workbench.core.task_buffers import TaskState, read_task_state, write_task_state
 
 
@@ -66,8 +66,7 @@ class Snapshot:
     """N, of the env that it was taken of."""
     env_idx: tuple[int, ...]
     """(n,) which of them."""
-    simulation: tuple[CpuEnvState, ...] | tuple[GpuEnvState, ...]
-    """(n,)"""
+    simulation: CpuState | GpuState
     memory: Memory
 
     @property
@@ -103,7 +102,7 @@ def take_snapshot(env: Any, env_idx: Sequence[int] | int | None = None) -> Snaps
     else:
         _require_gpu(env)
         simulation = read_gpu_state(env, chosen)
-    return Snapshot(env.num_envs, tuple(chosen), tuple(simulation), take_memory(env, chosen))
+    return Snapshot(env.num_envs, tuple(chosen), simulation, take_memory(env, chosen))
 
 
 def restore_snapshot(
@@ -144,16 +143,16 @@ def restore_snapshot(
         raise TypeError(f"a Snapshot is wanted, as take_snapshot gives it, not {type(snapshot).__name__}")
     targets, positions = _pairs(env, snapshot, env_idx, source)
     px = seams.batched_system(env.scene)
-    states: Any = [snapshot.simulation[k] for k in positions]
-    if isinstance(states[0], CpuEnvState) != (px is not None):
+    state: Any = snapshot.simulation
+    if isinstance(state, CpuState) != (px is not None):
         raise TypeError(
             "a snapshot of CPU simulation cannot be put into GPU simulation, nor the other way round"
         )
     if px is not None:
-        carried, missed = write_cpu_state(env, targets, states, fresh_physics)
+        carried, missed = write_cpu_state(env, targets, state, positions, fresh_physics)
     else:
         _require_gpu(env)
-        carried, missed = write_gpu_state(env, targets, states)
+        carried, missed = write_gpu_state(env, targets, state, positions)
     # In whichever order they were taken and are named.
     whole = snapshot.num_envs == env.num_envs == len(targets) and all(
         snapshot.env_idx[k] == i for i, k in zip(targets, positions, strict=True)
@@ -175,14 +174,9 @@ def begin_anew(env: Any, env_idx: list[int]) -> None:
 
 def in_this_state(env: Any, env_idx: int, snapshot: Snapshot, source: int) -> bool:
     """Whether an env is where env `source` of the snapshot was, to the last byte of what PhysX gives out."""
-    wanted = snapshot.simulation[snapshot.env_idx.index(source)]
-    return _essence(read_cpu_state(env, [env_idx])[0]) == _essence(wanted)
-
-
-def _essence(state: Any) -> tuple[Any, ...] | None:
-    if not isinstance(state, CpuEnvState):
-        return None
-    return state.contents, state.packed, state.asleep, state.qf.tobytes(), state.driven.tobytes()
+    wanted: Any = snapshot.simulation
+    k = snapshot.env_idx.index(source)
+    return read_cpu_state(env, [env_idx]).essence(0) == wanted.essence(k)
 
 
 def take_memory(env: BaseEnv, env_idx: list[int]) -> Memory:

@@ -22,12 +22,12 @@ import operator
 import pickle
 import secrets
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
-from workbench.core.cpu_state import CpuEnvState
+from workbench.core.cpu_state import CpuState
 from workbench.core.episode_rng import SharedRng
 from workbench.core.snapshot import Memory, Snapshot
 from workbench.core.task_buffers import Buffer, TaskState
@@ -78,8 +78,12 @@ class SnapshotPacker:
             keys.append(kept.key)
             return len(keys) - 1
 
-        columns, contents = _columns(snapshot.simulation)
-        part("contents", contents)
+        simulation = snapshot.simulation
+        if isinstance(simulation, CpuState):
+            part("contents", simulation.contents)
+            simulation = replace(simulation, contents=())
+        else:
+            part("contents", None)
         part("task", (task.built, task.omitted))
         shared = memory.shared_rng
         for name in ("torch_cpu", "torch_device", "numpy", "python"):
@@ -97,7 +101,7 @@ class SnapshotPacker:
                 written[path] = buffer
         self._buffers = dict(task.buffers)
         body = (
-            (snapshot.num_envs, snapshot.env_idx, columns),
+            (snapshot.num_envs, snapshot.env_idx, simulation),
             (memory.elapsed_steps, memory.episode_seeds, tuple(memory.rng)),
             (tuple(task.buffers), written, stayed),
         )
@@ -127,7 +131,7 @@ def unpack_snapshot(body: bytes, parts: Sequence[bytes]) -> Snapshot:
         parts: the bytes of its parts, in the order of `PackedSnapshot.keys`.
     """
     whole = [pickle.loads(part) for part in parts]
-    (num_envs, env_idx, columns), (elapsed, seeds, purposes), (paths, written, stayed) = pickle.loads(body)
+    (num_envs, env_idx, simulation), (elapsed, seeds, purposes), (paths, written, stayed) = pickle.loads(body)
     contents, (built, omitted), torch_cpu, torch_device, numpy_state, python_state = whole[:6]
     states = iter(whole[6 : 6 + len(purposes) * len(env_idx)])
     rng = {purpose: [next(states) for _ in env_idx] for purpose in purposes}
@@ -139,53 +143,9 @@ def unpack_snapshot(body: bytes, parts: Sequence[bytes]) -> Snapshot:
         TaskState(buffers, built, omitted),
         SharedRng(torch_cpu, torch_device, numpy_state, python_state),
     )
-    return Snapshot(num_envs, env_idx, _states(columns, contents), memory)
-
-
-def _columns(simulation: Sequence[Any]) -> tuple[Any, Any]:
-    """The simulation of n envs as one array a field, and what their packed bytes mean."""
-    if not isinstance(simulation[0], CpuEnvState):
-        return tuple(simulation), None
-    first = simulation[0]
-    if any(s.qf.shape != first.qf.shape or s.driven.shape != first.driven.shape for s in simulation):
-        return tuple(simulation), None  # envs of different robots
-    touching = [(k, a, b) for k, s in enumerate(simulation) for a, b, _ in s.touching]
-    impulses = [impulse for s in simulation for _, _, impulse in s.touching]
-    columns = (
-        b"".join(s.packed for s in simulation),
-        [len(s.packed) for s in simulation],
-        np.packbits(np.array([flag for s in simulation for flag in s.asleep], bool)).tobytes(),
-        np.stack([s.qf for s in simulation]),
-        np.stack([s.driven for s in simulation]),
-        touching,
-        np.stack(impulses) if impulses else None,
-    )
-    return columns, tuple(s.contents for s in simulation)
-
-
-def _states(columns: Any, contents: Any) -> tuple[Any, ...]:
-    if contents is None:
-        return columns
-    packed, lengths, asleep, qf, driven, touching, impulses = columns
-    flags = np.unpackbits(np.frombuffer(asleep, np.uint8)).astype(bool).tolist()
-    touches: list[list[Any]] = [[] for _ in lengths]
-    for (env, a, b), impulse in zip(touching, () if impulses is None else impulses, strict=True):
-        touches[env].append((a, b, impulse))
-    states, at, flag = [], 0, 0
-    for k, (length, parts) in enumerate(zip(lengths, contents, strict=True)):
-        states.append(
-            CpuEnvState(
-                parts,
-                packed[at : at + length],
-                tuple(flags[flag : flag + len(parts)]),
-                qf[k],
-                driven[k],
-                tuple(touches[k]),
-            )
-        )
-        at += length
-        flag += len(parts)
-    return tuple(states)
+    if contents is not None:
+        simulation = replace(simulation, contents=contents)
+    return Snapshot(num_envs, env_idx, simulation, memory)
 
 
 def _is_the_same(a: Any, b: Any) -> bool:

@@ -13,6 +13,7 @@ Where rules are checked, `StrictCpuSystem` is told of every read and write besid
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import torch
@@ -51,14 +52,10 @@ STATE_PROPERTIES: tuple[tuple[type, str, Group], ...] = (
 
 TARGET_SETTERS = ("set_joint_drive_targets", "set_joint_drive_velocity_targets")
 
-_installed = False
 
-
+@cache
 def install_struct_access() -> None:
     """Put the words into ManiSkill's setters and getters. Safe to call again."""
-    global _installed
-    if _installed:
-        return
     for owner, name, group in STATE_PROPERTIES:
         stock: property = owner.__dict__[name]
         getter = _told_reads(stock.fget, name, group)  # type: ignore[arg-type]
@@ -66,7 +63,6 @@ def install_struct_access() -> None:
         setattr(owner, name, property(getter, setter, doc=stock.__doc__))
     for name in TARGET_SETTERS:
         setattr(Articulation, name, _told_targets(Articulation.__dict__[name]))
-    _installed = True
 
 
 def _strict(system: Any) -> StrictCpuSystem | None:
