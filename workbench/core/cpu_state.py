@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -306,9 +307,10 @@ def _write_joint_forces(
 ) -> None:
     """Put ``set_qf``'s forces and the drives' flags back into each env; `matches` as of `_joined`."""
     rows, theirs = [], []
+    firsts = list(accumulate(map(_articulations, state.contents), initial=0))
     for i, k in sources.items():
         bodies, their_bodies = (len(c) - _articulations(c) for c in (plan.contents[i], state.contents[k]))
-        first = state.articulations(k).start - their_bodies
+        first = firsts[k] - their_bodies
         for row, match in zip(plan.articulations[i], matches[i][bodies:], strict=True):
             if match is not None:
                 rows.append(row)
