@@ -23,7 +23,6 @@ from workbench.recording.episode import Episode
 from workbench.recording.read_episode import read_episode
 from workbench.recording.sources import sources_among
 from workbench.session.clearance import Clearances
-from workbench.session.rescore import find_episodes
 from workbench.session.rescorer import Rescorer
 from workbench.ui.make_shared import Wanted
 from workbench.ui.making import Making
@@ -65,7 +64,7 @@ class Judging:
     process = "the process in the background"
 
     def __init__(self, place: Path) -> None:
-        self._files = find_episodes((place / "v1",))
+        self._files = sources_among((place / "v1",))
         self._rescorer = Rescorer(Clearances(all_trusted=True))
 
     def start(self) -> None:
@@ -78,17 +77,17 @@ class Judging:
         return [process.pid for process in found if process.ppid() in keepers]
 
     def ended(self) -> bool:
-        return self._rescorer.view.state in ("done", "failed")
+        return self._rescorer.judging.view.state in ("done", "failed")
 
     def told(self) -> str:
-        return self._rescorer.view.why
+        return self._rescorer.judging.view.why
 
     def assert_right(self) -> None:
-        (verdict,) = self._rescorer.view.verdicts
+        (verdict,) = self._rescorer.judging.view.verdicts
         assert (verdict.why_not, verdict.differs, verdict.length) == ("", False, 8)
 
     def close(self) -> None:
-        self._rescorer.close()
+        self._rescorer.judging.close()
 
 
 class Filming:

@@ -89,7 +89,7 @@ def rescored(rescorer: Rescorer, *states: str) -> JudgedView:
     """What a page shows of the judging of recordings once it is in one of these states."""
 
     def wanted() -> JudgedView | None:
-        view = rescorer.view
+        view = rescorer.judging.view
         return view if view.state in states else None
 
-    return until(wanted, " or ".join(states), 120.0, seen=lambda: rescorer.view)
+    return until(wanted, " or ".join(states), 120.0, seen=lambda: rescorer.judging.view)

@@ -61,7 +61,7 @@ def test_a_job_that_fails_unforeseen_is_told_and_the_next_is_done(said: list[str
     def broken(job: Job) -> None:
         raise AttributeError("no such thing")
 
-    lane = Lane("lane", lambda: None, failed.append)
+    lane = Lane("lane", lambda: None, lambda job, failure: failed.append(str(failure)))
     lane.start("counting", broken)
     until(lambda: failed, "the failure")
     lane.start("counting", lambda job: done.set())
@@ -80,7 +80,7 @@ def test_a_lane_whose_listener_fails_goes_on(said: list[str]) -> None:
         if threading.current_thread().name == "lane" and len(said) == 0:
             raise RuntimeError("the page is gone")
 
-    lane = Lane("lane", on_change, lambda why: None)
+    lane = Lane("lane", on_change, lambda job, failure: None)
     lane.start("one", lambda job: None)
     until(lambda: said, "a word of it")
     lane.start("two", lambda job: done.set())

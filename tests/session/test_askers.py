@@ -111,7 +111,7 @@ def test_who_is_told_to_stop_waits_no_longer_and_a_late_answer_is_nobody_s() -> 
 
 
 def a_job() -> Job:
-    return Job(Lane("test", go_on, lambda why: None), "judging", lambda job: None)
+    return Job(Lane("test", go_on, lambda job, failure: None), "judging", lambda job: None)
 
 
 @pytest.fixture

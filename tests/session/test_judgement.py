@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import threading
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +15,12 @@ from hypothesis import strategies as st
 from tests.session.moments import table
 from workbench.core.recorded_run import pose_distances
 from workbench.core.step import StepResult
+from workbench.session.askers import Background
 from workbench.session.history import History
+from workbench.session.judge import Judge
 from workbench.session.judgement import Judgement
-from workbench.session.messages import Stepped
+from workbench.session.judging import StoppedBy
+from workbench.session.messages import Load, Stepped, TaskOptions
 
 BODIES = 2
 
@@ -138,9 +144,9 @@ def test_the_newest_run_is_judged_first_and_each_begins_with_a_jump_of_all() -> 
     jumped[3, 1] = True
     judgement = Judgement(recorded(old, jumped))
     assert judgement.runs() == [range(6, 9), range(6)]
-    whole, envs = judgement.snapshot(3) or (None, ())
-    assert whole is not None and envs == (1,)
-    assert judgement.snapshot(4) is None
+    jump = judgement.to_judge(3)
+    assert jump.snapshot is not None and jump.env_idx == (1,) and jump.action is None
+    assert judgement.to_judge(4).snapshot is None
     assert judgement.steps == 6
 
 
@@ -148,7 +154,7 @@ def test_a_record_that_begins_in_the_middle_of_an_episode_begins_with_its_first_
     old, _, _ = drawn(1, 5, 2)
     judgement = Judgement(recorded(old, np.zeros((5, 2), bool)))
     assert judgement.runs() == [range(5)]
-    assert judgement.snapshot(0) is not None and judgement.steps == 4
+    assert judgement.to_judge(0).snapshot is not None and judgement.steps == 4
 
 
 def test_the_record_ends_at_a_jump_that_cannot_be_put_back() -> None:
@@ -174,6 +180,54 @@ def test_a_moment_that_is_judged_anew_is_compared_anew_and_not_a_number_is_a_dif
     assert first.look_at is not None and first.of.at(first.look_at) == 3
     assert second.of.name == "env 1" and not second.differs
     assert judgement.names() == (("reward", "success", "height"), frozenset({"reward"}))
+
+
+def test_an_entry_that_is_called_reward_is_told_apart_from_the_reward() -> None:
+    old, _, _ = drawn(3, 5, 2)
+    jumped = np.zeros((5, 2), bool)
+    jumped[0] = True
+    said = [replace(step, evaluate={"reward": np.full(2, 7.0)}) for step in old]
+    judgement = Judgement(recorded(said, jumped))
+    for row in range(5):
+        judgement.add(row, replace(said[row], evaluate={"reward": np.full(2, 8.0)}))
+    assert judgement.names() == (("reward", "evaluate/reward"), frozenset({"evaluate/reward"}))
+    for env, verdict in enumerate(judgement.verdicts()):
+        np.testing.assert_array_equal(verdict.old_reward, [step.reward[env] for step in old[1:]])
+        np.testing.assert_array_equal(verdict.new_reward, verdict.old_reward)
+        assert verdict.differing == verdict.others == ("evaluate/reward",) and not verdict.differs
+    curve = judgement.curve("reward", 0)
+    assert curve is not None and curve.new.tolist() == [step.reward[0] for step in old[1:]]
+
+
+def test_a_judgement_that_is_stopped_before_its_turn_keeps_nothing_of_the_past() -> None:
+    """The one before it hangs where it is told of: what waits behind it is never begun."""
+    begun, goes_on = threading.Event(), threading.Event()
+
+    def on_change() -> None:
+        if threading.current_thread().name == "judge":
+            begun.set()
+            goes_on.wait(30)
+
+    process = Background()
+    judge = Judge(on_change, process)
+    old, _, jumped = drawn(1, 6, 2)
+    load = Load("Nothing-v1", TaskOptions())
+    try:
+        judge.judge(load, Judgement(recorded(old, jumped)))
+        assert begun.wait(30)
+        history = recorded(old, jumped)
+        moment = weakref.ref(history.at(0))
+        judge.judge(load, Judgement(history))
+        del history
+        gc.collect()
+        assert moment() is not None
+        judge.stop(StoppedBy.HAND)
+        gc.collect()
+        assert moment() is None and judge.curve("reward", 0) is not None
+    finally:
+        goes_on.set()
+        judge.judging.close()
+        process.end()
 
 
 def test_an_entry_that_only_one_version_has_differs_and_comes_first() -> None:

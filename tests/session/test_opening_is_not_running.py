@@ -25,12 +25,12 @@ from tests.drive.waiting import until
 from workbench.cli import main
 from workbench.exit_codes import Exit
 from workbench.recording.library import Library
+from workbench.recording.sources import sources_among
 from workbench.session.clearance import Answer, Clearances, NotTrusted, Question
 from workbench.session.make_scene import MakeScene, make
 from workbench.session.messages import TaskOptions
 from workbench.session.record import RecordOptions, record
 from workbench.session.recorded_scene import SceneProcess
-from workbench.session.rescore import find_episodes
 from workbench.session.rescore_all import RescoreOptions, rescore_all
 from workbench.session.rescorer import Rescorer
 from workbench.session.review import Review
@@ -250,10 +250,10 @@ def test_on_a_page_it_is_asked_and_a_no_leaves_the_others(foreign: Path, recorde
     (foreign / "numpy.py").write_text("A = 1\n")
     rescorer = Rescorer(Clearances(ask=ask))
     try:
-        rescorer.start(find_episodes((foreign / "recordings",)))
+        rescorer.start(sources_among((foreign / "recordings",)))
         view = rescored(rescorer, "failed")
         assert "is not trusted" in view.why and not ran(foreign)
-        rescorer.start(find_episodes((foreign / "recordings",)))
+        rescorer.start(sources_among((foreign / "recordings",)))
         view = rescored(rescorer, "done", "failed")
         assert view.state == "done" and len(view.verdicts) == 2, view
         (said,) = view.warnings
@@ -262,7 +262,7 @@ def test_on_a_page_it_is_asked_and_a_no_leaves_the_others(foreign: Path, recorde
         )
         assert ran(foreign) and [[one.name for one in q.modules] for q in asked] == [["marks.py"]] * 2
     finally:
-        rescorer.close()
+        rescorer.judging.close()
 
 
 def test_a_question_on_a_page_can_be_withdrawn(foreign: Path) -> None:
@@ -275,11 +275,11 @@ def test_a_question_on_a_page_can_be_withdrawn(foreign: Path) -> None:
 
     rescorer = Rescorer(Clearances(ask=ask))
     try:
-        rescorer.start(find_episodes((foreign / "recordings",)))
+        rescorer.start(sources_among((foreign / "recordings",)))
         until(lambda: asking, "the question")
-        assert rescorer.view.state == "asking"
-        rescorer.stop()
+        assert rescorer.judging.view.state == "asking"
+        rescorer.judging.stop()
         rescored(rescorer, "stopped")
     finally:
-        rescorer.close()
+        rescorer.judging.close()
     assert len(asking) == 1 and not ran(foreign)

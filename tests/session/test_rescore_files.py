@@ -16,21 +16,24 @@ import numpy as np
 import pytest
 from mani_skill.utils.wrappers.record import RecordEpisode
 
+from tests.drive.episodes import made, write
 from tests.drive.session import rescored
 from tests.session.recorded_runs import opened
 from workbench.authoring.problem import TaskError
 from workbench.cli import main
 from workbench.core.recorded_state import apart, read_states
+from workbench.recording.lerobot_export import ExportOptions
 from workbench.recording.read_episode import UnreadableRecording, read_episode, read_maniskill
+from workbench.recording.sources import sources_among
 from workbench.session import rescore_words as words
 from workbench.session.given_actions import read_given
 from workbench.session.messages import TaskOptions
 from workbench.session.record import RecordOptions, record
 from workbench.session.relive import arrive
-from workbench.session.rescore import find_episodes
 from workbench.session.rescore_all import RescoreOptions, rescore_all
 from workbench.session.rescorer import Rescorer
 from workbench.session.step_back import run_of
+from workbench.share_command import export_in_terminal
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -130,7 +133,7 @@ def test_another_file_can_be_judged_with(author: Path, tmp_path: Path) -> None:
 
 
 def test_what_record_episode_wrote_is_judged_by_the_env_that_it_names(foreign: Path) -> None:
-    found = find_episodes((foreign,))
+    found = sources_among((foreign,))
     assert [source.part for source in found] == ["traj_0", "traj_1"]
     for use_env_states in (False, True):
         verdicts, _ = rescore_all(RescoreOptions((foreign.parent,), use_env_states=use_env_states))
@@ -163,13 +166,24 @@ def test_a_recording_of_ours_is_gone_into_to_the_last_bit(author: Path) -> None:
 
 
 def test_what_is_no_recording_is_said(author: Path, tmp_path: Path) -> None:
-    with pytest.raises(UnreadableRecording, match="nothing at"):
-        find_episodes((tmp_path / "gone",))
+    with pytest.raises(FileNotFoundError, match="nothing at"):
+        sources_among((tmp_path / "gone",))
     with pytest.raises(UnreadableRecording, match="no recording in"):
-        find_episodes((tmp_path,))
+        sources_among((tmp_path,))
     (tmp_path / "x.json").write_text("{}")
     with pytest.raises(UnreadableRecording, match="no recording in"):
-        find_episodes((tmp_path / "x.json",))
+        sources_among((tmp_path / "x.json",))
+
+
+def test_a_lerobot_dataset_is_passed_over_and_alone_it_is_refused(author: Path, tmp_path: Path) -> None:
+    write(tmp_path, made(6, seed=1), pictures=False)
+    dataset = author / "recordings" / "set"
+    assert export_in_terminal([tmp_path], dataset, ExportOptions()) == 0
+    assert {source.kind for source in sources_among([author / "recordings"])} == {"ours", "lerobot"}
+    with pytest.raises(UnreadableRecording, match="LeRobot dataset cannot be judged again"):
+        rescore_all(RescoreOptions((dataset,)))
+    verdicts, _ = rescore_all(RescoreOptions((author / "recordings",)))
+    assert len(verdicts) == EPISODES and not any(verdict.why_not for verdict in verdicts)
 
 
 def test_a_broken_recording_is_a_row_and_the_others_are_judged(author: Path, tmp_path: Path) -> None:
@@ -242,31 +256,31 @@ def test_a_page_judges_in_a_process_of_its_own_and_stops_it(author: Path, foreig
     rescorer = Rescorer()
     try:
         edit(author, REWARD, f"{REWARD} * 2")
-        rescorer.start(find_episodes((author / "recordings",)))
+        rescorer.start(sources_among((author / "recordings",)))
         view = rescored(rescorer, "done", "failed")
         assert view.why == "" and len(view.verdicts) == view.total == EPISODES
         assert view.steps == EPISODES * STEPS and all(verdict.differs for verdict in view.verdicts)
         assert words.summary(view.verdicts).startswith("3 of 3 episodes differ")
 
         edit(author, REWARD, "return 1 / 0")
-        rescorer.start(find_episodes((author / "recordings",)))
+        rescorer.start(sources_among((author / "recordings",)))
         view = rescored(rescorer, "failed", "done")
         assert "could not be opened" in view.why and "ZeroDivisionError" in view.problem.message
-        rescorer.start(find_episodes((author / "recordings", foreign)))
+        rescorer.start(sources_among((author / "recordings", foreign)))
         view = rescored(rescorer, "done", "failed")
         assert view.state == "done"
         assert ["ZeroDivisionError" in v.why_not for v in view.verdicts] == [True] * EPISODES + [False] * 2
-        rescorer.start(find_episodes((author / "recordings",)), recorded_source=True)
+        rescorer.start(sources_among((author / "recordings",)), recorded_source=True)
         view = rescored(rescorer, "done", "failed")
         assert view.why == "" and not any(verdict.differs for verdict in view.verdicts)
 
         edit(author, REWARD, "import time; time.sleep(1000)")
-        rescorer.start(find_episodes((author / "recordings",)))
+        rescorer.start(sources_among((author / "recordings",)))
         rescored(rescorer, "loading")
-        rescorer.stop()
+        rescorer.judging.stop()
         rescored(rescorer, "stopped")
     finally:
-        rescorer.close()
+        rescorer.judging.close()
 
 
 def test_a_recording_with_a_changed_file_is_judged_by_what_is_left_or_says_why(

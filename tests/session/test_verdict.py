@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from workbench.core.step import StepResult
 from workbench.session import rescore_words as words
 from workbench.session.verdict import (
-    FAR_METRES,
-    FAR_RADIANS,
+    DOUBTFUL_METRES,
+    DOUBTFUL_RADIANS,
     Said,
     Verdict,
     compare,
@@ -145,6 +144,12 @@ def test_it_is_compared_as_far_as_it_is_said_now() -> None:
     assert found.length == 2 and not found.differing and found.returns == (1, 1)
 
 
+def test_each_entry_has_a_scale_of_its_own() -> None:
+    old = said(large=[1e6] * 5, small=[1.0] * 5, lost=[np.inf] * 5)
+    now = said(large=[1e6 + 1] * 5, small=[1.0, 1.0, 1.5, 1.0, 1.0], lost=[np.inf] * 4 + [-np.inf])
+    assert compare(0, old, now).differing == ("small", "lost")
+
+
 def test_drift_is_that_of_the_state_that_is_furthest() -> None:
     drift = np.array([[0, 0], [2e-3, 1e-4], [1e-3, 0.02], [0, 0], [0, 0]])
     found = compare(0, said(), said(), drift, begin=7)
@@ -152,9 +157,9 @@ def test_drift_is_that_of_the_state_that_is_furthest() -> None:
     still = compare(0, said(), said(), np.zeros((5, 2)))
     assert (still.metres, still.drift_at) == (0, None) and not still.drifted
     for metres, radians, drifted in (
-        (FAR_METRES, FAR_RADIANS, False),
-        (2 * FAR_METRES, 0.0, True),
-        (0.0, 2 * FAR_RADIANS, True),
+        (DOUBTFUL_METRES, DOUBTFUL_RADIANS, False),
+        (2 * DOUBTFUL_METRES, 0.0, True),
+        (0.0, 2 * DOUBTFUL_RADIANS, True),
         (0.0, 0.02, True),
         (0.002, 0.0, True),
         (float("nan"), 0.0, True),
@@ -187,16 +192,7 @@ def test_entries_of_one_number_an_env_are_compared_and_no_others() -> None:
         "column": np.array([[1], [2]]),
         "place": np.zeros((2, 3)),
         "odd": np.array(["a", "b"]),
-        "whole": np.array([1.0, 2.0, 3.0]),
+        "reward": np.array([1.0, 2.0]),
     }
-    nothing = np.zeros(2, bool)
-    step = StepResult(
-        np.zeros(2, np.int32),
-        np.zeros(2, np.float32),
-        nothing,
-        nothing,
-        evaluate,
-        np.zeros((2, 0, 7), np.float32),
-    )
-    found = dict(single_numbers(step))
-    assert list(found) == ["flag", "column"] and found["column"].tolist() == [1, 2]
+    found = single_numbers(evaluate)
+    assert list(found) == ["flag", "column", "evaluate/reward"] and found["column"].tolist() == [1, 2]

@@ -113,7 +113,7 @@ class Told:
     """Stands where what judges again stands for the panel: what it has told last."""
 
     def __init__(self) -> None:
-        self.view = JudgedView()
+        self.view, self.judging = JudgedView(), self
 
     def stop(self) -> None:
         raise AssertionError("nobody asked for that")

@@ -22,7 +22,7 @@ from workbench.core.pictures import CameraInfo, Picture
 from workbench.session.askers import IDLE_SECONDS, Asker, Background
 from workbench.session.camera_messages import DrawCamera, JudgeCamera, SuggestCameras
 from workbench.session.history import Lived
-from workbench.session.lane import Job, Lane
+from workbench.session.lane import Job, JobFailed, Lane
 from workbench.session.messages import Load, Reset
 from workbench.session.studio_view import JudgedMoment, Looked, Picked, Progress
 
@@ -273,7 +273,8 @@ class CameraJudging:
             self._looked = replace(self._looked, **{"problem": "", **values})  # type: ignore[arg-type]
         self._on_change()
 
-    def _failed(self, why: str) -> None:
+    def _failed(self, job: Job, failure: JobFailed) -> None:
+        why = str(failure)
         self._know(problem=f"{why[:1].upper()}{why[1:]}" + ("" if why.endswith(".") else "."))
 
 

@@ -8,7 +8,7 @@ sending more, and a process that does not answer (the new code may loop for ever
 
 from __future__ import annotations
 
-import pickle
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,9 +18,9 @@ from typing import Literal
 from workbench.session.askers import IDLE_SECONDS, Background
 from workbench.session.judgement import JudgedCurve, Judgement
 from workbench.session.judging import JudgedView, Judging, StoppedBy
-from workbench.session.lane import Job, JobFailed, Lane
+from workbench.session.lane import Job, JobFailed
 from workbench.session.messages import Load, Loaded, TaskDescription
-from workbench.session.moment_messages import Judged, JudgeMoments, MomentToJudge
+from workbench.session.moment_messages import Judged, JudgeMoments
 
 _CHUNK_SECONDS = 0.1
 """About how long one answer takes: how soon progress is seen, and stopping heard."""
@@ -45,18 +45,17 @@ def what_a_load_means(
     return "forget"
 
 
-class Judge(Judging):
+class Judge:
     """Judges the past."""
 
     def __init__(self, on_change: Callable[[], None], process: Background) -> None:
         """
         Args:
-            on_change: called when `view` has something new.
+            on_change: called when `judging` has something new.
             process: in which it is judged. Whoever else wants it need not wait.
         """
-        # Changes and failures are told by `_tell`, with all that there is to them.
-        lane = Lane("judge", lambda: None, lambda why: None, IDLE_SECONDS, process.rest)
-        super().__init__(process, lane, on_change)
+        self.judging = Judging("judge", on_change, IDLE_SECONDS, process.rest)
+        self._process, self._lock = process, threading.Lock()
         self._judgement: Judgement | None = None
         """What is shown: what is being judged, or was last."""
 
@@ -78,14 +77,20 @@ class Judge(Judging):
         with self._lock:
             self._judgement = judgement
         view = JudgedView("loading", total=judgement.steps, task="the new code")
-        self._begin(view, lambda job: self._judge(job, load, judgement))
+        self.judging.begin(view, lambda job: self._judge(job, load, judgement))
+
+    def stop(self, why: StoppedBy) -> None:
+        """As `Judging.stop`."""
+        self.judging.stop(why)
+        with self._lock:
+            if self._judgement is not None:
+                self._judgement.let_go()  # a job that still waited does not come to it
 
     def forget(self) -> None:
         """Stop, and have nothing to show: the record is gone."""
-        self.stop(StoppedBy.LOSS)
+        self.judging.forget()
         with self._lock:
-            self._judgement, self._view = None, JudgedView(serial=self._view.serial + 1)
-        self._on_change()
+            self._judgement = None
 
     # --- on the lane ---------------------------------------------------------------------------------
 
@@ -101,13 +106,13 @@ class Judge(Judging):
                 with self._lock:
                     names, differing = judgement.names()
                     verdicts = tuple(judgement.verdicts())
-                self._tell(job, verdicts=verdicts, names=names, differing_names=differing)
-            self._tell(
+                self.judging.tell(job, verdicts=verdicts, names=names, differing_names=differing)
+            self.judging.tell(
                 job,
                 state="judging",
                 done=done,
                 steps=done,
-                seconds=self._view.seconds + seconds,
+                seconds=self.judging.view.seconds + seconds,
                 warnings=tuple(f"not put back: {what}: {why}" for what, why in missed.items()),
             )
             if answer.problem is not None:
@@ -127,12 +132,11 @@ class Judge(Judging):
     def _load(self, job: Job, load: Load, judgement: Judgement) -> None:
         if self._process.has(load):
             return
-        self._tell(job, state="loading")
-        first = judgement.runs()[0].start
-        if self._process.num_envs == len(judgement.moment(first).step.reward):
+        self.judging.tell(job, state="loading")
+        if self._process.num_envs == judgement.num_envs:
             # A version is tried at the moment at which the env stands, which is where the judgement before
             # ended: there the new code may raise or loop though it runs from the beginnings in the record.
-            self._process.ask(job.check, JudgeMoments((_to_judge(judgement, first),)))
+            self._ask(job, judgement, judgement.runs()[0][:1])
         try:
             self._process.ensure(job, load, or_else=replace(load, level="rebuilt"))
         except JobFailed as failure:
@@ -147,10 +151,10 @@ class Judge(Judging):
         while at < rows.stop:
             chunk = range(at, min(at + count, rows.stop))
             began = time.monotonic()
-            moments = tuple(_to_judge(judgement, row) for row in chunk)
-            answer = self._process.ask(job.check, JudgeMoments(moments))
+            answer = self._ask(job, judgement, chunk)
             took = time.monotonic() - began
             with self._lock:
+                job.check()
                 for row, step in zip(chunk, answer.steps, strict=False):
                     try:
                         judgement.add(row, step)
@@ -161,10 +165,8 @@ class Judge(Judging):
             count = max(1, min(int(wanted), 2 * count, _MOST_AT_ONCE))
             at = chunk.stop
 
-
-def _to_judge(judgement: Judgement, row: int) -> MomentToJudge:
-    jump = judgement.snapshot(row)
-    if jump is None:
-        return MomentToJudge(judgement.moment(row).step.action)
-    whole, envs = jump
-    return MomentToJudge(None, pickle.dumps(whole), envs)
+    def _ask(self, job: Job, judgement: Judgement, rows: range) -> Judged:
+        with self._lock:
+            job.check()
+            moments = tuple(judgement.to_judge(row) for row in rows)
+        return self._process.ask(job.check, JudgeMoments(moments))

@@ -14,6 +14,7 @@ A *run* here is what one env lived through without a jump, up to its reset or to
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,7 @@ from workbench.core.recorded_run import pose_distances
 from workbench.core.snapshot_bytes import WholeSnapshot
 from workbench.core.step import StepResult
 from workbench.session.history import History, Moment
+from workbench.session.moment_messages import MomentToJudge
 from workbench.session.verdict import Said, Verdict, compare, single_numbers
 
 MOST_ENTRIES = 24
@@ -69,12 +71,13 @@ class Judgement:
         """Take everything that `history` has, up to the first jump whose snapshot could not be made."""
         self._moments: list[Moment] = []
         self._snapshots: dict[int, WholeSnapshot] = {}
+        """By row."""
         for moment in history.between(history.first, history.last):
             if not self._moments or moment.jumped.any():
                 whole = history.whole_at(moment.serial)
                 if whole is None:
                     break
-                self._snapshots[moment.serial] = whole
+                self._snapshots[len(self._moments)] = whole
             self._moments.append(moment)
         count = len(self._moments)
         envs = len(self._moments[0].step.reward) if count else 0
@@ -116,18 +119,19 @@ class Judgement:
         What a person looks at is mostly what was last, and a history may hold minutes of simulation.
         """
         begins = [int(row) for row in np.flatnonzero(self._jumped.all(axis=1))]
-        ends = [*begins[1:], len(self._moments)]
+        ends = [*begins[1:], len(self._serial)]
         return [range(begin, end) for begin, end in zip(begins, ends, strict=True)][::-1]
 
-    def moment(self, row: int) -> Moment:
-        return self._moments[row]
+    @property
+    def num_envs(self) -> int:
+        return self._jumped.shape[1]
 
-    def snapshot(self, row: int) -> tuple[WholeSnapshot, tuple[int, ...]] | None:
-        """Where this row is a jump: the snapshot, and the envs to be put back to it."""
+    def to_judge(self, row: int) -> MomentToJudge:
+        """This row, for whoever lives through it again."""
         if self._is_step[row]:
-            return None
+            return MomentToJudge(self._moments[row].step.action)
         envs = tuple(int(env) for env in np.flatnonzero(self._jumped[row]))
-        return self._snapshots[int(self._serial[row])], envs
+        return MomentToJudge(None, pickle.dumps(self._snapshots[row]), envs)
 
     def add(self, row: int, step: StepResult) -> None:
         """What the new code says of this row.
@@ -151,7 +155,7 @@ class Judgement:
     def curve(self, name: str, env: int) -> JudgedCurve | None:
         """One number of one env; None if neither version has one of this name."""
         old, new = self._old.get(name), self._new.get(name)
-        if (old is None and new is None) or not 0 <= env < self._jumped.shape[1]:
+        if (old is None and new is None) or not 0 <= env < self.num_envs:
             return None
         steps, missing = self._is_step, np.full(self.steps, np.nan, np.float32)
         return JudgedCurve(
@@ -166,9 +170,8 @@ class Judgement:
     def verdicts(self) -> list[Verdict[PastRun]]:
         """Of each run of which a step was judged, as far as it was."""
         for number in self._changed:
-            rows, env = self._rows_of(number)
-            if len(rows) > 1:
-                self._verdicts[number] = self._compared(rows, env)
+            if (verdict := self._compared(number)) is not None:
+                self._verdicts[number] = verdict
         self._changed.clear()
         return [*self._verdicts.values()]
 
@@ -182,28 +185,29 @@ class Judgement:
             differing
         )
 
-    def _rows_of(self, number: int) -> tuple[NDArray[np.int64], int]:
-        """The rows of a run that are judged: its jump, and its control steps; and its env."""
-        env = int(np.searchsorted(self._run[0], number, side="right")) - 1
-        first, end = np.searchsorted(self._run[:, env], [number, number + 1])
+    def _compared(self, number: int) -> Verdict[PastRun] | None:
+        """A run by the rows of it that are judged, its jump and its control steps; None before there are two."""
+        env = int(self._run[0].searchsorted(number, side="right")) - 1
+        first, end = self._run[:, env].searchsorted([number, number + 1])
         counts = self._judged[first:end] & self._is_step[first:end]
         counts[0] = self._judged[first]
-        return first + np.flatnonzero(counts), env
-
-    def _compared(self, rows: NDArray[np.int64], env: int) -> Verdict[PastRun]:
-        begin = int(self._elapsed[rows[0], env])
+        # A run that nobody else's jump is in is a slice, which is ten times as quick.
+        rows = slice(first, end) if counts.all() else first + counts.nonzero()[0]
+        serials = self._serial[rows]
+        if len(serials) < 2:
+            return None
         old, new = (
             Said(
-                table["reward"][rows[1:], env],
+                table["reward"][rows, env][1:],
                 {name: column[rows, env] for name, column in table.items() if name != "reward"},
             )
             for table in (self._old, self._new)
         )
-        run = PastRun(env, begin, self._serial[rows])
-        return compare(run, old, new, self._drift[rows, env], begin=begin)
+        begin = int(self._elapsed[serials[0] - self._serial[0], env])
+        return compare(PastRun(env, begin, serials), old, new, self._drift[rows, env], begin=begin)
 
     def _write(self, table: dict[str, NDArray[np.float32]], row: int, step: StepResult) -> None:
-        for name, value in (("reward", step.reward), *single_numbers(step)):
+        for name, value in (("reward", step.reward), *single_numbers(step.evaluate).items()):
             if name not in table:
                 if len(table) > MOST_ENTRIES:
                     continue

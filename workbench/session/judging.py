@@ -9,8 +9,7 @@ from enum import Enum
 from typing import Any, Literal
 
 from workbench.authoring.problem import Problem
-from workbench.session.askers import Background
-from workbench.session.lane import Job, JobFailed, Lane, Stopped
+from workbench.session.lane import Job, JobFailed, Lane
 from workbench.session.verdict import Verdict
 
 
@@ -67,22 +66,49 @@ class JudgedView:
 class Judging:
     """One job at a time; a new one takes the place of the one before. All methods but `close` return at once."""
 
-    def __init__(self, process: Background, lane: Lane, on_change: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self,
+        name: str,
+        on_change: Callable[[], None] = lambda: None,
+        idle_seconds: float | None = None,
+        on_idle: Callable[[], None] = lambda: None,
+    ) -> None:
         """
         Args:
-            process: in which it is judged.
-            lane: whose thread does all of it.
+            name: of the thread that does all of it.
             on_change: called when `view` has something new.
+            idle_seconds, on_idle: as of `Lane`.
         """
         self._on_change = on_change
         self._lock = threading.Lock()
         """Of `view`: what a job that was stopped still has to say is not heard."""
         self._view = JudgedView()
-        self._process, self._lane = process, lane
+        self._lane = Lane(name, on_change, self._failed, idle_seconds, on_idle)
 
     @property
     def view(self) -> JudgedView:
         return self._view
+
+    def begin(self, view: JudgedView, work: Callable[[Job], None]) -> None:
+        """Do this in place of what was done before; `view` is what is to be seen first."""
+
+        def whole(job: Job) -> None:
+            work(job)
+            self.tell(job, state="done")
+
+        with self._lock:
+            # Under the lock, or the job might tell how far it is before it is said that it begins.
+            self._lane.start("judging", whole)
+            self._view = replace(view, serial=self._view.serial + 1)
+        self._on_change()
+
+    def tell(self, job: Job, **values: Any) -> None:
+        """What is new in `view`."""
+        with self._lock:
+            if job.stopped:
+                return
+            self._view = replace(self._view, serial=self._view.serial + 1, **values)
+        self._on_change()
 
     def stop(self, why: StoppedBy = StoppedBy.HAND) -> None:
         """Go no further with what is under way; what is known by now stays to be seen."""
@@ -94,34 +120,17 @@ class Judging:
             self._view = replace(stopped, serial=self._view.serial + 1)
         self._on_change()
 
+    def forget(self) -> None:
+        """Stop, and have nothing to show."""
+        self.stop(StoppedBy.LOSS)
+        with self._lock:
+            self._view = JudgedView(serial=self._view.serial + 1)
+        self._on_change()
+
     def close(self) -> None:
         """End it all; returns when the thread has ended."""
         self.stop(StoppedBy.CLOSING)
         self._lane.close()
 
-    def _begin(self, view: JudgedView, work: Callable[[Job], None]) -> None:
-        with self._lock:
-            # Under the lock, or the job might tell how far it is before it is said that it begins.
-            self._lane.start("judging", lambda job: self._do(job, work))
-            self._view = replace(view, serial=self._view.serial + 1)
-        self._on_change()
-
-    def _do(self, job: Job, work: Callable[[Job], None]) -> None:
-        try:
-            work(job)
-            self._tell(job, state="done")
-        except Stopped:
-            raise
-        except JobFailed as failure:
-            self._tell(job, state="failed", why=str(failure), problem=failure.problem)
-        except Exception as error:
-            why = f"it failed within the workbench ({type(error).__name__}: {error})"
-            self._tell(job, state="failed", why=why)
-            raise
-
-    def _tell(self, job: Job, **values: Any) -> None:
-        with self._lock:
-            if job.stopped:
-                return
-            self._view = replace(self._view, serial=self._view.serial + 1, **values)
-        self._on_change()
+    def _failed(self, job: Job, failure: JobFailed) -> None:
+        self.tell(job, state="failed", why=str(failure), problem=failure.problem)

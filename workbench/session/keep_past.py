@@ -13,7 +13,6 @@ rest is as it was said then.
 from __future__ import annotations
 
 import pickle
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -42,10 +41,9 @@ class PastKeeper:
         self, folder: Path, finisher: EpisodeFinisher, on_change: Callable[[], None], process: Background
     ) -> None:
         self._folder, self._finisher, self._on_change = folder, finisher, on_change
-        self._lock = threading.Lock()
-        self._said, self._failed = "", False
+        self._status = KeepStatus()
         self._process = process
-        self._lane = Lane("keep-past", on_change, self._fail, IDLE_SECONDS, process.rest)
+        self._lane = Lane("keep-past", on_change, self._failed, IDLE_SECONDS, process.rest)
 
     def keep(self, what: WhatToKeep) -> None:
         """Begin; what was under way is given up."""
@@ -59,15 +57,12 @@ class PastKeeper:
 
     def refuse(self, why: str) -> None:
         """Say why nothing can be kept."""
-        self._fail(why)
-        self._on_change()
+        self._say(why, failed=True)
 
     def status(self) -> KeepStatus:
-        progress = self._lane.progress
-        with self._lock:
-            if progress is None:
-                return KeepStatus(said=self._said, failed=self._failed)
-        return KeepStatus(True, progress.what, progress.done, progress.total)
+        if (progress := self._lane.progress) is not None:
+            return KeepStatus(True, progress.what, progress.done, progress.total)
+        return self._status
 
     def close(self) -> None:
         self._lane.close()
@@ -75,37 +70,27 @@ class PastKeeper:
     # --- on the lane's thread --------------------------------------------------------------------------
 
     def _keep(self, job: Job, what: WhatToKeep) -> None:
-        try:
-            with self._process.turn(job):
-                self._work(job, what)
-        except JobFailed as failure:
-            problem = failure.problem
-            if problem is None:
+        with self._process.turn(job):
+            self._process.ensure(job, what.load, what.placed)
+            what, lost = self._with_sure_seeds(job, what)
+            writers: dict[int, GatheredEpisode] = {}
+            try:
+                self._capture_all(job, what, writers)
+            except BaseException as error:
+                for episode in writers.values():
+                    episode.writer.discard()
+                if isinstance(error, RecordingError | ValueError):
+                    raise JobFailed(f"it could not be kept: {error}") from error
                 raise
-            where = "" if problem.line is None else f" (line {problem.line})"
-            raise JobFailed(f"it could not be drawn again: {problem.message}{where}") from failure
-
-    def _work(self, job: Job, what: WhatToKeep) -> None:
-        self._process.ensure(job, what.load, what.placed)
-        what, lost = self._with_sure_seeds(job, what)
-        writers: dict[int, GatheredEpisode] = {}
-        try:
-            self._capture_all(job, what, writers)
-        except (RecordingError, ValueError) as error:
-            _discard(writers)
-            raise JobFailed(f"it could not be kept: {error}") from error
-        except BaseException:
-            _discard(writers)
-            raise
-        job.tell(1, 1, "writing the files")
-        made = [self._finisher.finish(episode) for episode in writers.values()]
-        problems = [result for future in made if isinstance(result := future.result(), str)]
-        if problems:
-            raise JobFailed(problems[0])
-        steps = sum(episode.steps for episode in what.episodes)
-        unfinished = sum(not episode.ended for episode in what.episodes)
-        kept = f"kept {len(made)} episode{'' if len(made) == 1 else 's'}, {steps} steps"
-        self._say(kept + _not_ended(unfinished, len(made)) + _no_seed(lost, len(made)))
+            job.tell(1, 1, "writing the files")
+            made = [self._finisher.finish(episode) for episode in writers.values()]
+            problems = [result for future in made if isinstance(result := future.result(), str)]
+            if problems:
+                raise JobFailed(problems[0])
+            steps = sum(episode.steps for episode in what.episodes)
+            unfinished = sum(not episode.ended for episode in what.episodes)
+            kept = f"kept {len(made)} episode{'' if len(made) == 1 else 's'}, {steps} steps"
+            self._say(kept + _not_ended(unfinished, len(made)) + _no_seed(lost, len(made)))
 
     def _with_sure_seeds(self, job: Job, what: WhatToKeep) -> tuple[WhatToKeep, int]:
         """Each episode with its seed only if that, alone, starts it; and of how many it does not.
@@ -150,13 +135,16 @@ class PastKeeper:
                         writers[episode.env].acts(moment.acted_by)
                     writers[episode.env].take(packer, step, env, columns, pictures)
 
-    def _fail(self, why: str) -> None:
-        with self._lock:
-            self._said, self._failed = why, True
+    def _failed(self, job: Job, failure: JobFailed) -> None:
+        why, problem = str(failure), failure.problem
+        if problem is not None:
+            where = "" if problem.line is None else f" (line {problem.line})"
+            why = f"it could not be drawn again: {problem.message}{where}"
+        if not job.stopped:
+            self._say(why, failed=True)
 
-    def _say(self, words: str) -> None:
-        with self._lock:
-            self._said, self._failed = words, False
+    def _say(self, words: str, failed: bool = False) -> None:
+        self._status = KeepStatus(said=words, failed=failed)
         self._on_change()
 
 
@@ -173,8 +161,3 @@ def _no_seed(count: int, kept: int) -> str:
         return ""
     what = "its start was" if kept == 1 else "their starts were" if count == kept else f"{count} starts were"
     return f"; {what} drawn for several envs at once, so their first state is recorded and no seed"
-
-
-def _discard(writers: dict[int, GatheredEpisode]) -> None:
-    for episode in writers.values():
-        episode.writer.discard()

@@ -57,14 +57,14 @@ class Lane:
         self,
         name: str,
         on_change: Callable[[], None],
-        on_failure: Callable[[str], None],
+        on_failure: Callable[[Job, JobFailed], None],
         idle_seconds: float | None = None,
         on_idle: Callable[[], None] = lambda: None,
     ) -> None:
         """
         Args:
             on_change: called when `progress` is new.
-            on_failure: called with the sentence that a job failed with, whether that was foreseen (JobFailed) or not.
+            on_failure: called with a job that failed, whether that was foreseen (JobFailed) or not; it may be stopped.
             on_idle: called on the lane's thread when there was no job for so long, and at its end.
         """
         self._name, self.changed, self._on_failure = name, on_change, on_failure
@@ -122,13 +122,12 @@ class Lane:
             except Stopped:
                 pass
             except JobFailed as failure:
-                self._on_failure(str(failure))
+                self._on_failure(job, failure)
             except Exception as error:
                 # Of the workbench's own. Whoever shows the job must hear that it is over.
                 say_failure(f"The job '{job.progress.what}' failed", error)
-                self._on_failure(
-                    f"it failed within the workbench ({type(error).__name__}: {shorten(str(error))})"
-                )
+                why = f"it failed within the workbench ({type(error).__name__}: {shorten(str(error))})"
+                self._on_failure(job, JobFailed(why))
             finally:
                 with self._wake:
                     self._job = None

@@ -20,7 +20,7 @@ from workbench.core.pictures import Picture
 from workbench.core.step import StepResult
 from workbench.session.askers import Asker
 from workbench.session.camera_messages import DrawCamera
-from workbench.session.lane import Job, Lane
+from workbench.session.lane import Job, JobFailed, Lane
 
 MODALITIES = ("rgb", "depth", "segmentation")
 """That a preview has, whatever the camera's own shader gives."""
@@ -110,7 +110,7 @@ class Preview:
     def close(self) -> None:
         self._lane.close()
 
-    def _failed(self, why: str) -> None:
+    def _failed(self, job: Job, failure: JobFailed) -> None:
         """The last picture stays; the next change looks again."""
         with self._lock:
-            self._problem = f"{self._failing}: {why}."
+            self._problem = f"{self._failing}: {failure}."

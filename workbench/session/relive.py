@@ -38,7 +38,7 @@ from workbench.core.stand_still import only_these_move
 from workbench.core.step import StepResult
 from workbench.session.open_task import OpenedTask, blamed, reset_checked, step_checked
 
-FAR_METRES, FAR_RADIANS = 1e-4, 1e-3
+PARTED_METRES, PARTED_RADIANS = 1e-4, 1e-3
 """From here on a state is another one than the recorded, and is put back to it."""
 
 Way = Literal["re-simulated", "corrected", "put there"]
@@ -198,7 +198,7 @@ def _of(states: Mapping[str, NDArray], env: int) -> dict[str, NDArray]:
 
 def _far(env: object, chosen: list[int], wanted: Mapping[str, NDArray]) -> bool:
     metres, radians = _distance(env, chosen, wanted)
-    return (metres or 0.0) > FAR_METRES or (radians or 0.0) > FAR_RADIANS
+    return (metres or 0.0) > PARTED_METRES or (radians or 0.0) > PARTED_RADIANS
 
 
 def _distance(

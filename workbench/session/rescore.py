@@ -19,7 +19,7 @@ from workbench.recording.document import WrongDocument, read_document
 from workbench.recording.episode import EpisodeInfo
 from workbench.recording.made_here import made_here
 from workbench.recording.side_files import side_files_in_words
-from workbench.recording.sources import Source, sources_among
+from workbench.recording.sources import Source
 from workbench.recording.unreadable import UnreadableRecording
 from workbench.session.clearance import NotCleared, Wanted, recorded_content
 from workbench.session.lane import JobFailed
@@ -47,21 +47,6 @@ class Group:
     def wanted(self) -> Wanted:
         """What has to be cleared before it is judged."""
         return Wanted(self.reference, self.info, self.recorded_source)
-
-
-def find_episodes(places: Sequence[Path]) -> list[Source]:
-    """The episodes of these files and folders, each once: ours, and those in files of ManiSkill's RecordEpisode.
-
-    Raises:
-        UnreadableRecording: a place is not there, a file that is named holds no episode, or there is none at all.
-    """
-    try:
-        found = [source for source in sources_among(places) if source.kind != "lerobot"]
-    except OSError as error:
-        raise UnreadableRecording(str(error)) from error
-    if not found:
-        raise UnreadableRecording(f"A LeRobot dataset cannot be judged again: {', '.join(map(str, places))}.")
-    return found
 
 
 def group_episodes(

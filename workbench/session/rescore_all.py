@@ -13,13 +13,13 @@ from workbench.authoring.reference import TaskName
 from workbench.core.broken_rule import warn_of
 from workbench.core.rules import Finding
 from workbench.machine.current_folder import CurrentFolder
-from workbench.recording.sources import Source
+from workbench.recording.sources import Source, sources_among
+from workbench.recording.unreadable import UnreadableRecording
 from workbench.session.clearance import Clearances, NotCleared, NotTrusted
 from workbench.session.messages import TaskOptions
 from workbench.session.open_task import OpenedTask, open_task
 from workbench.session.rescore import (
     Group,
-    find_episodes,
     group_episodes,
     hidden_in_words,
     judge_each,
@@ -66,13 +66,17 @@ def rescore_all(
 
     Raises:
         NotTrusted: a recording names code that nobody agreed to, and there is nobody to ask; or the answer to all was no.
-        UnreadableRecording: there is nothing to judge.
+        FileNotFoundError, UnreadableRecording: there is nothing to judge.
         TaskError: no task can be opened, or each raises; where others can be judged, it is said of its episodes.
         CannotStepIn: as TaskError, where a recorded text cannot be opened.
     """
     torch.set_num_threads(1)  # see workbench.session.worker.work
     here = CurrentFolder()
-    files = find_episodes([place.absolute() for place in what.places])
+    files = [s for s in sources_among([place.absolute() for place in what.places]) if s.kind != "lerobot"]
+    if not files:
+        raise UnreadableRecording(
+            f"A LeRobot dataset cannot be judged again: {', '.join(map(str, what.places))}."
+        )
     groups, verdicts = group_episodes(
         files, what.num_envs, what.base, task=what.task, recorded_source=what.recorded_source
     )

@@ -57,15 +57,10 @@ class _Seat:
         run = self.run
         # A recording of somebody else's that holds no rewards: there is nothing to compare with.
         old = np.zeros(0) if np.isnan(run.reward).all() else run.reward
-        recorded = {
-            name: rows.reshape(len(rows))
-            for name, rows in run.evaluate.items()
-            if rows.dtype.kind in "fiub" and rows.shape in ((len(rows),), (len(rows), 1))
-        }
         now = {name: np.array(rows) for name, rows in self.evaluate.items()}
         return compare(
             self.file,
-            Said(old, recorded),
+            Said(old, single_numbers(run.evaluate)),
             Said(np.array(self.reward), now),
             np.array(self.drift) if run.env_states else None,
             task=self.task,
@@ -202,7 +197,7 @@ def _one_step(opened: OpenedTask, seats: dict[int, _Seat], use_env_states: bool)
 
 
 def _hear(seat: _Seat, step: StepResult, env: int, now: dict[str, NDArray[np.float32]]) -> None:
-    for name, values in single_numbers(step):
+    for name, values in single_numbers(step.evaluate).items():
         rows = seat.evaluate.setdefault(name, [])
         # The terms of a reward are there from the first step on.
         rows += [np.nan] * (seat.at - len(rows))

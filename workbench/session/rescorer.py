@@ -8,7 +8,7 @@ recordings is not to stay.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from workbench.recording.sources import Source
 from workbench.session.askers import Background
 from workbench.session.clearance import Clearances
 from workbench.session.judging import JudgedView, Judging
-from workbench.session.lane import Job, JobFailed, Lane
+from workbench.session.lane import Job, JobFailed
 from workbench.session.messages import Load, TaskOptions
 from workbench.session.rescore import (
     Group,
@@ -31,6 +31,7 @@ from workbench.session.rescore import (
 )
 from workbench.session.rescore_messages import Rescore, Rescored
 from workbench.session.step_back import CannotStepIn
+from workbench.session.verdict import Verdict
 
 MOST_AT_ONCE = 16
 """Envs."""
@@ -38,7 +39,7 @@ MOST_NAMED = 3
 """Of the versions that are judged with, where there are many."""
 
 
-class Rescorer(Judging):
+class Rescorer:
     """Judges recordings."""
 
     def __init__(self, clearances: Clearances | None = None, base: TaskOptions | None = None) -> None:
@@ -47,8 +48,8 @@ class Rescorer(Judging):
             clearances: says what of the code that recordings name may run; None asks nobody.
             base: what is the same for all that is opened.
         """
-        # Failures are told by `_tell`, with what the code raised.
-        super().__init__(Background(), Lane("rescore", lambda: None, lambda why: None))
+        self.judging = Judging("rescore")
+        self._process = Background()
         self._clearances = clearances or Clearances()
         self._base = base or TaskOptions()
 
@@ -71,7 +72,7 @@ class Rescorer(Judging):
             notes = [f"with {_judged_with(group)}" for group in groups[:MOST_NAMED]]
             notes += [f"and {len(groups) - MOST_NAMED} more"] if len(groups) > MOST_NAMED else []
             notes += dict.fromkeys(g.note for g in groups if g.note)
-            self._tell(job, state="asking", verdicts=tuple(unread), notes=tuple(notes))
+            self._tell(job, unread, state="asking", notes=tuple(notes))
             try:
                 self._judge_all(job, groups, use_env_states)
             except CannotStepIn as error:
@@ -79,7 +80,7 @@ class Rescorer(Judging):
             finally:
                 self._process.end()  # with the code that the recordings named
 
-        self._begin(JudgedView("loading", total=len(files), unit="episodes"), work)
+        self.judging.begin(JudgedView("loading", total=len(files), unit="episodes"), work)
 
     # --- on the lane ---------------------------------------------------------------------------------
 
@@ -91,14 +92,13 @@ class Rescorer(Judging):
             why = str(error)
             if isinstance(error, JobFailed) and error.problem is not None:
                 why += f": {error.problem.message}"
-            verdicts = self._view.verdicts
-            self._tell(job, verdicts=(*verdicts, *not_judged(group, verdicts, why)))
+            self._tell(job, not_judged(group, self.judging.view.verdicts, why))
 
         judge_each(groups, cleared, lambda group, task: self._judge(job, group, task, use_env_states), failed)
 
     def _judge(self, job: Job, group: Group, reference: TaskName, use_env_states: bool) -> None:
         process = self._process
-        warnings = tuple(dict.fromkeys((*self._view.warnings, *hidden_in_words(reference))))
+        warnings = tuple(dict.fromkeys((*self.judging.view.warnings, *hidden_in_words(reference))))
         self._tell(job, state="loading", task=_judged_with(group), warnings=warnings)
         # Never patched into what the last episodes were judged in.
         load = Load(reference, group.options, level="rebuilt")
@@ -111,12 +111,11 @@ class Rescorer(Judging):
                 f"{group.info.task} could not be opened to judge with", failure.problem
             ) from failure
         self._tell(job, state="judging")
-        began, before, steps = time.monotonic(), self._view.seconds, self._view.steps
+        began, before, steps = time.monotonic(), self.judging.view.seconds, self.judging.view.steps
 
         def told(now: Rescored) -> None:
-            verdicts = (*self._view.verdicts, *now.verdicts)
             seconds = before + time.monotonic() - began
-            self._tell(job, verdicts=verdicts, steps=steps + now.steps, seconds=seconds)
+            self._tell(job, now.verdicts, steps=steps + now.steps, seconds=seconds)
 
         question = Rescore(group.files, use_env_states)
         last = process.ask(job.check, question, lambda done, total, now: told(now))
@@ -124,10 +123,10 @@ class Rescorer(Judging):
         if last.problem is not None:
             raise JobFailed(f"the code of {group.info.task} raised", last.problem)
 
-    def _tell(self, job: Job, **values: Any) -> None:
-        if "verdicts" in values:
-            values["done"] = len(values["verdicts"])
-        super()._tell(job, **values)
+    def _tell(self, job: Job, verdicts: Iterable[Verdict[Source]] = (), **values: Any) -> None:
+        """What is new, and these verdicts besides those that are known."""
+        known = (*self.judging.view.verdicts, *verdicts)
+        self.judging.tell(job, verdicts=known, done=len(known), **values)
 
 
 def _judged_with(group: Group) -> str:

@@ -151,7 +151,7 @@ class Session:
             "recording": replace(self._recorder.status(), keeping=self._keeper.status()),
             "printed": self._printed.view(),
             "vitals": self._worker.vitals,
-            "judgement": self._judge.view,
+            "judgement": self._judge.judging.view,
         }
         with self._lock:
             view = self._state.view(**known)
@@ -354,7 +354,7 @@ class Session:
         self.versions.close()
         self._policy_file.close()
         self._worker.stop()
-        self._judge.close()
+        self._judge.judging.close()
         self.studio.close()
         self._keeper.close()
         self._background.end()
@@ -409,7 +409,7 @@ class Session:
         with self._lock:
             s = self._state
             restored, stale = self.versions.came_in(event.task)
-            meaning = what_a_load_means(s.now.task, event, self._judge.view)
+            meaning = what_a_load_means(s.now.task, event, self._judge.judging.view)
             judgement = None
             if meaning == "judge" and s.timeline is not None:
                 judgement = Judgement(s.timeline.history)

@@ -7,18 +7,16 @@ record belongs to each verdict.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.step import StepResult
-
 SAME_SHARE, SAME_NUMBER = 1e-5, 1e-7
 """Numbers that differ by no more than this share of the largest recorded one, or by no more than this, are the same."""
-FAR_METRES, FAR_RADIANS = 1e-3, 1e-2
+DOUBTFUL_METRES, DOUBTFUL_RADIANS = 1e-3, 1e-2
 """A body further than this from the record makes a comparison doubtful."""
 FLAGS = ("success", "fail")
 _MAIN = ("reward", *FLAGS)
@@ -86,14 +84,16 @@ class Verdict(Generic[Of]):
     @property
     def drifted(self) -> bool:
         """Whether what differs may come of other states and not of the code."""
-        return self.metres is not None and not (self.metres <= FAR_METRES and self.radians <= FAR_RADIANS)
+        return self.metres is not None and not (
+            self.metres <= DOUBTFUL_METRES and self.radians <= DOUBTFUL_RADIANS
+        )
 
 
 def compare(
     of: Of,
     old: Said,
     new: Said,
-    drift: NDArray[np.float64] | None = None,
+    drift: NDArray | None = None,
     *,
     begin: int = 0,
     task: str = "",
@@ -109,27 +109,36 @@ def compare(
         begin: the steps of its episode that were made before the run.
     """
     steps = len(new.reward)
-    recorded = len(old.reward) > 0
-    was = np.asarray(old.reward[:steps] if recorded else np.full(steps, np.nan), np.float64)
-    apart = gap(was, new.reward) if recorded else np.zeros(steps)
-    others = {name: np.flatnonzero(_others(old.evaluate, new.evaluate, name)) for name in new.evaluate}
-    others["reward"] = 1 + np.flatnonzero(unlike(was, new.reward)) if recorded else np.zeros(0, np.int64)
+    both = [n for n, values in new.evaluate.items() if len(old.evaluate.get(n, ())) >= len(values)]
+    names = ("reward", *both)
+    # All numbers at once: there are some ten, of hundreds of runs, several times a second.
+    was, now = np.full((2, len(names), steps + 1), np.nan)
+    if len(old.reward):
+        was[0, 1:], now[0, 1:] = old.reward[:steps], new.reward
+    for row, name in enumerate(both, 1):
+        length = len(new.evaluate[name])
+        was[row, :length], now[row, :length] = old.evaluate[name][:length], new.evaluate[name]
+    apart = gap(was, now)
+    differs = _too_far(was, apart, axis=1)
+    # Many a file says nothing of the state that a run begins with.
+    differs[:, 0] &= ~np.isnan(was[:, 0])
+    others = {name: differs[row].nonzero()[0] for row, name in enumerate(names)}
     turned: dict[str, tuple[int | None, int | None]] = {}
     for name in FLAGS:
         flags = [_flag(said.evaluate.get(name), steps + 1) for said in (old, new)]
-        others[name] = np.flatnonzero(flags[0] != flags[1])
-        then, now = (begin + int(np.argmax(flag)) if flag.any() else None for flag in flags)
-        turned[name] = then, now
-    first = min((begin + int(others[name][0]) for name in _MAIN if len(others[name])), default=None)
+        others[name] = (flags[0] != flags[1]).nonzero()[0]
+        turned[name] = _first(flags[0], begin), _first(flags[1], begin)
+    differing = tuple(name for name in dict.fromkeys((*_MAIN, *new.evaluate)) if len(others.get(name, ())))
+    first = min((begin + int(others[name][0]) for name in _MAIN if name in differing), default=None)
     look_at = first
-    if len(others["reward"]):
-        look_at = begin + 1 + int(np.argmax(apart))
+    if "reward" in differing:
+        look_at = begin + int(apart[0].argmax())
     for then, now in (turned["fail"], turned["success"]):
         if then != now:
             look_at = then if now is None else now
     metres, radians, drift_at = None, 0.0, None
     if drift is not None:
-        far = int(np.argmax(drift[:, 0]))
+        far = int(drift[:, 0].argmax())
         metres, radians = float(drift[far, 0]), float(drift[:, 1].max())
         drift_at = begin + far if metres else None
     return Verdict(
@@ -140,17 +149,17 @@ def compare(
         success=turned["success"],
         fail=turned["fail"],
         has_success="success" in old.evaluate or "success" in new.evaluate,
-        returns=(float(was.sum()), float(np.sum(new.reward, dtype=np.float64))),
-        largest=float(apart.max(initial=0.0)),
+        returns=(float(was[0, 1:].sum()), float(np.asarray(new.reward, np.float64).sum())),
+        largest=float(apart[0].max()),
         first_difference=first,
         look_at=look_at,
-        differing=tuple(name for name in dict.fromkeys((*_MAIN, *others)) if len(others[name])),
+        differing=differing,
         metres=metres,
         radians=radians,
         drift_at=drift_at,
         begins_otherwise=begins_otherwise,
         missed=dict(missed or {}),
-        old_reward=was.astype(np.float32),
+        old_reward=was[0, 1:].astype(np.float32),
         new_reward=np.asarray(new.reward, np.float32),
     )
 
@@ -166,12 +175,14 @@ def in_order(verdicts: Sequence[Verdict[Of]]) -> list[Verdict[Of]]:
     return sorted(verdicts, key=key)
 
 
-def single_numbers(step: StepResult) -> Iterator[tuple[str, NDArray]]:
-    """The entries of ``evaluate`` that are one number or flag for each env: (N,) each."""
-    count = len(step.reward)
-    for name, values in step.evaluate.items():
-        if values.dtype.kind in "fiub" and values.shape in ((count,), (count, 1)):
-            yield name, values.reshape(count)
+def single_numbers(evaluate: Mapping[str, NDArray]) -> dict[str, NDArray]:
+    """The entries that are one number or flag in each row, (n,) of them; of `evaluate`, (n, ...) each."""
+    return {
+        # Nobody keeps an author from calling an entry so, and it is not the reward.
+        "evaluate/reward" if name == "reward" else name: values.reshape(len(values))
+        for name, values in evaluate.items()
+        if values.dtype.kind in "fiub" and values.shape in ((len(values),), (len(values), 1))
+    }
 
 
 def gap(old: NDArray, new: NDArray) -> NDArray[np.float64]:
@@ -179,8 +190,10 @@ def gap(old: NDArray, new: NDArray) -> NDArray[np.float64]:
     a, b = np.asarray(old, np.float64), np.asarray(new, np.float64)
     with np.errstate(invalid="ignore"):
         apart = np.abs(b - a)
-    apart[(np.isnan(a) & np.isnan(b)) | (a == b)] = 0.0
-    return np.where(np.isnan(apart), np.inf, apart)
+    if not np.isfinite(apart).all():
+        apart[(np.isnan(a) & np.isnan(b)) | (a == b)] = 0.0
+        apart[np.isnan(apart)] = np.inf
+    return apart
 
 
 def unlike(old: NDArray, new: NDArray, least: float = SAME_NUMBER) -> NDArray[np.bool_]:
@@ -189,27 +202,26 @@ def unlike(old: NDArray, new: NDArray, least: float = SAME_NUMBER) -> NDArray[np
     Args:
         least: what differs by no more is the same.
     """
-    apart = gap(old, new)
-    scale = np.max(np.abs(old), initial=0.0, where=np.isfinite(old)) if apart.any() else 0.0
-    return apart > max(SAME_SHARE * scale, least)
+    return _too_far(old, gap(old, new), least)
 
 
-def _others(old: Mapping[str, NDArray], new: Mapping[str, NDArray], name: str) -> NDArray[np.bool_]:
-    """(T + 1,) of the states in which an entry that both have is another."""
-    a, b = old.get(name), np.asarray(new[name], np.float64)
-    if a is None or len(a) < len(b):
-        return np.zeros(len(b), bool)
-    a = np.asarray(a[: len(b)], np.float64)
-    differs = unlike(a, b)
-    # Many a file says nothing of the state that a run begins with.
-    differs[:1] &= ~np.isnan(a[:1])
-    return differs
+def _too_far(
+    old: NDArray, apart: NDArray, least: float = SAME_NUMBER, axis: int | None = None
+) -> NDArray[np.bool_]:
+    """Where new ones that are so far `apart` are not the same; with `axis` 1 each row is one of its own."""
+    if not apart.any():
+        return apart > 0
+    scale = np.abs(old).max(axis=axis, initial=0.0, where=np.isfinite(old), keepdims=True)
+    return apart > np.maximum(SAME_SHARE * scale, least)
+
+
+def _first(flag: NDArray[np.bool_], begin: int) -> int | None:
+    return begin + int(flag.argmax()) if flag.any() else None
 
 
 def _flag(values: NDArray | None, states: int) -> NDArray[np.bool_]:
     """(states,) of an entry that is a flag: False where it is not said."""
     found = np.zeros(states, bool)
     if values is not None:
-        said = np.nan_to_num(np.asarray(values[:states], np.float64)) > 0.5
-        found[: len(said)] = said
+        found[: len(values)] = values[:states] > 0.5
     return found

@@ -147,7 +147,7 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
             hint="Put the recorded state in after every step, so that nothing drifts from the record",
         )
         self._states.on_update(lambda _: self._chosen())
-        self._add_status("Stop", rescorer.stop)
+        self._add_status("Stop", rescorer.judging.stop)
         self._add_list()
         self._add_chart()
         self._selected: str | None = None
@@ -173,7 +173,7 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
     # --- drawing -----------------------------------------------------------------------------------
 
     def key(self, view: ReviewView) -> object:
-        at = self._rescorer.view.serial, view.opened_serial, view.selected
+        at = self._rescorer.judging.view.serial, view.opened_serial, view.selected
         return *at, self._pages.first, self._selected, self._codes_are_of(view)
 
     def _codes_are_of(self, view: ReviewView) -> object:
@@ -184,7 +184,7 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
 
     def draw(self, view: ReviewView) -> None:
         self._draw_codes(view)
-        told = self._rescorer.view
+        told = self._rescorer.judging.view
         self._begin.visible = bool(view.opened) and told.state not in RUNNING
         self._draw_status(told, idle=IDLE)
         self._draw_list(in_order(told.verdicts))

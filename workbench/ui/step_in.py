@@ -369,7 +369,7 @@ class Judging:
             )
 
     def close(self) -> None:
-        self.rescorer.close()
+        self.rescorer.judging.close()
 
 
 def episode_files(library: Library, ids: Sequence[str]) -> list[Source]:
