@@ -233,6 +233,17 @@ def test_a_constant_of_another_file_is_changed_there() -> None:
     assert plan.settings == real_settings(sources | {plan.file: plan.new_text}, "cam")
 
 
+def test_of_however_many_files_that_only_speak_of_it_a_constant_is_changed_where_it_is() -> None:
+    more = {f"/author/more_{number}.py": f"# EYE is not read here\nx = {number}\n" for number in range(20)}
+    sources = {FILE: IMPORTING, "/author/places.py": PLACES, **more}
+    before = real_settings(sources, "cam")
+    after = dataclasses.replace(higher(before), width=100)
+    plan = plan_edit(sources, ("sensor", "cam"), before, after, run_class)
+    assert isinstance(plan, SourceEdit), plan
+    assert plan.file == "/author/places.py" and not plan.others, plan.notes
+    assert "EYE = np.array([0.5, 0, 0.75])" in plan.new_text and "SIZE = 100" in plan.new_text
+
+
 def test_a_constant_that_another_file_reads_is_left_as_it_is() -> None:
     sources = {
         FILE: IMPORTING,

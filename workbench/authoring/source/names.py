@@ -39,10 +39,15 @@ class Project:
 
     def __init__(self, texts: Mapping[str, str]) -> None:
         self.texts = texts
+        self._files: dict[str, SourceFile] = {}
         self._bindings: dict[ast.AST, dict[str, list[Binding]]] = {}
 
     def file(self, path: str) -> SourceFile:
-        return parsed(path, self.texts[path])
+        if (
+            path not in self._files
+        ):  # kept here too: nodes are told apart by identity, however many files there are
+            self._files[path] = parsed(path, self.texts[path])
+        return self._files[path]
 
     def given(self, path: str) -> SourceFile:
         """Raises Refused for what is none of them."""
