@@ -69,12 +69,10 @@ def _set_otherwise(before: Mapping[str, str], after: Mapping[str, str], owner: A
     A live env has its attributes from the text that built it, and a camera may stand where one of them says.
     """
     old, new = Project(before), Project(after)
+    edited = [path for path, text in after.items() if before.get(path) != plain_line_ends(text)]
+    named = {n.attr for path in edited for n in new.file(path).nodes if isinstance(n, ast.Attribute)}
     found: dict[str, Any] = {}
-    for name in (
-        vars(owner).keys()
-        if any(before.get(path) != plain_line_ends(text) for path, text in after.items())
-        else ()
-    ):
+    for name in named & vars(owner).keys():
         was, stores = old.attribute_stores(name), new.attribute_stores(name)
         if len(was) != 1 or len(stores) != 1 or was[0].value is None or stores[0].value is None:
             continue
