@@ -7,12 +7,11 @@ program ends.
 from __future__ import annotations
 
 import datetime
-import json
 import logging
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+
+import msgspec
 
 from workbench.authoring.task_content import TaskContent
 from workbench.machine.user_folder import locked, read_private, set_aside, user_folder, write_private
@@ -26,16 +25,20 @@ MOST_WITH_FILES = 200
 """Of them, the newest, that say which files they were for: 300 modules take 30 kB."""
 
 
-@dataclass(frozen=True)
-class _Entry:
+class _Entry(msgspec.Struct, frozen=True):
     hash: str
     file: str
     """Where it lay when it was asked about; for people, and to say that a text has changed."""
     when: str
     followed: bool = False
     """Its saves may run too, where it lay then."""
-    files: Mapping[str, str] = field(default_factory=dict)
+    files: dict[str, str] = {}
     """`TaskContent.file_sums`, to say which of them has changed; empty where an earlier version wrote it."""
+
+
+class _Document(msgspec.Struct):
+    trusted: list[_Entry]
+    format: int = 1
 
 
 class TrustStore:
@@ -104,34 +107,19 @@ class TrustStore:
         if content is None:
             return []
         try:
-            return _entries(json.loads(content))
-        except (ValueError, TypeError, KeyError, RecursionError) as error:
+            return msgspec.json.decode(content, type=_Document).trusted
+        except (msgspec.MsgspecError, RecursionError) as error:
             self._tell(f"{user_folder() / STORE_FILE} is broken, so nothing is trusted: {error}")
             if mend:
                 self._tell(f"The broken one is {set_aside(STORE_FILE)} now.")
             return []
 
     def _write(self, entries: Sequence[_Entry]) -> None:
-        said: list[dict[str, Any]] = [dict(vars(entry)) for entry in entries]
-        for one in said[:-MOST_WITH_FILES]:
-            one["files"] = {}
-        document = {"format": 1, "trusted": said}
-        write_private(STORE_FILE, json.dumps(document, indent=1).encode())
+        said = [msgspec.structs.replace(one, files={}) for one in entries[:-MOST_WITH_FILES]]
+        document = _Document([*said, *entries[-MOST_WITH_FILES:]])
+        write_private(STORE_FILE, msgspec.json.format(msgspec.json.encode(document), indent=1))
 
     def _tell(self, what: str) -> None:
         if what not in self._told:
             self._told.add(what)
             log.warning("%s", what)
-
-
-def _entries(document: Any) -> list[_Entry]:
-    return [
-        _Entry(
-            str(one["hash"]),
-            str(one["file"]),
-            str(one["when"]),
-            one.get("followed") is True,
-            {str(name): str(found) for name, found in dict(one.get("files", {})).items()},
-        )
-        for one in document["trusted"]
-    ]
