@@ -16,10 +16,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from workbench.authoring.modules import MOST_SOURCE_BYTES, exact_text, module_name
+from workbench.authoring.modules import module_name, read_exactly
 from workbench.authoring.source.text import Refused, Replacement, SourceFile
 from workbench.machine.atomic_files import create_file
-from workbench.machine.regular_file import read_regular_file
 
 MOST_COPIES = 99
 _VERSION = re.compile(r"-v\d+$")
@@ -43,7 +42,7 @@ def copy_task(source: Path, folder: Path) -> TaskCopy:
         NoCopy: it cannot be copied; nothing was written.
     """
     try:
-        text, encoding = exact_text(str(source), read_regular_file(source, MOST_SOURCE_BYTES))
+        _, text, encoding = read_exactly(source)
     except (OSError, SyntaxError) as error:
         raise NoCopy(f"{source.name} cannot be read ({error})") from error
     if not folder.is_dir():

@@ -16,6 +16,7 @@ import inspect
 import re
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
@@ -429,34 +430,24 @@ def task_of_class(cls: type[BaseEnv], env_id: str) -> LoadedTask:
         # A class of others that the file only imports has its own file.
         registered = any(made.cls is cls and made.name == env_id for made in load.registrations.made)
         if registered or cls.__module__ in load.finder.names:
-            fields = _source_fields(load.finder)
-            return LoadedTask(
-                cls, env_id, cls.__name__, load.finder.file, **fields, max_episode_steps=limit,
-                default_kwargs=kwargs, followed=True,
-            )  # fmt: skip
-    source: dict[str, str] = {}
-    try:
-        name = inspect.getsourcefile(cls)
-    except (TypeError, OSError):  # a class made without a file: in a notebook, or by type()
-        name = None
-    if name is not None:
-        file = Path(name).resolve()
-        try:
-            source[str(file)] = read_source(file)
-        except (OSError, SyntaxError):  # shipped as bytecode only: it runs, but there is no text to keep
-            name = None
-    files = tuple(Path(path) for path in source)
+            file, followed, fields = load.finder.file, True, _source_fields(load.finder)
+            break
+    else:
+        file, followed, fields = None, False, _fields({}, None, Path())
+        # Of a class made without a file (in a notebook, or by type()), and of one that is shipped as bytecode only,
+        # there is no text to keep.
+        with suppress(TypeError, OSError, SyntaxError):
+            file = Path(inspect.getsourcefile(cls) or "").resolve()
+            fields = _fields({str(file): read_source(file)}, file, file.parent)
     return LoadedTask(
-        cls=cls,
-        env_id=env_id,
-        class_name=cls.__name__,
-        file=files[0] if files else None,
-        source_files=files,
-        source=source,
-        source_hash=source_hash(source, files[0].parent if files else Path()),
+        cls,
+        env_id,
+        cls.__name__,
+        file if fields["source_files"] else None,
+        **fields,
         max_episode_steps=limit,
         default_kwargs=kwargs,
-        followed=False,
+        followed=followed,
     )
 
 
@@ -489,11 +480,14 @@ def _task_in(module: ModuleType, wanted: str | None, load: _Load) -> LoadedTask:
 
 
 def _source_fields(finder: AuthorFinder) -> dict[str, Any]:
-    source = dict(finder.texts)
+    return _fields(finder.texts, finder.file, finder.own_folder)
+
+
+def _fields(source: Mapping[str, str], file: Path | None, folder: Path) -> dict[str, Any]:
     # A helper may have been read first, where the file is part of a package.
-    files = sorted((Path(path) for path in source), key=lambda path: path != finder.file)
+    files = sorted((Path(path) for path in source), key=lambda path: path != file)
     return {
         "source_files": tuple(files),
         "source": {str(path): source[str(path)] for path in files},
-        "source_hash": source_hash(source, finder.own_folder),
+        "source_hash": source_hash(source, folder),
     }

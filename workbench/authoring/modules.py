@@ -234,7 +234,13 @@ def read_source(path: str | Path) -> str:
         OSError: it cannot be read, also because it is no regular file or larger than any program.
         SyntaxError: it is no text.
     """
-    return decode(str(path), read_regular_file(path, MOST_SOURCE_BYTES))
+    return plain_line_ends(read_exactly(path)[1])
+
+
+def read_exactly(path: str | Path) -> tuple[bytes, str, str]:
+    """A Python source file's bytes, its text with its own line ends, and its encoding. Raises as `read_source`."""
+    raw = read_regular_file(path, MOST_SOURCE_BYTES)
+    return raw, *exact_text(str(path), raw)
 
 
 def decode(path: str, raw: bytes) -> str:

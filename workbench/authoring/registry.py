@@ -21,7 +21,7 @@ from __future__ import annotations
 import functools
 import inspect
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -147,37 +147,31 @@ def registering(is_own: Callable[[str], bool], registrations: Registrations) -> 
         registrations.placed[name] = _take(name)
         return result
 
-    @functools.wraps(register_env)
-    def own_register_env(*args: Any, **kwargs: Any) -> Callable[[type], type]:
-        caller = _caller()
-        decorator = register_env(*args, **kwargs)
-        if not is_own(caller[0]):
-            return decorator
-        given = inspect.signature(register_env).bind(*args, **kwargs).arguments
-        name, override = given["uid"], bool(given.get("override"))
-        return lambda cls: noting(name, cls, override, caller, lambda: decorator(cls))
+    def own(
+        register: Callable[..., Any], name_of: Callable[[Any, Mapping[str, Any]], str]
+    ) -> Callable[..., Any]:
+        @functools.wraps(register)
+        def own_register(*args: Any, **kwargs: Any) -> Callable[[type], type]:
+            frame = sys._getframe(1)
+            caller = frame.f_code.co_filename, frame.f_lineno
+            decorator = register(*args, **kwargs)
+            if not is_own(caller[0]):
+                return decorator
+            given = inspect.signature(register).bind(*args, **kwargs).arguments
+            override = bool(given.get("override"))
+            return lambda cls: noting(name_of(cls, given), cls, override, caller, lambda: decorator(cls))
 
-    @functools.wraps(register_agent)
-    def own_register_agent(*args: Any, **kwargs: Any) -> Callable[[type], type]:
-        caller = _caller()
-        decorator = register_agent(*args, **kwargs)
-        if not is_own(caller[0]):
-            return decorator
-        override = bool(inspect.signature(register_agent).bind(*args, **kwargs).arguments.get("override"))
-        return lambda cls: noting(cls.uid, cls, override, caller, lambda: decorator(cls))
+        return own_register
 
-    env_registration.register_env = own_register_env
-    agents.register_agent = agent_registration.register_agent = own_register_agent
+    env_registration.register_env = own(register_env, lambda cls, given: given["uid"])
+    agents.register_agent = agent_registration.register_agent = own(
+        register_agent, lambda cls, given: cls.uid
+    )
     try:
         yield
     finally:
         env_registration.register_env = register_env
         agents.register_agent = agent_registration.register_agent = register_agent
-
-
-def _caller() -> tuple[str, int]:
-    frame = sys._getframe(2)
-    return frame.f_code.co_filename, frame.f_lineno
 
 
 def _take(name: str) -> Slot:

@@ -12,8 +12,9 @@ name is computed or the program looks at itself, `Symbol.dynamic` says so.
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import PurePath
 from typing import Literal
 
@@ -45,19 +46,33 @@ class Symbol:
     path: str
     name: str
     kind: Kind
-    line: int
-    text: str
-    """Equal in two versions exactly when the code is."""
-    nodes: tuple[ast.AST, ...]
+    parts: Sequence[ast.AST]
+    """What its text is of: of a class, not what is in it."""
+    nodes: Sequence[ast.AST]
     """What it is made of: a property with its setter is one symbol."""
-    mentions: frozenset[str]
-    """Names in it, of variables and attributes, and strings that could be names."""
     shorts: frozenset[str]
     """Names under which others may mention it."""
     owner: str | None = None
     """The class that it is a member of."""
-    dynamic: str | None = None
-    """Something in it that may reach what it does not name."""
+
+    @cached_property
+    def text(self) -> str:
+        """Equal in two versions exactly when the code is."""
+        return "\n".join([self.kind, *map(ast.dump, self.parts)])
+
+    @cached_property
+    def _mentions(self) -> tuple[frozenset[str], str | None]:
+        return _mentions(self.parts)
+
+    @property
+    def mentions(self) -> frozenset[str]:
+        """Names in it, of variables and attributes, and strings that could be names."""
+        return self._mentions[0]
+
+    @property
+    def dynamic(self) -> str | None:
+        """Something in it that may reach what it does not name."""
+        return self._mentions[1]
 
     @property
     def key(self) -> Key:
@@ -86,7 +101,7 @@ def _scope(path: str, body: list[ast.stmt], owner: str | None) -> Iterator[Symbo
             groups.setdefault(name, []).append(statement)
         elif not isinstance(statement, ast.Pass) and not _runs_as_script_only(statement):
             loose.append(statement)
-    taken = {name for statement in loose for name in bound_names(statement)}
+    taken = _bound(loose)
     for name, statements in list(groups.items()):
         several = len(statements) > 1 and not all(isinstance(s, ast.FunctionDef) for s in statements)
         if name in taken or several:
@@ -97,7 +112,7 @@ def _scope(path: str, body: list[ast.stmt], owner: str | None) -> Iterator[Symbo
         first = statements[0]
         if isinstance(first, ast.ClassDef) and owner is None:
             head = [*first.decorator_list, *first.bases, *first.keywords, *getattr(first, "type_params", [])]
-            yield _symbol(path, name, "class", first.lineno, head, {name}, None, (first,))
+            yield Symbol(path, name, "class", head, [first], frozenset({name}))
             yield from _scope(path, first.body, name)
         else:
             functions = isinstance(first, (ast.FunctionDef, ast.AsyncFunctionDef))
@@ -108,38 +123,14 @@ def _scope(path: str, body: list[ast.stmt], owner: str | None) -> Iterator[Symbo
                 if isinstance(first, (ast.Import, ast.ImportFrom))
                 else "value"
             )
-            bound = {short for statement in statements for short in bound_names(statement)}
-            yield _symbol(path, prefix + name, kind, first.lineno, statements, bound, owner)
+            yield Symbol(path, prefix + name, kind, statements, statements, _bound(statements), owner)
     if loose:
         loose.sort(key=lambda statement: statement.lineno)
-        bound = {name for statement in loose for name in bound_names(statement)}
-        yield _symbol(path, prefix + STATEMENTS, "statements", loose[0].lineno, loose, bound, owner)
+        yield Symbol(path, prefix + STATEMENTS, "statements", loose, loose, _bound(loose), owner)
 
 
-def _symbol(
-    path: str,
-    name: str,
-    kind: Kind,
-    line: int,
-    parts: Iterable[ast.AST],
-    shorts: set[str],
-    owner: str | None,
-    nodes: tuple[ast.AST, ...] | None = None,
-) -> Symbol:
-    parts = tuple(parts)
-    mentions, dynamic = _mentions(parts)
-    return Symbol(
-        path=path,
-        name=name,
-        kind=kind,
-        line=line,
-        text="\n".join([kind, *(ast.dump(part) for part in parts)]),
-        nodes=parts if nodes is None else nodes,
-        mentions=mentions,
-        shorts=frozenset(shorts),
-        owner=owner,
-        dynamic=dynamic,
-    )
+def _bound(statements: Iterable[ast.AST]) -> frozenset[str]:
+    return frozenset(name for statement in statements for name in bound_names(statement))
 
 
 def _defines(statement: ast.stmt, at_top: bool) -> str | None:

@@ -16,8 +16,8 @@ from hashlib import sha256
 from pathlib import Path
 
 from workbench.authoring.library_names import is_library, is_own_file
-from workbench.authoring.modules import MOST_SOURCE_BYTES, decode, module_name
-from workbench.machine.regular_file import read_regular_file
+from workbench.authoring.modules import module_name, read_exactly
+from workbench.authoring.source.text import plain_line_ends
 
 MOST_MODULES = 300
 _DYNAMIC = frozenset(
@@ -211,8 +211,8 @@ def source_hash(source: Mapping[str, str], folder: Path) -> str:
 def _read(path: Path) -> tuple[str, str]:
     """The text, and the sha256 of the bytes that it was read from."""
     try:
-        raw = read_regular_file(path, MOST_SOURCE_BYTES)
-        return decode(str(path), raw), sha256(raw).hexdigest()
+        raw, text, _ = read_exactly(path)
+        return plain_line_ends(text), sha256(raw).hexdigest()
     except SyntaxError as error:
         raise CannotRead(f"{path} is no Python text: {error.msg}") from error
     except OSError as error:

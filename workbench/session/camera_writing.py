@@ -19,11 +19,10 @@ from workbench.authoring.camera_source import Refusal, SourceEdit
 from workbench.authoring.camera_source.cameras import Run
 from workbench.authoring.camera_source.hooks import HOOK_OF
 from workbench.authoring.copy_task import NoCopy, copy_task
-from workbench.authoring.modules import MOST_SOURCE_BYTES, exact_text
+from workbench.authoring.modules import read_exactly
 from workbench.authoring.source.text import plain_line_ends
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.core.pictures import CameraInfo
-from workbench.machine.regular_file import read_regular_file
 from workbench.session.messages import TaskDescription
 from workbench.session.studio_view import Change, Wish, Writing, WritingStage
 
@@ -191,7 +190,7 @@ def _texts(task: TaskDescription) -> tuple[dict[str, str], str]:
     texts: dict[str, str] = {}
     for path in task.source_files:
         try:
-            texts[path], _ = exact_text(path, read_regular_file(path, MOST_SOURCE_BYTES))
+            texts[path] = read_exactly(path)[1]
         except OSError as error:
             return {}, f"{path} cannot be read: {error.strerror}"
         except SyntaxError as error:

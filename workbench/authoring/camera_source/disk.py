@@ -16,10 +16,9 @@ from pathlib import Path
 
 from workbench.authoring.camera_source.cameras import check_own
 from workbench.authoring.camera_source.result import FileChange, Refusal, SourceEdit
-from workbench.authoring.modules import MOST_SOURCE_BYTES, exact_text
+from workbench.authoring.modules import read_exactly
 from workbench.authoring.source.text import Refused
 from workbench.machine.atomic_files import replace_file
-from workbench.machine.regular_file import read_regular_file
 
 
 def apply(edit: SourceEdit) -> Refusal | None:
@@ -77,8 +76,7 @@ def _exchange(path: str, expected: str, wanted: str | None, since: str) -> Refus
         return Refusal(reason)
     real = Path(path).resolve()
     try:
-        raw = read_regular_file(real, MOST_SOURCE_BYTES)
-        text, encoding = exact_text(str(real), raw)
+        raw, text, encoding = read_exactly(real)
         if text != expected:
             return Refusal(f"{real.name} was edited {since}, so it is left as it is; ask again")
         if wanted is None:
