@@ -51,6 +51,17 @@ PROTECTED = {
     " authoring/camera_source/test_shapes.py",
     "authoring/source/read_values": "authoring/source/test_read_values.py authoring/camera_source/test_shapes.py"
     " authoring/camera_source/test_which_camera.py",
+    "authoring/source/changes": "authoring/camera_source/test_shapes.py authoring/camera_source/test_round_trip.py"
+    " authoring/camera_source/test_which_camera.py",
+    "authoring/source/trace": "authoring/camera_source/test_shapes.py authoring/camera_source/test_round_trip.py"
+    " authoring/camera_source/test_which_camera.py",
+    "authoring/source/rotations": "authoring/camera_source/test_rotations.py",
+    "authoring/camera_source/plan": "authoring/camera_source/test_which_camera.py"
+    " authoring/camera_source/test_round_trip.py authoring/camera_source/test_shapes.py",
+    "authoring/camera_source/run_hooks": "authoring/camera_source/test_which_camera.py"
+    " authoring/camera_source/test_members.py",
+    "authoring/copy_task": "authoring/test_copy_task.py",
+    "authoring/watch": "authoring/test_watch.py",
     "core/snapshot": "core/test_snapshot.py",
     "core/partial_reset": "core/test_partial_reset.py",
     "core/task_env": "core/test_task_env.py",
