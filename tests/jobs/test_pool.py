@@ -192,10 +192,11 @@ def test_who_does_not_want_to_wait_ends_processes_that_hang(tmp_path: Path) -> N
     until(lambda: not any(map(psutil.pid_exists, pids)), "their end")
 
 
+@pytest.mark.parametrize("how", ["hangs", "half a message"])
 def test_a_process_that_does_not_stop_is_not_waited_for_for_ever(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    how: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("workbench.jobs.pool._END_SECONDS", 0.2)
-    run = Run([Setup("hangs", 0, folder=tmp_path)], range(8), stop=lambda: (tmp_path / "hangs").exists())
+    run = Run([Setup(how, 0, folder=tmp_path)], range(8), stop=lambda: (tmp_path / "hangs").exists())
     with pytest.raises(PoolError, match="that squares did not end in time"):
         run.by(Processes())

@@ -74,7 +74,9 @@ def go_wrong(setup: Setup, share: Share) -> None:
         share.tell(setup.at, {"number": setup.at, "square": 1.0, "path": "text", "pid": 1})
     elif setup.how == "another's":
         share.tell(10**6, Squared(0, 0, Path(), 0))
-    elif setup.how == "hangs":
+    elif setup.how in ("hangs", "half a message"):
+        if setup.how != "hangs":
+            os.write(int(sys.argv[2]), b"\x00\x00\x00\x10hel")
         (setup.folder / "hangs").touch()
         while True:
             time.sleep(0.01)

@@ -19,7 +19,6 @@ from workbench.recording.lerobot_frames import Choice, frames_of
 from workbench.recording.lerobot_read import is_lerobot, lerobot_rows, read_lerobot
 from workbench.recording.library import Library, LibraryError
 from workbench.recording.read_episode import UnreadableRecording, read_episode
-from workbench.session.review_rows import read_row
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -209,7 +208,7 @@ def test_a_dataset_is_in_the_library_an_episode_a_row(
         assert (first.name, first.kind, first.success) == ("sets/push#0", "lerobot", False)
         assert (second.success, second.length, second.seed) == (True, episode.length, episode.info.seed)
         assert second.problem is None
-        np.testing.assert_array_equal(read_row(second).action, episode.action)
+        np.testing.assert_array_equal(second.source.read().action, episode.action)
         with pytest.raises(LibraryError, match="delete the folder"):
             library.delete([first.id, second.id])
         assert is_lerobot(tmp_path / "sets" / "push")

@@ -18,7 +18,8 @@ from typing import Any, get_args
 
 from tests.ui.scenes import description, step_of, table_scene
 from workbench.authoring.problem import Interrupted
-from workbench.session.calls import Answer, Call
+from workbench.jobs.wire import Call, Unpacker, pack_message
+from workbench.session.calls import Answer
 from workbench.session.camera_messages import RunCameras
 from workbench.session.interrupts import INTERRUPT_SIGNAL, Interrupts
 from workbench.session.messages import (
@@ -32,7 +33,6 @@ from workbench.session.messages import (
 )
 from workbench.session.pulse import PulseWriter
 from workbench.session.server_line import QUESTIONS
-from workbench.session.wire import Unpacker, pack_message
 from workbench.session.worker_start import main
 
 

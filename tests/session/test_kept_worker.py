@@ -15,8 +15,8 @@ from typing import Any
 
 import pytest
 
+from workbench.jobs.wire import Call
 from workbench.session import kept_worker, process
-from workbench.session.calls import Call
 from workbench.session.camera_messages import RunCameras
 from workbench.session.kept_worker import Death, KeptWorker, WorkerOptions
 from workbench.session.last_words import Busy

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from workbench.core.scene_index import read_poses, scene_index
 from workbench.recording.episode import Episode
 from workbench.recording.read_episode import read_maniskill
+from workbench.session.lane import Stopped
 from workbench.session.recorded_scene import SceneError, SceneProcess
 
 pytestmark = pytest.mark.usefixtures("child_process")
@@ -46,14 +48,17 @@ def recorded(
 
 
 def make(episodes: dict[int, Episode], files: tuple[Path, ...] = (), stop: bool = False) -> dict[int, Any]:
-    ended: dict[int, Any] = {}
     said: list[str] = []
-    SceneProcess(files)(
-        episodes,
-        lambda: stop,
-        lambda _, words: said.append(words),
-        lambda key, made, _: ended.update({key: made}),
-    )
+
+    def check() -> None:
+        if stop:
+            raise Stopped
+
+    made = SceneProcess(files)([*episodes.values()], check, lambda _, words: said.append(words))
+    ended: dict[int, Any] = {}
+    with suppress(Stopped):
+        for key, scene in zip(episodes, made, strict=True):
+            ended[key] = scene if isinstance(scene, SceneError) else scene[0]
     assert said
     return ended
 

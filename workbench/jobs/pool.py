@@ -17,12 +17,11 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
-from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
 
-import msgspec
-
 from workbench.authoring.problem import Problem, TaskError, nobody_presses_ctrl_c
+from workbench.jobs.message_reader import MessageReader
+from workbench.jobs.wire import Unpacker, Unreadable, pack, pack_message
 from workbench.machine.breakpoints import ONE_PROCESS, refuse_breakpoints
 from workbench.machine.child_python import child_environment, python_command
 from workbench.machine.family import describe_exit, end_family
@@ -33,8 +32,6 @@ _LOOK_SECONDS = 0.1
 _END_SECONDS = 120.0
 """In which a process that was told to stop must have finished what is over."""
 _EXIT_SECONDS = 10.0
-_MOST_BYTES = 1 << 26
-"""Of one message."""
 _NO_LIMIT = sys.maxsize
 
 Setup = TypeVar("Setup")
@@ -118,7 +115,7 @@ class Work(Generic[Setup, Result, News]):
     """Its first argument, one for each process; can be pickled."""
     result: Any
     news: Any
-    """Types of what it tells and says: plain data as msgspec encodes it. Another process's words are held against them."""
+    """Types of what it tells and says, as `wire` packs it. Another process's words are held against them."""
     name: str
     """As in "a process *that records* was killed by SIGKILL"."""
 
@@ -171,57 +168,31 @@ def shares(count: int, processes: int) -> list[int]:
 # --- what is said between the processes ----------------------------------------------------------------
 
 
-class _Said(msgspec.Struct, tag=True, array_like=True):
-    pass
-
-
-class _Next(_Said):
+@dataclass(frozen=True)
+class _Next:
     """More items, please."""
 
 
-class _Result(_Said):
+@dataclass(frozen=True)
+class _Result:
     number: int
-    result: msgspec.Raw
+    result: bytes
 
 
-class _News(_Said):
-    news: msgspec.Raw
+@dataclass(frozen=True)
+class _News:
+    news: bytes
 
 
-class _Failed(_Said):
+@dataclass(frozen=True)
+class _Failed:
     why: str
     problem: Problem | None
 
 
-class _Over(_Said):
+@dataclass(frozen=True)
+class _Over:
     """Nothing is under way any more, and nothing comes after this."""
-
-
-_encoder = msgspec.msgpack.Encoder(enc_hook=os.fsencode)
-_decode_said = msgspec.msgpack.Decoder(_Next | _Result | _News | _Failed | _Over).decode
-
-
-def _encode(value: Any) -> bytes:
-    try:
-        return _encoder.encode(value)
-    except UnicodeEncodeError:
-        plain = msgspec.to_builtins(value, builtin_types=(bytes,), enc_hook=os.fsencode)
-        return _encoder.encode(_as_utf8(plain))
-
-
-def _as_utf8(value: Any) -> Any:
-    """The same with `\\udcff` spelt out, as a name of a file that is no UTF-8 has it: an error may quote one."""
-    if isinstance(value, str):
-        return value.encode("utf-8", "backslashreplace").decode()
-    if isinstance(value, dict):
-        return {_as_utf8(key): _as_utf8(entry) for key, entry in value.items()}
-    return [_as_utf8(entry) for entry in value] if isinstance(value, list) else value
-
-
-def _path(kind: type, value: Any) -> Any:
-    if kind is Path and isinstance(value, bytes):
-        return Path(os.fsdecode(value))
-    raise ValueError(f"{value!r:.100} is no {kind.__name__}")
 
 
 class _Pool:
@@ -229,8 +200,8 @@ class _Pool:
 
     def __init__(self, work: Work, deal: Deal, chunk: int) -> None:
         self._work, self._deal, self._chunk = work, deal, chunk
-        self._result = msgspec.msgpack.Decoder(work.result, dec_hook=_path).decode
-        self._news = msgspec.msgpack.Decoder(work.news, dec_hook=_path).decode
+        self._unpack = Unpacker().unpack
+        self._readers: dict[Connection, MessageReader] = {}
         self._processes: dict[Connection, subprocess.Popen[bytes]] = {}
         self._busy: list[Connection] = []
         self._begun: dict[Connection, set[int]] = {}
@@ -252,6 +223,9 @@ class _Pool:
                 )
             self._busy.append(connection)
             self._begun[connection] = set()
+            self._readers[connection] = MessageReader(
+                connection.fileno(), (_Next, _Result, _News, _Failed, _Over)
+            )
             self._send(connection, cores[i :: len(self._work.setups)] or cores)
             self._send(connection, (self._work.run, setup))
 
@@ -288,39 +262,37 @@ class _Pool:
             connection.close()
 
     def _hear(self, connection: Connection) -> None:
-        """The next message. Raises TaskError or PoolError where it is the last one of a process that failed."""
-        said, value = self._receive(connection)
-        begun = self._begun[connection]
-        if isinstance(said, _Next):
-            numbers = [n for n in (self._deal.next() for _ in range(self._chunk)) if n is not None]
-            begun.update(numbers)
-            self._send(connection, numbers)
-        elif isinstance(said, _Result):
-            if said.number not in begun:
-                raise PoolError(f"a process {self._work.name} told of an item that it does not have")
-            begun.remove(said.number)
-            self._deal.tell(said.number, value)
-        elif isinstance(said, _News):
-            self._deal.say(value)
-        elif isinstance(said, _Failed):
-            raise PoolError(said.why) if said.problem is None else TaskError(said.problem)
-        elif min(begun, default=_NO_LIMIT) < self._deal.limit():
-            raise PoolError(f"a process {self._work.name} ended before it was done")
-        else:
-            self._busy.remove(connection)
+        """The next message, if it is all there. The author's code runs at the other end: it may write into any descriptor.
 
-    def _receive(self, connection: Connection) -> tuple[_Said, Any]:
-        """What a process says, and what belongs to it. The author's code runs there: it may write into any descriptor."""
+        Raises:
+            TaskError, PoolError: it is the last one of a process that failed.
+        """
+        begun = self._begun[connection]
         try:
-            said = _decode_said(connection.recv_bytes(_MOST_BYTES))
-            if isinstance(said, _Result):
-                return said, self._result(said.result)
-            return said, self._news(said.news) if isinstance(said, _News) else None
-        except (EOFError, ConnectionError):
+            said = self._readers[connection].receive(0)
+            if isinstance(said, _Next):
+                numbers = [n for n in (self._deal.next() for _ in range(self._chunk)) if n is not None]
+                begun.update(numbers)
+                self._send(connection, numbers)
+            elif isinstance(said, _Result):
+                result = self._unpack(said.result, self._work.result)
+                if said.number not in begun:
+                    raise PoolError(f"a process {self._work.name} told of an item that it does not have")
+                begun.remove(said.number)
+                self._deal.tell(said.number, result)
+            elif isinstance(said, _News):
+                self._deal.say(self._unpack(said.news, self._work.news))
+            elif isinstance(said, _Failed):
+                raise PoolError(said.why) if said.problem is None else TaskError(said.problem)
+            elif said is not None and min(begun, default=_NO_LIMIT) < self._deal.limit():
+                raise PoolError(f"a process {self._work.name} ended before it was done")
+            elif said is not None:
+                self._busy.remove(connection)
+        except Unreadable as error:
+            raise PoolError(f"a process {self._work.name} sent what cannot be read ({error})") from error
+        except EOFError:
             words = describe_exit(self._exit_code(connection, 2.0))
-        except (OSError, msgspec.MsgspecError) as error:
-            words = f"sent what cannot be read ({error})"
-        raise PoolError(f"a process {self._work.name} {words}")
+            raise PoolError(f"a process {self._work.name} {words}") from None
 
     def _exit_code(self, connection: Connection, patience: float) -> int | None:
         try:
@@ -363,10 +335,10 @@ class _FarShare:
         return self._limit
 
     def tell(self, number: int, result: Any) -> None:
-        self._send(_Result(number, msgspec.Raw(_encode(result))))
+        self._send(_Result(number, pack(result)))
 
     def say(self, news: Any) -> None:
-        self._send(_News(msgspec.Raw(_encode(news))))
+        self._send(_News(pack(news)))
 
     def over(self) -> None:
         self._send(_Over())
@@ -382,8 +354,8 @@ class _FarShare:
             self._limit = heard
         return heard
 
-    def _send(self, said: _Said) -> None:
-        self._connection.send_bytes(_encode(said))
+    def _send(self, said: object) -> None:
+        self._connection.send_bytes(pack_message(said))
 
 
 def main(socket_fd: str) -> None:

@@ -20,12 +20,12 @@ from itertools import count
 from typing import Any, TypeVar
 
 from workbench.core.camera_settings import CameraKey
+from workbench.jobs.wire import Call, Unpacker, Unreadable
 from workbench.machine.family import describe_exit
-from workbench.session.calls import Answer, Call, Cancel, Progress, Question, value_type
+from workbench.session.calls import Answer, Cancel, Progress, Question, value_type
 from workbench.session.lane import Job, JobFailed
 from workbench.session.messages import Load, PlaceCamera, Request
 from workbench.session.process import WorkerProcess
-from workbench.session.wire import Unpacker, Unreadable
 
 _LOOK = 0.05
 """Seconds between two looks at whether the job is to stop."""

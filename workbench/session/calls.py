@@ -19,14 +19,6 @@ class Question(Generic[Value]):
 
 
 @dataclass(frozen=True)
-class Call:
-    """Request to a worker: an `Answer` with this number comes back, after any count of `Progress`."""
-
-    number: int
-    request: Question[Any]
-
-
-@dataclass(frozen=True)
 class Cancel:
     """Request to a worker: nobody waits for what was asked before. What takes long ends early at any request."""
 

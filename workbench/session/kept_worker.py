@@ -18,6 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from workbench.authoring.problem import shorten
+from workbench.jobs.wire import Unreadable
 from workbench.machine.family import describe_exit
 from workbench.machine.watched_thread import say_failure
 from workbench.session.last_words import Busy, busy_at, fatal_error
@@ -34,7 +35,6 @@ from workbench.session.messages import (
 from workbench.session.process import Output, WorkerProcess
 from workbench.session.pulse import Beat, Doing
 from workbench.session.spare import SpareWorker
-from workbench.session.wire import Unreadable
 
 _LOOK = 0.1
 """Seconds between two looks at the worker."""

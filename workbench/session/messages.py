@@ -25,7 +25,8 @@ from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.core.recorded_run import RecordedRun
 from workbench.core.rules import Degree, Finding
 from workbench.core.step import StepResult
-from workbench.session.calls import Answer, Call, Cancel, Progress, Question
+from workbench.jobs.wire import Call
+from workbench.session.calls import Answer, Cancel, Progress, Question
 
 Backend = Literal["auto", "cpu", "gpu"]
 ActionSource = Literal["hold", "zero", "random", "sliders", "policy"]

@@ -26,13 +26,14 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import get_args
 
+from workbench.jobs.message_reader import MessageReader
+from workbench.jobs.wire import pack_message
 from workbench.machine.child_python import child_environment, python_command
 from workbench.machine.family import end_family
 from workbench.machine.process_tree import main_thread_ended
 from workbench.machine.watched_thread import say_failure
 from workbench.session.interrupts import INTERRUPT_SIGNAL, STACK_SIGNAL
 from workbench.session.memory_limit import FamilyMemory
-from workbench.session.message_reader import MessageReader
 from workbench.session.messages import (
     Event,
     Load,
@@ -43,7 +44,6 @@ from workbench.session.messages import (
     is_a_step,
 )
 from workbench.session.pulse import Beat, PulseReader, make_pulse
-from workbench.session.wire import pack_message
 
 _WHOLE = (Load, Settings)
 """Of two of one kind that wait one behind the other only the second matters."""
@@ -102,7 +102,7 @@ class WorkerProcess:
             theirs.close()
             os.close(pulse)
         self._socket, self._connection = ours, Connection(os.dup(ours.fileno()))
-        self._reader = MessageReader(ours, get_args(Event))
+        self._reader = MessageReader(ours.fileno(), get_args(Event))
         self._memory = FamilyMemory(self._process.pid)
         self._output = output
         self._waiting: deque[Request] = deque()

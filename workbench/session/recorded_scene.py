@@ -10,7 +10,7 @@ The process lives as long as there is something to make in one go: several episo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from workbench.core.env_kwargs import HOW_IT_IS_RUN
 from workbench.recording.episode import Episode
 from workbench.session.askers import Background, OnProgress
 from workbench.session.clearance import files_named
-from workbench.session.lane import JobFailed, Stopped
+from workbench.session.lane import JobFailed
 from workbench.session.make_scene import MakeScene, SceneMade
 
 _NOT_PASSED_ON = HOW_IT_IS_RUN | {
@@ -45,39 +45,27 @@ class SceneProcess:
         self._files = tuple(str(Path(file).absolute()) for file in files)
 
     def __call__(
-        self,
-        episodes: Mapping[int, Episode],
-        stop: Callable[[], bool],
-        on_progress: Callable[[int, str], None],
-        on_end: Callable[[int, Episode | SceneError, tuple[str, ...]], None],
-    ) -> None:
-        """Make the scenes of these, one after the other. Returns when all have one, or an error, or on `stop`.
+        self, episodes: Sequence[Episode], check: Callable[[], None], say: Callable[[int, str], None]
+    ) -> Iterator[tuple[Episode, tuple[str, ...]] | SceneError]:
+        """Make the scenes of these, one after the other: each episode with its scene and what could not be put back, or
+        why there is none.
 
         Args:
-            stop: asked a few times a second.
-            on_progress: called with the key of an episode and what is being done for it.
-            on_end: called with its key, and the episode with a scene and what could not be put back, or why there is
-                none.
+            check: called a few times a second; what it raises ends it.
+            say: called with the place of an episode among `episodes` and what is being done for it.
         """
         process = Background(niceness=0)
-
-        def check() -> None:
-            if stop():
-                raise Stopped
-
         try:
-            for key, episode in episodes.items():
-                on_progress(key, "making its scene")
+            for number, episode in enumerate(episodes):
+                say(number, "making its scene")
                 try:
                     made = self._one(
-                        process, episode, check, lambda done, total, words, k=key: on_progress(k, words)
+                        process, episode, check, lambda done, total, words, number=number: say(number, words)
                     )
                 except SceneError as error:
-                    on_end(key, error, ())
-                    continue
-                on_end(key, replace(episode, geometry=made.geometry, poses=made.poses), made.missed)
-        except Stopped:
-            return
+                    yield error
+                else:
+                    yield replace(episode, geometry=made.geometry, poses=made.poses), made.missed
         finally:
             process.end()
 

@@ -26,20 +26,14 @@ from workbench.core.shared_shapes import SharedShapes
 from workbench.machine.process_tree import allocated_memory
 from workbench.machine.watched_thread import say_failure
 from workbench.recording.episode import Episode
+from workbench.recording.library import Library
+from workbench.recording.library_row import LibraryRow
 from workbench.recording.unreadable import UnreadableRecording
+from workbench.session.lane import Stopped
 from workbench.session.memory_limit import in_words, total_memory
 from workbench.session.recorded_scene import SceneError, SceneProcess
 from workbench.session.review_events import happenings
-from workbench.session.review_rows import (
-    Row,
-    Rows,
-    Stamp,
-    not_as_read,
-    opening_words,
-    read_row,
-    shared,
-    stamps_of,
-)
+from workbench.session.review_rows import Stamp, not_as_read, opening_words, shared, stamps_of
 from workbench.session.review_view import START, Opened, ReviewView
 
 log = logging.getLogger(__name__)
@@ -71,8 +65,8 @@ class Review:
 
     def __init__(
         self,
-        library: Rows,
-        read: Callable[[Row, SharedShapes], Episode] = read_row,
+        library: Library,
+        read: Callable[[LibraryRow, SharedShapes], Episode] | None = None,
         make_scene: SceneProcess | None = None,
         clock: Callable[[], float] = time.monotonic,
         most_bytes: int | None = None,
@@ -81,14 +75,16 @@ class Review:
         """
         Args:
             library: knows recordings by their ids.
-            read: reads the recording of a row, with shapes of others; raises OSError or UnreadableRecording with a sentence.
+            read: reads the recording of a row, with shapes of others; raises OSError or UnreadableRecording with a
+                sentence. None for `Source.read`.
             make_scene: for recordings without a scene; None leaves them without.
             clock: seconds.
             most_bytes: of memory that the recordings which are opened at once may take; None for `MEMORY_SHARE`.
             memory: bytes that the process has filled.
         """
         self._most_bytes = int(MEMORY_SHARE * total_memory()) if most_bytes is None else most_bytes
-        self._library, self._read, self._make_scene, self._clock = library, read, make_scene, clock
+        self._library, self._make_scene, self._clock = library, make_scene, clock
+        self._read = read or (lambda row, shapes: row.source.read(shapes, library.folder))
         self._memory = memory
         self._changed = threading.Condition()
         self._view = ReviewView()
@@ -195,7 +191,7 @@ class Review:
         if thread is not None:
             thread.join(timeout=10.0)
 
-    def _open(self, number: int, rows: list[Row], said: list[str], state: int | None) -> None:
+    def _open(self, number: int, rows: list[LibraryRow], said: list[str], state: int | None) -> None:
         opened: list[Opened] = []
         shapes = SharedShapes()
         files: dict[Path, Stamp] = {}
@@ -256,40 +252,46 @@ class Review:
                 self._seek(state)
 
     def _give_scenes(self, number: int, without: Sequence[Opened], shapes: SharedShapes) -> None:
-        def say(index: int, words: str, making: bool = True) -> None:
-            one = without[index]
+        def say(one: Opened, words: str, making: bool = True) -> None:
             self._replace_opened(number, one.id, lambda now: replace(now, scene=words, making=making))
 
-        def end(index: int, made: Episode | SceneError, missed: tuple[str, ...]) -> None:
-            if isinstance(made, SceneError):
-                say(index, str(made), False)
-                return
-            made = shared(made, shapes)
-            words = f"Not put back: {'; '.join(missed)}." if missed else ""
-            self._replace_opened(
-                number, without[index].id, lambda now: replace(now, episode=made, scene=words, making=False)
-            )
+        def check() -> None:
+            if number != self._opening or all(one.id in self._closed for one in without):
+                raise Stopped
 
-        def stop() -> bool:
-            return number != self._opening or all(one.id in self._closed for one in without)
-
-        wanted = {index: one.episode for index, one in enumerate(without) if one.episode.env_states}
-        for index in range(len(without)):
-            if index not in wanted or self._make_scene is None:
-                say(index, "This recording holds no scene to draw.", False)
+        make = self._make_scene
+        wanted = [] if make is None else [one for one in without if one.episode.env_states]
+        for one in without:
+            if one in wanted:
+                say(one, "its scene is made next")
             else:
-                say(index, "its scene is made next")
-        if wanted and self._make_scene is not None:
-            try:
-                self._make_scene(wanted, stop, say, end)
-            except OSError as error:
-                for index in wanted:
-                    say(index, f"The process that makes its scene could not be started: {error}.", False)
-            except Exception as error:
-                # What that process sent may fit nothing; a page that stays on "making" says nothing.
-                say_failure("Scenes of recordings could not be made", error)
-                for index in wanted:
-                    say(index, f"Its scene could not be made ({type(error).__name__}: {error}).", False)
+                say(one, "This recording holds no scene to draw.", False)
+        if make is None or not wanted:
+            return
+        scenes = make([one.episode for one in wanted], check, lambda index, words: say(wanted[index], words))
+        try:
+            for one, made in zip(wanted, scenes, strict=True):
+                if isinstance(made, SceneError):
+                    say(one, str(made), False)
+                    continue
+                episode, words = (
+                    shared(made[0], shapes),
+                    f"Not put back: {'; '.join(made[1])}." if made[1] else "",
+                )
+                self._replace_opened(
+                    number,
+                    one.id,
+                    lambda now, episode=episode, words=words: replace(
+                        now, episode=episode, scene=words, making=False
+                    ),
+                )
+        except Stopped:
+            return
+        except Exception as error:
+            # What that process sent may fit nothing; a page that stays on "making" says nothing.
+            say_failure("Scenes of recordings could not be made", error)
+            for one in wanted:
+                say(one, f"Its scene could not be made ({type(error).__name__}: {error}).", False)
 
     def _replace_opened(self, number: int, id: str, change: Callable[[Opened], Opened]) -> None:
         with self._changed:

@@ -1,42 +1,17 @@
-"""What a review needs of the library's rows: the recording behind one, and whether its files are still what was read.
+"""Whether the files of opened recordings are still what was read.
 
-A row is of any kind of recording that the library knows, and each kind is read by a reader of its own; whoever looks
-at recordings side by side need not know which is which. What was read stays in memory, so a file that is deleted or
-written anew later takes nothing away. It only has to be said.
+What was read stays in memory, so a file that is deleted or written anew later takes nothing away. It only has to be said.
 """
 
 from __future__ import annotations
 
-import datetime
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
 
 from workbench.core.shared_shapes import SharedShapes
 from workbench.recording.episode import Episode
-from workbench.recording.sources import Source
-
-
-class Row(Protocol):
-    """What is asked of a row of the library."""
-
-    @property
-    def id(self) -> str: ...
-    @property
-    def name(self) -> str: ...
-    @property
-    def paths(self) -> tuple[Path, ...]: ...
-    @property
-    def source(self) -> Source: ...
-    @property
-    def date(self) -> datetime.datetime | None: ...
-
-
-class Rows(Protocol):
-    """What is asked of the library."""
-
-    def rows(self) -> Sequence[Row]: ...
+from workbench.recording.library_row import LibraryRow
 
 
 @dataclass(frozen=True)
@@ -49,17 +24,12 @@ class Stamp:
     """Size and time of change then; None if it was not there."""
 
 
-def read_row(row: Row, shapes: SharedShapes | None = None, folder: Path | None = None) -> Episode:
-    """The recording of a row, with those shapes where it looks the same; `folder` is the library's. Raises as `read_recording`."""
-    return row.source.read(shapes, folder)
-
-
 def shared(episode: Episode, shapes: SharedShapes) -> Episode:
     """The same recording, with shapes of others where they look the same."""
     return episode if episode.geometry is None else replace(episode, geometry=shapes.share(episode.geometry))
 
 
-def stamps_of(row: Row) -> dict[Path, Stamp]:
+def stamps_of(row: LibraryRow) -> dict[Path, Stamp]:
     """Its files as they are now."""
     return {path: Stamp(row.name, _size_and_time(path)) for path in row.paths}
 
@@ -78,7 +48,7 @@ def not_as_read(files: Mapping[Path, Stamp]) -> list[str]:
     return said
 
 
-def opening_words(rows: Sequence[Row], done: int) -> str:
+def opening_words(rows: Sequence[LibraryRow], done: int) -> str:
     """What is being opened, and how far that is."""
     name = rows[done].name
     return f"opening {name}" if len(rows) == 1 else f"opening {done + 1} of {len(rows)}: {name}"

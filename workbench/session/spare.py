@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import time
 
-from workbench.session.calls import Answer, Call
+from workbench.jobs.wire import Call
+from workbench.session.calls import Answer
 from workbench.session.messages import WarmUp
 from workbench.session.process import WorkerProcess
 

@@ -31,9 +31,10 @@ from workbench.authoring.reference import named_file
 from workbench.core.camera_configs import note_camera_sites
 from workbench.core.inspect_env import inspect_env
 from workbench.core.step import StepResult
+from workbench.jobs.wire import Call, pack
 from workbench.machine.current_folder import CurrentFolder
 from workbench.session.acting import Acting
-from workbench.session.calls import Answer, Call, Cancel, CannotAnswer, Progress, Question
+from workbench.session.calls import Answer, Cancel, CannotAnswer, Progress, Question
 from workbench.session.camera_messages import CameraQuestion, RunCameras
 from workbench.session.debugger import CannotDebug, listen_for_debugger, wait_for_debugger
 from workbench.session.go_back import go_back, going_back
@@ -77,7 +78,6 @@ from workbench.session.server_line import ServerLine
 from workbench.session.step_back_run import going_there, step_back
 from workbench.session.step_events import StepEvents
 from workbench.session.warm_up import warm_up
-from workbench.session.wire import pack
 from workbench.session.worker_cameras import WorkerCameras
 
 _STATUS_PERIOD = 0.25

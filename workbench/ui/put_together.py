@@ -7,7 +7,6 @@ live env.
 
 from __future__ import annotations
 
-import functools
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,7 +20,6 @@ from workbench.recording.mend import mend
 from workbench.session.record_live import recovered_in_words
 from workbench.session.recorded_scene import SceneProcess
 from workbench.session.review import Review
-from workbench.session.review_rows import read_row
 from workbench.ui.commands import Command
 from workbench.ui.pages import Pages
 from workbench.ui.review_page import ReviewOffers, ReviewPage
@@ -88,8 +86,8 @@ class Workplace:
             if self._shelf is None:
                 library = Library(self._recordings)
                 library.watch()
-                read = functools.partial(read_row, folder=library.folder)
-                self._shelf = Shelf(library, Review(library, read, SceneProcess(self._tasks, self._imports)))
+                scenes = SceneProcess(self._tasks, self._imports)
+                self._shelf = Shelf(library, Review(library, make_scene=scenes))
                 if self.session is None:
                     # A live env's recorder has done it, and is writing.
                     self._mending = threading.Thread(

@@ -13,15 +13,15 @@ from typing import get_args
 import pytest
 
 from tests.drive.waiting import until
-from workbench.session.message_reader import MOST_BYTES, MessageReader
+from workbench.jobs.message_reader import MOST_BYTES, MessageReader
+from workbench.jobs.wire import Unreadable, pack, pack_message
 from workbench.session.messages import Event, Loading
-from workbench.session.wire import Unreadable, pack, pack_message
 
 
 class Line:
     def __init__(self) -> None:
         self.ours, self.theirs = socket.socketpair()
-        self.reader = MessageReader(self.ours, get_args(Event))
+        self.reader = MessageReader(self.ours.fileno(), get_args(Event))
 
     def close(self) -> None:
         self.ours.close()

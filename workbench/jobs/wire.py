@@ -1,4 +1,4 @@
-"""Messages between the server and a worker as bytes: msgpack that is read by the types of the messages, never a pickle.
+"""Messages between processes as bytes: msgpack that is read by the types of the messages, never a pickle.
 
 The author's code runs in the worker and may write whatever it likes into its line, so what comes is data of the kinds
 that are awaited, or `Unreadable`. Arrays stand behind the message, one after the other; in the message is what they are.
@@ -12,15 +12,15 @@ from __future__ import annotations
 
 import functools
 import math
+import os
 import struct
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_origin
 
 import msgspec
 import numpy as np
-
-from workbench.session.calls import Call
 
 _LENGTH = struct.Struct("!I")
 _ARRAY, _AGAIN = 1, 2
@@ -34,6 +34,15 @@ _Head = tuple[str, int | None, msgspec.Raw]
 
 class Unreadable(EOFError):
     """What came is no message. Nothing that follows can be read, so the line is at its end; the text says why."""
+
+
+@dataclass(frozen=True)
+class Call:
+    """Request to a worker: an `Answer` with this number comes back, after any count of `Progress`."""
+
+    number: int
+    request: Any
+    """A `session.calls.Question`."""
 
 
 def pack(value: object) -> bytes:
@@ -148,7 +157,7 @@ class _Written:
         if isinstance(value, np.generic):
             return value.item()
         if isinstance(value, Path):
-            return str(value)
+            return os.fsencode(value)
         if isinstance(value, Mapping):
             return dict(value)
         raise TypeError(f"a {type(value).__name__} cannot be sent")
@@ -201,8 +210,8 @@ def _checked(kind: Any, value: Any) -> Any:
     """A value of a type that is not msgpack's own."""
     if (get_origin(kind) or kind) is np.ndarray and isinstance(value, np.ndarray):
         return value
-    if kind is Path and isinstance(value, str):
-        return Path(value)
+    if kind is Path and isinstance(value, bytes):
+        return Path(os.fsdecode(value))
     raise ValueError(f"a {type(value).__name__} in place of a {getattr(kind, '__name__', kind)}")
 
 

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import os
 import select
-import socket
 import struct
 import time
 from collections.abc import Sequence
 from typing import Any
 
-from workbench.session.wire import Unpacker, Unreadable
+from workbench.jobs.wire import Unpacker, Unreadable
 
 MOST_BYTES = 1 << 30
 """Of one message. The largest of a healthy task are its meshes and the pictures of all envs: some 100 MB."""
@@ -27,13 +26,13 @@ _SHORT, _LONG = struct.Struct("!i"), struct.Struct("!Q")
 class MessageReader:
     """The messages that come in on one socket. Used on one thread."""
 
-    def __init__(self, connection: socket.socket, kinds: Sequence[type]) -> None:
+    def __init__(self, fd: int, kinds: Sequence[type]) -> None:
         """
         Args:
-            connection: read from here only; it may be written to elsewhere.
+            fd: of the socket, read from here only; it may be written to elsewhere.
             kinds: what may come.
         """
-        self._fd, self._unpacker = connection.fileno(), Unpacker(kinds)
+        self._fd, self._unpacker = fd, Unpacker(kinds)
         self._poll = select.poll()  # not select(): a server with many pages has descriptors beyond 1024
         self._poll.register(self._fd, select.POLLIN)
         self._head = bytearray()

@@ -19,12 +19,12 @@ from msgspec import inspect
 from tests.ui.scenes import camera, description, step_of, table_scene
 from workbench.core.inspection import Inspection
 from workbench.core.rules import Finding
+from workbench.jobs.wire import Call, Unpacker, Unreadable, pack, pack_message
 from workbench.recording.sources import Source
-from workbench.session.calls import Answer, Call, value_type
+from workbench.session.calls import Answer, value_type
 from workbench.session.messages import Event, Failed, Load, Loaded, Loading, Status, Stepped, TaskOptions
 from workbench.session.rescore_messages import Rescore
 from workbench.session.server_line import QUESTIONS
-from workbench.session.wire import Unpacker, Unreadable, pack, pack_message
 
 EVENTS: tuple[type, ...] = get_args(Event)
 WHATEVER = st.recursive(
@@ -98,7 +98,7 @@ def of_schema(draw: st.DrawFn, kind: inspect.Type, wrong: float) -> Any:
         case inspect.EnumType():
             return draw(st.sampled_from([one.value for one in kind.cls]))
         case inspect.CustomType():
-            return draw(st.text(max_size=5)) if kind.cls is Path else draw(ARRAYS)
+            return draw(st.binary(max_size=5)) if kind.cls is Path else draw(ARRAYS)
         case inspect.IntType():
             return draw(st.integers(-(2**31), 2**31))
         case inspect.FloatType():
