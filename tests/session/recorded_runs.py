@@ -12,7 +12,8 @@ from workbench.core.recorded_run import RecordedRun
 from workbench.core.recorded_state import read_states
 from workbench.core.step import StepResult
 from workbench.session.messages import TaskOptions
-from workbench.session.open_task import OpenedTask, open_task, reset_checked, step_checked
+from workbench.session.open_task import OpenedTask, reset_checked, step_checked
+from workbench.session.reload import open_task
 
 States = dict[str, np.ndarray]
 

@@ -9,8 +9,7 @@ import pytest
 from tests.drive.session import TASKS
 from workbench.authoring.problem import TaskError
 from workbench.session.messages import Load, TaskOptions
-from workbench.session.open_task import open_task
-from workbench.session.reload import Running, load_version
+from workbench.session.reload import Running, load_version, open_task
 
 KWARGS = {"render_backend": "none"}
 FOR_ONE = "        lifted = float(self.cube.pose.p[:, 2]) > 0.1\n"

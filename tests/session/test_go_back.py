@@ -16,7 +16,7 @@ from workbench.core import actions
 from workbench.core.snapshot import Snapshot
 from workbench.session import go_back
 from workbench.session.messages import Restore, TaskOptions, WayBack
-from workbench.session.open_task import Clock, OpenedTask, build_task, reset_checked, step_checked
+from workbench.session.open_task import OpenedTask, Opening, build_task, reset_checked, step_checked
 
 N = 3
 T = 12
@@ -72,7 +72,7 @@ class Lived:
 def lived() -> Iterator[Lived]:
     options = TaskOptions(num_envs=N, env_kwargs={"obs_mode": "state", "render_backend": "none"})
     opened = build_task(
-        load_task("MS-HumanoidStand-v1"), options, Clock(), lambda activity: None, lambda finding: None, True
+        load_task("MS-HumanoidStand-v1"), options, Opening(on_finding=lambda finding: None, begins_anew=True)
     )
     yield Lived(opened)
     opened.env.close()

@@ -25,8 +25,8 @@ from workbench.core.step import StepResult
 from workbench.core.take_pictures import take_pictures
 from workbench.core.task_env import TaskEnv
 from workbench.session.messages import Load, LoadLevel, ReloadReport, TaskOptions
-from workbench.session.open_task import OpenedTask, open_task, step_checked
-from workbench.session.reload import Running, load_version
+from workbench.session.open_task import OpenedTask, step_checked
+from workbench.session.reload import Running, load_version, open_task
 
 pytestmark = pytest.mark.usefixtures("renderer")
 

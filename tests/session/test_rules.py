@@ -19,9 +19,9 @@ from workbench.core.actions import hold_action
 from workbench.core.rules import Finding
 from workbench.recording.read_episode import read_episode
 from workbench.session.messages import Event, Load, RulesBroken, TaskOptions
-from workbench.session.open_task import OpenedTask, open_task, reset_checked, step_checked
+from workbench.session.open_task import OpenedTask, Opening, reset_checked, step_checked
 from workbench.session.record import RecordOptions, record
-from workbench.session.reload import Running, load_version
+from workbench.session.reload import Running, load_version, open_task
 from workbench.session.session import Session
 
 TASK = """
@@ -241,7 +241,8 @@ class Desk:
     def save(self, body: str) -> str:
         self.file.write_text(TASK.format(body=body))
         request = Load(str(self.file), self._options)
-        opened, report = load_version(request, self._running, on_finding=lambda finding: None)
+        quiet = Opening(on_finding=lambda finding: None, begins_anew=True)
+        opened, report = load_version(request, self._running, quiet)
         if self._running is not None and opened.env.env is not self.opened.env.env:
             self.opened.env.close()
         self._running = Running(request, opened, opened.first)

@@ -11,8 +11,7 @@ import pytest
 from tests.drive.session import TASKS, wait_until
 from workbench.authoring.problem import TaskError
 from workbench.session.messages import Load, TaskOptions
-from workbench.session.open_task import open_task
-from workbench.session.reload import load_version
+from workbench.session.reload import load_version, open_task
 from workbench.session.session import Session
 
 OPTIONS = TaskOptions(num_envs=2, env_kwargs={"render_backend": "none"})

@@ -12,12 +12,12 @@ import linecache
 import time
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from workbench.authoring import registry
-from workbench.authoring.load import LoadedTask, import_modules, load_task, take_back, with_late_imports
+from workbench.authoring.load import LoadedTask, take_back, with_late_imports
 from workbench.authoring.problem import (
     MESSAGE_LIMIT,
     Interrupted,
@@ -27,7 +27,6 @@ from workbench.authoring.problem import (
     problem_from_exception,
     shorten,
 )
-from workbench.authoring.reference import TaskName
 from workbench.authoring.returns import check_step_returns, problem_from_return
 from workbench.core import actions
 from workbench.core.assets import MissingAssets
@@ -57,37 +56,30 @@ class OpenedTask:
     """Wall time of each part: import, build, reset, rehearse, geometry."""
 
 
-def open_task(
-    reference: TaskName,
-    options: TaskOptions,
-    *,
-    on_activity: Callable[[str], None] = lambda activity: None,
-    on_finding: Callable[[Finding], None] = warn_of,
-) -> OpenedTask:
-    """Import, build, rehearse and reset a task.
+class Clock:
+    """Wall time of the parts of a load, in milliseconds."""
 
-    Args:
-        on_finding: called with each place where it breaks a rule that does not stop it, the first time.
+    def __init__(self) -> None:
+        self._last = time.perf_counter()
+        self.laps: dict[str, float] = {}
 
-    Raises:
-        TaskError: with the author's file and line; nothing of the task stays behind.
-    """
-    clock = Clock()
-    on_activity(f"importing {str(reference).rsplit('/', 1)[-1]}")
-    import_modules(options.imports)
-    loaded = load_task(reference)
-    clock.lap("import")
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.laps[name] = self.laps.get(name, 0.0) + 1000 * (now - self._last)
+        self._last = now
 
-    try:
-        return build_task(loaded, options, clock, on_activity, on_finding)
-    except TaskError as error:
-        take_back(loaded)
-        raise with_advice(error, loaded, options, lambda: load_task(reference)) from error.__cause__
-    except BaseException:
-        # The class imported and cannot be used: without this the last good version would go on with
-        # the new version's helper modules and registrations behind its back.
-        take_back(loaded)
-        raise
+
+@dataclass(frozen=True)
+class Opening:
+    """How a task is opened."""
+
+    on_activity: Callable[[str], None] = lambda activity: None
+    """Called with what is done next."""
+    on_finding: Callable[[Finding], None] = warn_of
+    """Called with each place where it breaks a rule that does not stop it, the first time."""
+    begins_anew: bool = False
+    """Whether each reset is an exact point (`BatchedCpuMixin.begins_anew`), for a session that goes back."""
+    clock: Clock = field(default_factory=Clock)
 
 
 def with_advice(
@@ -135,8 +127,7 @@ def _runs_alone(again: Callable[[], LoadedTask], options: TaskOptions) -> bool:
     except TaskError:
         return False
     try:
-        alone = replace(options, num_envs=1)
-        build_task(loaded, alone, Clock(), lambda activity: None, lambda finding: None).env.close()
+        build_task(loaded, replace(options, num_envs=1), Opening(on_finding=lambda finding: None)).env.close()
     except TaskError as error:
         if isinstance(error.__cause__, Interrupted):
             raise
@@ -146,19 +137,9 @@ def _runs_alone(again: Callable[[], LoadedTask], options: TaskOptions) -> bool:
     return True
 
 
-def build_task(
-    loaded: LoadedTask,
-    options: TaskOptions,
-    clock: Clock,
-    on_activity: Callable[[str], None],
-    on_finding: Callable[[Finding], None],
-    begins_anew: bool = False,
-) -> OpenedTask:
-    """The second half of `open_task`; raises as it does, and leaves taking back `loaded` to the caller.
-
-    Args:
-        begins_anew: whether each reset is an exact point (`BatchedCpuMixin.begins_anew`), for a session that goes back.
-    """
+def build_task(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> OpenedTask:
+    """Build, rehearse and reset what was imported; taking back `loaded` where that raises TaskError is the caller's."""
+    on_activity, clock = opening.on_activity, opening.clock
     on_activity(f"building {options.num_envs} {'env' if options.num_envs == 1 else 'envs'}")
     with blamed("build", loaded):
         env = make_env(
@@ -167,14 +148,14 @@ def build_task(
                 num_envs=options.num_envs,
                 backend=options.backend,
                 rules=_rules(loaded, options),
-                on_finding=on_finding,
+                on_finding=opening.on_finding,
                 kwargs=options.env_kwargs,
             ),
             asset_ids=_asset_ids(loaded),
             default_kwargs=loaded.default_kwargs,
         )
     clock.lap("build")
-    if begins_anew and isinstance(env, BatchedCpuMixin):
+    if opening.begins_anew and isinstance(env, BatchedCpuMixin):
         env.begins_anew = True
     try:
         with blamed("build", loaded):
@@ -375,16 +356,3 @@ def _env_on_traceback(error: BaseException, cls: type) -> Any:
             return owner
         trace = trace.tb_next
     return None
-
-
-class Clock:
-    """Wall time of the parts of a load, in milliseconds."""
-
-    def __init__(self) -> None:
-        self._last = time.perf_counter()
-        self.laps: dict[str, float] = {}
-
-    def lap(self, name: str) -> None:
-        now = time.perf_counter()
-        self.laps[name] = self.laps.get(name, 0.0) + 1000 * (now - self._last)
-        self._last = now

@@ -28,7 +28,7 @@ from workbench.authoring.load import (
 )
 from workbench.authoring.modules import read_source
 from workbench.authoring.problem import Interrupted, TaskError
-from workbench.authoring.reference import class_beside
+from workbench.authoring.reference import TaskName, class_beside
 from workbench.authoring.same_function import line_in
 from workbench.core import actions
 from workbench.core.broken_rule import BrokenRules, warn_of
@@ -45,10 +45,11 @@ from workbench.core.snapshot import RestoreReport, Snapshot, restore_snapshot
 from workbench.core.step import StepResult
 from workbench.core.take_pictures import list_cameras
 from workbench.core.task_env import TaskEnv
-from workbench.session.messages import Load, ReloadReport
+from workbench.session.messages import Load, ReloadReport, TaskOptions
 from workbench.session.open_task import (
     Clock,
     OpenedTask,
+    Opening,
     blamed,
     build_task,
     notices_of,
@@ -76,8 +77,7 @@ class _MustRebuild(Exception):
 def load_version(
     request: Load,
     running: Running | None,
-    on_activity: Callable[[str], None] = lambda activity: None,
-    on_finding: Callable[[Finding], None] = warn_of,
+    opening: Opening | None = None,
 ) -> tuple[OpenedTask, ReloadReport | None]:
     """Load the task, or the version of it that is on disk now, keeping what can be kept of `running`.
 
@@ -87,19 +87,19 @@ def load_version(
     Raises:
         TaskError: the version does not work; `running` is as it was.
     """
-    began, clock = perf_counter(), Clock()
+    began, opening = perf_counter(), opening or Opening(begins_anew=True)
     before = None if running is None else with_late_imports(running.opened.loaded)
-    on_activity(f"importing {str(request.task).rsplit('/', 1)[-1]}")
+    opening.on_activity(f"importing {str(request.task).rsplit('/', 1)[-1]}")
     import_modules(request.options.imports)
     loaded = load_task(request.task, source=request.source)
-    clock.lap("import")
+    opening.clock.lap("import")
     try:
-        return _bring_in(request, running, before, loaded, began, clock, on_activity, on_finding)
+        return _bring_in(request, running, before, loaded, began, opening)
     except TaskError as error:
         # The author of a task that runs knows what else is in the file, and so does a person who chose one in it.
         knows_others = False
         if running is None:
-            found = _another(request, loaded, error, on_activity, on_finding)
+            found = _another(request, loaded, error, opening)
             if found is not None:
                 return found, None
         else:
@@ -116,26 +116,35 @@ def load_version(
         ) from error.__cause__
 
 
+def open_task(
+    reference: TaskName,
+    options: TaskOptions,
+    *,
+    on_activity: Callable[[str], None] = lambda activity: None,
+    on_finding: Callable[[Finding], None] = warn_of,
+) -> OpenedTask:
+    """Import, build, rehearse and reset a task, to be run without a page.
+
+    Raises:
+        TaskError: with the author's file and line; nothing of the task stays behind.
+    """
+    return load_version(Load(reference, options), None, Opening(on_activity, on_finding))[0]
+
+
 _MAY_BE_OF_THE_BATCH = (RuntimeError, ValueError, TypeError, IndexError)
 """What torch and numpy raise over shapes, of which one env may have none."""
 
 
-def _another(
-    request: Load,
-    tried: LoadedTask,
-    error: TaskError,
-    on_activity: Callable[[str], None],
-    on_finding: Callable[[Finding], None],
-) -> OpenedTask | None:
+def _another(request: Load, tried: LoadedTask, error: TaskError, opening: Opening) -> OpenedTask | None:
     """The first other task of a file that opens, where any will do; None if there is none."""
     if not request.any_task or isinstance(error.__cause__, Interrupted) or tried.file is None:
         return None
     for name in tried.alternatives:
-        on_activity(f"trying {name}")
+        opening.on_activity(f"trying {name}")
         loaded = load_task(class_beside(request.task, tried.file, name), source=request.source)
         loaded = replace(loaded, in_place_of=Refused(tried.chosen, str(error)))
         try:
-            return build_task(loaded, request.options, Clock(), on_activity, on_finding)
+            return build_task(loaded, request.options, replace(opening, clock=Clock()))
         except TaskError as further:
             take_back(loaded)
             if isinstance(further.__cause__, Interrupted):
@@ -152,20 +161,18 @@ def _bring_in(
     before: LoadedTask | None,
     loaded: LoadedTask,
     began: float,
-    clock: Clock,
-    on_activity: Callable[[str], None],
-    on_finding: Callable[[Finding], None],
+    opening: Opening,
 ) -> tuple[OpenedTask, ReloadReport | None]:
     try:
         change = _what_changed(request, running, before, loaded)
         if running is not None and change.level != "rebuilt":
             try:
-                on_activity("trying the new version")
-                opened, report = _exchange(running, loaded, change, clock)
+                opening.on_activity("trying the new version")
+                opened, report = _exchange(running, loaded, change, opening.clock)
                 return opened, replace(report, milliseconds=1000 * (perf_counter() - began))
             except _MustRebuild as why:
                 change = replace(change, level="rebuilt", reason=str(why))
-        opened, report = _build(request, running, loaded, change, clock, on_activity, on_finding)
+        opened, report = _build(request, running, loaded, change, opening)
     except BaseException:
         # The last good version must not go on with the new one's helper modules and registrations.
         take_back(loaded)
@@ -320,16 +327,10 @@ def _judge(task: TaskEnv, loaded: LoadedTask, last: StepResult, change: Change) 
 
 
 def _build(
-    request: Load,
-    running: Running | None,
-    loaded: LoadedTask,
-    change: Change,
-    clock: Clock,
-    on_activity: Callable[[str], None],
-    on_finding: Callable[[Finding], None],
+    request: Load, running: Running | None, loaded: LoadedTask, change: Change, opening: Opening
 ) -> tuple[OpenedTask, ReloadReport | None]:
     snapshot = _moment(request, running, loaded)
-    opened = build_task(loaded, request.options, clock, on_activity, on_finding, begins_anew=True)
+    opened = build_task(loaded, request.options, opening)
     if snapshot is None:
         report = ReloadReport("rebuilt", change.reason, 0.0) if running is not None else None
         return opened, report
@@ -343,11 +344,11 @@ def _build(
     except BaseException:
         opened.env.close()
         raise
-    clock.lap("restore")
+    opening.clock.lap("restore")
     level = "restarted" if running is None else "rebuilt"
     reason = change.reason if running is not None else "the worker was started anew"
     report = ReloadReport(level, reason, 0.0, restored.carried, dict(restored.not_carried))
-    return replace(opened, first=first, milliseconds=clock.laps), report
+    return replace(opened, first=first, milliseconds=opening.clock.laps), report
 
 
 def _moment(request: Load, running: Running | None, loaded: LoadedTask) -> Snapshot | None:

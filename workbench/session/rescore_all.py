@@ -17,7 +17,8 @@ from workbench.recording.sources import Source, sources_among
 from workbench.recording.unreadable import UnreadableRecording
 from workbench.session.clearance import Clearances, NotCleared, NotTrusted
 from workbench.session.messages import TaskOptions
-from workbench.session.open_task import OpenedTask, open_task
+from workbench.session.open_task import OpenedTask
+from workbench.session.reload import open_task
 from workbench.session.rescore import (
     Group,
     group_episodes,

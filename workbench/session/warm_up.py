@@ -14,8 +14,8 @@ from dataclasses import replace
 from workbench.authoring.problem import TaskError
 from workbench.core.take_pictures import take_pictures
 from workbench.session.messages import TaskOptions
-from workbench.session.open_task import open_task
 from workbench.session.recorded_pictures import recorded_pictures
+from workbench.session.reload import open_task
 
 _TASK = "PickCube-v1"
 """Needs no download, has a sensor and a human camera, and the robot that most tasks have."""

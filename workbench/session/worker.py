@@ -69,7 +69,7 @@ from workbench.session.messages import (
     WarmUp,
 )
 from workbench.session.moment_messages import CaptureMoment, JudgeMoments
-from workbench.session.open_task import OpenedTask, reset_checked, step_checked
+from workbench.session.open_task import OpenedTask, Opening, reset_checked, step_checked
 from workbench.session.pacing import Pacer, Rate
 from workbench.session.pulse import Doing, PulseWriter
 from workbench.session.reload import Running, load_version
@@ -235,8 +235,11 @@ class Worker:
                 opened, report = load_version(
                     request,
                     running,
-                    on_activity=lambda activity: self._line.send(Loading(activity)),
-                    on_finding=lambda finding: None,  # see `_tell_of_rules`
+                    Opening(
+                        on_activity=lambda activity: self._line.send(Loading(activity)),
+                        on_finding=lambda finding: None,  # see `_tell_of_rules`
+                        begins_anew=True,
+                    ),
                 )
         except TaskError:
             self._cameras.put_back()  # trying new cameras took the old ones away
