@@ -105,7 +105,7 @@ clean:
 set-up: $(VENV)/.installed
 
 set-up-test: $(VENV)/.installed-test
-	@$(BIN)/python -m workbench.machine.chromium
+	@$(BIN)/python -m tests.drive.bring_browser
 
 $(VENV)/pyvenv.cfg: $(BROKEN_VENV)
 	@if [ -z "$(PYTHON)" ]; then \

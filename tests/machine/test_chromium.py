@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from workbench.machine.chromium import chromium_version, driver_complaint, find_chromium, how_to_get_chromium
+from tests.drive.bring_browser import driver_complaint
+from workbench.machine.chromium import chromium_version, find_chromium, how_to_get_chromium
 
 
 def test_the_chromium_of_this_machine_tells_its_version(chromium_path: str) -> None:
@@ -13,11 +14,19 @@ def test_the_chromium_of_this_machine_tells_its_version(chromium_path: str) -> N
     assert version and any(character.isdigit() for character in version)
 
 
+@pytest.mark.parametrize(
+    "says",
+    [
+        "echo 'requires the chromium snap to be installed.' >&2; exit 10",
+        "echo 'Chromium comes as a snap'",
+        "echo 'Chromium 120.0.6099.129'; exit 1",
+    ],
+)
 def test_ubuntus_stub_for_the_snap_is_not_taken_for_a_browser(
-    child_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    says: str, child_process: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stub = tmp_path / "chromium-browser"
-    stub.write_text("#!/bin/sh\necho 'requires the chromium snap to be installed.' >&2\nexit 10\n")
+    stub.write_text(f"#!/bin/sh\n{says}\n")
     stub.chmod(stub.stat().st_mode | stat.S_IXUSR)
     monkeypatch.delenv("PLAYWRIGHT_CHROMIUM", raising=False)
     monkeypatch.setenv("PATH", str(tmp_path))

@@ -11,8 +11,8 @@ trusted (``Signed-By``, ``Trusted``) is taken over with it, otherwise apt would 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, field
+from email.parser import HeaderParser
 from pathlib import Path
 
 CARRIED_OPTIONS = ("Signed-By", "Trusted", "Architectures")
@@ -50,41 +50,19 @@ def _parse_line(line: str) -> AptSource | None:
 
 
 def parse_deb822_format(text: str) -> list[AptSource]:
-    """The enabled ``deb`` sources of a ``*.sources`` file."""
+    """The enabled ``deb`` sources of a ``*.sources`` file: paragraphs of ``Name: value``, as a mail's header has them."""
     sources: list[AptSource] = []
-    for fields in _paragraphs(text):
-        if (
-            "deb" not in fields.get("types", "").split()
-            or fields.get("enabled", "yes").strip().lower() == "no"
-        ):
-            continue
-        options = {name: fields[name.lower()] for name in CARRIED_OPTIONS if name.lower() in fields}
-        uris, suites, components = (
-            tuple(fields.get(key, "").split()) for key in ("uris", "suites", "components")
+    without_comments = "\n".join(line for line in text.splitlines() if not line.startswith("#"))
+    for paragraph in re.split(r"\n\s*\n", without_comments):
+        fields = HeaderParser().parsestr(paragraph.strip("\n"))
+        types, uris, suites, components = (
+            tuple(fields.get(name, "").split()) for name in ("Types", "URIs", "Suites", "Components")
         )
-        if uris and suites:
+        if "deb" in types and uris and suites and fields.get("Enabled", "yes").strip().lower() != "no":
+            # A value that goes on over lines, as an inline key does, keeps them.
+            options = {name: fields[name].strip(" ") for name in CARRIED_OPTIONS if name in fields}
             sources.append(AptSource(uris, suites, components, options))
     return sources
-
-
-def _paragraphs(text: str) -> Iterator[dict[str, str]]:
-    """Paragraphs of ``Name: value``, names in lower case; a continued value (an inline key) keeps its lines."""
-    fields: dict[str, str] = {}
-    last = ""
-    for line in [*text.splitlines(), ""]:
-        if line.startswith("#"):
-            continue
-        if not line.strip():
-            if fields:
-                yield fields
-            fields, last = {}, ""
-        elif line[0].isspace():
-            if last:
-                fields[last] += "\n" + line
-        else:
-            name, _, value = line.partition(":")
-            last = name.strip().lower()
-            fields[last] = value.strip()
 
 
 def read_apt_sources(folder: Path = Path("/etc/apt")) -> list[AptSource]:
