@@ -362,9 +362,8 @@ def test_what_was_not_done_is_said_until_something_else_happens() -> None:
     refused = Refusal("task.py was edited since the camera was written into it")
     for stage in ("written", "undone"):
         writing = CameraWriting()
-        writing.wish = Wish("edit", key, None)
         message = f"Not done: {refused.reason}."
-        writing.view = Writing(stage, key, "edit", edit, refused, message, loading=True)
+        writing.view = Writing(stage, Wish("edit", key, None), edit, refused, message, loading=True)
         writing.failed_to_load()
         assert "does not load" in writing.view.message and writing.view.refusal is None
         html = writing_html(writing.view, stale=False)

@@ -93,9 +93,9 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish, run: Run) -
         if elsewhere and info is not None and (not task.source_files or _is_a_robots(info)):
             ways = " The text below is for a class of your own that inherits from it."
         message = f"Not written: {made.reason}.{ways}"
-        return Writing("refused", wish.result, wish.what, None, made, message, can_copy)
+        return Writing("refused", wish, None, made, message, can_copy)
     message = f"{said(wish, PLANNED, made.names)} Nothing is written yet."
-    return Writing("planned", wish.result, wish.what, made, None, message)
+    return Writing("planned", wish, made, None, message)
 
 
 def _made_elsewhere(task: TaskDescription, info: CameraInfo) -> str:
@@ -203,28 +203,25 @@ class CameraWriting:
 
     def __init__(self) -> None:
         self.view = Writing()
-        self.wish: Wish | None = None
         self.copy: Path | None = None
         """Of the task, which is being opened."""
         self._just_copied = ""
         """What is said first of the plan in it."""
-        self._made: list[tuple[Wish, Writing]] = []
+        self._made: list[Writing] = []
         """What is in the file and can be taken back, the last one last."""
 
-    def planned(self, wish: Wish, view: Writing) -> None:
-        before = self.wish if self.view.stage == "planned" else None
-        first = self._just_copied
+    def planned(self, view: Writing) -> None:
+        before, wish = self.view.wish if self.view.stage == "planned" else None, view.wish
+        assert wish is not None
+        first, self._just_copied = self._just_copied, ""
         if before is not None and (before.what, before.key) != (wish.what, wish.key):
             first = said(before, LEFT)
-        self._just_copied = ""
-        if first:
-            view = replace(view, message=f"{first} {view.message}")
-        self.wish, self.view = wish, view
+        self.view = replace(view, message=f"{first} {view.message}".strip())
 
     def drop(self) -> None:
         if self.view.stage in MADE:
             self._made.clear()
-        self.wish, self.view = self._made[-1] if self._made else (None, Writing())
+        self.view = self._made[-1] if self._made else Writing()
         self.copy, self._just_copied = None, ""
 
     def copied(self, copy: Path | None, view: Writing) -> None:
@@ -232,7 +229,7 @@ class CameraWriting:
         self.copy = copy
         if copy is not None:
             self._made.clear()  # of another file
-        self.view = replace(view, key=self.view.key, what=self.view.what)
+        self.view = replace(view, wish=self.view.wish)
         self._just_copied = "" if copy is None else f"This is your copy of the task, {copy}."
 
     def wish_for(self, task: TaskDescription) -> Wish | None:
@@ -240,17 +237,15 @@ class CameraWriting:
         if self.copy is None or task.file != str(self.copy):
             return None
         self.copy = None
-        return self.wish
+        return self.view.wish
 
-    def write(self) -> bool:
-        """Make the planned edit. False if there is none, or it cannot be made."""
-        return self._apply(
-            ("planned",), camera_source.apply, "written", "Written to {file}, being loaded now."
-        )
+    def write(self) -> None:
+        """Make the planned edit, if there is one."""
+        self._apply(("planned",), camera_source.apply, "written", "Written to {file}, being loaded now.")
 
-    def undo(self) -> bool:
+    def undo(self) -> None:
         """Take the edit that was made out of the file again."""
-        return self._apply(MADE, camera_source.revert, "undone", "{file} {was} before, being loaded now.")
+        self._apply(MADE, camera_source.revert, "undone", "{file} {was} before, being loaded now.")
 
     def _apply(
         self,
@@ -258,38 +253,25 @@ class CameraWriting:
         do: Callable[[SourceEdit], Refusal | None],
         stage: WritingStage,
         message: str,
-    ) -> bool:
+    ) -> None:
         view = self.view
         if view.edit is None or view.stage not in needs:
-            return False
+            return
         refusal = do(view.edit)
-        file = view.edit.names
         if refusal is not None:
             kept = "refused" if stage == "written" else view.stage
             self.view = replace(view, stage=kept, refusal=refusal, message=f"Not done: {refusal.reason}.")
-            return False
-        self.view = replace(
-            view,
-            stage=stage,
-            refusal=None,
-            message=message.format(file=file, was=_was(view.edit)),
-            loading=True,
-        )
+            return
+        self._say(message.format(file=view.edit.names, was=_was(view.edit)), stage, loading=True)
         if stage == "undone":
             del self._made[-1:]
-        elif self.wish is not None:
-            self._made.append((self.wish, self.view))
-        return True
-
-    @property
-    def awaited(self) -> bool:
-        """The edit was made or taken back, and the version with it has not come in yet."""
-        return self.view.loading
+        else:
+            self._made.append(self.view)
 
     def is_in(self, task: TaskDescription) -> bool:
         """Whether this version is the one with the edit, or without it, that is awaited."""
         edit = self.view.edit
-        if edit is None or not self.awaited:
+        if edit is None or not self.view.loading:
             return False
         written = self.view.stage == "written"
         return all(
@@ -303,47 +285,34 @@ class CameraWriting:
         Args:
             went_back: the camera stands as the file says again, and not as it was placed.
         """
-        view, wish = self.view, self.wish
-        assert view.edit is not None and wish is not None
-        infos = {c.key: c for c in task.cameras}
-        file = view.edit.names
-        if view.stage == "undone":
+        wish, edit = self.view.wish, self.view.edit
+        assert edit is not None and wish is not None
+        if self.view.stage == "undone":
             back = f" {wish.key[1]} stands as it says; Undo puts it where you placed it." if went_back else ""
-            message = f"{file} {_was(view.edit)} before.{back}"
-            self.view = replace(view, message=message, refusal=None, loading=False)
+            self._say(f"{edit.names} {_was(edit)} before.{back}", "undone")
             return
-        wrong = _mismatch(wish, infos, view.edit.settings)
+        wrong = _mismatch(wish, {c.key: c for c in task.cameras}, edit.settings)
         if wrong:
-            self.view = replace(
-                view,
-                stage="mismatch",
-                message=f"{wrong} Take the change back, or look at what else in the task places this camera.",
-                refusal=None,
-                loading=False,
-            )
-            self._made[-1:] = [(wish, self.view)]
-            return
-        self.view = replace(
-            view, stage="checked", message=said(wish, DONE, file), refusal=None, loading=False
-        )
-        self._made[-1:] = [(wish, self.view)]
+            more = "Take the change back, or look at what else in the task places this camera."
+            self._say(f"{wrong} {more}", "mismatch")
+        else:
+            self._say(said(wish, DONE, edit.names), "checked")
+        self._made[-1:] = [self.view]
 
     def failed_to_load(self) -> None:
         if self.copy is not None:
-            self.view = Writing(
-                "refused",
-                what=self.view.what,
-                message=f"{self.copy} was made, but does not load: mend or delete it.",
-            )
-        if self.awaited and self.view.edit is not None:
-            file = self.view.edit.names
-            undone = self.view.stage == "undone"
+            why = f"{self.copy} was made, but does not load: mend or delete it."
+            self.view = Writing("refused", self.view.wish, message=why)
+        if self.view.loading and self.view.edit is not None:
+            edit, undone = self.view.edit, self.view.stage == "undone"
             told = "the change is in it; take it back if that is the reason"
             if undone:
                 told = "the camera's change is out of it"
-            does = "does" if len(self.view.edit.changes) == 1 else "do"
-            message = f"{file} {does} not load: {told}."
-            self.view = replace(self.view, message=message, refusal=None, loading=not undone)
+            does = "does" if len(edit.changes) == 1 else "do"
+            self._say(f"{edit.names} {does} not load: {told}.", self.view.stage, loading=not undone)
+
+    def _say(self, message: str, stage: WritingStage, loading: bool = False) -> None:
+        self.view = replace(self.view, stage=stage, message=message, refusal=None, loading=loading)
 
 
 def _was(edit: SourceEdit) -> str:

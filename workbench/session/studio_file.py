@@ -77,7 +77,7 @@ class StudioFile:
             return
         writing = plan(task, info, wish, self._run)
         with self._cameras.lock:
-            self._writing.planned(wish, writing)
+            self._writing.planned(writing)
         self._note()
 
     def _run(self, texts: Mapping[str, str]) -> Ran:
@@ -128,7 +128,7 @@ class StudioFile:
         if file is not None:
             self._open_copy(file, task.class_name)
 
-    def _write(self, do: Callable[[], bool]) -> None:
+    def _write(self, do: Callable[[], None]) -> None:
         with self._cameras.lock:  # the version with it must not come in before it is known to be awaited
             do()
         self._note()
@@ -149,7 +149,7 @@ class StudioFile:
         Returns:
             the cameras that were changed here, if this is the version with that change.
         """
-        wish = self._writing.wish
+        wish = self._writing.view.wish
         if wish is None or not self._writing.is_in(task):
             return frozenset()
         said = {info.key: info.settings for info in task.cameras}

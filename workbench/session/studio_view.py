@@ -70,9 +70,7 @@ class Writing:
     """How far a change is on its way into the file. One at a time."""
 
     stage: WritingStage = "none"
-    key: CameraKey | None = None
-    """Whose: of a camera that is added, the new one's."""
-    what: Change = "edit"
+    wish: Wish | None = None
     edit: SourceEdit | None = None
     refusal: Refusal | None = None
     """Why the last thing that was asked for was not done; its reason is told in `message` too."""
@@ -82,6 +80,15 @@ class Writing:
     """Refused since the file is not the user's to edit, and a copy of it would be: see `StudioFile.copy_task`."""
     loading: bool = False
     """It is in the file, or out of it again, and the version with that has not come in yet."""
+
+    @property
+    def key(self) -> CameraKey | None:
+        """Whose: of a camera that is added, the new one's."""
+        return None if self.wish is None else self.wish.result
+
+    @property
+    def what(self) -> Change:
+        return "edit" if self.wish is None else self.wish.what
 
 
 @dataclass(frozen=True)
