@@ -79,7 +79,7 @@ def open_page(
     if (why := why_not_there(task)) is not None:
         return refuse(why)
     from workbench.page_command import open_in_terminal
-    from workbench.session.debugger_words import port_for_debugger
+    from workbench.session.debugger import port_for_debugger
     from workbench.session.kept_worker import WorkerOptions
     from workbench.session.memory_limit import parse_memory
     from workbench.ui.door import DoorOptions

@@ -23,7 +23,7 @@ import linecache
 import traceback
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,7 +34,7 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.observations import CameraObsTextures
 
 from workbench.authoring import registry
-from workbench.authoring.load import class_of_module, load_task
+from workbench.authoring.load import LoadedTask, class_of_module, load_task, task_of_class
 from workbench.authoring.named_modules import split_reference
 from workbench.authoring.problem import definition_line
 from workbench.core.backends import BackendUnavailable, find_renderer
@@ -44,18 +44,6 @@ from workbench.core.task_env import Backend, EnvOptions, build_env, default_rewa
 
 _STATE_MODES = {"state", "state_dict", "none"}
 """The parts of an ``obs_mode`` for which nothing is drawn."""
-
-
-@dataclass(frozen=True)
-class _Found:
-    """What `make` must know of a task, wherever it came from."""
-
-    cls: type[BaseEnv]
-    env_id: str
-    max_episode_steps: int | None
-    default_kwargs: Mapping[str, Any]
-    asset_ids: Sequence[str]
-    installed: bool
 
 
 def make(
@@ -96,7 +84,7 @@ def make(
     found = _find(task)
     _refuse_unknown_modes(found.cls, kwargs)
     given = {**found.default_kwargs, **kwargs}
-    if rules is None and found.installed:
+    if rules is None and not found.followed and class_is_installed(found.cls):
         rules = "warn"  # nobody here can mend it
     if given.get("reward_mode") is None and not _stock_reward_works(found.cls):
         # Among the spec's arguments, so that a replay by gym.make has a reward too.
@@ -113,7 +101,7 @@ def make(
     options = EnvOptions(num_envs=int(num_envs), backend=backend, threads=threads, rules=rules)
     spec = EnvSpec(
         id=found.env_id,
-        entry_point=partial(_build, found.cls, tuple(found.asset_ids), options),
+        entry_point=partial(_build, found.cls, found.asset_ids, options),
         max_episode_steps=limit,
         disable_env_checker=True,  # it knows nothing of batches
         kwargs=dict(found.default_kwargs),
@@ -212,37 +200,20 @@ def _stock_reward_works(cls: type[BaseEnv]) -> bool:
     return mode not in ("dense", "normalized_dense") or getattr(cls, hook) is not getattr(BaseEnv, hook)
 
 
-def _find(task: str | Path | type[BaseEnv]) -> _Found:
-    if isinstance(task, type):
-        return _registered_class(task)
-    if not isinstance(task, (str, Path)):
+def _find(task: str | Path | type[BaseEnv]) -> LoadedTask:
+    if not isinstance(task, (str, Path, type)):
         raise TypeError(
             f"make() takes a registered id, a file or a class that inherits BaseEnv, not {type(task).__name__}"
         )
-    task = str(task)
-    named = None if registry.environment(task) is not None else split_reference(task)
-    if named is not None:
-        return _registered_class(class_of_module(*named))
-    loaded = load_task(task)
+    cls = task if isinstance(task, type) else None
+    if cls is None and registry.environment(str(task)) is None:
+        named = split_reference(str(task))
+        cls = None if named is None else class_of_module(*named)
+    if cls is not None:
+        if not registry.is_task(cls):
+            raise TypeError(f"{cls.__name__} does not inherit mani_skill.envs.sapien_env.BaseEnv")
+        return task_of_class(cls, registry.id_of(cls) or cls.__name__)
+    loaded = load_task(str(task))
     for notice in loaded.notices:
         warnings.warn(notice, stacklevel=3)
-    spec = registry.environment(loaded.env_id)
-    asset_ids = () if spec is None else spec.asset_download_ids or ()
-    return _Found(
-        loaded.cls,
-        loaded.env_id,
-        loaded.max_episode_steps,
-        loaded.default_kwargs,
-        asset_ids,
-        installed=not loaded.followed and class_is_installed(loaded.cls),
-    )
-
-
-def _registered_class(cls: type) -> _Found:
-    if not registry.is_task(cls):
-        raise TypeError(f"{cls.__name__} does not inherit mani_skill.envs.sapien_env.BaseEnv")
-    env_id = registry.id_of(cls)
-    if env_id is not None and (spec := registry.environment(env_id)) is not None:
-        limit, assets = spec.max_episode_steps, spec.asset_download_ids or ()
-        return _Found(cls, env_id, limit, dict(spec.default_kwargs), assets, class_is_installed(cls))
-    return _Found(cls, cls.__name__, None, {}, (), class_is_installed(cls))
+    return loaded

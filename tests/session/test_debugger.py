@@ -19,7 +19,7 @@ from tests.session.debug_client import DebugClient
 from workbench.cli import main
 from workbench.machine.child_python import child_environment, python_command
 from workbench.session import kept_worker
-from workbench.session.debugger_words import port_for_debugger
+from workbench.session.debugger import port_for_debugger
 from workbench.session.kept_worker import WorkerOptions
 from workbench.session.messages import TaskOptions
 from workbench.session.session import Session
@@ -170,7 +170,7 @@ def test_a_port_that_is_taken_is_refused_or_another_found(monkeypatch: pytest.Mo
         taken = other.getsockname()[1]
         with pytest.raises(ValueError, match=f"--debug-port {taken} cannot be listened on"):
             port_for_debugger(taken)
-        monkeypatch.setattr("workbench.session.debugger_words.USUAL_PORT", taken)
+        monkeypatch.setattr("workbench.session.debugger.USUAL_PORT", taken)
         assert port_for_debugger(None) not in (0, taken)
 
 

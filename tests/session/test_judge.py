@@ -52,7 +52,7 @@ class Desk:
         session.versions.reload("rebuilt")
         first = session.view().timeline.last
         wait_until(session, lambda v: v.timeline.first > first and v.timeline.moments == 1, "a new history")
-        session.stop_judging()
+        session.judge.stop()
         wait_until(session, lambda v: v.judgement.state not in ("loading", "judging"), "its end")
         session.change(speed=math.inf)
         session.play()
@@ -110,7 +110,7 @@ def test_a_reward_that_is_doubled_is_judged_as_the_double_to_the_last_bit(desk: 
     rewards = np.array([moment.step.reward for moment in steps_of(record)])
     assert (view.done, view.total) == (len(rewards), len(rewards))
     for env in range(N):
-        curve = desk.session.judged_curve("reward", env)
+        curve = desk.session.judge.curve("reward", env)
         np.testing.assert_array_equal(curve.old, rewards[:, env])
         np.testing.assert_array_equal(curve.new, 2 * rewards[:, env])
     assert all(verdict.metres == verdict.radians == 0 for verdict in view.verdicts)
@@ -166,7 +166,7 @@ def test_code_that_raises_is_told_with_its_line_and_the_record_stays(desk: Desk,
     assert "KeyError: 'late'" in view.problem.message
     assert Path(view.problem.file) == desk.file
     assert desk.file.read_text().splitlines()[view.problem.line - 1].strip() == late
-    curve = desk.session.judged_curve("reward", 1)
+    curve = desk.session.judge.curve("reward", 1)
     rewards = np.array([moment.step.reward[1] for moment in steps_of(record)])
     np.testing.assert_array_equal(curve.old, rewards)
     assert np.isfinite(curve.new).sum() == view.done
@@ -191,7 +191,7 @@ def test_the_next_save_takes_the_place_of_a_judgement_while_the_worker_plays_on(
     view = desk.judged("done")
     assert len(calls.read_text()) < view.done
     for env in range(N):
-        curve = session.judged_curve("reward", env)
+        curve = session.judge.curve("reward", env)
         # What was played since the first of the two saves was rewarded twofold when it was recorded.
         factor = np.where(curve.serial <= record[-1].serial, 4, 2)
         np.testing.assert_array_equal(curve.new, factor * curve.old)
@@ -205,7 +205,7 @@ def test_a_judgement_that_loops_for_ever_can_be_stopped_and_the_next_one_runs(de
     until(loops.exists, "the loop")
     desk.note()
     process = desk.session._background.pid
-    desk.session.stop_judging()
+    desk.session.judge.stop()
     view = desk.judged("stopped")
     assert view.done < view.total and view.stopped_by is StoppedBy.HAND
     wait_until(
@@ -263,5 +263,5 @@ def test_what_somebody_waits_for_and_a_save_in_the_middle_share_one_process_with
     wait_until(session, lambda v: not v.recording.keeping.active and v.recording.keeping.said, "the second")
     assert not session.view().recording.keeping.failed
     for env in range(N):
-        np.testing.assert_array_equal(session.judged_curve("reward", env).new, 3 * rewards[:, env])
+        np.testing.assert_array_equal(session.judge.curve("reward", env).new, 3 * rewards[:, env])
     assert session._background.pid == process

@@ -10,7 +10,7 @@ import pytest
 
 from workbench.session.last_words import (
     as_traceback,
-    author_frame,
+    author_place,
     busy_at,
     death_problem,
     fatal_error,
@@ -39,11 +39,10 @@ def test_the_authors_line_is_found_whatever_the_file_is_called(
 ) -> None:
     file = tmp_path / name
     frames = parse_stack(dump_of(file, "faulthandler.dump_traceback(all_threads=False)"))
-    assert [frame.function for frame in frames] == ["deep", "evaluate", "<module>"]
-    place = author_frame(frames, [str(file)])
-    assert place is not None and (place.file, place.line) == (str(file), 3)
+    assert [frame.name for frame in frames] == ["deep", "evaluate", "<module>"]
+    assert author_place(frames, [str(file)])[:2] == (str(file), 3)
     assert hook_of(frames) == "evaluate"
-    assert author_frame(frames, ["/elsewhere.py"]) is None
+    assert author_place(frames, ["/elsewhere.py"]) == (None, None, None)
 
 
 def test_a_crash_says_what_it_was(child_process: None, tmp_path: Path) -> None:

@@ -45,8 +45,9 @@ class RecordedSession:
     def __init__(self) -> None:
         self.asked: list[tuple[object, ...]] = []
         self.shown = running(40, timeline=TimelineView(first=0, last=1000))
+        self.judge = self
 
-    def judged_curve(self, name: str, env: int) -> JudgedCurve | None:
+    def curve(self, name: str, env: int) -> JudgedCurve | None:
         tick = np.arange(20)
         old = np.full(20, env, np.float32)
         return JudgedCurve(tick, tick, old, 2 * old) if name in ("reward", "success") else None
@@ -60,7 +61,7 @@ class RecordedSession:
     def change(self, *, selected_env: int) -> None:
         self.asked.append(("select", selected_env))
 
-    def stop_judging(self) -> None:
+    def stop(self) -> None:
         self.asked.append(("stop",))
 
 

@@ -105,6 +105,12 @@ class LoadedTask:
         return self.class_name if self.robot is None else self.robot.class_name
 
     @property
+    def asset_ids(self) -> tuple[str, ...]:
+        """What it was registered to need, and has to be downloaded."""
+        spec = registry.environment(self.env_id)
+        return () if spec is None else tuple(spec.asset_download_ids or ())
+
+    @property
     def notices(self) -> tuple[str, ...]:
         """What its author should know although it works, in sentences."""
         found = [named_like_library(file) for file in self.named_like_libraries]

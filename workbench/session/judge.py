@@ -79,7 +79,7 @@ class Judge:
         view = JudgedView("loading", total=judgement.steps, task="the new code")
         self.judging.begin(view, lambda job: self._judge(job, load, judgement))
 
-    def stop(self, why: StoppedBy) -> None:
+    def stop(self, why: StoppedBy = StoppedBy.HAND) -> None:
         """As `Judging.stop`."""
         self.judging.stop(why)
         with self._lock:

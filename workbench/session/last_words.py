@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import dropwhile
 from pathlib import Path
+from traceback import FrameSummary, StackSummary
 
 from workbench.authoring.modules import read_source
 from workbench.authoring.problem import HOOK_STAGES, Problem
@@ -23,13 +25,6 @@ _FATAL = re.compile(r"^Fatal Python error: (?P<what>.+)$", re.MULTILINE)
 _EXIT = re.compile(r"^os\._exit\((?P<code>[^)]*)\)$", re.MULTILINE)
 _MOST_FRAMES = 60
 _OURS = ("/workbench/session/", "/workbench/core/", "/workbench/authoring/", "<frozen runpy>")
-
-
-@dataclass(frozen=True)
-class Frame:
-    file: str
-    line: int
-    function: str
 
 
 @dataclass(frozen=True)
@@ -56,11 +51,13 @@ class Busy:
     """Nothing is done until a debugger attaches."""
 
 
-def parse_stack(dump: str) -> list[Frame]:
+def parse_stack(dump: str) -> list[FrameSummary]:
     """The frames of the dump's last stack, innermost first; empty when there is none."""
     last = dump.rfind("(most recent call first):")
     return [
-        Frame(found["file"], int(found["line"]) if found["line"].isdigit() else 0, found["function"])
+        FrameSummary(
+            found["file"], int(found["line"]) if found["line"].isdigit() else 0, found["function"], line=""
+        )
         for found in _FRAME.finditer(dump, max(last, 0))
     ][:_MOST_FRAMES]
 
@@ -73,49 +70,50 @@ def fatal_error(dump: str) -> str | None:
     return None if left is None else f"called os._exit({left['code']})"
 
 
-def author_frame(frames: Sequence[Frame], own_files: Iterable[str]) -> Frame | None:
-    """The innermost frame in one of `own_files` (the author's paths)."""
+def author_place(
+    frames: Sequence[FrameSummary], own_files: Iterable[str], texts: Mapping[str, str] | None = None
+) -> tuple[str | None, int | None, str | None]:
+    """File, line and code of the innermost frame in one of `own_files` (the author's paths); None where there is none.
+
+    Args:
+        texts: as of `as_traceback`.
+    """
     named = {path.encode("ascii", "backslashreplace").decode(): path for path in own_files}
     for frame in frames:
-        if frame.file in named:
-            return replace(frame, file=named[frame.file])
-    return None
+        if frame.filename in named:
+            file, line = named[frame.filename], frame.lineno or 0
+            return file, line, code_of(file, line, texts)
+    return None, None, None
 
 
-def hook_of(frames: Sequence[Frame]) -> str | None:
+def hook_of(frames: Sequence[FrameSummary]) -> str | None:
     """The stage of the innermost hook of a task on the stack: ``evaluate``, ``reward``, ``build`` ..."""
-    return next((HOOK_STAGES[f.function] for f in frames if f.function in HOOK_STAGES), None)
+    return next((HOOK_STAGES[f.name] for f in frames if f.name in HOOK_STAGES), None)
 
 
-def as_traceback(frames: Sequence[Frame], texts: Mapping[str, str] | None = None) -> str:
+def as_traceback(frames: Sequence[FrameSummary], texts: Mapping[str, str] | None = None) -> str:
     """As Python prints a traceback: outermost first, with the lines; less the workbench's own at its start.
 
     Args:
         texts: source by path, of files whose running version is not what is on disk.
     """
-    outermost_first = list(reversed(frames))
-    while outermost_first and any(part in outermost_first[0].file for part in _OURS):
-        outermost_first.pop(0)
-    if not outermost_first:
-        return ""
-    lines = ["Traceback (most recent call last):"]
-    for frame in outermost_first:
-        lines.append(f'  File "{frame.file}", line {frame.line}, in {frame.function}')
-        code = code_of(frame.file, frame.line, texts)
-        if code:
-            lines.append(f"    {code}")
-    return "\n".join(lines)
+    theirs = dropwhile(lambda frame: any(part in frame.filename for part in _OURS), reversed(frames))
+    with_code = [_frame(f.filename, f.lineno or 0, f.name, texts) for f in theirs]
+    said = "".join(StackSummary.from_list(with_code).format()).rstrip()
+    return f"Traceback (most recent call last):\n{said}" if said else ""
+
+
+def _frame(file: str, line: int, function: str, texts: Mapping[str, str] | None) -> FrameSummary:
+    # Never without a text, or Python would read the file: it may be a device or a pipe by now.
+    return FrameSummary(file, line, function, line=code_of(file, line, texts) or "")
 
 
 def code_of(file: str, line: int, texts: Mapping[str, str] | None = None) -> str | None:
     """Text of a line, stripped; None where it cannot be had."""
     text = None if texts is None else texts.get(file)
-    if text is not None:
-        lines = text.splitlines()
-        return lines[line - 1].strip() or None if 0 < line <= len(lines) else None
     try:
         # Not linecache: the file may be a device or a pipe by now, and this is the page's process.
-        lines = read_source(file).splitlines()
+        lines = (read_source(file) if text is None else text).splitlines()
     except (OSError, SyntaxError):
         return None
     return lines[line - 1].strip() or None if 0 < line <= len(lines) else None
@@ -126,13 +124,13 @@ def busy_at(
 ) -> Busy:
     """What a look at a worker at work showed; `dump` may be empty. Other arguments are as of `Busy`."""
     frames = parse_stack(dump)
-    hook, place = hook_of(frames), author_frame(frames, own_files)
+    hook, (file, line, code) = hook_of(frames), author_place(frames, own_files)
     return Busy(
         seconds=seconds,
         doing=f"in {hook}" if hook is not None else doing,
-        file=None if place is None else place.file,
-        line=None if place is None else place.line,
-        code=None if place is None else code_of(place.file, place.line),
+        file=file,
+        line=line,
+        code=code,
         traceback=as_traceback(frames),
         drawing=doing == "drawing" and hook is None,
         getting_ready=doing in ("starting", "warming up") and hook is None,
@@ -155,7 +153,8 @@ def death_problem(
         texts: source by path of the version that ran.
     """
     frames = parse_stack(dump)
-    place, hook, fatal = author_frame(frames, own_files), hook_of(frames), fatal_error(dump)
+    hook, fatal = hook_of(frames), fatal_error(dump)
+    file, line, code = author_place(frames, own_files, texts)
     message = f"the worker process {why}"
     if fatal is not None and fatal.startswith("called"):
         message = f"the worker process {fatal}"
@@ -169,9 +168,9 @@ def death_problem(
     return Problem(
         stage="worker",
         message=message,
-        file=None if place is None else place.file,
-        line=None if place is None else place.line,
-        code=None if place is None else code_of(place.file, place.line, texts),
+        file=file,
+        line=line,
+        code=code,
         traceback="\n\n".join(part for part in parts if part),
     )
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -148,8 +148,9 @@ class Reset(Question[StepResult]):
     """None goes on with the task's own random numbers."""
 
 
-@dataclass(frozen=True)
-class CameraRequest:
+class CameraRequest(NamedTuple):
+    """As `take_pictures.Request`."""
+
     name: str
     kind: CameraKind
     modalities: tuple[str, ...] = ("rgb",)

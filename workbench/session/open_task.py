@@ -16,7 +16,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from workbench.authoring import registry
 from workbench.authoring.load import LoadedTask, take_back, with_late_imports
 from workbench.authoring.problem import (
     MESSAGE_LIMIT,
@@ -151,7 +150,7 @@ def build_task(loaded: LoadedTask, options: TaskOptions, opening: Opening) -> Op
                 on_finding=opening.on_finding,
                 kwargs=options.env_kwargs,
             ),
-            asset_ids=_asset_ids(loaded),
+            asset_ids=loaded.asset_ids,
             default_kwargs=loaded.default_kwargs,
         )
     clock.lap("build")
@@ -276,11 +275,6 @@ def _rules(loaded: LoadedTask, options: TaskOptions) -> Degree | None:
     if options.rules is None and not loaded.followed and class_is_installed(loaded.cls):
         return "warn"
     return options.rules
-
-
-def _asset_ids(loaded: LoadedTask) -> list[str]:
-    spec = registry.environment(loaded.env_id)
-    return [] if spec is None else list(spec.asset_download_ids or [])
 
 
 class blamed:

@@ -27,10 +27,10 @@ from workbench.session.askers import Asker, Background
 from workbench.session.calls import Answer, Progress
 from workbench.session.camera_studio import CameraStudio
 from workbench.session.curves import TermCurves
-from workbench.session.debugger_words import listening_for_a_debugger
+from workbench.session.debugger import listening_for_a_debugger
 from workbench.session.env_table import EnvRows
 from workbench.session.judge import Judge, what_a_load_means
-from workbench.session.judgement import JudgedCurve, Judgement
+from workbench.session.judgement import Judgement
 from workbench.session.judging import StoppedBy
 from workbench.session.keep_past import PastKeeper
 from workbench.session.kept_worker import Death, KeptWorker, WorkerOptions
@@ -99,8 +99,8 @@ class Session:
         self._lock, self._note = self._shared.lock, self._shared.note
         self._sending_settings = threading.Lock()
         """Taken before `_lock`."""
-        self._step_in: tuple[int, RecordedRun, bool, str | None, Mapping[str, str]] | None = None
-        """What is to be gone into as soon as a task is there."""
+        self._step_in: tuple[Callable[[tuple[int, ...]], StepBack], bool] | None = None
+        """What is to be gone into, and whether by all envs, as soon as a task is there."""
         self._step_backs = itertools.count(1)
         self._printed = PrintedLog(self._on_lines)
         self.versions = Versions(
@@ -122,8 +122,8 @@ class Session:
         )
         self._background = Background()
         """The process that does all that is done beside playing."""
-        self._keeper = PastKeeper(recordings, self._recorder.finisher, self._note, self._background)
-        self._judge = Judge(self._note, self._background)
+        self.keeper = PastKeeper(recordings, self._recorder.finisher, self._note, self._background)
+        self.judge = Judge(self._note, self._background)
         self._policy_file = PolicyFile(self._on_policy_saved)
         self.past = TimeTravel(self._shared, self._send, self.pause)
         """What the batch lived through."""
@@ -148,10 +148,10 @@ class Session:
     def view(self) -> SessionView:
         """A snapshot; cheap enough for every frame."""
         known = {
-            "recording": replace(self._recorder.status(), keeping=self._keeper.status()),
+            "recording": replace(self._recorder.status(), keeping=self.keeper.status()),
             "printed": self._printed.view(),
             "vitals": self._worker.vitals,
-            "judgement": self._judge.judging.view,
+            "judgement": self.judge.judging.view,
         }
         with self._lock:
             view = self._state.view(**known)
@@ -285,13 +285,9 @@ class Session:
         with self._lock:
             what = self._state.what_to_keep(env_idx, load, placed, before)
         if isinstance(what, str):
-            self._keeper.refuse(what)
+            self.keeper.refuse(what)
         else:
-            self._keeper.keep(what)
-
-    def stop_keeping(self) -> None:
-        """Give up what `keep_past` began; nothing of it is kept."""
-        self._keeper.stop()
+            self.keeper.keep(what)
 
     def step_back(
         self,
@@ -310,37 +306,19 @@ class Session:
             What `TimelineView.entered` is when it is done.
         """
         number = next(self._step_backs)
-        self._go_into(number, run, everywhere, source_file, source)
+        self._go_into(lambda env_idx: StepBack(run, env_idx, source_file, dict(source), number), everywhere)
         return number
 
-    def _go_into(
-        self,
-        number: int,
-        run: RecordedRun,
-        everywhere: bool,
-        source_file: str | None,
-        source: Mapping[str, str],
-    ) -> None:
+    def _go_into(self, request: Callable[[tuple[int, ...]], StepBack], everywhere: bool) -> None:
         self.past.seek(None)
         self.pause()
         with self._lock:
             task, env = self._state.now.task, self._state.now.settings.selected_env
             if task is None:
-                self._step_in = number, run, everywhere, source_file, source
+                self._step_in = request, everywhere
                 return
-        env_idx = tuple(range(task.num_envs)) if everywhere else (env,)
-        self._send(StepBack(run, env_idx, source_file, dict(source), number))
+        self._send(request(tuple(range(task.num_envs)) if everywhere else (env,)))
         self._note()
-
-    # --- the past judged again -----------------------------------------------------------------------
-
-    def stop_judging(self) -> None:
-        """Judge the past no further; what is known by then stays."""
-        self._judge.stop(StoppedBy.HAND)
-
-    def judged_curve(self, name: str, env: int) -> JudgedCurve | None:
-        """One number of one env, as recorded and as the new code has it. Copies: not for every frame."""
-        return self._judge.curve(name, env)
 
     def show(self, env: int, serial: int) -> None:
         """Select an env and show a moment of its past."""
@@ -354,9 +332,9 @@ class Session:
         self.versions.close()
         self._policy_file.close()
         self._worker.stop()
-        self._judge.judging.close()
+        self.judge.judging.close()
         self.studio.close()
-        self._keeper.close()
+        self.keeper.close()
         self._background.end()
         self._recorder.close()
 
@@ -409,7 +387,7 @@ class Session:
         with self._lock:
             s = self._state
             restored, stale = self.versions.came_in(event.task)
-            meaning = what_a_load_means(s.now.task, event, self._judge.judging.view)
+            meaning = what_a_load_means(s.now.task, event, self.judge.judging.view)
             judgement = None
             if meaning == "judge" and s.timeline is not None:
                 judgement = Judgement(s.timeline.history)
@@ -419,9 +397,9 @@ class Session:
         if judgement is not None:
             load = self.versions.same_again()
             assert load is not None
-            self._judge.judge(load, judgement)
+            self.judge.judge(load, judgement)
         elif meaning == "forget":
-            self._judge.forget()
+            self.judge.forget()
         self.versions.follow(event.task, stale)
         self._send_settings()
         self.studio.ask_for(placed)
@@ -449,7 +427,7 @@ class Session:
         self._recorder.take(event)
 
     def _on_save(self) -> None:
-        self._judge.stop(StoppedBy.SAVE)
+        self.judge.stop(StoppedBy.SAVE)
         self.studio.interrupted()
 
     def _on_lines(self, lines: list[PrintedLine], dropped: int) -> None:

@@ -14,7 +14,6 @@ from workbench.authoring.problem import problem_from_exception
 from workbench.core.camera_settings import CameraKey
 from workbench.core.exchange import keep_observation_space
 from workbench.core.place_camera import PlacedCameras
-from workbench.core.take_pictures import Request as PictureRequest
 from workbench.core.take_pictures import list_cameras, take_pictures
 from workbench.session.calls import CannotAnswer
 from workbench.session.camera_answers import answer
@@ -98,9 +97,8 @@ class WorkerCameras:
         if opened is None:
             return
         self.settle()  # its cameras and bodies are about to be drawn elsewhere
-        wanted: list[PictureRequest] = [(c.name, c.kind, c.modalities) for c in request.cameras]
         try:
-            pictures = take_pictures(opened.env.env, request.env, wanted, request.poses)
+            pictures = take_pictures(opened.env.env, request.env, request.cameras, request.poses)
         except (RuntimeError, ValueError, IndexError) as error:
             self._held.fail(problem_from_exception(error, "pictures", opened.loaded.source_files))
             return
@@ -120,9 +118,7 @@ class WorkerCameras:
             return
         known = {(camera.name, camera.kind) for camera in opened.description.cameras}
         env, cameras = self._watched
-        wanted: list[PictureRequest] = [
-            (c.name, c.kind, c.modalities) for c in cameras if (c.name, c.kind) in known
-        ]
+        wanted = [camera for camera in cameras if (camera.name, camera.kind) in known]
         self._pictures.watch(min(env, opened.env.num_envs - 1), wanted)
 
     def scene_changed(self) -> None:

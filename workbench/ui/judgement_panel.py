@@ -31,7 +31,7 @@ class JudgementPanel(JudgedPanel[SessionView, PastRun]):
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         super().__init__(server, "env")
         self._session = session
-        self._add_status("Stop judging", session.stop_judging)
+        self._add_status("Stop judging", session.judge.stop)
         names: tuple[str, ...] = ("reward",)
         self._name: viser.GuiDropdownHandle = server.gui.add_dropdown(
             "Curve",
@@ -70,7 +70,7 @@ class JudgementPanel(JudgedPanel[SessionView, PastRun]):
         # What a page sends as its choice may be anything.
         name = self._name.value if self._name.value in names else "reward"
         differs = bool(self._listed or judged.differing_names)
-        curve = self._session.judged_curve(name, env) if differs else None
+        curve = self._session.judge.curve(name, env) if differs else None
         self._name.visible = curve is not None
         if curve is None:
             self._chart.hide()

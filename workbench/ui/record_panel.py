@@ -75,7 +75,7 @@ class RecordPanel(Part[SessionView]):
     def keep(self) -> None:
         """Keep what was just seen, or give that up."""
         if self._keeping:
-            self._session.stop_keeping()
+            self._session.keeper.stop()
         else:
             self._session.keep_past(self._envs)
 
