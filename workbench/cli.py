@@ -31,8 +31,7 @@ from workbench.task_arguments import (
     history_bytes,
     imported,
 )
-from workbench.terminal import err, print_finding, print_problem, refuse, say
-from workbench.terminal import out as terminal
+from workbench.terminal import print_problem, refuse, say
 
 Task = Annotated[str, tyro.conf.Positional]
 """A task file, ``file.py:ClassName``, ``package.module:ClassName``, or a registered env id such as ``PickCube-v1``."""
@@ -227,7 +226,7 @@ def rescore(
 
     what = RescoreOptions(places, task, recorded_source, use_env_states, batch.num_envs, base)
     try:
-        return run_rescore(what, terminal, err, csv, json, print_finding, trust)
+        return run_rescore(what, csv, json, trust)
     except NotTrusted as error:
         for line in not_trusted(error):
             refuse(line)

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
-from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -29,7 +28,7 @@ from workbench.jobs.pool import PoolError
 from workbench.recording.landing import try_folder
 from workbench.recording.mend import mend
 from workbench.session.record import Progress, Recorded, RecordOptions, record, with_given_actions
-from workbench.terminal import err, print_finding, print_problem, refuse, say
+from workbench.terminal import err, print_finding, print_problem, refuse, say, warn
 
 
 class _StopAtInterrupt:
@@ -72,9 +71,9 @@ def record_in_terminal(what: RecordOptions) -> int:
             err.print(f"{_episodes(len(mended))} that an earlier recording left half written: mended")
         file = named_file(what.task)
         for hidden in () if file is None else hidden_by_libraries(file.resolve()):
-            err.print(f"[yellow]{escape(named_like_library(hidden))}[/]", soft_wrap=True)
+            warn(named_like_library(hidden))
         if (left_alone := gpu_left_alone(what.options.backend)) is not None:
-            err.print(f"[yellow]{escape(left_alone)}[/]", soft_wrap=True)
+            warn(left_alone)
         with Bar(*columns, console=err) as bar:
             row = bar.add_task("opening", total=asked.successes or asked.episodes)
             with _StopAtInterrupt(lambda words: bar.update(row, description=words)) as interrupt:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,7 +15,6 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 
 from workbench.core.backends import gpu_left_alone
-from workbench.core.rules import Finding
 from workbench.exit_codes import Exit
 from workbench.machine.current_folder import CurrentFolder
 from workbench.machine.terminal_text import plain_text
@@ -24,22 +23,15 @@ from workbench.session import rescore_words as words
 from workbench.session.clearance import Clearances
 from workbench.session.rescore_all import Progress, RescoreOptions, rescore_all
 from workbench.session.verdict import Verdict
+from workbench.terminal import err, out, print_finding, warn
 from workbench.trust_prompt import TerminalPrompt, can_ask
 
 
-def run_rescore(
-    what: RescoreOptions,
-    out: Console,
-    err: Console,
-    csv: Path | None,
-    json: Path | None,
-    say_finding: Callable[[Finding], None],
-    trust: bool = False,
-) -> int:
+def run_rescore(what: RescoreOptions, csv: Path | None, json: Path | None, trust: bool) -> int:
     """Judge, print, write the tables that are asked for; raises as `rescore_all`, and OSError for a table."""
     here = CurrentFolder()  # a task may go to another
     if (left_alone := gpu_left_alone(what.base.backend)) is not None:
-        err.print(f"[yellow]{escape(left_alone)}[/]", soft_wrap=True)
+        warn(left_alone)
     asks = can_ask()  # before the bar takes the terminal
     columns = (
         TextColumn("{task.description}", markup=False),
@@ -66,9 +58,9 @@ def run_rescore(
             what,
             lambda activity: bar.update(row, description=activity),
             tell,
-            say_finding,
+            print_finding,
             Clearances(ask=ask, all_trusted=trust),
-            lambda notice: err.print(f"[yellow]{escape(plain_text(notice))}[/]", soft_wrap=True),
+            warn,
         )
         bar.update(row, total=len(verdicts), completed=len(verdicts), description="judged")
     for path, text in ((csv, words.as_csv), (json, words.as_json)):
@@ -77,9 +69,9 @@ def run_rescore(
                 words.write_table(path, text(verdicts))
     print_verdicts(verdicts, out)
     for note in (*notes, *words.not_carried(verdicts)):
-        err.print(f"[yellow]{escape(plain_text(note))}[/]", soft_wrap=True)
+        warn(note)
     if words.is_doubtful(verdicts):
-        err.print(f"[yellow]{escape(plain_text(words.doubts(verdicts, words.PUT_IN)))}[/]", soft_wrap=True)
+        warn(words.doubts(verdicts, words.PUT_IN))
     return Exit.DONE
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from workbench.recording.lerobot_export import DoesNotFit, ExportOptions
-from workbench.recording.sources import sources_among
+from workbench.recording.sources import Source, sources_among
 from workbench.terminal import err, refuse, say
 from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted, make
 
@@ -23,33 +23,31 @@ def share_in_terminal(
     out: Path,
 ) -> int:
     """Returns the exit code."""
-    try:
-        sources = sources_among(files)
-    except (OSError, ValueError) as error:
-        return refuse(str(error))
-    wanted = [
-        Wanted("scene", sources, out)
-        if name == SCENE
-        else Wanted("film", sources, out, EVERY_CAMERA if name == CAMERAS else name)
-        for name in mp4
-    ]
-    wanted += [Wanted("page", sources, out)] if html else []
-    wanted += [Wanted("sheet", sources, out)] if sheet else []
-    if not wanted:
+
+    def wanted(sources: tuple[Source, ...]) -> list[Wanted]:
+        films = [
+            Wanted("scene", sources, out)
+            if name == SCENE
+            else Wanted("film", sources, out, EVERY_CAMERA if name == CAMERAS else name)
+            for name in mp4
+        ]
+        return [*films, *[Wanted("page", sources, out)] * html, *[Wanted("sheet", sources, out)] * sheet]
+
+    if not (mp4 or html or sheet):
         return refuse("say what to make: --mp4 CAMERA, --mp4 scene, --html or --sheet")
-    return _make_all(wanted)
+    return _make_all(files, wanted)
 
 
 def export_in_terminal(files: Sequence[Path], folder: Path, options: ExportOptions) -> int:
     """Returns the exit code."""
+    return _make_all(files, lambda sources: [Wanted("lerobot", sources, folder, export=options)])
+
+
+def _make_all(files: Sequence[Path], wanted_of: Callable[[tuple[Source, ...]], list[Wanted]]) -> int:
     try:
-        sources = sources_among(files)
+        wanted = wanted_of(sources_among(files))
     except (OSError, ValueError) as error:
         return refuse(str(error))
-    return _make_all([Wanted("lerobot", sources, folder, export=options)])
-
-
-def _make_all(wanted: Sequence[Wanted]) -> int:
     made: list[Made] = []
     not_made: list[str] = []
     columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeRemainingColumn())
