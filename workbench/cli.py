@@ -17,7 +17,6 @@ from typing import Annotated, Any
 
 import tyro
 
-from workbench.exit_codes import Exit
 from workbench.machine.guarded_terminal import guard_terminal
 from workbench.machine.quick_imports import quick_imports
 from workbench.machine.software_vulkan import use_private_driver
@@ -31,7 +30,7 @@ from workbench.task_arguments import (
     history_bytes,
     imported,
 )
-from workbench.terminal import print_problem, refuse, say
+from workbench.terminal import Exit, print_problem, refuse, say
 
 Task = Annotated[str, tyro.conf.Positional]
 """A task file, ``file.py:ClassName``, ``package.module:ClassName``, or a registered env id such as ``PickCube-v1``."""

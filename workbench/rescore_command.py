@@ -15,7 +15,6 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 
 from workbench.core.backends import gpu_left_alone
-from workbench.exit_codes import Exit
 from workbench.machine.current_folder import CurrentFolder
 from workbench.machine.terminal_text import plain_text
 from workbench.recording.sources import Source
@@ -23,7 +22,7 @@ from workbench.session import rescore_words as words
 from workbench.session.clearance import Clearances
 from workbench.session.rescore_all import Progress, RescoreOptions, rescore_all
 from workbench.session.verdict import Verdict
-from workbench.terminal import err, out, print_finding, warn
+from workbench.terminal import Exit, err, out, print_finding, warn
 from workbench.trust_prompt import TerminalPrompt, can_ask
 
 

@@ -8,13 +8,13 @@ and tracebacks say past this module, `machine.guarded_terminal` stands before bo
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from enum import IntEnum
 from typing import IO, TYPE_CHECKING
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
 from rich.segment import Segment
 
-from workbench.exit_codes import Exit
 from workbench.machine.guarded_terminal import SafeStream
 from workbench.machine.terminal_text import plain_text
 
@@ -23,6 +23,18 @@ if TYPE_CHECKING:
     from workbench.core.rules import Finding
     from workbench.session.messages import Event
     from workbench.session.printed import PrintedLine
+
+
+class Exit(IntEnum):
+    """What the commands end with."""
+
+    DONE = 0
+    FAILED = 1
+    """The author's code raised, or there is less than was asked for."""
+    REFUSED = 2
+    """Nothing was done, and it was said why: a wrong argument, a missing file."""
+    NOT_TRUSTED = 4
+    """Nothing was run, because recordings name code that nobody agreed to; ``--trust`` agrees."""
 
 
 class SafeConsole(Console):

@@ -20,7 +20,7 @@ import pytest
 
 from tests.golden.make import GOLDEN
 from workbench import cli
-from workbench.exit_codes import Exit
+from workbench.terminal import Exit
 
 TEXTS = Path(__file__).parent / "cli"
 COMMANDS = ("open", "record", "review", "rescore", "share", "export", "view", "doctor")

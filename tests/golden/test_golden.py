@@ -17,11 +17,11 @@ import pytest
 from tests.drive.session import live_session, wait_until
 from tests.golden.make import GOLDEN, expected_of, read_folder
 from workbench.cli import main
-from workbench.exit_codes import Exit
 from workbench.recording.library import Library
 from workbench.recording.read_episode import UnreadableRecording, read_episode
 from workbench.session.session import Session
 from workbench.session.step_back import run_of
+from workbench.terminal import Exit
 
 # Recordings are read, mended and gone into in processes of their own; one is recorded in this one, which asks for a renderer.
 pytestmark = pytest.mark.usefixtures("child_process", "renderer")

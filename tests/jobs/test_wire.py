@@ -23,8 +23,8 @@ from workbench.jobs.wire import Call, Unpacker, Unreadable, pack, pack_message
 from workbench.recording.sources import Source
 from workbench.session.calls import Answer, value_type
 from workbench.session.messages import Event, Failed, Load, Loaded, Loading, Status, Stepped, TaskOptions
+from workbench.session.questions import QUESTIONS
 from workbench.session.rescore_messages import Rescore
-from workbench.session.server_line import QUESTIONS
 
 EVENTS: tuple[type, ...] = get_args(Event)
 WHATEVER = st.recursive(

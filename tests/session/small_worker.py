@@ -20,7 +20,6 @@ from tests.ui.scenes import description, step_of, table_scene
 from workbench.authoring.problem import Interrupted
 from workbench.jobs.wire import Call, Unpacker, pack_message
 from workbench.session.calls import Answer
-from workbench.session.camera_messages import RunCameras
 from workbench.session.interrupts import INTERRUPT_SIGNAL, Interrupts
 from workbench.session.messages import (
     DebuggerListens,
@@ -32,7 +31,7 @@ from workbench.session.messages import (
     Request,
 )
 from workbench.session.pulse import PulseWriter
-from workbench.session.server_line import QUESTIONS
+from workbench.session.questions import QUESTIONS, RunCameras
 from workbench.session.worker_start import main
 
 

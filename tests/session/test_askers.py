@@ -21,10 +21,9 @@ from workbench.authoring.problem import Problem
 from workbench.jobs.wire import Call, pack
 from workbench.session.askers import Asker, Background
 from workbench.session.calls import Answer, Progress
-from workbench.session.camera_messages import JudgeCamera
 from workbench.session.lane import Job, JobFailed, Lane, Stopped
-from workbench.session.make_scene import MakeScene
 from workbench.session.messages import Load, Request, Reset, TaskOptions
+from workbench.session.questions import JudgeCamera, MakeScene
 
 BASE = ("sensor", "base_camera")
 PROBLEM = Problem("step", "it broke", None, None, None, "")

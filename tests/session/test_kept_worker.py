@@ -17,7 +17,6 @@ import pytest
 
 from workbench.jobs.wire import Call
 from workbench.session import kept_worker, process
-from workbench.session.camera_messages import RunCameras
 from workbench.session.kept_worker import Death, KeptWorker, WorkerOptions
 from workbench.session.last_words import Busy
 from workbench.session.messages import (
@@ -29,6 +28,7 @@ from workbench.session.messages import (
     TaskOptions,
     WarmUp,
 )
+from workbench.session.questions import RunCameras
 
 pytestmark = pytest.mark.usefixtures("child_process")
 SMALL_WORKER = Path(__file__).with_name("small_worker.py")

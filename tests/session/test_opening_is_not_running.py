@@ -23,17 +23,18 @@ from mani_skill.utils.wrappers.record import RecordEpisode
 from tests.drive.session import rescored
 from tests.drive.waiting import until
 from workbench.cli import main
-from workbench.exit_codes import Exit
 from workbench.recording.library import Library
 from workbench.recording.sources import sources_among
 from workbench.session.clearance import Answer, Clearances, NotTrusted, Question
-from workbench.session.make_scene import MakeScene, make
+from workbench.session.make_scene import make
 from workbench.session.messages import TaskOptions
+from workbench.session.questions import MakeScene
 from workbench.session.record import RecordOptions, record
 from workbench.session.recorded_scene import SceneProcess
 from workbench.session.rescore_all import RescoreOptions, rescore_all
 from workbench.session.rescorer import Rescorer
 from workbench.session.review import Review
+from workbench.terminal import Exit
 from workbench.ui.judged_panel import status_html
 
 pytestmark = pytest.mark.usefixtures("child_process")

@@ -64,7 +64,7 @@ def test_only_what_is_lacking_is_asked_for() -> None:
     assert timeline.draw(1, (EYE,)) is None and not timeline.view(1, (EYE,)).wants_pictures
     assert timeline.view(0, (EYE,)).wants_pictures
     assert timeline.draw(1, (EYE, HAND, PEOPLE)).cameras == (HAND, PEOPLE)
-    deeper = replace(EYE, modalities=("rgb", "depth"))
+    deeper = EYE._replace(modalities=("rgb", "depth"))
     assert timeline.draw(1, (deeper,)).cameras == (deeper,)
     assert list(timeline.pictures(1)) == [("sensor", "eye")]
     timeline.camera_moved("human", "eye")

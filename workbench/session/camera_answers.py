@@ -1,4 +1,4 @@
-"""In the worker: what is asked about a camera (`camera_messages`), answered with the env as it is, and no trace left."""
+"""In the worker: what is asked about a camera (`questions`), answered with the env as it is, and no trace left."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from workbench.core.pictures import Picture
 from workbench.core.place_camera import PlacedCameras
 from workbench.core.take_pictures import take_pictures
 from workbench.core.visibility import Placement, judge_camera, picture_of, small_size
-from workbench.session.camera_messages import (
+from workbench.session.open_task import OpenedTask
+from workbench.session.questions import (
     CameraQuestion,
     DrawCamera,
     JudgeCamera,
     RunCameras,
     SuggestCameras,
 )
-from workbench.session.open_task import OpenedTask
 from workbench.session.run_cameras import run_cameras
 
 JUDGED_SIDE = 128

@@ -1,6 +1,6 @@
 """Cameras looked at with more than one pair of eyes: over all envs, over many seeds, side by side, pixel by pixel.
 
-Every question here is a small job of several requests to a worker (see `camera_messages`). What concerns the moment
+Every question here is a small job of several requests to a worker (see `questions`). What concerns the moment
 on the screen is asked of the worker that plays, one env at a time, so that it goes on playing; what needs fresh
 episodes, of another in the background. There is one job of each kind at a time, and a new one takes its place.
 """
@@ -20,10 +20,10 @@ from workbench.core.camera_report import CameraReport, join_reports
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.pictures import CameraInfo, Picture
 from workbench.session.askers import IDLE_SECONDS, Asker, Background
-from workbench.session.camera_messages import DrawCamera, JudgeCamera, SuggestCameras
 from workbench.session.history import Lived
 from workbench.session.lane import Job, JobFailed, Lane
 from workbench.session.messages import Load, Reset
+from workbench.session.questions import DrawCamera, JudgeCamera, SuggestCameras
 from workbench.session.studio_view import JudgedMoment, Looked, Picked, Progress
 
 FIRST_SEED = 10_000

@@ -29,7 +29,7 @@ from workbench.session.askers import Asker, Background
 from workbench.session.camera_judging import CameraJudging, ShownMoment
 from workbench.session.history import Lived
 from workbench.session.messages import Load, PlaceCamera, Placed, ReloadLevel, Request, TaskDescription
-from workbench.session.preview import Preview, Sight
+from workbench.session.preview import IN_A_QUICK_LOOK, Preview, Sight
 from workbench.session.studio_cameras import StudioCameras, exported, imported
 from workbench.session.studio_file import StudioFile
 from workbench.session.studio_view import StudioCamera, StudioView, Wish
@@ -73,7 +73,7 @@ class CameraStudio:
         """Held while placements are sent; taken before `_lock`."""
         self._serial = 0
         self._judging = CameraJudging(asker, background, self._note)
-        self._quick = Preview(asker, self._note, "The quick look failed")
+        self._quick = Preview(asker, self._note, "The quick look failed", IN_A_QUICK_LOOK)
         self._quick_scale = 1.0
         self._first = Preview(asker, self._note, "There is no picture of the new camera")
 

@@ -40,7 +40,7 @@ class HeldTask:
             steps: has the moment that is gone back to.
             on_failure: called when the server has been told of one.
         """
-        self._line, self._interrupts, self._pulse, self._steps = line, interrupts, pulse, steps
+        self.line, self.interrupts, self.pulse, self.steps = line, interrupts, pulse, steps
         self._on_failure = on_failure
         self.opened: OpenedTask | None = None
         self.asked_for: Path | None = None
@@ -56,21 +56,21 @@ class HeldTask:
         if doing is None:
             work()
             return None
-        self._pulse.begin(doing)
+        self.pulse.begin(doing)
         try:
-            self._interrupts.run(work)
+            self.interrupts.run(work)
         except Exception:
             raise
         except BaseException as error:
             # Outside of what knows its task: between two hooks, or in the workbench's own code.
             if isinstance(error, Interrupted):
-                self._line.drop_steps()
+                self.line.drop_steps()
             problem = problem_from_exception(error, _STAGE.get(doing, "step"), self._own_files(error))
             self.fail(problem)
             self.back_to_the_moment()
             return problem
         finally:
-            self._pulse.begin("idle")
+            self.pulse.begin("idle")
         return None
 
     def _own_files(self, error: BaseException) -> list[Path]:
@@ -97,20 +97,20 @@ class HeldTask:
         """Whether somebody had the author's code left; then the steps that wait are dropped."""
         left = isinstance(error.__cause__, Interrupted)
         if left:
-            self._line.drop_steps()
+            self.line.drop_steps()
         return left
 
     def fail(self, problem: Problem) -> None:
         """Tell the server, and stop playing."""
-        self._line.send(Failed(problem, kept=self.opened is not None))
+        self.line.send(Failed(problem, kept=self.opened is not None))
         self._on_failure()
 
     def back_to_the_moment(self) -> None:
         """After a step was left half done: the batch stands again where the last one ended."""
-        if self.opened is None or self._steps.moment is None:
+        if self.opened is None or self.steps.moment is None:
             return
         try:
             # Not `TaskEnv.restore`: that calls `evaluate`, which may be what would not end.
-            restore_snapshot(self.opened.env.env, self._steps.moment)
+            restore_snapshot(self.opened.env.env, self.steps.moment)
         except (RuntimeError, ValueError, TypeError) as error:
             self.fail(problem_from_exception(error, "reset", self.opened.loaded.source_files))

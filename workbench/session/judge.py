@@ -20,7 +20,7 @@ from workbench.session.judgement import JudgedCurve, Judgement
 from workbench.session.judging import JudgedView, Judging, StoppedBy
 from workbench.session.lane import Job, JobFailed
 from workbench.session.messages import Load, Loaded, TaskDescription
-from workbench.session.moment_messages import Judged, JudgeMoments
+from workbench.session.questions import Judged, JudgeMoments
 
 _CHUNK_SECONDS = 0.1
 """About how long one answer takes: how soon progress is seen, and stopping heard."""

@@ -11,8 +11,8 @@ import pickle
 
 from workbench.authoring.problem import TaskError
 from workbench.core.step import StepResult
-from workbench.session.moment_messages import Judged, JudgeMoments
 from workbench.session.open_task import OpenedTask, restore_checked, step_checked
+from workbench.session.questions import Judged, JudgeMoments
 
 
 def judge_moments(opened: OpenedTask, request: JudgeMoments) -> Judged:

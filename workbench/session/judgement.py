@@ -24,7 +24,7 @@ from workbench.core.recorded_run import pose_distances
 from workbench.core.snapshot_bytes import WholeSnapshot
 from workbench.core.step import StepResult
 from workbench.session.history import History, Moment
-from workbench.session.moment_messages import MomentToJudge
+from workbench.session.questions import MomentToJudge
 from workbench.session.verdict import Said, Verdict, compare, single_numbers
 
 MOST_ENTRIES = 24

@@ -26,8 +26,8 @@ from workbench.session.episode_files import EpisodeFinisher
 from workbench.session.episodes import GatheredEpisode
 from workbench.session.lane import Job, JobFailed, Lane
 from workbench.session.messages import Reset
-from workbench.session.moment_messages import CaptureMoment
 from workbench.session.past_episodes import PastEpisode, WhatToKeep, moments_of
+from workbench.session.questions import CaptureMoment
 from workbench.session.view import KeepStatus
 
 _SAME_START = 1e-6

@@ -7,48 +7,19 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from workbench.core.geometry import SceneGeometry
-from workbench.session.calls import CannotAnswer, Question
+from workbench.session.calls import CannotAnswer
+from workbench.session.questions import MakeScene, SceneMade
 
 if TYPE_CHECKING:
     from workbench.core.task_env import TaskEnv
 
 _SAY_EVERY = 50
 """States between two words on how far it is."""
-
-
-@dataclass(frozen=True)
-class SceneMade:
-    geometry: SceneGeometry
-    poses: NDArray[np.float32]
-    """(T + 1, B, 7)"""
-    missed: tuple[str, ...]
-    """What of the states could not be put into the env, each with its reason."""
-
-
-@dataclass(frozen=True)
-class MakeScene(Question[SceneMade]):
-    """Have a worker that holds no task make a recording's env, and put it into each recorded state."""
-
-    part: ClassVar[Any] = str
-    task: str
-    """Registered id."""
-    files: tuple[str, ...]
-    """Task files in which it may be found before ManiSkill is asked."""
-    env_kwargs: dict[str, Any]
-    seed: int
-    reset_options: dict[str, Any]
-    env_states: dict[str, NDArray]
-    """(T + 1, D) by name."""
-    imports: tuple[str, ...] = ()
-    """As `TaskOptions.imports`."""
 
 
 class SceneEnv:

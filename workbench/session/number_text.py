@@ -1,4 +1,4 @@
-"""Numbers as text, NaN and infinite ones too: one way for the page, the terminal and the files.
+"""Numbers and lengths as text, NaN and infinite ones too: one way for the page, the terminal and the files.
 
 Short, since it is one decision that everything that shows a number must share.
 """
@@ -10,6 +10,9 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike
+
+_UNITS = (("m", 1.0, 1.0), ("cm", 1e-2, 1e-2), ("mm", 1e-3, 1e-4), ("µm", 1e-6, 1e-6), ("nm", 1e-9, 0.0))
+"""Name, size, and from where on it is used."""
 
 
 def number_text(value: float, form: str = ".4g") -> str:
@@ -36,3 +39,13 @@ def mean_text(values: ArrayLike, say: Callable[[float], str] = number_text) -> s
     return ", ".join(
         part for part in (say(float(finite.mean())) if len(finite) else "", lost_text(flat)) if part
     )
+
+
+def length(metres: float) -> str:
+    """As a person says it: ``3.2 cm``, ``0.4 mm``, ``70 nm``, ``0``."""
+    if metres == 0:
+        return "0"
+    if not math.isfinite(metres):
+        return "more than can be told"
+    unit, size = next((unit, size) for unit, size, least in _UNITS if metres >= least)
+    return f"{metres / size:.2g} {unit}"

@@ -19,11 +19,10 @@ from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.pictures import Picture
 from workbench.core.step import StepResult
 from workbench.session.askers import Asker
-from workbench.session.camera_messages import DrawCamera
 from workbench.session.lane import Job, JobFailed, Lane
+from workbench.session.questions import DrawCamera
 
-MODALITIES = ("rgb", "depth", "segmentation")
-"""That a preview has, whatever the camera's own shader gives."""
+IN_A_QUICK_LOOK = ("rgb", "depth", "segmentation")
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +48,19 @@ class Sight:
 class Preview:
     """One look at a time; a new one takes the place of the one before. Thread-safe; every method returns at once."""
 
-    def __init__(self, asker: Asker, on_change: Callable[[], None], failing: str) -> None:
+    def __init__(
+        self,
+        asker: Asker,
+        on_change: Callable[[], None],
+        failing: str,
+        modalities: tuple[str, ...] = ("rgb",),
+    ) -> None:
         """
         Args:
             failing: how the sentence begins that says why there is no picture.
+            modalities: that the picture has, whatever the camera's own shader gives.
         """
-        self._asker, self._failing = asker, failing
+        self._asker, self._failing, self._modalities = asker, failing, modalities
         self._lock = threading.Lock()
         self._lane = Lane("studio-preview", on_change, self._failed)
         self._asked: Sight | None = None
@@ -85,7 +91,7 @@ class Preview:
         Args:
             poses: (B, 7) of the env's bodies at a moment of the past; None for now.
         """
-        question = DrawCamera(sight.key, sight.settings, sight.env, MODALITIES, poses, sight.scale)
+        question = DrawCamera(sight.key, sight.settings, sight.env, self._modalities, poses, sight.scale)
 
         def work(job: Job) -> None:
             picture = self._asker.ask(job.check, question)

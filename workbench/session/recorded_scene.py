@@ -19,7 +19,7 @@ from workbench.recording.episode import Episode
 from workbench.session.askers import Background, OnProgress
 from workbench.session.clearance import files_named
 from workbench.session.lane import JobFailed
-from workbench.session.make_scene import MakeScene, SceneMade
+from workbench.session.questions import MakeScene, SceneMade
 
 _NOT_PASSED_ON = HOW_IT_IS_RUN | {
     "obs_mode", "reward_mode", "backend", "parallel_in_single_scene", "sensor_configs",

@@ -14,8 +14,7 @@ import numpy as np
 
 from workbench.machine.atomic_files import replace_file
 from workbench.recording.sources import Source
-from workbench.session.lengths import length
-from workbench.session.number_text import mean_text, number_text
+from workbench.session.number_text import length, mean_text, number_text
 from workbench.session.verdict import FLAGS, Verdict
 
 PUT_IN = " With the recorded states put in at every step nothing drifts."

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from workbench.core.recorded_run import pose_distances
 from workbench.recording.episode import Episode
-from workbench.session.lengths import length
-from workbench.session.number_text import number_text
+from workbench.session.number_text import length, number_text
 from workbench.session.verdict import gap, unlike
 
 ARM = 0.1

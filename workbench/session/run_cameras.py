@@ -16,8 +16,8 @@ from workbench.authoring.source.names import Project
 from workbench.authoring.source.text import plain_line_ends
 from workbench.core import seams
 from workbench.core.exchange import put_class, undone
-from workbench.session.camera_messages import RunCameras
 from workbench.session.open_task import OpenedTask, blamed
+from workbench.session.questions import RunCameras
 
 
 def run_cameras(opened: OpenedTask, question: RunCameras) -> Ran:

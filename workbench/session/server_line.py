@@ -11,17 +11,9 @@ from multiprocessing.connection import Connection
 from typing import get_args
 
 from workbench.jobs.wire import Unpacker, Unreadable, pack_message
-from workbench.session.camera_messages import CameraQuestion
 from workbench.session.interrupts import Interrupts
-from workbench.session.make_scene import MakeScene
-from workbench.session.messages import Event, Load, PlaceCamera, Request, Reset, WarmUp, is_a_step
-from workbench.session.moment_messages import CaptureMoment, JudgeMoments
-from workbench.session.rescore_messages import Rescore
-
-QUESTIONS = (
-    Load, Reset, PlaceCamera, WarmUp, *get_args(CameraQuestion), JudgeMoments, CaptureMoment, Rescore, MakeScene
-)  # fmt: skip
-"""That come in a `Call`."""
+from workbench.session.messages import Event, Load, Request, is_a_step
+from workbench.session.questions import QUESTIONS
 
 
 class ServerLine:

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 from workbench.core.step import StepResult
 from workbench.session.changed_since import changed_since
-from workbench.session.lengths import length
 from workbench.session.messages import NO_MOMENT, Restored, StepBack
+from workbench.session.number_text import length
 from workbench.session.open_task import OpenedTask
 from workbench.session.relive import Arrival, arrive
 

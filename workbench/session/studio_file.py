@@ -19,10 +19,10 @@ from workbench.authoring.camera_source.cameras import Ran
 from workbench.authoring.source.text import Refused
 from workbench.core.camera_settings import CameraKey, CameraSettings, differences
 from workbench.session.askers import Asker
-from workbench.session.camera_messages import RunCameras
 from workbench.session.camera_writing import CameraWriting, copy, plan
 from workbench.session.lane import JobFailed, Stopped
 from workbench.session.messages import Load, TaskDescription
+from workbench.session.questions import RunCameras
 from workbench.session.studio_cameras import StudioCameras
 from workbench.session.studio_view import Wish, Writing
 

@@ -35,13 +35,12 @@ from workbench.jobs.wire import Call, pack
 from workbench.machine.current_folder import CurrentFolder
 from workbench.session.acting import Acting
 from workbench.session.calls import Answer, Cancel, CannotAnswer, Progress, Question
-from workbench.session.camera_messages import CameraQuestion, RunCameras
 from workbench.session.debugger import CannotDebug, listen_for_debugger, wait_for_debugger
 from workbench.session.go_back import go_back, going_back
 from workbench.session.held_task import HeldTask
 from workbench.session.interrupts import Interrupts
 from workbench.session.judge_moments import judge_moments
-from workbench.session.make_scene import MakeScene, SceneEnv
+from workbench.session.make_scene import SceneEnv
 from workbench.session.messages import (
     SCENE_KEPT,
     DebuggerListens,
@@ -68,10 +67,10 @@ from workbench.session.messages import (
     StepBack,
     WarmUp,
 )
-from workbench.session.moment_messages import CaptureMoment, JudgeMoments
 from workbench.session.open_task import OpenedTask, Opening, reset_checked, step_checked
 from workbench.session.pacing import Pacer, Rate
 from workbench.session.pulse import Doing, PulseWriter
+from workbench.session.questions import CameraQuestion, CaptureMoment, JudgeMoments, MakeScene, RunCameras
 from workbench.session.reload import Running, load_version
 from workbench.session.rescore_messages import Rescore
 from workbench.session.server_line import ServerLine
@@ -94,9 +93,7 @@ class Worker:
         self._line = ServerLine(connection, self._interrupts)
         self._steps = StepEvents()
         self._held = HeldTask(self._line, self._interrupts, pulse, self._steps, self._pause)
-        self._cameras = WorkerCameras(
-            self._held, self._line, self._interrupts, pulse, self._steps, self._on_first_picture
-        )
+        self._cameras = WorkerCameras(self._held, self._on_first_picture)
         self._loaded_by: Load | None = None
         self._last: StepResult | None = None
         self._playing = False

@@ -6,6 +6,7 @@ changes the scene, the picture under way is finished and the cameras that wait t
 
 from __future__ import annotations
 
+import pickle
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,13 +15,12 @@ from workbench.authoring.problem import problem_from_exception
 from workbench.core.camera_settings import CameraKey
 from workbench.core.exchange import keep_observation_space
 from workbench.core.place_camera import PlacedCameras
+from workbench.core.state_columns import read_state_columns
+from workbench.core.step_pictures import step_pictures
 from workbench.core.take_pictures import list_cameras, take_pictures
 from workbench.session.calls import CannotAnswer
 from workbench.session.camera_answers import answer
-from workbench.session.camera_messages import CameraQuestion
-from workbench.session.capture_moments import capture_moment
 from workbench.session.held_task import HeldTask
-from workbench.session.interrupts import Interrupts
 from workbench.session.messages import (
     CameraRequest,
     DrawPast,
@@ -29,33 +29,21 @@ from workbench.session.messages import (
     PlaceCamera,
     Placed,
 )
-from workbench.session.moment_messages import Captured, CaptureMoment
 from workbench.session.open_task import OpenedTask, blamed
 from workbench.session.picture_maker import PictureMaker
-from workbench.session.pulse import PulseWriter
-from workbench.session.server_line import ServerLine
-from workbench.session.step_events import StepEvents
+from workbench.session.questions import CameraQuestion, Captured, CaptureMoment
+from workbench.session.recorded_pictures import recorded_pictures
 
 
 class WorkerCameras:
     """See the module's text."""
 
-    def __init__(
-        self,
-        held: HeldTask,
-        line: ServerLine,
-        interrupts: Interrupts,
-        pulse: PulseWriter,
-        steps: StepEvents,
-        on_first: Callable[[bool], None],
-    ) -> None:
+    def __init__(self, held: HeldTask, on_first: Callable[[bool], None]) -> None:
         """
         Args:
-            steps: counts the moments, of which the pictures say what they show.
             on_first: called with False before the first picture of the process is begun, and with True when it is there.
         """
-        self._held, self._line, self._interrupts = held, line, interrupts
-        self._pulse, self._steps, self._on_first = pulse, steps, on_first
+        self._held, self._on_first = held, on_first
         self._watched: tuple[int, tuple[CameraRequest, ...]] = 0, ()
         """The env, and its cameras, whose pictures are kept being made."""
         self._pictures = PictureMaker()
@@ -84,13 +72,13 @@ class WorkerCameras:
         self, opened: OpenedTask, question: CameraQuestion, tell: Callable[[int, int], None]
     ) -> object:
         self.settle()
-        self._pulse.begin("drawing")
+        self._held.pulse.begin("drawing")
         try:
-            return answer(opened, self._placed, question, tell, self._line.waits)
+            return answer(opened, self._placed, question, tell, self._held.line.waits)
         except (ValueError, IndexError, RuntimeError) as error:
             raise CannotAnswer(str(error)) from error
         finally:
-            self._pulse.begin("idle")
+            self._held.pulse.begin("idle")
 
     def draw_past(self, request: DrawPast) -> None:
         opened = self._held.opened
@@ -102,11 +90,23 @@ class WorkerCameras:
         except (RuntimeError, ValueError, IndexError) as error:
             self._held.fail(problem_from_exception(error, "pictures", opened.loaded.source_files))
             return
-        self._line.send(PastPictures(request.origin, pictures))
+        self._held.line.send(PastPictures(request.origin, pictures))
 
     def capture(self, opened: OpenedTask, request: CaptureMoment) -> Captured:
+        """What the server's history has not: env states, observations and pictures, of envs that are put back.
+
+        Raises:
+            TaskError: a hook of the author's raised.
+        """
         self.settle()  # the same scene is about to be drawn
-        return capture_moment(opened, request)
+        with blamed("restore", opened.loaded, opened.env):
+            # All of them: what the task keeps for the batch, and the process's generators, go back with all only. They
+            # make no step, so their physics needs no fresh scene.
+            opened.env.restore(pickle.loads(request.snapshot), fresh_physics=False)
+            columns = read_state_columns(opened.env)
+        wanted = recorded_pictures(opened.description.cameras) if request.pictures else ()
+        drawn = [picture for env in request.env_idx for picture in step_pictures(opened.env, env, wanted)]
+        return Captured(columns, tuple(drawn))
 
     # --- what the worker does to the scene -----------------------------------------------------------
 
@@ -123,7 +123,7 @@ class WorkerCameras:
 
     def scene_changed(self) -> None:
         """What was drawn is old."""
-        self._pictures.scene_changed(self._steps.number)
+        self._pictures.scene_changed(self._held.steps.number)
 
     def settle(self) -> None:
         """The scene is about to be drawn or built otherwise: what is under way ends, and cameras stand as asked."""
@@ -158,7 +158,7 @@ class WorkerCameras:
         wanted, self._to_place = self._to_place, {}
         for request in wanted.values():
             if self._held.opened is not None:
-                self._line.send(self._place(self._held.opened, request))
+                self._held.line.send(self._place(self._held.opened, request))
 
     def make(self, nothing_else_to_do: bool) -> None:
         """Move the pictures on that somebody looks at."""
@@ -168,7 +168,7 @@ class WorkerCameras:
         if not self._renderer_ready and self._pictures.idle:
             # The first picture of a process compiles the shaders: 5 to 19 s on a software renderer.
             self._on_first(False)
-        self._pulse.begin("drawing")
+        self._held.pulse.begin("drawing")
         self._pictures.nothing_else_to_do = nothing_else_to_do
         try:
             made = self._pictures.poll(opened.env, time.monotonic())
@@ -179,7 +179,7 @@ class WorkerCameras:
         if made is None:
             return
         pictures, seconds = made
-        self._line.send(Pictures(pictures, 1000 * seconds, tuple(self._pictures.moments)))
+        self._held.line.send(Pictures(pictures, 1000 * seconds, tuple(self._pictures.moments)))
         if not self._renderer_ready:
             self._renderer_ready = True
             self._on_first(True)
@@ -189,7 +189,7 @@ class WorkerCameras:
     def _place(self, opened: OpenedTask, request: PlaceCamera) -> Placed:
         key, env = request.key, opened.env.env
         try:
-            with self._interrupts.shielded():
+            with self._held.interrupts.shielded():
                 reshaped = self._placed.place(env, key, request.settings)
         except (ValueError, RuntimeError) as error:
             return Placed(key, request.settings, None, why_not=str(error))

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from workbench.core.camera_settings import CameraKey
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
 from workbench.session.messages import CameraRequest
-from workbench.session.preview import MODALITIES as IN_A_QUICK_LOOK
+from workbench.session.preview import IN_A_QUICK_LOOK
 from workbench.session.session import Session
 from workbench.session.view import Seen, SessionView
 from workbench.ui.false_colour import DepthRange

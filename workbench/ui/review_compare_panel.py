@@ -8,7 +8,7 @@ from __future__ import annotations
 import viser
 
 from workbench.session.curves import PREFIX
-from workbench.session.lengths import length
+from workbench.session.number_text import length
 from workbench.session.review import Review
 from workbench.session.review_compare import (
     TOLERANCES,
