@@ -21,7 +21,7 @@ from workbench.machine.software_vulkan import use_private_driver
 from workbench.recording.reading import start_reading
 from workbench.session.kept_worker import WorkerOptions
 from workbench.session.messages import Event, Failed, Loaded, Loading, TaskOptions
-from workbench.session.session import Session
+from workbench.session.session import HISTORY_BYTES, Session
 from workbench.terminal import out, print_event, print_line, refuse, say, say_addresses, warn
 from workbench.ui.commands import Command
 from workbench.ui.door import Door, DoorError, DoorOptions, open_door
@@ -69,16 +69,7 @@ def open_in_terminal(
             # Not before: the task is what is waited for.
             start_reading()
 
-    session = Session(
-        task,
-        options,
-        recordings=recordings,
-        history_bytes=history_bytes,
-        worker=worker,
-        on_event=on_event,
-        on_line=print_line,
-        on_notice=warn,
-    )
+    session = _session(task, options, recordings, worker, on_event, history_bytes)
     place = Workplace(door.server, recordings, session, imports=options.imports, on_notice=warn)
     what = f"{task}, {options.num_envs} envs"
     beside = WorkerOptions(worker.memory_limit)
@@ -122,6 +113,18 @@ def _opened(at: DoorOptions, label: str) -> Door | int:
     return door
 
 
+def _session(
+    task: TaskName,
+    options: TaskOptions,
+    recordings: Path,
+    worker: WorkerOptions,
+    on_event: Callable[[Event], None],
+    history_bytes: int = HISTORY_BYTES,
+) -> Session:
+    said = {"on_event": on_event, "on_line": print_line, "on_notice": warn}
+    return Session(task, options, recordings=recordings, history_bytes=history_bytes, worker=worker, **said)
+
+
 def _serve(
     door: Door,
     place: Workplace,
@@ -135,15 +138,7 @@ def _serve(
     trust: bool,
 ) -> NoReturn:
     def open_task(task: TaskName, options: TaskOptions) -> Session:
-        return Session(
-            task,
-            options,
-            recordings=recordings,
-            worker=worker,
-            on_event=print_event,
-            on_line=print_line,
-            on_notice=warn,
-        )
+        return _session(task, options, recordings, worker, print_event)
 
     sharing = Sharing(door)
     place.offer(sharing.offer)

@@ -62,38 +62,30 @@ class TerminalPrompt:
 
 def print_question(question: Question, out: Console) -> None:
     """What would run."""
-    if question.recorded_text:
-        out.print(
-            f"Recordings of {escape(plain_text(question.task))} that were not made by this installation hold this text:",
-            soft_wrap=True,
-        )
-    else:
-        out.print(
-            f"Recordings of {escape(plain_text(question.task))} that were not made by this installation name this file:",
-            soft_wrap=True,
-        )
-    out.print(
-        f"    [bold]{escape(plain_text(question.file))}[/]  {_marks(question.files[0])}", soft_wrap=True
-    )
-    if question.modules:
-        out.print(_about_modules(question), soft_wrap=True)
-    for module in question.modules:
-        out.print(f"    {escape(plain_text(module.name))}  {_marks(module)}", soft_wrap=True)
+
+    def tell(text: str, style: str = "") -> None:
+        out.print(escape(plain_text(text)), style=style, soft_wrap=True)
+
+    holds = "hold this text" if question.recorded_text else "name this file"
+    tell(f"Recordings of {question.task} that were not made by this installation {holds}:")
+    for place, file in enumerate(question.files):
+        if place == 1:
+            tell(_about_modules(question))
+        name = escape(plain_text(file.name))
+        out.print(f"    {name if place else f'[bold]{name}[/]'}  {_marks(file)}", soft_wrap=True)
     if question.nothing_known:
-        out.print(
-            "[yellow]You trusted another version of this file and the modules beside it before. Which of them has changed "
-            "since is not known.[/]",
-            soft_wrap=True,
+        tell(
+            "You trusted another version of this file and the modules beside it before. Which of them has changed since is "
+            "not known.",
+            "yellow",
         )
     elif question.trusted_before:
         gone = f"; gone since: {', '.join(question.gone)}" if question.gone else ""
-        what = f"You trusted another version of this before. What has changed since is marked{gone}."
-        out.print(f"[yellow]{escape(plain_text(what))}[/]", soft_wrap=True)
+        tell(f"You trusted another version of this before. What has changed since is marked{gone}.", "yellow")
     for what in question.unseen:
-        out.print(f"[yellow]{escape(plain_text(what))}[/]", soft_wrap=True)
-    out.print(
-        "It can read and change all that you can. The digits are the first that sha256sum says of each file.",
-        soft_wrap=True,
+        tell(what, "yellow")
+    tell(
+        "It can read and change all that you can. The digits are the first that sha256sum says of each file."
     )
 
 

@@ -9,7 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from workbench.machine.apt import AptFailed, apt_get, can_install_packages, os_release
+from workbench.machine.apt import AptFailed, apt_install, can_install_packages, os_release
 from workbench.machine.chromium import VARIABLE, find_chromium, how_to_get_chromium
 
 
@@ -23,9 +23,8 @@ def ensure_chromium() -> str | None:
         and os_release().get("ID") == "debian"
     ):
         try:
-            apt_get(["update"])
             # Without its recommended packages: they bring a Mesa that is too old for SAPIEN.
-            apt_get(["install", "--no-install-recommends", "chromium", "fonts-liberation"])
+            apt_install("chromium", "fonts-liberation")
         except AptFailed as failure:
             print(failure, file=sys.stderr)
         found = find_chromium()
@@ -62,8 +61,7 @@ def ensure_driver() -> None:
     complaint = driver_complaint()
     if complaint is not None and _lacks_libatomic() and can_install_packages():
         try:
-            apt_get(["update"])
-            apt_get(["install", "--no-install-recommends", "libatomic1"])
+            apt_install("libatomic1")
         except AptFailed as failure:
             print(failure, file=sys.stderr)
         complaint = driver_complaint()

@@ -71,6 +71,12 @@ def apt_get(arguments: Sequence[str], options: Sequence[str] = (), timeout_s: fl
         raise AptFailed(f"{' '.join(command)} ended with {done.returncode}:\n{said}")
 
 
+def apt_install(*packages: str) -> None:
+    """Install what apt's lists have now, without what is only recommended. Raises AptFailed."""
+    apt_get(["update"])
+    apt_get(["install", "--no-install-recommends", *packages])
+
+
 def available_versions(package: str, options: Sequence[str] = ()) -> list[PackageVersion]:
     """What apt could install, newest first; empty without apt or before the first ``apt-get update``."""
     if shutil.which("apt-cache") is None:

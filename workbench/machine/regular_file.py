@@ -25,10 +25,9 @@ class NotARegularFile(OSError):
 
 
 class FileTooLarge(OSError):
-    """A file with more bytes than its kind may have. As text, a sentence that names the path."""
+    """A file with more bytes than its kind may have. As text, as of `NotARegularFile`."""
 
-    def __str__(self) -> str:
-        return f"{self.filename} {self.strerror}"
+    __str__ = NotARegularFile.__str__
 
 
 def read_regular_file(path: str | os.PathLike[str], most_bytes: int) -> bytes:

@@ -25,6 +25,7 @@ from workbench.machine.apt import (
     AptFailed,
     PackageVersion,
     apt_get,
+    apt_install,
     available_versions,
     can_install_packages,
     has_apt,
@@ -107,14 +108,7 @@ def use_private_driver() -> None:
 
 def _install_libraries(probe: RenderProbe) -> RenderProbe:
     try:
-        apt_get(["update"])
-        apt_get(
-            [
-                "install",
-                "--no-install-recommends",
-                *(SYSTEM_LIBRARIES[name] for name in probe.missing_libraries),
-            ]
-        )
+        apt_install(*(SYSTEM_LIBRARIES[name] for name in probe.missing_libraries))
     except AptFailed as failure:
         return replace(probe, error=f"{probe.error}; {failure}")
     return probe_render_device()

@@ -60,7 +60,7 @@ def _looked_at(opened: OpenedTask, question: DrawCamera) -> Picture:
     if settings is None or not 0 < scale <= LARGEST_SCALE:
         raise ValueError(f"a camera is looked through in up to {LARGEST_SCALE} times its size, not {scale}")
     size = (max(1, round(settings.width * scale)), max(1, round(settings.height * scale)))
-    info = next((info for info in opened.description.cameras if info.key == question.key), None)
+    info = opened.description.camera(question.key)
     placement = Placement(settings, question.key[0], None if info is None else info.mount)
     picture = picture_of(opened.env.env, question.env, placement, question.poses, size)
     wanted = question.modalities
@@ -74,13 +74,13 @@ def _looked_at(opened: OpenedTask, question: DrawCamera) -> Picture:
 
 def _drawn(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> Picture:
     env, key = opened.env.env, question.key
-    if question.scale != 1.0 or all(info.key != key for info in opened.description.cameras):
+    if question.scale != 1.0 or opened.description.camera(key) is None:
         return _looked_at(opened, question)
     before = placed.settings(key)
     if question.settings is not None:
         placed.place(env, key, question.settings)
     try:
-        info = next((info for info in opened.description.cameras if info.key == key), None)
+        info = opened.description.camera(key)
         gives = question.modalities if info is None else info.modalities
         wanted = tuple(m for m in question.modalities if m in gives)
         return take_pictures(env, question.env, [(key[1], key[0], wanted)], question.poses)[0]
@@ -90,7 +90,7 @@ def _drawn(opened: OpenedTask, placed: PlacedCameras, question: DrawCamera) -> P
 
 
 def _judged(opened: OpenedTask, question: JudgeCamera) -> CameraReport:
-    info = next((info for info in opened.description.cameras if info.key == question.key), None)
+    info = opened.description.camera(question.key)
     width, height = (128, 128) if info is None else (info.width, info.height)
     if question.settings is not None:
         width, height = question.settings.width, question.settings.height
@@ -108,7 +108,7 @@ def _suggested(
     cancelled: Callable[[], bool],
 ) -> tuple[OfferedPlacement, ...]:
     told = 0.0
-    info = next((info for info in opened.description.cameras if info.key == question.key), None)
+    info = opened.description.camera(question.key)
 
     def progress(done: int, total: int) -> None:
         nonlocal told

@@ -65,13 +65,13 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish, run: Run) -
     """
     made: Plan
     texts, unread = _texts(task)
+    text = "" if wish.settings is None else camera_source.snippet(wish.result[1], wish.settings)
     elsewhere = "" if wish.what == "add" or info is None else _made_elsewhere(task, info)
     if unread:
         made = camera_source.Refusal(unread)
     elif elsewhere and info is not None:
         made = _made_of_a_parents(task, texts, info, wish, elsewhere, run)
     elif not task.source_files:
-        text = "" if wish.settings is None else camera_source.snippet(wish.result[1], wish.settings)
         where = "" if task.file is None else f" ({task.file})"
         made = camera_source.Refusal(
             f"{task.class_name} is installed{where}, and an installed file is not to be edited: copy the task into a "
@@ -85,7 +85,6 @@ def plan(task: TaskDescription, info: CameraInfo | None, wish: Wish, run: Run) -
             filter(None, (camera_source.not_writable(change.file) for change in made.changes)), None
         )
         if blocked is not None:
-            text = "" if wish.settings is None else camera_source.snippet(wish.result[1], wish.settings)
             made = camera_source.Refusal(blocked, text)
     if isinstance(made, camera_source.Refusal):
         can_copy = not elsewhere and _could_be_copied(task)

@@ -109,6 +109,9 @@ class TaskDescription:
     notices: tuple[str, ...] = ()
     """What its author should know although it works, in sentences."""
 
+    def camera(self, key: CameraKey) -> CameraInfo | None:
+        return next((camera for camera in self.cameras if camera.key == key), None)
+
 
 # --- requests: server to worker ------------------------------------------------------------------
 

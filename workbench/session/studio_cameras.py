@@ -37,8 +37,7 @@ class StudioCameras:
         """What was shown last: the step and the selected env."""
 
     def info(self, key: CameraKey) -> CameraInfo | None:
-        infos = () if self.task is None else self.task.cameras
-        return next((info for info in infos if info.key == key), None)
+        return None if self.task is None else self.task.camera(key)
 
     def asked_for(self, key: CameraKey) -> StudioCamera | None:
         """The camera, if there is one; it is said if not. What went wrong before it was asked for is over."""

@@ -116,9 +116,9 @@ class Worker:
             Settings: self._change,
             ReadPolicyAgain: self._read_policy_again,
             PlaceCamera: self._cameras.place,
-            SetCapture: self._set_capture,
-            Restore: self._restore,
-            StepBack: self._step_back,
+            SetCapture: lambda request: self._steps.capture(request.env_idx, request.from_reset),
+            Restore: lambda request: self._held.guarded(partial(self._restore_envs, request)),
+            StepBack: lambda request: self._held.guarded(partial(self._into_recording, request)),
             DrawPast: self._cameras.draw_past,
             ListenForDebugger: self._listen_for_debugger,
             Inspect: self._inspect,
@@ -339,15 +339,6 @@ class Worker:
         if self._take_actions() and request.play and not self._playing:
             self._play(Play(True))
 
-    def _set_capture(self, request: SetCapture) -> None:
-        self._steps.capture(request.env_idx, request.from_reset)
-
-    def _restore(self, request: Restore) -> None:
-        self._held.guarded(lambda opened: self._restore_envs(opened, request))
-
-    def _step_back(self, request: StepBack) -> None:
-        self._held.guarded(lambda opened: self._into_recording(opened, request))
-
     def _inspect(self, request: Inspect) -> None:
         # The page asked while another version, with fewer envs, was on its way.
         if self._held.opened is not None and request.env < self._held.opened.env.num_envs:
@@ -381,11 +372,7 @@ class Worker:
         self._cameras.finish_picture()  # a reset may build the scene anew
         step = self._reset_with_seeds(opened, env_idx, seed)
         self._cameras.put_back()
-        mask = np.ones(opened.env.num_envs, bool)
-        if env_idx is not None:
-            mask[:] = False
-            mask[list(env_idx)] = True
-        self._send_step(step, mask, seeds=opened.env.episode_seeds)
+        self._send_step(step, _mask(opened, env_idx), seeds=opened.env.episode_seeds)
         return step
 
     def _reset_with_seeds(
@@ -414,15 +401,15 @@ class Worker:
         assert step is not None
         return step
 
-    def _restore_envs(self, opened: OpenedTask, request: Restore) -> None:
+    def _restore_envs(self, request: Restore, opened: OpenedTask) -> None:
         self._cameras.settle()  # the envs get new scenes, with the same entities, and may make steps
-        step, restored = go_back(opened, request, self._tell_now_and_then(going_back))
-        mask = np.zeros(opened.env.num_envs, bool)
-        mask[list(request.env_idx)] = True
-        self._send_step(step, mask, opened.env.episode_seeds, restored)
+        self._arrived(opened, *go_back(opened, request, self._tell_now_and_then(going_back)))
+
+    def _arrived(self, opened: OpenedTask, step: StepResult, restored: Restored) -> None:
+        self._send_step(step, _mask(opened, restored.env_idx), opened.env.episode_seeds, restored)
         self._send_status(None)
 
-    def _into_recording(self, opened: OpenedTask, request: StepBack) -> None:
+    def _into_recording(self, request: StepBack, opened: OpenedTask) -> None:
         self._cameras.settle()
         try:
             step, restored = step_back(
@@ -433,10 +420,7 @@ class Worker:
             raise
         finally:
             self._cameras.put_back()
-        mask = np.zeros(opened.env.num_envs, bool)
-        mask[list(request.env_idx)] = True
-        self._send_step(step, mask, opened.env.episode_seeds, restored)
-        self._send_status(None)
+        self._arrived(opened, step, restored)
 
     def _tell_now_and_then(self, words: Callable[..., str]) -> Callable[..., None]:
         """What tells how far a long way is, in `words` of its arguments."""
@@ -504,6 +488,13 @@ class Worker:
         if told.rows or self._rules_told.rows:
             self._line.send(told)
         self._rules_told = told
+
+
+def _mask(opened: OpenedTask, env_idx: tuple[int, ...] | None) -> np.ndarray:
+    """(N,) True for these envs; for all where it is None."""
+    mask = np.zeros(opened.env.num_envs, bool)
+    mask[slice(None) if env_idx is None else list(env_idx)] = True
+    return mask
 
 
 _DOING: dict[type, Doing] = {
