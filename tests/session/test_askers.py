@@ -256,3 +256,23 @@ def test_when_the_process_dies_only_the_job_that_has_it_fails_and_the_queue_goes
         for one in queue:
             one.result(timeout=90)
     assert pids[1] == pids[2] == background.pid != pids[0]
+
+
+def test_a_process_that_nobody_wants_is_ended_and_one_that_is_wanted_is_not(
+    background: Background, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    load = Load(str(write_task(tmp_path)), TaskOptions(1, env_kwargs={"render_backend": "none"}))
+    job = a_job()
+    with background.turn(job):
+        background.ensure(job, load)
+    monkeypatch.setattr("workbench.session.askers.IDLE_SECONDS", 0.0)
+    first = background.pid
+    assert first is not None, "it is kept for the next job"
+    with background.turn(job):
+        assert background.has(load) and background.pid == first
+    until(lambda: background.pid is None, "its end")
+    assert not psutil.pid_exists(first)
+    with background.turn(job):
+        background.ensure(job, load)
+        assert background.pid is not None
+        background.ask(job.check, Reset((0,), 1))

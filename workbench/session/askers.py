@@ -117,7 +117,8 @@ class Background(Asker):
         self._taken = self._gives_way = False
         self._wanted = 0
         """Jobs that wait for their turn and that somebody waits for."""
-        self._used = 0.0
+        self._idle: threading.Timer | None = None
+        """Ends the process if nobody wants it meanwhile."""
         self._process: WorkerProcess | None = None
         self._owed: Call | None = None
         self._loaded: Load | None = None
@@ -148,7 +149,8 @@ class Background(Asker):
         finally:
             self._settle(job)
             with self._turns:
-                self._taken, self._used = False, time.monotonic()
+                self._taken = False
+                self._rest_later()
                 self._turns.notify_all()
 
     def in_turns(self, job: Job, work: Callable[[], object]) -> None:
@@ -165,10 +167,17 @@ class Background(Asker):
         """Whether it would not have to be loaded."""
         return load.level == "auto" and self._loaded == load
 
-    def rest(self) -> None:
-        """End the process if nobody has asked for anything in a while."""
+    def _rest_later(self) -> None:
+        if self._idle is not None:
+            self._idle.cancel()
+        self._idle = threading.Timer(IDLE_SECONDS, self._rest)
+        self._idle.daemon = True
+        self._idle.start()
+
+    def _rest(self) -> None:
         with self._turns:
-            if not self._taken and not self._wanted and time.monotonic() - self._used > 0.9 * IDLE_SECONDS:
+            # There was a turn since, or there is one, which will say when it ends.
+            if threading.current_thread() is self._idle and not self._taken and not self._wanted:
                 self.end()
 
     def _take(self, job: Job, gives_way: bool) -> None:
@@ -267,9 +276,10 @@ class Background(Asker):
 
     def end(self) -> None:
         """End it, if there is one. `pid` is its own until it has ended."""
-        if self._process is not None:
-            self._process.stop(grace=0.0)
-        self._process, self._owed, self._loaded, self._placed, self.num_envs = None, None, None, {}, 0
+        with self._turns:
+            if self._process is not None:
+                self._process.stop(grace=0.0)
+            self._process, self._owed, self._loaded, self._placed, self.num_envs = None, None, None, {}, 0
 
     def _settle(self, job: Job) -> None:
         """Take the answer that is still owed, or end the process that does not give it in time."""

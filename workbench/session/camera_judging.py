@@ -19,7 +19,7 @@ from workbench.core.camera_frames import compose
 from workbench.core.camera_report import CameraReport, join_reports
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.pictures import CameraInfo, Picture
-from workbench.session.askers import IDLE_SECONDS, Asker, Background
+from workbench.session.askers import Asker, Background
 from workbench.session.history import Lived
 from workbench.session.lane import Job, JobFailed, Lane
 from workbench.session.messages import Load, Reset
@@ -67,9 +67,7 @@ class CameraJudging:
         self._looked = Looked()
         self._live, self._background = asker, background
         self._live_lane = Lane("studio-live", on_change, self._failed)
-        self._background_lane = Lane(
-            "studio-background", on_change, self._failed, IDLE_SECONDS, background.rest
-        )
+        self._background_lane = Lane("studio-background", on_change, self._failed)
 
     # --- what is known -------------------------------------------------------------------------------
 

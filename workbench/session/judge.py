@@ -15,7 +15,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Literal
 
-from workbench.session.askers import IDLE_SECONDS, Background
+from workbench.session.askers import Background
 from workbench.session.judgement import JudgedCurve, Judgement
 from workbench.session.judging import JudgedView, Judging, StoppedBy
 from workbench.session.lane import Job, JobFailed
@@ -54,7 +54,7 @@ class Judge:
             on_change: called when `judging` has something new.
             process: in which it is judged. Whoever else wants it need not wait.
         """
-        self.judging = Judging("judge", on_change, IDLE_SECONDS, process.rest)
+        self.judging = Judging("judge", on_change)
         self._process, self._lock = process, threading.Lock()
         self._judgement: Judgement | None = None
         """What is shown: what is being judged, or was last."""

@@ -66,24 +66,17 @@ class JudgedView:
 class Judging:
     """One job at a time; a new one takes the place of the one before. All methods but `close` return at once."""
 
-    def __init__(
-        self,
-        name: str,
-        on_change: Callable[[], None] = lambda: None,
-        idle_seconds: float | None = None,
-        on_idle: Callable[[], None] = lambda: None,
-    ) -> None:
+    def __init__(self, name: str, on_change: Callable[[], None] = lambda: None) -> None:
         """
         Args:
             name: of the thread that does all of it.
             on_change: called when `view` has something new.
-            idle_seconds, on_idle: as of `Lane`.
         """
         self._on_change = on_change
         self._lock = threading.Lock()
         """Of `view`: what a job that was stopped still has to say is not heard."""
         self._view = JudgedView()
-        self._lane = Lane(name, on_change, self._failed, idle_seconds, on_idle)
+        self._lane = Lane(name, on_change, self._failed)
 
     @property
     def view(self) -> JudgedView:

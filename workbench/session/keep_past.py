@@ -21,7 +21,7 @@ import numpy as np
 
 from workbench.recording.columns import BatchPacker
 from workbench.recording.landing import RecordingError
-from workbench.session.askers import IDLE_SECONDS, Background
+from workbench.session.askers import Background
 from workbench.session.episode_files import EpisodeFinisher
 from workbench.session.episodes import GatheredEpisode
 from workbench.session.lane import Job, JobFailed, Lane
@@ -43,7 +43,7 @@ class PastKeeper:
         self._folder, self._finisher, self._on_change = folder, finisher, on_change
         self._status = KeepStatus()
         self._process = process
-        self._lane = Lane("keep-past", on_change, self._failed, IDLE_SECONDS, process.rest)
+        self._lane = Lane("keep-past", on_change, self._failed)
 
     def keep(self, what: WhatToKeep) -> None:
         """Begin; what was under way is given up."""

@@ -54,21 +54,14 @@ class Lane:
     """See the module's text."""
 
     def __init__(
-        self,
-        name: str,
-        on_change: Callable[[], None],
-        on_failure: Callable[[Job, JobFailed], None],
-        idle_seconds: float | None = None,
-        on_idle: Callable[[], None] = lambda: None,
+        self, name: str, on_change: Callable[[], None], on_failure: Callable[[Job, JobFailed], None]
     ) -> None:
         """
         Args:
             on_change: called when `progress` is new.
             on_failure: called with a job that failed, whether that was foreseen (JobFailed) or not; it may be stopped.
-            on_idle: called on the lane's thread when there was no job for so long, and at its end.
         """
         self._name, self.changed, self._on_failure = name, on_change, on_failure
-        self._idle_seconds, self._on_idle = idle_seconds, on_idle
         self._wake = threading.Condition()
         self._waiting: Job | None = None
         self._job: Job | None = None
@@ -132,13 +125,10 @@ class Lane:
                 with self._wake:
                     self._job = None
                 self.changed()
-        self._on_idle()
 
     def _next(self) -> Job | None:
         with self._wake:
-            while self._waiting is None and not self.closing:
-                if not self._wake.wait(self._idle_seconds):
-                    self._on_idle()
+            self._wake.wait_for(lambda: self._waiting is not None or self.closing)
             if self.closing:
                 return None
             self._job, self._waiting = self._waiting, None
