@@ -5,14 +5,12 @@ from __future__ import annotations
 import shlex
 import signal
 import time
-from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
-    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -31,15 +29,16 @@ from workbench.session.record import Progress, Recorded, RecordOptions, record, 
 from workbench.terminal import err, print_finding, print_problem, refuse, say, warn
 
 
-class _StopAtInterrupt:
-    """Ctrl-C while episodes are made ends the recording in good order; before that, or a second time, at once."""
+class _Recording:
+    """The bar, and Ctrl-C: while episodes are made it ends the recording in good order; before that, or again, at once."""
 
-    def __init__(self, say: Callable[[str], None]) -> None:
-        """`say` is told what the first one did: whoever waits for a step that never ends has to know of the second."""
-        self.asked = self.making = False
-        self._say = say
+    def __init__(self, bar: Bar, total: int | None) -> None:
+        self._bar, self._row = bar, bar.add_task("opening", total=total)
+        self.asked = False
+        self._began: float | None = None
+        """When the first episode began to be made."""
 
-    def __enter__(self) -> _StopAtInterrupt:
+    def __enter__(self) -> _Recording:
         self._before = signal.signal(signal.SIGINT, self._on_signal)
         return self
 
@@ -47,10 +46,21 @@ class _StopAtInterrupt:
         signal.signal(signal.SIGINT, self._before)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        if self.asked or not self.making:
+        if self.asked or self._began is None:
             raise KeyboardInterrupt
         self.asked = True
-        self._say("ending after this step; Ctrl-C again ends at once")
+        # Whoever waits for a step that never ends has to know of the second.
+        self.say("ending after this step; Ctrl-C again ends at once")
+
+    def say(self, words: str, kept: int | None = None) -> None:
+        self._bar.update(self._row, description=words, completed=kept)
+
+    def show(self, now: Progress) -> None:
+        self._began = self._began or time.monotonic()
+        seconds = max(time.monotonic() - self._began, 1e-3)
+        self._bar.update(self._row, completed=now.kept)
+        if not self.asked:
+            self.say(f"recording, {now.steps / seconds:.0f} steps a second")
 
 
 def record_in_terminal(what: RecordOptions) -> int:
@@ -75,16 +85,9 @@ def record_in_terminal(what: RecordOptions) -> int:
         if (left_alone := gpu_left_alone(what.options.backend)) is not None:
             warn(left_alone)
         with Bar(*columns, console=err) as bar:
-            row = bar.add_task("opening", total=asked.successes or asked.episodes)
-            with _StopAtInterrupt(lambda words: bar.update(row, description=words)) as interrupt:
-                recorded = record(
-                    what,
-                    lambda activity: bar.update(row, description=activity),
-                    _Rate(bar, row, interrupt).show,
-                    lambda: interrupt.asked,
-                    print_finding,
-                )
-            bar.update(row, completed=len(recorded.written), description="recorded")
+            with _Recording(bar, asked.successes or asked.episodes) as shown:
+                recorded = record(what, shown.say, shown.show, lambda: shown.asked, print_finding)
+            shown.say("recorded", len(recorded.written))
     except TaskError as error:
         print_problem(error.problem)
         _say_what_is_kept(what, before)
@@ -95,22 +98,6 @@ def record_in_terminal(what: RecordOptions) -> int:
     except KeyboardInterrupt:
         return refuse("interrupted; episodes that had ended are kept")
     return _say(asked, recorded)
-
-
-class _Rate:
-    def __init__(self, bar: Bar, row: TaskID, interrupt: _StopAtInterrupt) -> None:
-        self._bar, self._row, self._interrupt = bar, row, interrupt
-        self._began = time.monotonic()
-
-    def show(self, now: Progress) -> None:
-        if not self._interrupt.making:
-            self._interrupt.making = True
-            self._began = time.monotonic()
-        seconds = max(time.monotonic() - self._began, 1e-3)
-        self._bar.update(self._row, completed=now.kept)
-        if not self._interrupt.asked:
-            words = f"recording, {now.steps / seconds:.0f} steps a second"
-            self._bar.update(self._row, description=words)
 
 
 def _say_what_is_kept(asked: RecordOptions, before: set[Path]) -> None:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Literal
 
 from workbench.core.camera_frames import Convention, Direction, with_pose
@@ -26,13 +25,14 @@ from workbench.core.camera_settings import (
 )
 from workbench.core.step import StepResult
 from workbench.session.askers import Asker, Background
-from workbench.session.camera_judging import CameraJudging, ShownMoment
-from workbench.session.history import Lived
-from workbench.session.messages import Load, PlaceCamera, Placed, ReloadLevel, Request, TaskDescription
+from workbench.session.camera_judging import CameraJudging
+from workbench.session.messages import PlaceCamera, Placed, ReloadLevel, Request, TaskDescription
 from workbench.session.preview import IN_A_QUICK_LOOK, Preview, Sight
 from workbench.session.studio_cameras import StudioCameras, exported, imported
 from workbench.session.studio_file import StudioFile
 from workbench.session.studio_view import StudioCamera, StudioView, Wish
+from workbench.session.time_travel import TimeTravel
+from workbench.session.versions import Versions
 
 MOST_SEEDS = 1000
 MOST_STEPS = 1000
@@ -49,26 +49,22 @@ class CameraStudio:
         asker: Asker,
         background: Background,
         on_change: Callable[[], None],
-        shown: Callable[[], ShownMoment],
-        load: Callable[[], Load | None],
-        episode: Callable[[int], tuple[Lived, ...]],
-        open_copy: Callable[[Path, str], None],
+        past: TimeTravel,
+        versions: Versions,
     ) -> None:
         """
         Args:
             send, asker: tell and ask the worker that plays.
             background: asks the other.
             on_change: called, on any thread, when `view` has something new.
-            shown: what the page shows now.
-            load: how another worker gets the version that runs; None before there is one.
-            episode: so many moments at most of the selected env's episode at the shown moment.
-            open_copy: open this class of this file, in a folder of the user's, in place of the task.
+            past: says which moment the page shows.
+            versions: say how another worker gets the version that runs, and open another file.
         """
-        self._send, self._on_change, self._shown, self._load = send, on_change, shown, load
-        self._episode = episode
+        self._send, self._on_change = send, on_change
+        self._shown, self._episode, self._load = past.shown_moment, past.episode_moments, versions.same_again
         self._cameras = StudioCameras()
         self._lock = self._cameras.lock
-        self.file = StudioFile(self._cameras, self._note, open_copy, asker, load)
+        self.file = StudioFile(self._cameras, self._note, versions.open_file, asker, self._load)
         self._asking = threading.Lock()
         """Held while placements are sent; taken before `_lock`."""
         self._serial = 0

@@ -128,7 +128,7 @@ def source_changes(
         lines: list[tuple[str, str]] = []
         for line in list(difflib.unified_diff(old.splitlines(), new.splitlines(), lineterm="", n=2))[2:]:
             kind = {"+": "add", "-": "del", "@": "at"}.get(line[:1], "same")
-            lines.append((kind, line if kind == "at" else line[:1] + line[1:]))
+            lines.append((kind, line))
         if len(lines) > _MOST_LINES:
             lines = [*lines[:_MOST_LINES], ("at", f"… and {len(lines) - _MOST_LINES} more lines")]
         found.append((name, tuple(lines)))

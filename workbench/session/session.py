@@ -129,14 +129,7 @@ class Session:
         """What the batch lived through."""
         self._asker = Asker(self._send)
         self.studio = CameraStudio(
-            self._send,
-            self._asker,
-            self._background,
-            self._note,
-            self.past.shown_moment,
-            self.versions.same_again,
-            self.past.episode_moments,
-            self.versions.open_file,
+            self._send, self._asker, self._background, self._note, self.past, self.versions
         )
         """Cameras placed by hand."""
         listen(self._say_failure)
