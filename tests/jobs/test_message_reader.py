@@ -7,6 +7,7 @@ import socket
 import struct
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from typing import get_args
 
@@ -67,6 +68,18 @@ def test_a_message_that_stops_in_the_middle_is_not_waited_for(line: Line) -> Non
         assert line.reader.receive(0) is None
     line.theirs.send(whole[-1:])
     assert line.reader.receive(0) == Loading("importing")
+
+
+def test_what_is_there_is_read_at_once_and_what_is_missing_is_waited_for(line: Line) -> None:
+    whole = framed(pack_message(Loading("importing")))
+    line.theirs.sendall(whole)
+    assert line.reader.receive(0) == Loading("importing")
+    with ThreadPoolExecutor(1) as threads:
+        received = threads.submit(line.reader.receive, 60.0)
+        line.theirs.sendall(whole[:-1])
+        until(lambda: line.reader._filled == len(whole) - 5, "all but one byte taken")
+        line.theirs.sendall(whole[-1:])
+        assert received.result(timeout=60) == Loading("importing")
 
 
 @pytest.mark.parametrize(

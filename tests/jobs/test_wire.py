@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import random
 import struct
@@ -281,3 +282,11 @@ def test_bytes_that_changed_on_the_way_raise_nothing_else(seed: int) -> None:
 def test_a_failure_without_its_author_s_file_is_one(tmp_path: Path) -> None:
     with pytest.raises(Unreadable):
         Unpacker([Failed]).message(framed(("Failed", None, {"problem": {"stage": "step"}, "kept": False})))
+
+
+def test_a_path_is_the_bytes_that_the_disk_has_and_nothing_else_is_one() -> None:
+    path = Path(os.fsdecode(b"/author/caf\xe9.py"))
+    assert Unpacker().unpack(pack(path), Path) == path
+    for value, kind in (("/a/text", Path), (b"bytes", np.ndarray), (np.zeros(2), Path)):
+        with pytest.raises(Unreadable):
+            Unpacker().unpack(pack(value), kind)
