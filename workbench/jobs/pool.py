@@ -321,7 +321,7 @@ class _FarShare:
 
     def next(self) -> int | None:
         if not self._mine and not self._none_left:
-            self._send(_Next())
+            self.send(_Next())
             while not isinstance(heard := self._take(), list):
                 pass
             self._none_left = not heard
@@ -335,16 +335,10 @@ class _FarShare:
         return self._limit
 
     def tell(self, number: int, result: Any) -> None:
-        self._send(_Result(number, pack(result)))
+        self.send(_Result(number, pack(result)))
 
     def say(self, news: Any) -> None:
-        self._send(_News(pack(news)))
-
-    def over(self) -> None:
-        self._send(_Over())
-
-    def failed(self, why: str, problem: Problem | None) -> None:
-        self._send(_Failed(why, problem))
+        self.send(_News(pack(news)))
 
     def _take(self) -> list[int] | int:
         heard: list[int] | int = self._connection.recv()
@@ -354,7 +348,7 @@ class _FarShare:
             self._limit = heard
         return heard
 
-    def _send(self, said: object) -> None:
+    def send(self, said: object) -> None:
         self._connection.send_bytes(pack_message(said))
 
 
@@ -372,10 +366,10 @@ def main(socket_fd: str) -> None:
             run, setup = connection.recv()
         try:
             run(setup, share)
-            share.over()
+            share.send(_Over())
         except TaskError as error:
-            share.failed(str(error), error.problem)
+            share.send(_Failed(str(error), error.problem))
         except (OSError, ValueError, RuntimeError) as error:
-            share.failed(str(error), None)
+            share.send(_Failed(str(error), None))
     except (ConnectionError, EOFError):
         return  # the process that started this one is gone
