@@ -118,3 +118,14 @@ def test_an_end_in_the_middle_of_a_message_is_an_end(line: Line) -> None:
     with pytest.raises(EOFError):
         for _ in range(5):
             line.reader.receive(0.2)
+
+
+@pytest.mark.parametrize("begun", [b"", b"\0\0", framed(b"hello")[:6]])
+def test_a_process_that_goes_without_reading_what_it_was_sent_is_an_end(line: Line, begun: bytes) -> None:
+    line.theirs.sendall(begun)
+    assert line.reader.receive(0) is None
+    line.ours.sendall(b"a request")
+    line.theirs.close()  # the kernel says that the connection was reset, and not that it is over
+    with pytest.raises(EOFError) as caught:
+        line.reader.receive(1.0)
+    assert not isinstance(caught.value, Unreadable)
