@@ -71,10 +71,7 @@ class Judging:
         self._rescorer.start(self._files)
 
     def pids(self) -> list[int]:
-        found = running("workbench.session.worker_start")
-        # Each has a keeper above it of the same name, which is there before it.
-        keepers = {process.pid for process in found}
-        return [process.pid for process in found if process.ppid() in keepers]
+        return running("workbench.session.worker_start")
 
     def ended(self) -> bool:
         return self._rescorer.judging.view.state in ("done", "failed")
@@ -91,7 +88,7 @@ class Judging:
 
 
 class Filming:
-    process = "the process that makes it"
+    process = "a process that makes it"
 
     def __init__(self, place: Path) -> None:
         self._wanted = Wanted("film", sources_among([place / "v1"]), place / "films", "eye")
@@ -101,7 +98,7 @@ class Filming:
         assert self._making.start(self._wanted)
 
     def pids(self) -> list[int]:
-        return [process.pid for process in running("workbench.ui.making")]
+        return running("workbench.jobs.pool")
 
     def ended(self) -> bool:
         return not self._making.view().running
@@ -118,15 +115,17 @@ class Filming:
         self._making.close()
 
 
-def running(module: str) -> list[psutil.Process]:
-    """Of what this process has started, itself or by a keeper; a page's server of other tests has workers further down."""
+def running(module: str) -> list[int]:
+    """Of what this process has started by a keeper; a page's server of other tests has workers further down."""
     found = []
     for child in psutil.Process().children():
         try:
             found += [process for process in (child, *child.children()) if module in process.cmdline()]
         except psutil.NoSuchProcess:
             continue
-    return found
+    # Each has a keeper above it of the same name, which is there before it.
+    keepers = {process.pid for process in found}
+    return [process.pid for process in found if process.ppid() in keepers]
 
 
 @pytest.fixture

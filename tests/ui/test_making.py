@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tests.drive.episodes import Made, Track
+from tests.drive.waiting import until
 from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
 from workbench.core.pictures import CameraInfo
 from workbench.recording.episode import EpisodeInfo
-from workbench.recording.lerobot_export import ExportOptions
-from workbench.recording.scene_eye import Eye
 from workbench.recording.sources import Source, sources_among
 from workbench.ui.make_shared import Wanted
-from workbench.ui.making import Making, MakingView, decode, encode
+from workbench.ui.making import Making, MakingView
 
 pytestmark = pytest.mark.usefixtures("child_process")
 
@@ -61,28 +60,11 @@ class Told:
     """A `Making`, and a way to wait for what it tells."""
 
     def __init__(self) -> None:
-        self._changed = threading.Condition()
-        self.making = Making(self._note)
+        self.making = Making()
 
-    def _note(self) -> None:
-        with self._changed:
-            self._changed.notify_all()
-
-    def wait(self, reached) -> MakingView:
-        with self._changed:
-            assert self._changed.wait_for(lambda: reached(self.making.view()), timeout=120)
-            return self.making.view()
-
-
-def test_what_is_wanted_crosses_the_pipe_as_it_is() -> None:
-    wanted = Wanted(
-        "scene",
-        (Source(Path("/a/b.json")), Source(Path("/a/c.h5"), "traj_1")),
-        Path("/out"),
-        eye=Eye((1.0, 2.0, 3.0), (0.0, 0.0, 0.0)),
-        export=ExportOptions(only_successes=True, instruction="push ä"),
-    )
-    assert decode(encode(wanted)) == wanted
+    def wait(self, reached: Callable[[MakingView], bool]) -> MakingView:
+        until(lambda: reached(self.making.view()), "what is waited for", seen=self.making.view)
+        return self.making.view()
 
 
 def test_a_sheet_is_made_and_a_second_one_says_why_not(recordings: Path, tmp_path: Path) -> None:
@@ -105,6 +87,16 @@ def test_stopping_leaves_nothing(recordings: Path, tmp_path: Path) -> None:
     view = told.wait(lambda view: not view.running)
     assert (view.problem, view.made) == ("", ())
     assert not [path for path in (tmp_path / "films").iterdir() if path.suffix != ".mp4"]
+
+
+def test_a_dataset_is_stopped_in_the_middle_of_an_episode(recordings: Path, tmp_path: Path) -> None:
+    told = Told()
+    told.making.start(Wanted("lerobot", sources_among([recordings]) * 200, tmp_path / "datasets" / "one"))
+    until(lambda: list(tmp_path.glob("datasets/.one.*/videos/*/*/*")), "a film that is written")
+    told.making.stop()
+    view = told.wait(lambda view: not view.running)
+    assert view.done < 0.9 and (view.problem, view.made) == ("", ())
+    assert list((tmp_path / "datasets").iterdir()) == []
 
 
 def test_what_cannot_be_read_is_said(tmp_path: Path) -> None:

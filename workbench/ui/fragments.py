@@ -52,6 +52,15 @@ def percent(done: float, total: float) -> int:
     return round(100 * done / total) if total else 0
 
 
+def short_text(text: str, longest: int = 120) -> str:
+    return text if len(text) <= longest else text[: longest - 1] + "…"
+
+
+def sentence(why: str) -> str:
+    """With a capital and a full stop."""
+    return f"{why[:1].upper()}{why[1:].removesuffix('.')}." if why else ""
+
+
 def counted(count: int, what: str) -> str:
     """``1 step``, ``7 steps``."""
     return f"{count} {what}" if count == 1 else f"{count} {what}s"
