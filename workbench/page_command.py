@@ -27,8 +27,6 @@ from workbench.ui.commands import Command
 from workbench.ui.door import Door, DoorError, DoorOptions, open_door
 from workbench.ui.pages import Which
 from workbench.ui.put_together import Workplace
-from workbench.ui.share_panel import Sharing
-from workbench.ui.step_in import offer_going_back_in
 
 
 def open_in_terminal(
@@ -70,11 +68,10 @@ def open_in_terminal(
             start_reading()
 
     session = _session(task, options, recordings, worker, on_event, history_bytes)
-    place = Workplace(door.server, recordings, session, imports=options.imports, on_notice=warn)
-    what = f"{task}, {options.num_envs} envs"
-    beside = WorkerOptions(worker.memory_limit)
+    make_session = _opener(recordings, WorkerOptions(worker.memory_limit))
     base = TaskOptions(rules=options.rules, imports=options.imports)
-    _serve(door, place, "live", what, recordings, beside, base, end, session.close, trust)
+    place = Workplace(door, recordings, make_session, base, session, trust=trust, on_notice=warn)
+    _serve(door, place, "live", f"{task}, {options.num_envs} envs", end, session.close)
 
 
 def review_in_terminal(
@@ -94,10 +91,11 @@ def review_in_terminal(
     door = _opened(at, "Recordings")
     if isinstance(door, int):
         return door
-    place = Workplace(door.server, folder, tasks=tasks, imports=base.imports, on_notice=warn)
+    make_session = _opener(folder, worker)
+    place = Workplace(door, folder, make_session, base, tasks=tasks, trust=trust, on_notice=warn)
     end = _End()
     end.show_address()
-    _serve(door, place, "review", f"recordings in {folder}", folder, worker, base, end, lambda: None, trust)
+    _serve(door, place, "review", f"recordings in {folder}", end, lambda: None)
 
 
 def _opened(at: DoorOptions, label: str) -> Door | int:
@@ -125,26 +123,16 @@ def _session(
     return Session(task, options, recordings=recordings, history_bytes=history_bytes, worker=worker, **said)
 
 
-def _serve(
-    door: Door,
-    place: Workplace,
-    first: Which,
-    what: str,
-    recordings: Path,
-    worker: WorkerOptions,
-    base: TaskOptions,
-    end: _End,
-    close_session: Callable[[], None],
-    trust: bool,
-) -> NoReturn:
-    def open_task(task: TaskName, options: TaskOptions) -> Session:
-        return _session(task, options, recordings, worker, print_event)
+def _opener(recordings: Path, worker: WorkerOptions) -> Callable[[TaskName, TaskOptions], Session]:
+    """Opens the tasks that recordings name."""
+    return lambda task, options: _session(task, options, recordings, worker, print_event)
 
-    sharing = Sharing(door)
-    place.offer(sharing.offer)
+
+def _serve(
+    door: Door, place: Workplace, first: Which, what: str, end: _End, close_session: Callable[[], None]
+) -> NoReturn:
     if door.options.token:
         place.commands = (Command("Renew the token and close every page", end.renew),)
-    close_others = offer_going_back_in(place, open_task, base, trust)
     end.at_signals()
     try:
         place.pages.start(first)
@@ -153,8 +141,6 @@ def _serve(
     finally:
         out.print("closing")
         place.close()
-        sharing.close()
-        close_others()
         close_session()
         door.close()
     _leave(end.code)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Iterator
 
@@ -59,10 +60,9 @@ def served(child_process: None, tmp_path_factory: pytest.TempPathFactory) -> Ite
     folder = tmp_path_factory.mktemp("recordings")
     write(folder, made(5))
     door = open_door(DoorOptions(port=0))
-    session = Session(
-        str(folder / "push.py"), TaskOptions(num_envs=2), recordings=folder, make_worker=scripted(2)
-    )
-    place = Workplace(door.server, folder, session)
+    make_session = functools.partial(Session, recordings=folder, make_worker=scripted(2))
+    session = make_session(str(folder / "push.py"), TaskOptions(num_envs=2))
+    place = Workplace(door, folder, make_session, TaskOptions(), session)
     place.pages.start("live")
     wait_until(session, lambda view: view.task is not None, "the task")
     yield Served(door, place)
@@ -112,7 +112,7 @@ def test_no_claim_disturbs_another_page(served, listener, monkeypatch, capfd, wh
     monkeypatch.setattr(page_guard, "HANDS_OFF", 0.05)
     monkeypatch.setattr(page_guard, "RATE", 1e6)  # not a test of the pace
     served.show(which)
-    assert len(served.controls()) > (30 if which == "live" else 10)
+    assert len(served.controls()) > (30 if which == "live" else 20)
     claim_all(served, NASTY)
     with client(served.door):  # and a page that comes later is let in and gets all
         pass

@@ -21,8 +21,7 @@ from workbench.session.judging import JudgedView
 from workbench.session.review import Review
 from workbench.session.verdict import Verdict
 from workbench.ui.judged_panel import MOST_ROWS, status_html
-from workbench.ui.rescore_panel import IDLE, RescoreChoices, RescorePanel
-from workbench.ui.step_in import episode_files
+from workbench.ui.rescore_panel import IDLE, RescoreChoices, RescorePanel, episode_files
 
 
 def verdict(id: str = "a", **changes: Any) -> Verdict:
@@ -139,13 +138,7 @@ class Rescoring:
 @pytest.fixture
 def rescoring(panels: Panels, library: Library, review: Review, clock: Clock) -> Rescoring:
     told, choices = Told(), RescoreChoices(True, False)
-    panel = RescorePanel(
-        panels.server,
-        cast(Any, told),
-        review,
-        lambda ids: episode_files(library, ids),
-        choices,
-    )
+    panel = RescorePanel(panels.server, cast(Any, told), review, library, choices)
     return Rescoring(panel, panels, clock, review, choices, told)
 
 
@@ -167,6 +160,20 @@ def test_a_row_opens_its_episode_at_the_first_difference(
     rescoring.draw(replace(rescoring.told.view, serial=2))
     assert len(rescoring.panels.charts()) == 1 and rescoring.panels.shows("Judge what is open")
     assert "wb-selected" in rescoring.panels.html()
+
+
+def test_why_nothing_could_be_judged_is_said_once(rescoring: Rescoring) -> None:
+    why = "push.py (0123456) is not trusted"
+    lost = (
+        verdict("a", why_not=why),
+        verdict("b", why_not=f"{why}: line 1"),
+        verdict("c", why_not="it has no step"),
+    )
+    rescoring.draw(JudgedView("failed", 1, lost, 3, 3, why=why))
+    assert rescoring.panels.html().count("is not trusted") == 1
+    assert "not judged: it has no step" in rescoring.panels.html()
+    rescoring.draw(JudgedView("done", 2, lost, 3, 3))
+    assert rescoring.panels.html().count(f"not judged: {why}") == 2, "nothing else says it"
 
 
 def test_a_long_list_is_turned_a_page_at_a_time(rescoring: Rescoring) -> None:

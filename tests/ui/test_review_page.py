@@ -16,8 +16,12 @@ from tests.drive.panels import Clock, Panels
 from tests.drive.waiting import until
 from workbench.core.step import OtherEntry
 from workbench.recording.library import Library
+from workbench.session.messages import TaskOptions
 from workbench.session.review import Review
-from workbench.ui.review_page import ReviewOffers, ReviewPage
+from workbench.session.session import Session
+from workbench.ui.door import Door
+from workbench.ui.put_together import Workplace
+from workbench.ui.review_page import ReviewPage
 from workbench.ui.review_panel import GHOSTS, GO_LIVE
 from workbench.ui.review_scene import MOST_NAMED
 
@@ -60,16 +64,20 @@ class Shown:
 
 
 @pytest.fixture
-def shown(child_process: None, folder: Path, panels: Panels, clock: Clock) -> Iterator[Shown]:
-    library = Library(folder)
-    library.refresh()
-    review = Review(library)
-    offers = ReviewOffers(on_step_back=lambda id, state: None)
-    yield Shown(
-        ReviewPage(panels.server, review, library, offers, clock=clock), review, library, panels, clock
-    )
-    review.close()
-    library.close()
+def server(door: Door) -> viser.ViserServer:
+    return door.server
+
+
+def no_session(task: object, options: object) -> Session:
+    raise AssertionError("nobody goes live from a recording")
+
+
+@pytest.fixture
+def shown(child_process: None, folder: Path, door: Door, panels: Panels, clock: Clock) -> Iterator[Shown]:
+    place = Workplace(door, folder, no_session, TaskOptions())
+    place.shelf.library.refresh()
+    yield Shown(ReviewPage(place, clock=clock), place.shelf.review, place.shelf.library, panels, clock)
+    place.close()
 
 
 SLIDER = "step of the timeline"

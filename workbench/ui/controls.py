@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, Literal, TypeVar
 
 import viser
 
@@ -27,6 +27,18 @@ KEY_SETTLES = 0.03
 """Seconds. An input that has the focus takes the arrow keys too, and what it says comes in any order with the key."""
 HANDS_OFF = 0.5
 """Seconds after a person touched an input in which it is not written to."""
+
+
+def tell_all(
+    server: viser.ViserServer,
+    title: str,
+    text: str,
+    color: Literal["orange", "red"] | None = "orange",
+    seconds: float | None = None,
+) -> None:
+    """Notify every open page: a key does not tell which one it was pressed on."""
+    for client in server.get_clients().values():
+        client.add_notification(title, text, color=color, auto_close_seconds=seconds)
 
 
 @contextmanager

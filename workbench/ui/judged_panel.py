@@ -13,7 +13,7 @@ from workbench.session.judging import RUNNING, JudgedView
 from workbench.session.verdict import Verdict
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import Line, LineChart, span_of
-from workbench.ui.parts import Part
+from workbench.ui.parts import PagePart
 from workbench.ui.presses import Paged, Presses
 
 MOST_ROWS = 10
@@ -23,7 +23,7 @@ View = TypeVar("View")
 Of = TypeVar("Of")
 
 
-class JudgedPanel(Part[View], Generic[View, Of]):
+class JudgedPanel(PagePart[View], Generic[View, Of]):
     """Its parts, to be put into the present container in an order of its own; a row of the list goes to its run.
 
     Args:
@@ -38,6 +38,8 @@ class JudgedPanel(Part[View], Generic[View, Of]):
     def __init__(self, server: viser.ViserServer, column: str) -> None:
         self._server, self._column = server, column
         self._listed: Sequence[Verdict[Of]] = ()
+        self._failed_since = ""
+        """As the status says it; the rows need not say it again."""
 
     def _add_status(self, label: str, stop: Callable[[], None]) -> None:
         self._stop = self._server.gui.add_button(label, icon=viser.Icon.PLAYER_STOP, visible=False)
@@ -53,6 +55,7 @@ class JudgedPanel(Part[View], Generic[View, Of]):
         self._chart = LineChart(self._server, self._server.gui.add_folder(None), height=160)
 
     def _draw_status(self, judged: JudgedView, title: str = "", idle: str = "") -> None:
+        self._failed_since = judged.why if judged.state == "failed" else ""
         self._stop.visible = judged.state in RUNNING
         self._status.visible = judged.state != "none" or bool(idle)
         self._status.content = status_html(judged, title, idle, self.advice)
@@ -72,9 +75,10 @@ class JudgedPanel(Part[View], Generic[View, Of]):
 
     def _row(self, place: int) -> dict[str, Any]:
         verdict, row = self._listed[place], place % MOST_ROWS
+        told = self._failed_since and verdict.why_not.startswith(self._failed_since)
         return {
             "letter": "",
-            "changed": words.what_changed(verdict),
+            "changed": "not judged" if told else words.what_changed(verdict),
             "returns": "" if verdict.why_not else words.returns(verdict),
             "drift": f"drifted {words.drift(verdict)}" if verdict.drifted else "",
             "same": not verdict.differs,

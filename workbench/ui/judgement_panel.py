@@ -21,8 +21,8 @@ from workbench.session.verdict import Verdict, in_order
 from workbench.session.view import SessionView
 from workbench.ui.fragments import render
 from workbench.ui.judged_panel import JudgedPanel
-from workbench.ui.line_chart import LONGEST
-from workbench.ui.parts import Part
+from workbench.ui.line_chart import part_round
+from workbench.ui.parts import PagePart
 
 TITLE = "The past, judged again"
 
@@ -67,8 +67,7 @@ class JudgementPanel(JudgedPanel[SessionView, PastRun]):
         names, env = judged.names, view.selected_env
         if names and self._name.options != names:
             self._name.options = names
-        # What a page sends as its choice may be anything.
-        name = self._name.value if self._name.value in names else "reward"
+        name = self._name.value
         differs = bool(self._listed or judged.differing_names)
         curve = self._session.judge.curve(name, env) if differs else None
         self._name.visible = curve is not None
@@ -119,12 +118,8 @@ def chart_data(curve: JudgedCurve, shown: int | None) -> tuple[NDArray, ...]:
 
     Of a long record the newest part, or the part round the moment that is shown.
     """
-    count = len(curve.tick)
-    end = count
-    if shown is not None:
-        end = int(np.searchsorted(curve.serial, shown)) + LONGEST // 2
-    end = min(max(end, LONGEST), count)
-    part = slice(max(0, end - LONGEST), end)
+    place = None if shown is None else int(np.searchsorted(curve.serial, shown))
+    part = part_round(len(curve.tick), place)
     x, old, new = (v[part] for v in (curve.tick, curve.old, curve.new))
     if shown is None or shown not in curve.serial[part]:
         return x, old, new
@@ -143,7 +138,7 @@ def in_a_line(judged: JudgedView) -> str:
     return f"{TITLE}: {judged.why}" if judged.why else ""
 
 
-class JudgedAbove(Part[SessionView]):
+class JudgedAbove(PagePart[SessionView]):
     def __init__(self, server: viser.ViserServer) -> None:
         self._line = server.gui.add_html("", visible=False)
 

@@ -153,6 +153,12 @@ def with_gaps(values: NDArray[np.float64]) -> NDArray[np.float64] | list[float |
     return [value if there else None for value, there in zip(values.tolist(), finite.tolist(), strict=True)]
 
 
+def part_round(count: int, place: int | None) -> slice:
+    """`LONGEST` of so many points, as far as there are: round a place, or the newest."""
+    end = count if place is None else min(max(place + LONGEST // 2, LONGEST), count)
+    return slice(max(0, end - LONGEST), end)
+
+
 def span_of(lines: Sequence[NDArray[np.float64]]) -> Span | None:
     """The range of a chart: of a yes or no always the same one, whether it changes or not; else that of the data."""
     values = np.concatenate([[], *lines])

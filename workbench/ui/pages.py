@@ -15,26 +15,20 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal
 
 import viser
 
 from workbench.machine.watched_thread import watched_thread
 from workbench.ui.viewpoint import Stage
 
+if TYPE_CHECKING:
+    from workbench.ui.page import Page
+    from workbench.ui.review_page import ReviewPage
+
 log = logging.getLogger(__name__)
 
 Which = Literal["live", "review"]
-
-
-class AnyPage(Protocol):
-    def start(self) -> None:
-        """Draw it, and go on with that."""
-        ...
-
-    def stop(self) -> None: ...
-    @property
-    def dark(self) -> bool: ...
 
 
 class Pages:
@@ -42,31 +36,19 @@ class Pages:
     Args:
         server: Of viser, already behind its door.
         stage: The 3-D view that the pages share.
-        make: Builds a page on the (empty) server: by its name, given whether it is to be dark.
+        make: Builds a page on the (empty) server, given which and whether it is to be dark.
     """
 
     def __init__(
-        self, server: viser.ViserServer, stage: Stage, make: dict[Which, Callable[[bool], AnyPage]]
+        self, server: viser.ViserServer, stage: Stage, make: Callable[[Which, bool], Page | ReviewPage]
     ) -> None:
-        self._server, self._stage, self._make = server, stage, dict(make)
+        self._server, self._stage, self._make = server, stage, make
         self._wake = threading.Condition()
         self._wish: Which | None = None
         self._shown: Which | None = None
-        self._page: AnyPage | None = None
+        self._page: Page | ReviewPage | None = None
         self._ending = False
         self._thread = watched_thread("pages", self._serve)
-
-    @property
-    def shown(self) -> Which | None:
-        return self._shown
-
-    def can_show(self, which: Which) -> bool:
-        return which in self._make
-
-    def offer(self, which: Which, make: Callable[[bool], AnyPage]) -> None:
-        """From now on there is this page as well: a live env that was opened from the review."""
-        with self._wake:
-            self._make[which] = make
 
     def start(self, which: Which) -> None:
         """Show the first page; returns when it is there."""
@@ -101,7 +83,7 @@ class Pages:
                 if self._ending:
                     return
                 wish, self._wish = self._wish, None
-            if wish is None or wish == self._shown or wish not in self._make:
+            if wish is None or wish == self._shown:
                 continue
             try:
                 self._show(wish)
@@ -118,7 +100,7 @@ class Pages:
                 # Nothing of the page that went is left: handles, commands, callbacks, nodes.
                 self._stage.clear()
                 self._server.gui.reset()
-            self._page = self._make[which](dark)
+            self._page = self._make(which, dark)
             self._page.start()
         self._server.flush()
         with self._wake:

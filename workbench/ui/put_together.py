@@ -13,21 +13,26 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import viser
-
 from workbench.recording.library import Library
 from workbench.recording.mend import mend
+from workbench.session.clearance import Clearances
+from workbench.session.messages import TaskOptions
 from workbench.session.record_live import recovered_in_words
 from workbench.session.recorded_scene import SceneProcess
+from workbench.session.rescorer import Rescorer
 from workbench.session.review import Review
+from workbench.session.session import Session
 from workbench.ui.commands import Command
-from workbench.ui.pages import Pages
-from workbench.ui.review_page import ReviewOffers, ReviewPage
+from workbench.ui.door import Door
+from workbench.ui.pages import Pages, Which
+from workbench.ui.rescore_panel import RescoreChoices
+from workbench.ui.review_page import ReviewPage
+from workbench.ui.share_panel import Sharing
+from workbench.ui.step_in import MakeSession, StepIn
+from workbench.ui.trust_dialog import TrustDialog
 from workbench.ui.viewpoint import Stage
 
 if TYPE_CHECKING:
-    # What a live env needs is not needed for looking at recordings.
-    from workbench.session.session import Session
     from workbench.ui.page import Page
 
 
@@ -40,44 +45,46 @@ class Shelf:
 
 
 class Workplace:
-    """Both pages over one server.
+    """Both pages behind one door, and what outlives them.
 
     Args:
-        server: Of viser, already behind its door.
+        door: Of the pages.
         recordings: The folder that is recorded to and reviewed.
+        make_session: Opens a task that a recording names; gets what `Session` gets.
+        base: What is the same for all tasks that recordings name.
         session: The live env, if there is one.
         tasks: Task files in which envs of foreign recordings may be found.
-        imports: Modules that register such envs.
+        trust: Run what recordings name without asking.
         on_notice: Called, on any thread, with a sentence that is to be seen in the terminal too.
     """
 
     def __init__(
         self,
-        server: viser.ViserServer,
+        door: Door,
         recordings: Path,
+        make_session: MakeSession,
+        base: TaskOptions,
         session: Session | None = None,
         tasks: tuple[Path, ...] = (),
-        imports: tuple[str, ...] = (),
+        trust: bool = False,
         on_notice: Callable[[str], None] = lambda words: None,
     ) -> None:
-        self._server, self._recordings, self._tasks = server, recordings, tasks
-        self._imports = imports
-        self._on_notice = on_notice
+        self.server, self._recordings, self._tasks = door.server, recordings, tasks
+        self._imports, self._on_notice = base.imports, on_notice
         self._shelf: Shelf | None = None
         self._lock = threading.Lock()
         self._mending: threading.Thread | None = None
-        self._offers: Callable[[Workplace, ReviewOffers], ReviewOffers] = lambda _, offers: offers
         self.commands: tuple[Command, ...] = ()
         """In the palette of both pages; set before the first is shown."""
         self.session = session
-        self._stage = Stage(server)
-        self.pages = Pages(server, self._stage, {"review": self._review_page})
-        if session is not None:
-            self.go_live_with(session)
-
-    @property
-    def server(self) -> viser.ViserServer:
-        return self._server
+        """That the live page shows when it is next built."""
+        self.dialog = TrustDialog(self.server)
+        clearances = Clearances(self.task_files, self.dialog.ask, all_trusted=trust)
+        self.step_in = StepIn(self, make_session, clearances, base)
+        self.rescorer, self.rescore_choices = Rescorer(clearances, base), RescoreChoices()
+        self.sharing = Sharing(door)
+        self.stage = Stage(self.server)
+        self.pages = Pages(self.server, self.stage, self._page)
 
     @property
     def shelf(self) -> Shelf:
@@ -110,24 +117,14 @@ class Workplace:
             self._on_notice(recovered_in_words(mended))
             shelf.library.look_soon()
 
-    def go_live_with(self, session: Session) -> None:
-        """From now on there is a live page, of this session. It is not shown yet."""
-        self.session = session
-        self.pages.offer("live", self._live_page)
-
     def task_files(self) -> tuple[Path, ...]:
         """The task files that this program was started with, or has open."""
         task = None if self.session is None else self.session.view().task
         live = () if task is None or task.file is None else (Path(task.file),)
         return tuple(file.absolute() for file in (*live, *self._tasks))
 
-    def offer(self, add: Callable[[Workplace, ReviewOffers], ReviewOffers]) -> None:
-        """Let `add` put more into what the review page offers; it is asked whenever that page is built."""
-        before = self._offers
-        self._offers = lambda place, offers: add(place, before(place, offers))
-
     def close(self) -> None:
-        """Stop the pages and what they read from; the session is its owner's to close."""
+        """Stop the pages and what they read from; the first session and the door are their owner's to close."""
         self.pages.stop()
         with self._lock:
             if self._shelf is not None:
@@ -135,22 +132,17 @@ class Workplace:
                     self._mending.join(timeout=10.0)
                 self._shelf.review.close()
                 self._shelf.library.close()
+        for part in (self.sharing, self.dialog, self.rescorer.judging, self.step_in):
+            part.close()
 
-    def _live_page(self, dark: bool) -> Page:
+    def _page(self, which: Which, dark: bool) -> Page | ReviewPage:
+        if which == "review":
+            self.shelf.library.look_soon()
+            return ReviewPage(self, dark)
+        # What a live env needs is not needed for looking at recordings.
         from workbench.ui.page import Page
 
-        assert self.session is not None, "a live page is offered with its session"
+        assert self.session is not None, "the live page is shown with its session"
         return Page(
-            self._server, self.session, dark, lambda: self.pages.show("review"), self._stage, self.commands
-        )
-
-    def _review_page(self, dark: bool) -> ReviewPage:
-        shelf = self.shelf
-        shelf.library.look_soon()
-        offers = ReviewOffers(
-            on_back=(lambda: self.pages.show("live")) if self.pages.can_show("live") else None,
-            commands=self.commands,
-        )
-        return ReviewPage(
-            self._server, shelf.review, shelf.library, self._offers(self, offers), dark, self._stage
+            self.server, self.session, dark, lambda: self.pages.show("review"), self.stage, self.commands
         )

@@ -18,6 +18,7 @@ from collections.abc import Callable
 import viser
 
 from workbench.machine.watched_thread import watched_thread
+from workbench.ui.controls import tell_all
 from workbench.ui.viser_seam import wait_until_taken
 
 log = logging.getLogger(__name__)
@@ -80,18 +81,15 @@ class RedrawLoop:
             self._draw()
         except Exception:
             log.exception("The page could not be drawn; trying again.")
-            self._say_broken()
-            return False
-        return True
-
-    def _say_broken(self) -> None:
-        for client in self._server.get_clients().values():
-            client.add_notification(
+            tell_all(
+                self._server,
                 "This page could not be drawn",
                 "The reason is in the terminal of the workbench. It is tried again.",
-                color="red",
-                auto_close_seconds=5.0,
+                "red",
+                5.0,
             )
+            return False
+        return True
 
 
 def draw_apart(server: viser.ViserServer, panels: Callable[[], None], scene: Callable[[], None]) -> None:

@@ -16,6 +16,7 @@ import viser
 
 from workbench.authoring.reference import RecordedTask, named_file
 from workbench.recording.episode import EpisodeInfo
+from workbench.recording.library import Library
 from workbench.recording.sources import Source
 from workbench.session import rescore_words as words
 from workbench.session.judging import RUNNING
@@ -25,9 +26,10 @@ from workbench.session.review import Review
 from workbench.session.review_view import ReviewView
 from workbench.session.step_back import class_in, reference_of
 from workbench.session.verdict import Verdict, in_order
-from workbench.ui.fragments import render
+from workbench.ui.controls import tell_all
+from workbench.ui.fragments import counted, render
 from workbench.ui.judged_panel import JudgedPanel
-from workbench.ui.line_chart import LONGEST
+from workbench.ui.line_chart import part_round
 from workbench.ui.review_scene import COLOURS, letter
 
 TODAYS, RECORDED = "today's", "as recorded"
@@ -101,6 +103,12 @@ class RescoreChoices:
     """Asked before the files that the recordings name."""
 
 
+def episode_files(library: Library, ids: Sequence[str]) -> list[Source]:
+    """Where these recordings are; those that are gone, or cannot be read, are left out."""
+    rows = {row.id: row for row in library.rows()}
+    return [row.source for row in (rows[id] for id in dict.fromkeys(ids) if id in rows) if row.paths]
+
+
 class RescorePanel(JudgedPanel[ReviewView, Source]):
     """The panel in the present container.
 
@@ -108,7 +116,7 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
         server: The page.
         rescorer: What judges.
         review: Shows the episode of a row, and says what is open.
-        find: The files of recordings by their ids in the library; ids that are gone are left out.
+        library: Of the recordings that may be judged.
         choices: What was chosen before.
         known: Task files that the server knows of besides those that recordings name.
     """
@@ -120,13 +128,13 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
         server: viser.ViserServer,
         rescorer: Rescorer,
         review: Review,
-        find: Callable[[Sequence[str]], list[Source]],
+        library: Library,
         choices: RescoreChoices,
         known: Callable[[], Sequence[Path]] = tuple,
     ) -> None:
         super().__init__(server, "episode")
         self._rescorer, self._review = rescorer, review
-        self._find, self._choices, self._known = find, choices, known
+        self._library, self._choices, self._known = library, choices, known
         gui = server.gui
         self._begin = gui.add_button("Judge what is open", icon=viser.Icon.GAVEL, visible=False)
         self._begin.on_click(lambda _: self.judge([one.id for one in review.view().opened]))
@@ -152,9 +160,18 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
         self._add_chart()
         self._selected: str | None = None
 
+    def judge_and_tell(self, ids: Sequence[str]) -> None:
+        """As `judge`, for a press from where the tab is not seen."""
+        if not ids:
+            tell_all(self._server, "Nothing to judge", "No recording is selected or open.")
+            return
+        self.judge(ids)
+        title = f"Judging {counted(len(ids), 'recording')} again"
+        tell_all(self._server, title, "What is otherwise now is listed under Judge.", None, 4.0)
+
     def judge(self, ids: Sequence[str]) -> None:
         """Begin with these recordings of the library."""
-        files = self._find(ids)
+        files = episode_files(self._library, ids)
         self._selected = None
         self._pages.go_to(0)
         self._rescorer.start(
@@ -165,10 +182,9 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
         )
 
     def _chosen(self) -> None:
-        # What a page sends as its choice may be anything.
-        code = next((code for code in self._codes if code.label == self._code.value), self._codes[0])
+        code = next(code for code in self._codes if code.label == self._code.value)
         self._choices.recorded_source, self._choices.file = code.recorded, code.file
-        self._choices.use_env_states = self._states.value is True
+        self._choices.use_env_states = self._states.value
 
     # --- drawing -----------------------------------------------------------------------------------
 
@@ -242,10 +258,7 @@ class RescorePanel(JudgedPanel[ReviewView, Source]):
         if chosen is None:
             self._chart.hide()
             return
-        end = chosen.length
-        if chosen.first_difference is not None:
-            end = min(end, max(LONGEST, chosen.first_difference + LONGEST // 2))
-        part = slice(max(0, end - LONGEST), end)
+        part = part_round(chosen.length, chosen.first_difference)
         steps = np.arange(1, chosen.length + 1)
         name = f"seed {chosen.seed}" if chosen.seed >= 0 else chosen.of.name
         self._draw_chart(

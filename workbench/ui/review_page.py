@@ -1,16 +1,14 @@
 """The review: recordings in place of a live env, on the same page, with the same timeline and keys.
 
 It is put together as the live page is: one loop waits until the review has something new, takes a snapshot, and every
-part draws what is new to it. There is no worker and no task file; what is shown comes from the recordings. What
-other parts of the program add to it (judging again, sharing) are `Part`s, which put themselves into the tab that they
-belong in and are drawn with the rest.
+part draws what is new to it. There is no worker and no task file; what is shown comes from the recordings.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import viser
 
@@ -18,7 +16,7 @@ from workbench.core.camera_settings import CameraKey
 from workbench.core.pictures import Picture
 from workbench.recording.library import Library
 from workbench.session.messages import CameraRequest
-from workbench.session.review import MOST_OPEN, Review
+from workbench.session.review import MOST_OPEN
 from workbench.session.review_events import success_words
 from workbench.session.review_pictures import PictureReader
 from workbench.session.review_view import ReviewView
@@ -28,16 +26,20 @@ from workbench.ui.commands import Command, register
 from workbench.ui.fragments import render
 from workbench.ui.library_list import Action
 from workbench.ui.library_panel import LibraryPanel
-from workbench.ui.parts import Clock, DrawDue, Part, Parts
+from workbench.ui.parts import Clock, DrawDue, PagePart, Parts
 from workbench.ui.presses import Presses
 from workbench.ui.redraw_loop import RedrawLoop, draw_apart
+from workbench.ui.rescore_panel import RescorePanel
 from workbench.ui.review_compare_panel import ReviewComparePanel
 from workbench.ui.review_curves import ReviewCurves, ReviewNumbers
 from workbench.ui.review_panel import ReviewPanel
 from workbench.ui.review_scene import COLOURS, ReviewIn3D, letter
 from workbench.ui.review_timeline import ReviewTimeline
+from workbench.ui.step_in import StepInPart
 from workbench.ui.view_panel import ViewPanel
-from workbench.ui.viewpoint import Stage
+
+if TYPE_CHECKING:
+    from workbench.ui.put_together import Workplace
 
 TOLD_EVERY = 0.1
 """Seconds, while it plays. Faster, numbers cannot be read."""
@@ -52,69 +54,18 @@ TOLD_WIDTH = 20.0
 BACK = "Back to the live env"
 
 
-@dataclass(frozen=True)
-class Places:
-    """Where a part may put itself: tabs, to be entered with ``with``, and the table of recordings."""
-
-    review: viser.GuiTabHandle
-    share: viser.GuiTabHandle
-    tabs: viser.GuiTabGroupHandle
-    """For a tab of its own."""
-    library: LibraryPanel
-    """Says which recordings are selected, and takes further buttons for them (`LibraryPanel.add_action`)."""
-    make_way: Callable[[Callable[[bool], None]], int]
-    """Folds the table of recordings, for a part that opens a panel of its own; says how many pixels of the smallest
-    page are between the panels then. It gets what folds and unfolds that panel in turn, where there is no room for it
-    beside the table."""
-    unfolded: Callable[[], None]
-    """To be called when a page shows that panel: the table is folded if the two leave no view."""
-
-
-AddPart = Callable[[viser.ViserServer, Places], "Part[ReviewView] | None"]
-"""Builds a part into the page."""
-
-
-@dataclass(frozen=True)
-class ReviewOffers:
-    """What the review offers besides looking."""
-
-    on_step_back: Callable[[str, int], None] = lambda id, state: None
-    """Go on live from a state of a recording: its id and the state. Asked for again on the way there, it is given up."""
-    going: Callable[[], str] = lambda: ""
-    """What is waited for on the way to the live env; empty while nobody is on it."""
-    on_back: Callable[[], None] | None = None
-    """Back to the live page; None where there is none."""
-    on_rescore: Callable[[tuple[str, ...]], None] = lambda ids: None
-    """Judge recordings again: their ids."""
-    parts: tuple[AddPart, ...] = ()
-    commands: tuple[Command, ...] = ()
-
-
 class ReviewPage:
-    """The review's page on this server.
+    """The review's page.
 
     Args:
-        server: Of viser, already behind its door.
-        review: What is shown and asked.
-        library: The recordings that can be opened.
-        offers: What else there is on the page.
+        place: Of the recordings, and of what can be done with them.
         dark: How it begins.
-        stage: The 3-D view; None makes one.
         clock: That the parts of the page go by.
     """
 
-    def __init__(
-        self,
-        server: viser.ViserServer,
-        review: Review,
-        library: Library,
-        offers: ReviewOffers = ReviewOffers(),
-        dark: bool = True,
-        stage: Stage | None = None,
-        clock: Clock = time.monotonic,
-    ) -> None:
-        self._server, self._review, self._clock = server, review, clock
-        self._offers = offers
+    def __init__(self, place: Workplace, dark: bool = True, clock: Clock = time.monotonic) -> None:
+        self._place, self._clock = place, clock
+        self._server, self._review = server, review = place.server, place.shelf.review
         self._loop = RedrawLoop(server, "review-page", review.wait, self._has_viewers, self._look_and_redraw)
         self._reader = PictureReader()
         self._requests: tuple[CameraRequest, ...] = ()
@@ -122,48 +73,43 @@ class ReviewPage:
         self._pictures_serial = 0
         self._had_opened = tuple(one.id for one in review.view().opened)
         self._fold_other: Callable[[bool], None] = lambda folded: None
-        """Of a part's own panel."""
+        """Folds and unfolds the panel of rerun."""
         self._other_folded = False
         self._unfolded = "", 0.0
         """Which of the two panels came into a page last, and when, until something is done about it."""
         self._told = DrawDue(TOLD_EVERY, clock)
-        stage = stage or Stage(server)
-        self._framing = stage.framing
+        self._framing = place.stage.framing
 
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(PANEL_WIDTH)
         server.gui.set_panel_label("Recordings")
         self._status = server.gui.add_html("")
         self._add_way_back()
-        tabs = server.gui.add_tab_group()
-        review_tab = self._add_tabs(tabs)
-        share_tab = tabs.add_tab("Share", viser.Icon.SHARE)
-        self._add_library(library)
-        places = Places(review_tab, share_tab, tabs, self._library, self._make_way, self._other_unfolded)
-        more = [add(server, places) for add in offers.parts]
-        with review_tab:
-            self._view_panel = ViewPanel(server, dark)
+        review_tab, in_tabs = self._add_tabs(dark)
         self._timeline = ReviewTimeline(server, review, clock)
-        self._in_3d = ReviewIn3D(server, review, stage)
-        own = self._panel, self._timeline, *self._in_tabs, self._library
-        self._parts = Parts((*own, *(part for part in more if part is not None)), clock)
-        commands = [*self._commands(), *offers.commands, *self._library.commands()]
+        self._in_3d = ReviewIn3D(server, review, place.stage)
+        self._parts = Parts((self._panel, self._timeline, *in_tabs), clock)
+        commands = [*self._commands(), *place.commands, *self._library.commands()]
         register(server, commands)
         with review_tab, server.gui.add_folder("Keys", expand_by_default=False):
             server.gui.add_html(render("keys", commands=commands))
 
     def _add_way_back(self) -> None:
-        on_back = self._offers.on_back
-        if on_back is not None:
+        if self._place.session is not None:
             go_back = self._server.gui.add_button(BACK, icon=viser.Icon.ARROW_BACK_UP, color="gray")
-            go_back.on_click(lambda _: on_back())
+            go_back.on_click(lambda _: self._go_back())
 
-    def _add_tabs(self, tabs: viser.GuiTabGroupHandle) -> viser.GuiTabHandle:
-        """Returns the Review tab, which other parts put something into."""
-        server, review = self._server, self._review
+    def _go_back(self) -> None:
+        self._place.pages.show("live")
+
+    def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[PagePart[ReviewView]]]:
+        """Returns the Review tab, which another part is put into, and what is in all of them."""
+        server, review, place = self._server, self._review, self._place
+        library, step_in = place.shelf.library, place.step_in
+        tabs = server.gui.add_tab_group()
         review_tab = tabs.add_tab("Review", viser.Icon.PLAYER_PLAY)
         with review_tab:
-            self._panel = ReviewPanel(server, review, self._offers.on_step_back, self._offers.going)
+            self._panel = ReviewPanel(server, review, step_in.go, step_in.going)
         with tabs.add_tab("Cameras", viser.Icon.CAMERA):
             self._cameras_note = server.gui.add_html("")
             self._cameras = CamerasPanel(
@@ -172,8 +118,20 @@ class ReviewPage:
         with tabs.add_tab("Curves", viser.Icon.CHART_LINE):
             numbers, curves = ReviewNumbers(server), ReviewCurves(server)
         with tabs.add_tab("Compare", viser.Icon.ARROWS_DIFF):
-            self._in_tabs = numbers, curves, ReviewComparePanel(server, review)
-        return review_tab
+            compare = ReviewComparePanel(server, review)
+        share_tab = tabs.add_tab("Share", viser.Icon.SHARE)
+        with tabs.add_tab("Judge", viser.Icon.GAVEL):
+            self._rescore = RescorePanel(
+                server, place.rescorer, review, library, place.rescore_choices, place.task_files
+            )
+        self._add_library(library)
+        with share_tab:
+            sharing = place.sharing
+            share = sharing.part(server, library, self._library, self._make_way, self._other_unfolded)
+        with review_tab:
+            going = StepInPart(server, step_in)
+            self._view_panel = ViewPanel(server, dark)
+        return review_tab, [numbers, curves, compare, self._library, share, going, self._rescore]
 
     def _add_library(self, library: Library) -> None:
         """The table of recordings, in a panel of its own."""
@@ -193,11 +151,14 @@ class ReviewPage:
             )
         )
         self._library.add_action(
-            Action("Judge again", "Run today's reward and evaluate over them (J)", self._offers.on_rescore)
+            Action(
+                "Judge again", "Run today's reward and evaluate over them (J)", self._rescore.judge_and_tell
+            )
         )
         self._library_window.dock_left()
         self._library_window.set_width(LIBRARY_WIDTH)
         self._library_open = True
+        self._place.dialog.tell(self._library.leave_keys)
         if self._had_opened:
             self._show_library(False)
 
@@ -236,7 +197,7 @@ class ReviewPage:
         self._make_way_for_the_first(view)
         self._fold_what_crowds()
         keys = " ".join(self._library.keys)
-        self._status.content = status_html(view, self._offers.going(), keys)
+        self._status.content = status_html(view, self._place.step_in.going(), keys)
         self._draw_cameras(view)
         self._parts.draw(view)
 
@@ -343,13 +304,10 @@ class ReviewPage:
     # --- keys --------------------------------------------------------------------------------------
 
     def _commands(self) -> Sequence[Command]:
-        review, timeline, offers = self._review, self._timeline, self._offers
+        review, timeline = self._review, self._timeline
         commands = [
             Command("Play or pause", review.toggle_play, "space"),
-            Command("A step back in time", lambda: timeline.step_by(-1), "arrowleft"),
-            Command("A step on in time", lambda: timeline.step_by(1), "arrowright"),
-            Command("To the event before", lambda: timeline.to_event(-1), "arrowleft", "shift"),
-            Command("To the next event", lambda: timeline.to_event(1), "arrowright", "shift"),
+            *timeline.commands(),
             Command("The first moment", review.to_first, "home"),
             Command("The last moment", review.to_last, "end"),
             Command("Next recording", lambda: self._panel.select_neighbour(1), "N"),
@@ -358,16 +316,16 @@ class ReviewPage:
             Command("Frame what is shown", self._in_3d.frame, "F"),
             Command("Open or close the library", lambda: self._show_library(not self._library_open), "B"),
             Command("Dark or light", self._view_panel.toggle_dark, "D"),
-            Command("Judge again what is selected, or else what is open", self._judge, "J"),
+            Command("Judge again what is selected, or else what is open", self._judge_chosen, "J"),
             Command("Go on live from here", self._panel.step_back, "G"),
         ]
-        if offers.on_back is not None:
-            commands.append(Command(BACK, offers.on_back, "V"))
+        if self._place.session is not None:
+            commands.append(Command(BACK, self._go_back, "V"))
         return commands
 
-    def _judge(self) -> None:
+    def _judge_chosen(self) -> None:
         opened = tuple(one.id for one in self._review.view().opened)
-        self._offers.on_rescore(self._library.selected() or opened)
+        self._rescore.judge_and_tell(self._library.selected() or opened)
 
     def _open_side_by_side(self, ids: tuple[str, ...]) -> None:
         self._panel.lay_side_by_side()
@@ -381,22 +339,14 @@ def status_html(view: ReviewView, going: str = "", library_keys: str = "") -> st
         library_keys: those that `library_keys.js` keeps from doing anything while the library is folded.
     """
     chosen = view.chosen
-    several = len(view.opened) > 1
-    ended, mood = ("", "") if chosen is None else success_words(chosen.episode)
     return render(
         "review_status",
-        loading=view.loading,
+        view=view,
         going=going,
-        playing=view.playing,
         word="playing" if view.playing else "paused" if view.opened else "nothing open",
-        speed=f"{view.speed:g}",
-        task=None if chosen is None else chosen.episode.info.task,
-        letter=letter(view.selected) if several else "",
+        chosen=chosen,
+        letter=letter(view.selected) if len(view.opened) > 1 else "",
         colour=COLOURS[view.selected % len(COLOURS)],
         library_keys=library_keys,
-        name="" if chosen is None else chosen.name,
-        scene="" if chosen is None or not chosen.making else chosen.scene,
-        ended=ended,
-        mood=mood,
-        where="" if chosen is None else f"step {view.states[view.selected]} / {chosen.length}",
+        ended=None if chosen is None else success_words(chosen.episode),
     )

@@ -9,10 +9,10 @@ from __future__ import annotations
 import datetime
 import re
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import viser
 
@@ -30,13 +30,8 @@ from workbench.ui.library_panel import LibraryPanel
 from workbench.ui.make_shared import EVERY_CAMERA, Made, Wanted, What, file_name
 from workbench.ui.making import Making, MakingView
 from workbench.ui.offers import Offers
-from workbench.ui.parts import Part
+from workbench.ui.parts import PagePart
 from workbench.ui.rerun_view import RerunPages, RerunView
-from workbench.ui.review_page import AddPart, Places, ReviewOffers
-
-if TYPE_CHECKING:
-    from workbench.ui.put_together import Workplace
-
 
 WHAT: dict[str, What] = {
     "Film of a camera (mp4)": "film",
@@ -162,16 +157,7 @@ class SharePanel:
         self._making.start(replace(wanted, folder=folder, camera=camera))
 
     def _html(self, view: MakingView) -> str:
-        made = [self._said(one) for one in view.made[:MOST_SHOWN]]
-        return render(
-            "share",
-            running=view.running,
-            percent=round(100 * view.done),
-            doing=view.doing,
-            problem=view.problem,
-            made=made,
-            has_links=any(one["links"] for one in made),
-        )
+        return render("share", view=view, made=[self._said(one) for one in view.made[:MOST_SHOWN]])
 
     def _said(self, made: Made) -> dict[str, object]:
         links = [
@@ -242,26 +228,25 @@ class Sharing:
         self._rerun = RerunPages(door, self._offers)
         self._making = Making()
 
-    def offer(self, place: Workplace, offers: ReviewOffers) -> ReviewOffers:
-        """`offers` with the Share tab, for `Workplace.offer`."""
-        return replace(offers, parts=(*offers.parts, self._part(place.shelf.library)))
-
-    def _part(self, library: Library) -> AddPart:
-        def build(server: viser.ViserServer, places: Places) -> SharePart:
-            with places.share:
-                share = SharePanel(server, self._offers, self._making, library.folder)
-                server.gui.add_divider()
-                rerun = RerunView(server, self._rerun, places.make_way, places.unfolded)
-            return SharePart(library, places.library, share, rerun)
-
-        return build
+    def part(
+        self,
+        server: viser.ViserServer,
+        library: Library,
+        table: LibraryPanel,
+        make_way: Callable[[Callable[[bool], None]], int],
+        unfolded: Callable[[], None],
+    ) -> SharePart:
+        """The Share tab, in the present container; `make_way` and `unfolded` as `RerunView` has them."""
+        share = SharePanel(server, self._offers, self._making, library.folder)
+        server.gui.add_divider()
+        return SharePart(library, table, share, RerunView(server, self._rerun, make_way, unfolded))
 
     def close(self) -> None:
         """Stop what is made, and take away what was made for the page."""
         self._making.close()
 
 
-class SharePart(Part[ReviewView]):
+class SharePart(PagePart[ReviewView]):
     """The Share tab of a review page."""
 
     def __init__(self, library: Library, table: LibraryPanel, share: SharePanel, rerun: RerunView) -> None:

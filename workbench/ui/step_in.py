@@ -10,21 +10,19 @@ from __future__ import annotations
 
 import shutil
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import viser
 
 from workbench.authoring.reference import TaskName
 from workbench.core.recorded_run import RecordedRun
 from workbench.recording.episode import EpisodeInfo
-from workbench.recording.library import Library
 from workbench.recording.side_files import side_files_in_words
-from workbench.recording.sources import Source
 from workbench.session.clearance import Clearances, NotCleared, Wanted
 from workbench.session.messages import TaskOptions
-from workbench.session.rescorer import Rescorer
 from workbench.session.review_view import ReviewView
 from workbench.session.session import Session
 from workbench.session.step_back import (
@@ -37,12 +35,13 @@ from workbench.session.step_back import (
 )
 from workbench.session.view import SessionView
 from workbench.ui.banner import is_busy_for_long
-from workbench.ui.fragments import render
-from workbench.ui.parts import Part
-from workbench.ui.put_together import Workplace
-from workbench.ui.rescore_panel import RECORDED, TODAYS, RescoreChoices, RescorePanel
-from workbench.ui.review_page import Places, ReviewOffers
-from workbench.ui.trust_dialog import TrustDialog
+from workbench.ui.controls import tell_all
+from workbench.ui.fragments import render, sentence
+from workbench.ui.parts import PagePart
+from workbench.ui.rescore_panel import RECORDED, TODAYS
+
+if TYPE_CHECKING:
+    from workbench.ui.put_together import Workplace
 
 
 @dataclass(frozen=True)
@@ -67,15 +66,6 @@ class GoingLive:
         else:
             doing = f"putting {self.task} into step {self.state}"
         return f"{doing}: {view.activity}" if view.activity else f"{doing} …"
-
-
-def begin_to_go(
-    session: Session, run: RecordedRun, everywhere: bool, info: EpisodeInfo, state: int
-) -> GoingLive:
-    """Ask the session for a recorded moment."""
-    problems = session.view().problem_serial
-    number = session.step_back(run, everywhere, info.source_file, info.source)
-    return GoingLive(session, number, info.task, state, problems)
 
 
 ONE, ALL = "the selected env", "all envs"
@@ -112,15 +102,13 @@ class StepIn:
         place: Workplace,
         make_session: MakeSession,
         clearances: Clearances,
-        base: TaskOptions | None = None,
+        base: TaskOptions,
     ) -> None:
-        self._place, self._make, self._clearances = place, make_session, clearances
-        self._base = base or TaskOptions()
+        self._place, self._make, self._clearances, self._base = place, make_session, clearances, base
         self._first = place.session
         self._lock = threading.Lock()
         self._own: tuple[Session, Path | None] | None = None
         self.recorded_source, self.everywhere = False, False
-        self._server: viser.ViserServer | None = None
         self._going: GoingLive | None = None
         self._clearing: _Clearing | None = None
 
@@ -140,7 +128,7 @@ class StepIn:
             return
         info = one.episode.info
         if (why := self._clearances.why_not_its_arguments(info)) is not None:
-            self._say(_sentence(why))
+            self._say(sentence(why))
             return
         there = None if self.recorded_source else self._open_already(info)
         if there is not None:
@@ -177,7 +165,7 @@ class StepIn:
                 folder, reference = write_source(wanted.info)
         except (CannotStepIn, NotCleared) as error:
             if not clearing.stop.is_set():
-                self._say(_sentence(str(error)))
+                self._say(sentence(str(error)))
             self._cleared(clearing)
             return
         with self._lock:
@@ -190,8 +178,10 @@ class StepIn:
         self._cleared(clearing)
 
     def _enter(self, session: Session, run: RecordedRun, info: EpisodeInfo, state: int) -> None:
-        self._place.go_live_with(session)
-        self._going = begin_to_go(session, run, self.everywhere, info, state)
+        self._place.session = session
+        problems = session.view().problem_serial
+        number = session.step_back(run, self.everywhere, info.source_file, info.source)
+        self._going = GoingLive(session, number, info.task, state, problems)
 
     def _cleared(self, clearing: _Clearing) -> None:
         if self._clearing is clearing:
@@ -216,11 +206,9 @@ class StepIn:
             self._going = None
             self._place.pages.show("live")
 
-    def part(self, server: viser.ViserServer, places: Places) -> StepInPart:
-        """The choices, for the review page."""
-        self._server, self._going = server, None
-        with places.review:
-            return StepInPart(server, self)
+    def review_is_back(self) -> None:
+        """The page of recordings is shown anew: nobody is on the way any more."""
+        self._going = None
 
     def can_go_home(self) -> bool:
         """Whether another session is live than the one that was opened first."""
@@ -230,12 +218,10 @@ class StepIn:
         """Back to the session that was opened first; the other ends."""
         if self._first is None:
             return
-        self._place.go_live_with(self._first)
+        self._place.session = self._first
         self._place.pages.show("live")
         with self._lock:
-            before, self._own = self._own, None
-        if before is not None:
-            threading.Thread(target=_end, args=before, name="end-session", daemon=True).start()
+            self._let_go()
 
     def close(self) -> None:
         """End what was opened here; the pages must be stopped."""
@@ -244,7 +230,9 @@ class StepIn:
         if clearing is not None and clearing.thread is not None:
             clearing.thread.join()
         with self._lock:
-            self._end_own()
+            own, self._own = self._own, None
+        if own is not None:
+            _end(*own)
 
     def _count(self) -> int:
         return NEW_ENVS if self.everywhere else 1
@@ -252,30 +240,27 @@ class StepIn:
     def _open(self, reference: TaskName, options: TaskOptions, folder: Path | None) -> Session:
         if self._first is not None:
             self._first.pause()
-        before, self._own = self._own, None
         session = self._make(reference, options)
+        self._let_go()
         self._own = session, folder
-        if before is not None:
-            # Its page, if it is the one that is shown, is taken away before it is missed.
-            threading.Thread(target=_end, args=before, name="end-session", daemon=True).start()
         return session
 
-    def _end_own(self) -> None:
-        own, self._own = self._own, None
-        if own is not None:
-            _end(*own)
+    def _let_go(self) -> None:
+        """End the session that was opened here. Its page, if that is shown, is taken away before it is missed."""
+        if self._own is not None:
+            threading.Thread(target=_end, args=self._own, name="end-session", daemon=True).start()
+        self._own = None
 
     def _say(self, text: str) -> None:
-        if self._server is not None:
-            for client in self._server.get_clients().values():
-                client.add_notification("This recording cannot be gone into", text, color="red")
+        tell_all(self._place.server, "This recording cannot be gone into", text, "red")
 
 
-class StepInPart(Part[ReviewView]):
+class StepInPart(PagePart[ReviewView]):
     """How to go live: the code, and into which envs."""
 
     def __init__(self, server: viser.ViserServer, step_in: StepIn) -> None:
         self._step_in = step_in
+        step_in.review_is_back()
         self._about: object = None
         """Which recording and code the note below the code was made for."""
         gui = server.gui
@@ -317,104 +302,6 @@ class StepInPart(Part[ReviewView]):
     def _chosen(self) -> None:
         self._step_in.recorded_source = self._code.value == RECORDED
         self._step_in.everywhere = self._envs.value == ALL
-
-
-class Judging:
-    """Judging again, as the review page offers it.
-
-    Args:
-        place: The pages.
-        clearances: Say what of the code that recordings name may run.
-        base: What is the same for all that is opened.
-    """
-
-    def __init__(self, place: Workplace, clearances: Clearances, base: TaskOptions | None = None) -> None:
-        self._place = place
-        self.rescorer = Rescorer(clearances, base)
-        self._choices = RescoreChoices()
-        self._panel: RescorePanel | None = None
-        self._server: viser.ViserServer | None = None
-
-    def part(self, server: viser.ViserServer, places: Places) -> RescorePanel:
-        """The tab, for the review page."""
-        self._server = server
-        with places.tabs.add_tab("Judge", viser.Icon.GAVEL):
-            shelf = self._place.shelf
-            self._panel = RescorePanel(
-                server,
-                self.rescorer,
-                shelf.review,
-                lambda ids: episode_files(shelf.library, ids),
-                self._choices,
-                self._place.task_files,
-            )
-        return self._panel
-
-    def judge(self, ids: tuple[str, ...]) -> None:
-        """Judge recordings that are selected in the library."""
-        if self._panel is None or self._server is None:
-            return
-        if not ids:
-            for client in self._server.get_clients().values():
-                client.add_notification(
-                    "Nothing to judge", "No recording is selected or open.", color="orange"
-                )
-            return
-        self._panel.judge(ids)
-        for client in self._server.get_clients().values():
-            client.add_notification(
-                f"Judging {len(ids)} recording{'' if len(ids) == 1 else 's'} again",
-                "What is otherwise now is listed under Judge.",
-                auto_close_seconds=4.0,
-            )
-
-    def close(self) -> None:
-        self.rescorer.judging.close()
-
-
-def episode_files(library: Library, ids: Sequence[str]) -> list[Source]:
-    """Where these recordings are; those that are gone, or cannot be read, are left out."""
-    rows = {row.id: row for row in library.rows()}
-    return [row.source for row in (rows[id] for id in dict.fromkeys(ids) if id in rows) if row.paths]
-
-
-def _sentence(why: str) -> str:
-    return f"{why[:1].upper()}{why[1:].removesuffix('.')}."
-
-
-def offer_going_back_in(
-    place: Workplace, make_session: MakeSession, base: TaskOptions | None = None, trust: bool = False
-) -> Callable[[], None]:
-    """Put both into what the review page offers.
-
-    Args:
-        base: What is the same for all tasks that are opened for it.
-        trust: Run what recordings name without asking.
-
-    Returns:
-        what ends them, to be called after the pages were stopped.
-    """
-    dialog = TrustDialog(place.server)
-    clearances = Clearances(place.task_files, dialog.ask, all_trusted=trust)
-    step_in, judging = StepIn(place, make_session, clearances, base), Judging(place, clearances, base)
-
-    def add(_: Workplace, offers: ReviewOffers) -> ReviewOffers:
-        return replace(
-            offers,
-            on_step_back=step_in.go,
-            going=step_in.going,
-            on_rescore=judging.judge,
-            parts=(*offers.parts, step_in.part, judging.part, dialog.part),
-        )
-
-    place.offer(add)
-
-    def close() -> None:
-        dialog.close()
-        judging.close()
-        step_in.close()
-
-    return close
 
 
 def _end(session: Session, folder: Path | None) -> None:

@@ -16,7 +16,6 @@ import viser
 from workbench.session.clearance import FOLLOWED, Answer, Question
 from workbench.ui.fragments import render
 from workbench.ui.library_edits import Question as Window
-from workbench.ui.review_page import Places
 
 TITLE = "Run this code?"
 DO_NOT, ONCE, ALWAYS = (
@@ -56,10 +55,10 @@ class TrustDialog:
         self._closed = False
         self._asking: Callable[[bool], None] = lambda asking: None
 
-    def part(self, server: viser.ViserServer, places: Places) -> None:
-        """For the review page, whose table of recordings takes no keys while something is asked."""
-        self._asking = places.library.leave_keys
+    def tell(self, asking: Callable[[bool], None]) -> None:
+        """Tell this from now on whether something is asked: a page's table of recordings takes no keys then."""
         with self._lock:
+            self._asking = asking
             self._asking(bool(self._waiting))
 
     def ask(self, question: Question, stopped: Callable[[], bool]) -> Answer:
@@ -141,16 +140,4 @@ def question_html(question: Question) -> str:
         left_out = len(file.text) - len(shown)
         said = {"name": file.name, "hash": file.hash, "since": file.since.value, "text": shown}
         files.append({**said, "left_out": left_out})
-    return render(
-        "trust_question",
-        task=question.task,
-        recorded_text=question.recorded_text,
-        files=files,
-        computed=question.computed,
-        unseen=question.unseen,
-        trusted_before=question.trusted_before,
-        nothing_known=question.nothing_known,
-        gone=question.gone,
-        followed=FOLLOWED if question.followed else "",
-        agreed=question.agreed,
-    )
+    return render("trust_question", asked=question, files=files, followed=FOLLOWED)
