@@ -116,9 +116,7 @@ def test_loopback_may_do_without_a_token(host):
     assert DoorOptions(host=host, token=False).token is False
 
 
-@pytest.mark.parametrize(
-    "options", [{"host": ""}, {"port": -1}, {"port": 70000}, {"names": ("http://box/",)}, {"names": ("a b",)}]
-)
+@pytest.mark.parametrize("options", [{"host": ""}, {"port": -1}, {"port": 70000}])
 def test_options_that_cannot_be_are_refused(options):
     with pytest.raises(ValueError):
         DoorOptions(**options)

@@ -2,7 +2,7 @@
 
 A frame is decoded straight into its structure. What does not fit is refused at the first byte that does not, so
 that eight megabytes of nested lists never become millions of Python objects on the event loop. A value for a
-control is left undecoded (`GuiUpdate.updates`), since what it may be depends on the control; see
+control is left undecoded (`GuiUpdateMessage.updates`), since what it may be depends on the control; see
 `workbench.ui.control_values`.
 """
 
@@ -22,7 +22,6 @@ LARGEST_PICTURE = 100_000
 
 Name = Annotated[str, msgspec.Meta(max_length=1024)]
 Uuid = Annotated[str, msgspec.Meta(max_length=64)]
-Index = Annotated[int, msgspec.Meta(ge=0, lt=2**31)]
 Pair = tuple[float, float]
 Triple = tuple[float, float, float]
 Quadruple = tuple[float, float, float, float]
@@ -39,14 +38,8 @@ class ImpossibleValue(ValueError):
     """A number that cannot be meant, in a message that is well formed; the message is dropped."""
 
 
-class ClientMessage(
-    msgspec.Struct, tag_field="type", tag=lambda name: f"{name}Message", forbid_unknown_fields=True
-):
+class ClientMessage(msgspec.Struct, tag_field="type", tag=True, forbid_unknown_fields=True):
     """One of the kinds below; each has the fields of viser's message of that name."""
-
-    @classmethod
-    def kind(cls) -> str:
-        return f"{cls.__name__}Message"
 
     def check(self) -> None:
         """
@@ -55,89 +48,45 @@ class ClientMessage(
         """
 
 
-class CommandTrigger(ClientMessage):
+class CommandTriggerMessage(ClientMessage):
     uuid: Uuid
 
 
-class GuiButtonHold(ClientMessage):
-    uuid: Uuid
-    frequency: float
-
-    def check(self) -> None:
-        _check_numbers(self.frequency)
-
-
-class GuiFormDirty(ClientMessage):
+class GuiFormDirtyMessage(ClientMessage):
     uuid: Uuid
 
 
-class GuiFormSubmit(ClientMessage):
+class GuiFormSubmitMessage(ClientMessage):
     uuid: Uuid
 
 
-class GuiUpdate(ClientMessage):
+class GuiUpdateMessage(ClientMessage):
     uuid: Uuid
     updates: Annotated[dict[str, msgspec.Raw], msgspec.Meta(max_length=16)]
 
 
-class SceneNodeClick(ClientMessage):
-    name: Name
-    instance_index: Index | None
+class ScenePointerMessage(ClientMessage):
+    event_type: Literal["click"]
     ray_origin: Triple
     ray_direction: Triple
-    screen_pos: Pair
-    modifier: Modifier | None
-    owner: Name = ""
-
-    def check(self) -> None:
-        _check_numbers(*self.ray_origin, *self.ray_direction, *self.screen_pos)
-
-
-class SceneNodeDrag(ClientMessage):
-    phase: Literal["start", "update", "end"]
-    name: Name
-    instance_index: Index | None
-    start_position: Triple
-    start_screen_pos: Pair
-    end_position: Triple
-    end_screen_pos: Pair
-    button: Literal["left", "middle", "right"]
-    modifier: Modifier | None
-    owner: Name = ""
-
-    def check(self) -> None:
-        _check_numbers(*self.start_position, *self.start_screen_pos)
-        _check_numbers(*self.end_position, *self.end_screen_pos)
-
-
-class ScenePointer(ClientMessage):
-    event_type: Literal["click", "rect-select"]
-    ray_origin: Triple | None
-    ray_direction: Triple | None
-    screen_pos: Annotated[list[Pair], msgspec.Meta(min_length=1, max_length=2)]
+    screen_pos: tuple[Pair]
     modifier: Modifier | None
 
     def check(self) -> None:
-        # viser asserts the one and indexes the other.
-        if self.event_type == "click" and (self.ray_origin is None or self.ray_direction is None):
-            raise ImpossibleValue("a click without a ray")
-        if self.event_type == "rect-select" and len(self.screen_pos) != 2:
-            raise ImpossibleValue("a rectangle of one corner")
-        _check_numbers(*(self.ray_origin or ()), *(self.ray_direction or ()))
-        _check_numbers(*(number for pair in self.screen_pos for number in pair))
+        _check_numbers(*self.ray_origin, *self.ray_direction, *self.screen_pos[0])
 
 
-class TransformControlsDragEnd(ClientMessage):
+class TransformControlsDragEndMessage(ClientMessage):
     name: Name
     owner: Name = ""
 
 
-class TransformControlsDragStart(ClientMessage):
+class TransformControlsDragStartMessage(ClientMessage):
     name: Name
     owner: Name = ""
 
 
-class TransformControlsUpdate(ClientMessage):
+class TransformControlsUpdateMessage(ClientMessage):
     name: Name
     wxyz: Quadruple
     position: Triple
@@ -148,7 +97,7 @@ class TransformControlsUpdate(ClientMessage):
         _check_rotation(self.wxyz)
 
 
-class ViewerCamera(ClientMessage):
+class ViewerCameraMessage(ClientMessage):
     wxyz: Quadruple
     position: Triple
     fov: float
@@ -173,7 +122,7 @@ class ViewerCamera(ClientMessage):
 Value = bool | int | float | str | list[bool | int | float | str]
 """What any control may hold, as it comes."""
 
-KINDS: dict[str, type[ClientMessage]] = {kind.kind(): kind for kind in ClientMessage.__subclasses__()}
+KINDS: dict[str, type[ClientMessage]] = {kind.__name__: kind for kind in ClientMessage.__subclasses__()}
 
 
 class _Any(msgspec.Struct):

@@ -131,12 +131,6 @@ def check_value(control: Any, value: object) -> None:
         _check_number(value, control.value, control.min, control.max, name)
     elif isinstance(control, (viser.GuiVector2Handle, viser.GuiVector3Handle)):
         _check_components(value, control.value, control.min, control.max, name)
-    elif isinstance(control, viser.GuiMultiSliderHandle):
-        count = len(control.value)
-        _check_components(value, control.value, (control.min,) * count, (control.max,) * count, name)
-    elif isinstance(control, (viser.GuiRgbHandle, viser.GuiRgbaHandle)):
-        count = len(control.value)
-        _check_components(value, control.value, (0,) * count, (255,) * count, name)
     else:
         raise ValueError(f"The {name} takes nothing from a page.")
 

@@ -70,9 +70,6 @@ class DoorOptions:
     one at the other end of ``ssh -L``, and `host` is not used."""
     token: bool = True
     """Ask for the token of the printed address. Can be left out on a port of loopback only."""
-    names: tuple[str, ...] = ()
-    """Further names under which browsers reach this machine (a DNS alias). Its own host name, loopback
-    names and, when bound wider than loopback, IP addresses need not be named."""
 
     def __post_init__(self) -> None:
         if not self.host:
@@ -93,9 +90,6 @@ class DoorOptions:
                 f"Without a token everyone who can reach {self.host} could run code on this machine through the "
                 "page. Leave the token on, or listen on 127.0.0.1 and come in over ssh -L."
             )
-        for name in self.names:
-            if gate.split_authority(name) is None:
-                raise ValueError(f"{name!r} is not a host name; give it without http:// and without a path.")
 
 
 @dataclass
@@ -311,7 +305,7 @@ def _listen(options: DoorOptions) -> Listening:
 
 def _our_names(options: DoorOptions) -> frozenset[str]:
     own = socket.gethostname()
-    split = (gate.split_authority(name) for name in (options.host, own, f"{own}.local", *options.names))
+    split = (gate.split_authority(name) for name in (options.host, own, f"{own}.local"))
     return frozenset(name[0] for name in split if name is not None)
 
 

@@ -16,9 +16,9 @@ from typing import Any, Protocol
 from workbench.ui.client_messages import (
     KINDS,
     ClientMessage,
-    GuiFormDirty,
-    GuiFormSubmit,
-    GuiUpdate,
+    GuiFormDirtyMessage,
+    GuiFormSubmitMessage,
+    GuiUpdateMessage,
     ImpossibleValue,
     MalformedMessage,
     kind_of,
@@ -116,14 +116,14 @@ class PageGuard:
         self._corrections.clear()
 
     def _admits_message(self, message: ClientMessage) -> bool:
-        if isinstance(message, GuiUpdate):
+        if isinstance(message, GuiUpdateMessage):
             return self._admits_update(message)
-        if isinstance(message, (GuiFormDirty, GuiFormSubmit)):
+        if isinstance(message, (GuiFormDirtyMessage, GuiFormSubmitMessage)):
             # viser sends it on to all pages and keeps it for later ones, whatever the id.
             return self._page.has_form(message.uuid)
         return True
 
-    def _admits_update(self, message: GuiUpdate) -> bool:
+    def _admits_update(self, message: GuiUpdateMessage) -> bool:
         control = self._page.control(message.uuid)
         # Of a control that went a moment ago. viser would set any attribute that it has, ``removed`` too.
         if control is None or set(message.updates) != {"value"}:

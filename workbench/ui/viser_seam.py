@@ -63,6 +63,9 @@ REFUSED_FROM_CLIENTS = (
     "ShareUrlDisconnect",
     "FileTransferStartUpload",  # no size limit, file name taken verbatim; nothing here takes uploads
     "FileTransferPart",
+    "SceneNodeClickMessage",  # nothing of ours takes a click, a drag or a press that is held, so no page has them to say
+    "SceneNodeDragMessage",
+    "GuiButtonHoldMessage",
 )
 
 PRIVATE_NAMES = (
