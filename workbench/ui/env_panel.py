@@ -8,6 +8,7 @@ value in a column comes last whichever way it is sorted.
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -19,42 +20,36 @@ from workbench.session.number_text import number_text
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.fragments import render
-from workbench.ui.parts import Part
+from workbench.ui.parts import PagePart
 from workbench.ui.presses import Paged, Presses
 from workbench.ui.timeline_panel import polylines
 
 Filter = Literal["all", "failed", "running", "flagged"]
-FILTERS: tuple[Filter, ...] = ("all", "failed", "running", "flagged")
-SHOWN_AS: dict[Filter, str] = {
-    "all": "all",
-    "failed": "last failed",
-    "running": "running",
-    "flagged": "flagged",
+FILTERS: dict[Filter, tuple[str, str, str]] = {
+    "all": ("all", "Every env", "There is no env."),
+    "failed": (
+        "last failed",
+        "The last episode that came to an end ended without success: by fail, or at the time limit",
+        "In no env did the last episode fail.",
+    ),
+    "running": (
+        "running",
+        "The episode under way has not come to its first end",
+        "No env is running.",
+    ),
+    "flagged": (
+        "flagged",
+        "Something odd in the episode under way, or in the one before",
+        "No env is flagged.",
+    ),
 }
-"""What a pill says. An env that runs may have failed before, so "failed 16" beside "running 16" puzzles."""
-MEANS: dict[Filter, str] = {
-    "all": "Every env",
-    "failed": "The last episode that came to an end ended without success: by fail, or at the time limit",
-    "running": "The episode under way has not come to its first end",
-    "flagged": "Something odd in the episode under way, or in the one before",
-}
-NONE_SO: dict[Filter, str] = {
-    "all": "There is no env.",
-    "failed": "In no env did the last episode fail.",
-    "running": "No env is running.",
-    "flagged": "No env is flagged.",
-}
+"""What a pill says (an env that runs may have failed before, so "failed 16" beside "running 16" puzzles), what it means,
+and what is said where there is none."""
 MOST_ENTRIES = 6
 """Columns of bool entries; a row of more is wider than the view."""
 POINTS = 40
 """Of a row's small curve: it is 60 pixels wide."""
 CURVE_WIDTH, CURVE_HEIGHT = 60, 14
-WORDS = {
-    Outcome.RUNNING: "running",
-    Outcome.SUCCESS: "success",
-    Outcome.FAIL: "fail",
-    Outcome.TRUNCATED: "truncated",
-}
 _GRAVITY = np.array([2, 3, 0, 1])
 """Of an `Outcome` when sorted by: failed first, then cut off, then running, then solved."""
 
@@ -122,7 +117,7 @@ def make_rows(rows: EnvRows, envs: NDArray[np.int64]) -> list[dict[str, Any]]:
     curves = _curves(rows.rewards, envs)
     made = []
     for env, curve in zip(envs.tolist(), curves, strict=True):
-        outcome, last = Outcome(int(rows.outcome[env])), Outcome(int(rows.last.outcome[env]))
+        state, last = (Outcome(int(one)).name.lower() for one in (rows.outcome[env], rows.last.outcome[env]))
         had_one = rows.last.steps[env] >= 0
         before = [
             f"{outlier.reason} (episode before, step {outlier.step})"
@@ -132,15 +127,15 @@ def make_rows(rows: EnvRows, envs: NDArray[np.int64]) -> list[dict[str, Any]]:
         made.append(
             {
                 "env": env,
-                "state": WORDS[outcome],
+                "state": state,
                 "total": number_text(float(rows.total[env]), ".3g") if rows.followed[env] else "",
                 "steps": str(int(rows.steps[env])),
                 "first_true": tuple(_step(int(rows.first_true[name][env])) for name in names),
                 "curve": curve,
-                "last": f"{'cut short' if last == Outcome.RUNNING else WORDS[last]} {rows.last.steps[env]}"
+                "last": f"{'cut short' if last == 'running' else last} {rows.last.steps[env]}"
                 if had_one
                 else "",
-                "last_state": WORDS[last],
+                "last_state": last,
                 "tally": f"{rows.succeeded[env]} of {rows.ended[env]} episodes ended in success",
                 "flags": tuple(now + before),
             }
@@ -210,7 +205,7 @@ HINTS = {
 }
 
 
-class EnvPanel(Part[SessionView]):
+class EnvPanel(PagePart[SessionView]):
     """The table of envs in the present container."""
 
     every = 0.3
@@ -245,21 +240,25 @@ class EnvPanel(Part[SessionView]):
         shown = envs[places.start : places.stop]
         return render(
             "envs",
-            none_so=NONE_SO[self._filter],
+            none_so=FILTERS[self._filter][2],
             pills=[
                 {
-                    "name": SHOWN_AS[name],
-                    "hint": MEANS[name],
+                    "name": shown_as,
+                    "hint": means,
                     "count": int(np.count_nonzero(mask(rows, name))),
                     "on": name == self._filter,
                     "press": self._press(("filter", name), lambda name=name: self._choose_filter(name)),
                 }
-                for name in FILTERS
+                for name, (shown_as, means, _) in FILTERS.items()
             ],
             pages=self._pages.shown,
             head=self._head(rows),
             rows=[
-                {"cells": row, "selected": row["env"] == selected, "press": self._press_of_env(row["env"])}
+                {
+                    "cells": row,
+                    "selected": row["env"] == selected,
+                    "press": self._press(("env", row["env"]), partial(self._choose_env, row["env"])),
+                }
                 for row in make_rows(rows, shown)
             ],
         )
@@ -292,13 +291,11 @@ class EnvPanel(Part[SessionView]):
 
         return self._presses.id_of(key, pressed)
 
-    def _press_of_env(self, env: int) -> str:
-        return self._press(("env", env), lambda: self._choose_env(env))
-
     def _choose_env(self, env: int) -> None:
         rows = self._session.env_rows()
         if rows is None or env >= rows.num_envs:
             return  # a version with fewer envs was loaded since the table was drawn
+        self._pressed += 1
         self._session.change(selected_env=env)
         step = moment_of(rows, env)
         if step is not None:
@@ -319,7 +316,6 @@ class EnvPanel(Part[SessionView]):
         env = None if rows is None else first_flagged(rows)
         if env is not None:
             self._choose_env(env)
-            self._pressed += 1
 
     def select_next(self, wanted: Filter) -> None:
         """The next env, by number and round the end, that a filter lets through; none if there is none."""
@@ -330,4 +326,3 @@ class EnvPanel(Part[SessionView]):
         if len(envs):
             later = envs[envs > self._session.view().selected_env]
             self._choose_env(int(later[0] if len(later) else envs[0]))
-            self._pressed += 1

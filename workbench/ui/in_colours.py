@@ -41,7 +41,11 @@ def data_address(pixels: NDArray[np.uint8], longest: int) -> str:
         image = image.resize(size, Image.Resampling.BOX)
     written = io.BytesIO()
     image.save(written, "JPEG", quality=78)
-    return "data:image/jpeg;base64," + base64.b64encode(written.getvalue()).decode("ascii")
+    return address_of_jpeg(written.getvalue())
+
+
+def address_of_jpeg(jpeg: bytes) -> str:
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii")
 
 
 COLOUR = "rgb"

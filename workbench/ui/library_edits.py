@@ -13,6 +13,7 @@ import viser
 
 from workbench.recording.library import Library, LibraryError
 from workbench.recording.library_row import LONGEST_NOTE, LibraryRow, clean_tags
+from workbench.ui.controls import tell_all
 from workbench.ui.fragments import counted, render, size
 from workbench.ui.library_rows import in_words
 
@@ -35,80 +36,6 @@ class Question:
             self.modal.close()
         self._closed()
         return True
-
-    def give_up(self, _event: object) -> None:
-        """For *Cancel*."""
-        self.close()
-
-
-def ask_text(
-    server: viser.ViserServer,
-    title: str,
-    explained: str,
-    names: Sequence[str],
-    value: str,
-    answered: Callable[[str], None],
-    closed: Callable[[], None],
-) -> Question:
-    """Ask for one line of text; Enter or *Save* is the answer.
-
-    Args:
-        names: of the recordings that it is for.
-        value: what stands in the field.
-        answered: gets what was typed, as the page sent it, on a thread of viser's.
-        closed: is called once, when the window is gone, before `answered`.
-    """
-    question = Question(server, title, closed)
-    with question.modal:
-        server.gui.add_html(_question("", names, explained))
-        form = server.gui.add_form(None)
-        with form:
-            field = server.gui.add_text("", value)
-        save = server.gui.add_button("Save", icon=viser.Icon.CHECK)
-        cancel = server.gui.add_button("Cancel", color="gray")
-
-    def answer(_event: object) -> None:
-        typed = field.value
-        if question.close():
-            answered(typed)
-
-    form.on_submit(answer)
-    save.on_click(answer)
-    cancel.on_click(question.give_up)
-    return question
-
-
-def ask_whether(
-    server: viser.ViserServer,
-    title: str,
-    asked: str,
-    names: Sequence[str],
-    explained: str,
-    do: str,
-    answered: Callable[[], None],
-    closed: Callable[[], None],
-) -> Question:
-    """Ask whether to do something that takes something away; only the button `do` is a yes."""
-    question = Question(server, title, closed)
-    with question.modal:
-        server.gui.add_html(_question(asked, names, explained))
-        yes = server.gui.add_button(do, color="red", icon=viser.Icon.TRASH)
-        cancel = server.gui.add_button("Cancel", color="gray")
-
-    def answer(_event: object) -> None:
-        if question.close():
-            answered()
-
-    yes.on_click(answer)
-    cancel.on_click(question.give_up)
-    return question
-
-
-def _question(asked: str, names: Sequence[str], answer: str) -> str:
-    shown = names if len(names) <= MOST_NAMES else names[: MOST_NAMES - 1]
-    return render(
-        "library_question", question=asked, names=shown, more=len(names) - len(shown), answer=answer
-    )
 
 
 MOST_KNOWN = 12
@@ -150,7 +77,7 @@ class LibraryEdits:
             explained += " Those that all of them have stand here; others that they have stay."
         if known:
             explained += f" In use: {', '.join(known[:MOST_KNOWN])}."
-        self._ask_text("Tags", explained, rows, ", ".join(shared), answered)
+        self._ask("Tags", "", rows, explained, "Save", answered, ", ".join(shared))
 
     def ask_note(self, ids: tuple[str, ...]) -> None:
         rows = self._rows(ids)
@@ -162,74 +89,85 @@ class LibraryEdits:
         def answered(typed: str) -> None:
             self._do(lambda: self._library.set_note(ids, typed[:LONGEST_NOTE]))
 
-        self._ask_text("Note", explained, rows, notes.pop() if len(notes) == 1 else "", answered)
+        self._ask("Note", "", rows, explained, "Save", answered, notes.pop() if len(notes) == 1 else "")
 
     def ask_delete(self, ids: tuple[str, ...]) -> None:
         rows = self._rows(ids)
         if not rows or not self._do(lambda: self._library.may_delete(ids)):
             return
         self._ask(
-            lambda: ask_whether(
-                self._server,
-                "Delete recordings",
-                f"Delete {in_words(rows)}?",
-                [row.name for row in rows],
-                "All their files go to the folder .trash in the library, and can be taken back from there.",
-                "Delete",
-                lambda: self._delete(ids),
-                self._closed,
-            )
+            "Delete recordings",
+            f"Delete {in_words(rows)}?",
+            rows,
+            "All their files go to the folder .trash in the library, and can be taken back from there.",
+            "Delete",
+            lambda _: self._do(lambda: self._library.delete(ids)),
         )
 
     def ask_empty(self) -> None:
         trash = self._library.view().trash
         self._ask(
-            lambda: ask_whether(
-                self._server,
-                "Empty the trash",
-                f"Delete {counted(trash.files, 'file')} ({size(trash.size)}) for good?",
-                [],
-                "This cannot be undone.",
-                "Delete for good",
-                self._empty,
-                self._closed,
-            )
+            "Empty the trash",
+            f"Delete {counted(trash.files, 'file')} ({size(trash.size)}) for good?",
+            [],
+            "This cannot be undone.",
+            "Delete for good",
+            lambda _: self._do(self._library.empty_trash),
         )
-
-    def _delete(self, ids: tuple[str, ...]) -> None:
-        self._do(lambda: self._library.delete(ids))
-
-    def _empty(self) -> None:
-        self._do(self._library.empty_trash)
 
     def undo_delete(self) -> None:
         self._do(self._library.undo_delete)
 
     def notify(self, title: str, body: str) -> None:
-        """Say something to every open page: a key does not tell which one it was pressed on."""
-        for client in self._server.get_clients().values():
-            client.add_notification(title, body, color="orange", auto_close_seconds=8.0)
+        tell_all(self._server, title, body, seconds=8.0)
 
-    def _ask_text(
+    def _ask(
         self,
         title: str,
-        explained: str,
+        asked: str,
         rows: Sequence[LibraryRow],
-        value: str,
-        answered: Callable[[str], None],
+        explained: str,
+        do: str,
+        answered: Callable[[str], object],
+        value: str | None = None,
     ) -> None:
-        names = [row.name for row in rows]
-        self._ask(lambda: ask_text(self._server, title, explained, names, value, answered, self._closed))
-
-    def _ask(self, make: Callable[[], Question]) -> None:
+        """
+        Args:
+            do: the button that is a yes.
+            answered: gets what was typed, as the page sent it, on a thread of viser's.
+            value: what stands in a field for a line of text, in which Enter is a yes too. None asks for none: what is
+                done then takes something away.
+        """
+        gui, names = self._server.gui, [row.name for row in rows]
+        shown = names if len(names) <= MOST_NAMES else names[: MOST_NAMES - 1]
         with self._lock:
-            if self._question is not None:
-                self._question.close()
+            self.close()
             self._asking(True)
-            self._question = make()
+            self._question = question = Question(self._server, title, lambda: self._asking(False))
+        with question.modal:
+            more = len(names) - len(shown)
+            gui.add_html(render("library_question", question=asked, names=shown, more=more, answer=explained))
+            form = None if value is None else gui.add_form(None)
+            if form is None:
+                yes = gui.add_button(do, color="red", icon=viser.Icon.TRASH)
+            else:
+                with form:
+                    field = gui.add_text("", value or "")
+                yes = gui.add_button(do, icon=viser.Icon.CHECK)
+            cancel = gui.add_button("Cancel", color="gray")
 
-    def _closed(self) -> None:
-        self._asking(False)
+        def answer(_event: object) -> None:
+            typed = "" if form is None else field.value
+            if question.close():
+                answered(typed)
+
+        def give_up(_event: object) -> None:
+            question.close()
+
+        if form is not None:
+            form.on_submit(answer)
+        yes.on_click(answer)
+        cancel.on_click(give_up)
 
     def _rows(self, ids: Sequence[str]) -> list[LibraryRow]:
         rows = (self._library.row(id) for id in ids)

@@ -11,7 +11,6 @@ the page, selection, sorting and filter are the same for all who look at it.
 
 from __future__ import annotations
 
-import base64
 import datetime
 import os
 import threading
@@ -25,13 +24,13 @@ from workbench.recording.library import Library, LibraryView
 from workbench.recording.library_row import LibraryRow
 from workbench.ui.commands import Command
 from workbench.ui.fragments import render
+from workbench.ui.in_colours import address_of_jpeg
 from workbench.ui.library_edits import LibraryEdits
 from workbench.ui.library_list import MOST_ROWS, RANGE, TOGGLE, Action, LibraryList, acting, walking
 from workbench.ui.library_rows import (
     COLUMNS,
     HINTS,
     MEANS,
-    OUTCOMES,
     SECOND_LINE,
     Column,
     cells,
@@ -40,7 +39,7 @@ from workbench.ui.library_rows import (
     newest_sources,
     none_like_that,
 )
-from workbench.ui.parts import Clock, Part
+from workbench.ui.parts import Clock, PagePart
 from workbench.ui.presses import Presses
 
 MOST_OPEN = 4
@@ -52,7 +51,7 @@ OPEN = 4
 """In what ``choosable.html`` says of a press, beside `TOGGLE` and `RANGE`: it was the second of two."""
 
 
-class LibraryPanel(Part[object]):
+class LibraryPanel(PagePart[object]):
     """The table in the present container.
 
     Args:
@@ -228,28 +227,21 @@ class LibraryPanel(Part[object]):
         self._tasks.visible = len(tasks) > 1
         self._find.visible = bool(view.rows)
         others = chosen(view.rows, listed.words, "all", listed.task)
-        counts = {outcome: sum(has_outcome(row, outcome) for row in others) for outcome in OUTCOMES}
-        done, total = view.reading or (0, 0)
+        counts = {outcome: sum(has_outcome(row, outcome) for row in others) for outcome in MEANS}
         self._filters.content = render(
             "library_filters",
-            problem=view.problem or "",
-            reading=""
-            if view.reading is None
-            else f"Reading {done} of {total} recordings"
-            if total
-            else "Looking through the folder",
-            percent=f"{100 * done / max(1, total):.0f}",
+            view=view,
             pills=[
                 {
                     "name": outcome,
-                    "hint": MEANS[outcome],
+                    "hint": means,
                     "count": f"{len(others)} of {len(view.rows)}"
                     if outcome == "all" and len(others) < len(view.rows)
                     else counts[outcome],
                     "on": outcome == listed.outcome,
                     "press": self._press(outcome, lambda outcome=outcome: listed.choose(outcome)),
                 }
-                for outcome in OUTCOMES
+                for outcome, means in MEANS.items()
                 if outcome != "broken" or counts["broken"] or listed.outcome == "broken"
             ]
             if view.rows
@@ -286,7 +278,7 @@ class LibraryPanel(Part[object]):
                     "number": self._number(row.id),
                     "of": row,
                     "cells": cells(row, newest, now),
-                    "picture": data_address_of_jpeg(pictures.get(row.id)),
+                    "picture": address_of_jpeg(pictures[row.id]) if row.id in pictures else "",
                 }
                 for row in page
             ],
@@ -417,8 +409,3 @@ class LibraryPanel(Part[object]):
         for key in self._keys:
             key.disabled = asking
         self._can_escape()
-
-
-def data_address_of_jpeg(jpeg: bytes | None) -> str:
-    """``data:image/jpeg;base64,...``; empty for none."""
-    return "" if jpeg is None else "data:image/jpeg;base64," + base64.b64encode(jpeg).decode("ascii")

@@ -32,7 +32,6 @@ HINTS: dict[Column, str] = {
     "name": "Name of its files",
 }
 Outcome = Literal["all", "success", "failed", "broken"]
-OUTCOMES: tuple[Outcome, ...] = ("all", "success", "failed", "broken")
 MEANS: dict[Outcome, str] = {
     "all": "Every recording",
     "success": "Success at the last step",
