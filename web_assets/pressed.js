@@ -55,11 +55,14 @@
       }
     },
 
-    // A style sheet tells when it is in the page; what stands beside it comes a moment later.
+    // A style sheet tells when it is in the page. At once: a pill that is moved after it was seen is missed. And again,
+    // since what stands beside it comes a moment later.
     intoSight(sheet) {
       const named = sheet.dataset.intoSight;
       const target = () => (named ? document.getElementById(named) : sheet.parentElement);
-      setTimeout(() => target()?.scrollIntoView({ block: "nearest" }), 150);
+      const show = () => target()?.scrollIntoView({ block: "nearest" });
+      show();
+      setTimeout(show, 150);
     },
 
     follow(sheet) {

@@ -13,10 +13,11 @@ import viser
 
 from workbench.core import camera_frames as frames
 from workbench.core.camera_settings import CameraKey, CameraSettings
+from workbench.core.pictures import Picture
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera
 from workbench.session.view import SessionView
-from workbench.ui.camera_work import WorkBar
+from workbench.ui.camera_work import Answer
 from workbench.ui.controls import refusals_told
 from workbench.ui.fragments import render
 from workbench.ui.in_colours import data_address
@@ -33,7 +34,6 @@ class CameraCompare:
         self._session = session
         self._kept: dict[CameraKey, CameraSettings] = {}
         self._asked: tuple[CameraKey, CameraSettings, CameraSettings, str] | None = None
-        self._drawn: object = None
         with server.gui.add_folder("Compare", expand_by_default=False) as self.folder:
             self._other = server.gui.add_dropdown(
                 "Now, with",
@@ -47,8 +47,7 @@ class CameraCompare:
                 hint="To compare it later, or return to it.",
             )
             self._compare = server.gui.add_button("Show side by side", icon=viser.Icon.COLUMNS_2)
-            self._bar = WorkBar(server, session)
-            self._html = server.gui.add_html("", visible=False)
+            self._pair = Answer(server, session)
             self._take = server.gui.add_button(
                 "Place it as A", icon=viser.Icon.ARROW_BACK_UP, color="gray", visible=False
             )
@@ -82,34 +81,27 @@ class CameraCompare:
                 )
             other = camera.info.settings if choice == FILE else self._kept[camera.key]
             self._asked = (camera.key, camera.now, other, choice)
-            self._bar.asked()
+            self._pair.asked(self._session.view().studio.looked.compared)
             self._session.studio.compare(camera.key, other)
 
     def draw(self, view: SessionView) -> None:
         studio = view.studio
         camera = studio.chosen
         usable = camera is not None and camera.now is not None
-        self._bar.draw(studio.progress)
         for button in (self._keep, self._compare):
             button.disabled = not usable
         kept = None if camera is None else self._kept.get(camera.key)
         back = camera is not None and kept is not None and kept != camera.now
         self._take.visible = back
         both = studio.looked.compared
-        mine = (
-            both is not None
-            and camera is not None
-            and all((picture.kind, picture.camera) == camera.key for picture in both)
-        )
-        wanted = (id(both) if mine else None, None if camera is None else camera.now)
-        if wanted == self._drawn:
-            return
-        self._drawn = wanted
-        self._html.visible = mine
-        if not mine or both is None or camera is None or both[0].rgb is None or both[1].rgb is None:
-            return
+        mine = camera is not None and both is not None and (both[0].kind, both[0].camera) == camera.key
+        now = None if camera is None else camera.now
+        self._pair.draw(studio.progress, both if mine else None, now, lambda _: self._html(both, camera))
+
+    def _html(self, both: tuple[Picture, Picture] | None, camera: StudioCamera | None) -> str:
+        assert both is not None and camera is not None, "drawn only then"
         asked = self._asked if self._asked is not None and self._asked[0] == camera.key else None
-        content = render(
+        return render(
             "camera_pair",
             pictures=[data_address(picture.rgb, LARGEST) for picture in both if picture.rgb is not None],
             captions=(
@@ -119,7 +111,6 @@ class CameraCompare:
             env=both[0].env,
             differences=[] if asked is None else what_differs(asked[2], asked[1]),
         )
-        self._html.content = content
 
 
 def what_differs(old: CameraSettings, new: CameraSettings) -> list[str]:

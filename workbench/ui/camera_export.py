@@ -152,24 +152,15 @@ def matrices_html(camera: StudioCamera | None, convention: Convention, direction
     pose = frames.pose_of(camera.now)
     if camera.mount_pose is not None:
         pose = frames.compose(camera.mount_pose, pose)
-    extrinsic = frames.matrix_of(pose, convention, direction)
-    intrinsic = frames.intrinsic_of(camera.now)
-    ways = {
-        "world_to_camera": "of the env's frame (metres, z up) into the camera's",
-        "camera_to_world": "of the camera's frame into the env's (metres, z up)",
-    }
     return render(
         "camera_matrices",
-        extrinsic=aligned(extrinsic),
-        extrinsic_copy=as_lists(extrinsic),
-        about=f"takes points {ways[direction]}; the camera's axes: {AXES[convention]}",
-        mount=""
-        if camera.info.mount is None
-        else f"It rides on {camera.info.mount}: as it is in this env at this moment.",
-        intrinsic=aligned(intrinsic),
-        intrinsic_copy=as_lists(intrinsic),
-        lens="OpenCV's pinhole, in pixels from the outer corner of the upper left one",
-        size=f"{camera.now.width} × {camera.now.height}",
+        camera=camera,
+        extrinsic=frames.matrix_of(pose, convention, direction),
+        intrinsic=frames.intrinsic_of(camera.now),
+        direction=direction,
+        axes=AXES[convention],
+        aligned=aligned,
+        as_lists=as_lists,
     )
 
 

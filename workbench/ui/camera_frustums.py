@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import viser
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from workbench.core.camera_frames import intrinsic_of, vertical_fov
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
+from workbench.ui.selection_mark import InView
 
 CAMERA_TO_OPENCV = viser.transforms.SO3.from_matrix(
     # Columns: OpenCV's right, down and forward in ManiSkill's camera frame (x forward, y left, z up).
@@ -47,13 +49,13 @@ class CameraFrustums:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
-        self._drawn: dict[tuple[CameraKind, str], viser.CameraFrustumHandle] = {}
-        self._worn: dict[tuple[CameraKind, str], Picture | None] = {}
+        self._drawn: dict[CameraKey, InView] = {}
+        self._worn: dict[CameraKey, Picture] = {}
 
     def draw(
         self,
         cameras: tuple[CameraInfo, ...],
-        pictures: dict[tuple[CameraKind, str], Picture],
+        pictures: dict[CameraKey, Picture],
         offset: NDArray[np.float32],
         size: float = LARGE,
         placed: Mapping[CameraKey, Placed] | None = None,
@@ -68,15 +70,15 @@ class CameraFrustums:
             placed: Those that are being placed; with or without a picture.
         """
         placed = placed or {}
-        known = {(camera.kind, camera.name): camera for camera in cameras}
+        known = {camera.key: camera for camera in cameras}
         shown = {
             key: pictures.get(key)
             for key in (*pictures, *placed)
             if key in known and not (key in placed and placed[key].hidden)
         }
         for key in [key for key in self._drawn if key not in shown]:
-            self._drawn.pop(key).remove()
-            del self._worn[key]
+            self._drawn.pop(key).draw()
+            self._worn.pop(key, None)
         for key, picture in shown.items():
             self._draw_one(known[key], picture, placed.get(key), offset, size)
 
@@ -87,8 +89,9 @@ class CameraFrustums:
         """The camera whose frustum a ray (3,) in the view meets first; None if it meets none."""
         met = [
             (distance, key)
-            for key, handle in list(self._drawn.items())  # another thread may be drawing
-            if (distance := _distance_to(handle, origin, direction)) is not None
+            for key, frustum in list(self._drawn.items())
+            if (handle := frustum.handle) is not None  # another thread may be drawing
+            and (distance := _distance_to(handle, origin, direction)) is not None
         ]
         return min(met)[1] if met else None
 
@@ -113,33 +116,26 @@ class CameraFrustums:
         else:
             return
         thickness = THIN if placed is None else THICK
-        key = (camera.kind, camera.name)
-        handle = self._drawn.get(key)
-        if handle is None:
-            handle = self._server.scene.add_camera_frustum(
+        frustum = self._drawn.get(camera.key)
+        if frustum is None:
+            add = partial(
+                self._server.scene.add_camera_frustum,
                 f"/cameras/{camera.kind} {camera.name}",
-                fov=fov,
-                aspect=aspect,
-                scale=size,
-                thickness=thickness,
                 thickness_units="screen",
                 color=COLOURS[camera.kind],
-                image=None if picture is None else small_image(picture),
                 format="jpeg",
                 jpeg_quality=75,
-                wxyz=wxyz,
-                position=position,
                 cast_shadow=False,
                 receive_shadow=False,
             )
-            self._drawn[key], self._worn[key] = handle, picture
-            return
-        handle.wxyz, handle.position, handle.scale = wxyz, position, size
-        handle.fov, handle.aspect, handle.thickness = fov, aspect, thickness
-        if picture is not None and picture is not self._worn[key] and picture.rgb is not None:
+            frustum = self._drawn[camera.key] = InView(
+                add, "wxyz", "position", "scale", "fov", "aspect", "thickness"
+            )
+        frustum.draw(wxyz, position, size, fov, aspect, thickness)
+        if picture is not None and picture is not self._worn.get(camera.key) and picture.rgb is not None:
             # Assigning encodes and sends it, also when it is the picture that is there already.
-            self._worn[key] = picture
-            handle.image = small_image(picture)
+            self._worn[camera.key] = picture
+            frustum.handle.image = small_image(picture)
 
 
 def _distance_to(handle: viser.CameraFrustumHandle, origin: NDArray, direction: NDArray) -> float | None:
@@ -180,8 +176,8 @@ def frustum_pose(pose: NDArray, offset: NDArray) -> tuple[NDArray, NDArray]:
 
 
 def without_the_viewpoint(
-    pictures: dict[tuple[CameraKind, str], Picture], seen: dict[tuple[CameraKind, str], Picture]
-) -> dict[tuple[CameraKind, str], Picture]:
+    pictures: dict[CameraKey, Picture], seen: dict[CameraKey, Picture]
+) -> dict[CameraKey, Picture]:
     """The pictures to draw while one env is alone in the view.
 
     The view then starts at the task's human camera (see `viewpoint`); its own picture, or that of a

@@ -22,7 +22,7 @@ from workbench.session.studio_view import StudioCamera
 from workbench.ui.camera_moves import Floats, Frame, Snap, looking_at, snapped, turned_in_world
 from workbench.ui.controls import refusals_told
 from workbench.ui.placing import Placing
-from workbench.ui.selection_mark import LineSet
+from workbench.ui.selection_mark import line_set
 
 LEFT_ALONE = 60.0
 """Seconds without a movement after which a gizmo that was never let go (a page that went away) is free again."""
@@ -82,7 +82,7 @@ class CameraGizmo:
             disable_rotations=True,
             visible=False,
         )
-        self._line = LineSet(server, "/studio/line of sight", SIGHT_COLOUR, 2.0)
+        self._line = line_set(server, "/studio/line of sight", SIGHT_COLOUR, 2.0)
         self._held_at = -1e9
         self._start: _Taken | None = None
         # Async: callbacks in viser's pool of threads would come in any order.
@@ -120,7 +120,7 @@ class CameraGizmo:
     def _draw_line(self, camera: StudioCamera | None) -> None:
         """From the eye to the target, which otherwise would be any three arrows in the air."""
         if camera is None or camera.now is None or not self._look_at():
-            self._line.draw(None)
+            self._line.draw()
             return
         eye = self._placing.frame(camera).to_view(camera.now)[:3]
         self._line.draw(np.stack([eye, self._placing.target_in_view(camera, camera.now)])[None])

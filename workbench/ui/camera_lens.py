@@ -7,8 +7,8 @@ in ManiSkill's config; the choice between them is a change of the config, after 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import viser
 
@@ -35,8 +35,6 @@ METRES, DEGREES, PIXELS = 4, 2, 2
 """Digits that are shown."""
 SMALLEST, LARGEST = 8, 4096
 """Pixels of a picture's side."""
-
-Change = Callable[[CameraSettings], CameraSettings]
 
 
 class CameraLens:
@@ -66,12 +64,20 @@ class CameraLens:
         )
         self._radians = numbers_field(gui, "Radians", self._set_fov, 1, low=0.02, high=3.05, hint=vertical)
         self._focal = numbers_field(
-            gui, "fx, fy", self._set_focal, 2, digits=PIXELS, step=1.0, low=1.0, high=1e5, hint="Pixels."
+            gui,
+            "fx, fy",
+            partial(self._set_intrinsic, ((0, 0), (1, 1))),
+            2,
+            digits=PIXELS,
+            step=1.0,
+            low=1.0,
+            high=1e5,
+            hint="Pixels.",
         )
         self._centre = numbers_field(
             gui,
             "cx, cy",
-            self._set_centre,
+            partial(self._set_intrinsic, ((0, 2), (1, 2))),
             2,
             digits=PIXELS,
             step=1.0,
@@ -108,7 +114,7 @@ class CameraLens:
                 initial_value="minimal",
                 hint="minimal is what ManiSkill trains with; the rt ones trace rays, slowly.",
             ),
-            send=lambda name: self._change("shader", lambda s: replace(s, shader_pack=name)),
+            send=lambda name: self._placing.change("shader", lambda s: replace(s, shader_pack=name)),
         )
 
     def draw(self, camera: StudioCamera | None) -> None:
@@ -144,12 +150,6 @@ class CameraLens:
 
     # --- what is typed -----------------------------------------------------------------------------------
 
-    def _change(self, hand: str, change: Change) -> None:
-        camera, now, _ = self._placing.require()
-        changed = change(now)
-        if changed != now:
-            self._placing.place(camera.key, changed, hand)
-
     def _set_lens(self, said: str) -> None:
         def change(s: CameraSettings) -> CameraSettings:
             if said == INTRINSIC and s.intrinsic is None:
@@ -158,22 +158,16 @@ class CameraLens:
                 return replace(s, fov=vertical_fov(intrinsic_of(s), s.height), intrinsic=None)
             return s
 
-        self._change("lens", change)
+        self._placing.change("lens", change)
 
     def _set_fov(self, fov: float) -> None:
         def change(s: CameraSettings) -> CameraSettings:
             intrinsic_from_fov(fov, s.width, s.height)  # refuses what is no fov
             return s if s.fov is None else replace(s, fov=fov)
 
-        self._change("fov", change)
+        self._placing.change("fov", change)
 
-    def _set_focal(self, typed: tuple[float, ...]) -> None:
-        self._set_intrinsic(typed, ((0, 0), (1, 1)))
-
-    def _set_centre(self, typed: tuple[float, ...]) -> None:
-        self._set_intrinsic(typed, ((0, 2), (1, 2)))
-
-    def _set_intrinsic(self, typed: tuple[float, ...], places: tuple[tuple[int, int], ...]) -> None:
+    def _set_intrinsic(self, places: tuple[tuple[int, int], ...], typed: tuple[float, ...]) -> None:
         def change(s: CameraSettings) -> CameraSettings:
             k = intrinsic_of(s)
             kept = kept_where_equal([k[place] for place in places], typed, PIXELS)
@@ -181,7 +175,7 @@ class CameraLens:
                 k[place] = number
             return s if s.intrinsic is None else replace(s, intrinsic=matrix3(k))
 
-        self._change("intrinsic", change)
+        self._placing.change("intrinsic", change)
 
     def _set_size(self, typed: tuple[float, ...]) -> None:
         if any(n % 1 for n in typed):
@@ -196,7 +190,7 @@ class CameraLens:
             k = scaled_intrinsic(s.intrinsic, (s.width, s.height), (width, height))
             return replace(sized, intrinsic=matrix3(k))
 
-        self._change("size", change)
+        self._placing.change("size", change)
 
     def _set_range(self, typed: tuple[float, ...]) -> None:
         def change(s: CameraSettings) -> CameraSettings:
@@ -205,4 +199,4 @@ class CameraLens:
                 raise ValueError("What is near must be nearer than what is far.")
             return replace(s, near=near, far=far)
 
-        self._change("range", change)
+        self._placing.change("range", change)

@@ -11,9 +11,11 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import viser
+from numpy.typing import ArrayLike
 
 from workbench.core.camera_frames import (
     axes_of,
@@ -72,8 +74,6 @@ METRES, UNIT, DEGREES, QUATERNION = 4, 4, 2, 6
 GOES_ALONG = "What it looks at goes along with the position. To keep it: Place, eye and target."
 STAYS = "Each moves alone: the camera goes on looking at its target."
 
-Change = Callable[[CameraSettings], CameraSettings]
-
 
 class CameraNumbers:
     """The folder in the present container.
@@ -124,14 +124,14 @@ class CameraNumbers:
                 "w x y z", "", hint="As sapien.Pose(q=...) has it: w first. It is brought to length 1."
             ),
             read=_read_quaternion,
-            send=lambda q: self._change("quaternion", lambda s: _turned(s, q)),
+            send=lambda q: self._placing.change("quaternion", lambda s: _turned(s, q)),
             settle=0.8,
         )
         limit_text(self._wxyz.handle, 200)
         about = "The line of sight: ManiSkill's x axis of a camera."
-        self._forward = numbers_field(gui, "Forward", self._set_forward, step=0.1, hint=about)
+        self._forward = numbers_field(gui, "Forward", partial(self._set_axis, 0), step=0.1, hint=about)
         about = "The top of the picture: ManiSkill's z axis of a camera."
-        self._up = numbers_field(gui, "Up", self._set_up, step=0.1, hint=about)
+        self._up = numbers_field(gui, "Up", partial(self._set_axis, 1), step=0.1, hint=about)
         self._left = gui.add_html("")
 
     def draw(self, camera: StudioCamera | None) -> None:
@@ -174,12 +174,6 @@ class CameraNumbers:
 
     # --- what is typed -----------------------------------------------------------------------------------
 
-    def _change(self, hand: str, change: Change) -> None:
-        camera, now, _ = self._placing.require()
-        changed = change(now)
-        if changed != now:
-            self._placing.place(camera.key, changed, hand)
-
     def _set_position(self, typed: tuple[float, ...]) -> None:
         camera, now, _ = self._placing.require()
         x, y, z = kept_where_equal(now.position, typed, METRES)
@@ -197,26 +191,20 @@ class CameraNumbers:
         self._placing.look(camera, now, frame.point_to_view(target), "target")
 
     def _set_rpy(self, typed: tuple[float, ...]) -> None:
-        self._change(
+        self._placing.change(
             "angles",
             lambda s: _turned(
                 s, quaternion_from_rpy(*kept_where_equal(rpy_of(s.quaternion), typed, DEGREES))
             ),
         )
 
-    def _set_forward(self, typed: tuple[float, ...]) -> None:
+    def _set_axis(self, place: int, typed: tuple[float, ...]) -> None:
         def change(s: CameraSettings) -> CameraSettings:
-            forward, _left, up = axes_of(s.quaternion)
-            return _turned(s, quaternion_from_axes(kept_where_equal(forward, typed, UNIT), up))
+            axes: list[ArrayLike] = [*axes_of(s.quaternion)[::2]]
+            axes[place] = kept_where_equal(axes_of(s.quaternion)[2 * place], typed, UNIT)
+            return _turned(s, quaternion_from_axes(*axes))
 
-        self._change("forward", change)
-
-    def _set_up(self, typed: tuple[float, ...]) -> None:
-        def change(s: CameraSettings) -> CameraSettings:
-            forward, _left, up = axes_of(s.quaternion)
-            return _turned(s, quaternion_from_axes(forward, kept_where_equal(up, typed, UNIT)))
-
-        self._change("up", change)
+        self._placing.change(("forward", "up")[place], change)
 
 
 def _read_quaternion(text: str) -> Floats:

@@ -19,7 +19,7 @@ from workbench.session.studio_view import Picked, StudioCamera
 from workbench.session.view import SessionView
 from workbench.ui.fragments import render
 from workbench.ui.presses import Presses
-from workbench.ui.selection_mark import LineSet, ViewLabel
+from workbench.ui.selection_mark import line_set, view_label
 
 MARK_COLOUR = (230, 73, 128)
 MARK_SIZE = 0.05
@@ -43,7 +43,8 @@ class CameraPick:
         self._pane = server.gui.add_html("", order=1e5, visible=False)
         self._found = server.gui.add_html("", order=1e5 + 1, visible=False)
         self._press = presses.place_id("picture", lambda u, v, client: self._pick(u, v))
-        self._mark = PointMark(server)
+        self._cross = line_set(server, "/picked/cross", MARK_COLOUR, 3.0)
+        self._label = view_label(server, "/picked/label", "bottom-left")
 
     def _pick(self, u: float, v: float) -> None:
         key = self._session.view().studio.selected
@@ -68,15 +69,23 @@ class CameraPick:
         self._drawn = (size, picked)
         self._pane.content = pane_html(camera, picked, self._press)
         if picked is not None:
-            self._found.content = found_html(picked)
+            self._found.content = render("camera_found", picked=picked)
 
     def draw_in_view(self, view: SessionView, offset: NDArray[np.float32]) -> None:
-        """Mark the point that was picked.
+        """Mark the point that was picked by a cross and the body's name.
 
         Args:
             offset: (3,) where the selected env stands in the view.
         """
-        self._mark.draw(picked_here(view), offset)
+        picked = picked_here(view)
+        if picked is None or picked.point is None:
+            self._cross.draw()
+            self._label.draw()
+            return
+        place = np.asarray(picked.point, np.float64) + offset
+        ends = np.eye(3) * MARK_SIZE
+        self._cross.draw(np.stack([place - ends, place + ends], axis=1))
+        self._label.draw(picked.body or "", place)
 
 
 def picked_here(view: SessionView) -> Picked | None:
@@ -95,26 +104,3 @@ def pane_html(camera: StudioCamera, picked: Picked | None, press: str) -> str:
 def _size(camera: StudioCamera) -> tuple[int, int]:
     said = camera.info if camera.now is None else camera.now
     return said.width, said.height
-
-
-def found_html(picked: Picked) -> str:
-    numbers = "" if picked.point is None else ", ".join(f"{x:.4f}" for x in picked.point)
-    return render("camera_found", picked=picked, point=numbers)
-
-
-class PointMark:
-    """A cross and the body's name in the view, at a point of the selected env."""
-
-    def __init__(self, server: viser.ViserServer) -> None:
-        self._cross = LineSet(server, "/picked/cross", MARK_COLOUR, 3.0)
-        self._label = ViewLabel(server, "/picked/label", "bottom-left")
-
-    def draw(self, picked: Picked | None, offset: NDArray[np.float32]) -> None:
-        if picked is None or picked.point is None:
-            self._cross.draw(None)
-            self._label.draw(None)
-            return
-        place = np.asarray(picked.point, np.float64) + offset
-        ends = np.eye(3) * MARK_SIZE
-        self._cross.draw(np.stack([place - ends, place + ends], axis=1))
-        self._label.draw(picked.body or "", place)

@@ -14,20 +14,20 @@ from numpy.typing import NDArray
 
 from workbench.core.camera_frames import rotation_matrix, triple
 from workbench.core.camera_report import OfferedPlacement
-from workbench.core.camera_settings import CameraKey
+from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.pictures import CameraKind
 from workbench.session.messages import TaskDescription
 from workbench.session.session import Session
 from workbench.session.studio_view import StudioCamera
 from workbench.session.view import SessionView
-from workbench.ui.camera_work import Arrival, WorkBar
+from workbench.ui.camera_work import Answer
 from workbench.ui.controls import refusals_told
 from workbench.ui.env_layout import box_corners
 from workbench.ui.fragments import render
 from workbench.ui.in_colours import data_address
 from workbench.ui.placing import FARTHEST
 from workbench.ui.presses import Presses
-from workbench.ui.selection_mark import LineSet
+from workbench.ui.selection_mark import line_set
 
 ROOM, ROOM_ON_MOUNT = 0.3, 0.1
 """Metres from the eye to each side of the box that is first offered; less on a body, which has to carry it."""
@@ -64,9 +64,7 @@ class CameraSuggest:
         self._all_links = False
         self._of: CameraKey | None = None
         self._touched = False
-        self._drawn: object = None
         self._drawn_names: object = None
-        self._arrival = Arrival()
         with server.gui.add_folder("Suggest a placement", expand_by_default=False) as self.folder:
             self._mounted = server.gui.add_html("", visible=False)
             self._objects = server.gui.add_html("")
@@ -96,13 +94,12 @@ class CameraSuggest:
                 hint="Freshly reset envs in which a placement is judged; as many as there are envs at most.",
             )
             self._search = server.gui.add_button("Search", icon=viser.Icon.SEARCH)
-            self._bar = WorkBar(server, session)
-            self._offers = server.gui.add_html("", visible=False)
+            self._offers = Answer(server, session)
             self._presses = Presses(server)
         self._search.on_click(self._ask)
         for corner in (self._low, self._high):
             corner.on_update(self._on_touch)
-        self._box = LineSet(server, "/bounds of the eye", BOX_COLOUR, 2.0)
+        self._box = line_set(server, "/bounds of the eye", BOX_COLOUR, 2.0)
 
     # --- asked ---------------------------------------------------------------------------------------
 
@@ -133,8 +130,7 @@ class CameraSuggest:
         with refusals_told(event.client):
             if not wanted:
                 raise ValueError("Choose at least one object that must be seen.")
-            self._bar.asked()
-            self._arrival.asked(self._session.view().studio.looked.suggestions)
+            self._offers.asked(self._session.view().studio.looked.suggestions)
             self._session.studio.suggest(key, wanted, *self._bounds(), self._resets.value)
 
     # --- drawn ---------------------------------------------------------------------------------------
@@ -143,21 +139,12 @@ class CameraSuggest:
         studio, camera = view.studio, view.studio.chosen
         able = camera is not None and camera.now is not None and not camera.refused
         self._search.disabled = not able
-        self._bar.draw(studio.progress)
         self._draw_mounted(camera)
         self._draw_bounds(camera)
         self._draw_names(view)
-        offered = studio.looked.suggestions
-        new = self._arrival.just_came(offered)
-        wanted = (id(offered), studio.selected, None if camera is None else camera.now, new)
-        if wanted == self._drawn:
-            return
-        self._drawn = wanted
-        mine = bool(offered) and studio.looked.suggestions_of == studio.selected
-        self._offers.visible = mine
-        if mine and camera is not None:
-            content = self._offers_html(offered, camera, new)
-            self._offers.content = content
+        now = None if camera is None else camera.now
+        offered = studio.looked.suggestions if studio.looked.suggestions_of == studio.selected else ()
+        self._offers.draw(studio.progress, offered, now, lambda new: self._offers_html(offered, now, new))
 
     def _draw_mounted(self, camera: StudioCamera | None) -> None:
         mount = None if camera is None else camera.info.mount
@@ -202,24 +189,24 @@ class CameraSuggest:
         press = self._presses.id_of(("object", name), lambda _: self._toggle(name))
         return {"name": choice.label, "title": name, "on": name in chosen, "press": press}
 
-    def _offers_html(self, suggestions: tuple[OfferedPlacement, ...], camera: StudioCamera, new: bool) -> str:
+    def _offers_html(
+        self, offered: tuple[OfferedPlacement, ...], now: CameraSettings | None, new: bool
+    ) -> str:
         return render(
             "camera_offers",
             new=new,
             offers=[
                 {
                     "picture": "" if offer.picture.rgb is None else data_address(offer.picture.rgb, LARGEST),
-                    "score": f"{offer.score:.2f}",
-                    "words": offer.words,
-                    "eye": ", ".join(f"{x:.2f}" for x in offer.settings.position),
-                    "taken": camera.now is not None
+                    "of": offer,
+                    "taken": now is not None
                     and (offer.settings.position, offer.settings.quaternion)
-                    == (camera.now.position, camera.now.quaternion),
+                    == (now.position, now.quaternion),
                     "press": self._presses.id_of(
                         ("take", i), lambda _, i=i: self._session.studio.take_suggestion(i)
                     ),
                 }
-                for i, offer in enumerate(suggestions)
+                for i, offer in enumerate(offered)
             ],
         )
 
@@ -232,7 +219,7 @@ class CameraSuggest:
         camera = view.studio.chosen
         nowhere = camera is None or (camera.info.mount is not None and camera.mount_pose is None)
         if not self._show_box.value or nowhere or camera is None:
-            self._box.draw(None)
+            self._box.draw()
             return
         edges = box_edges(*self._bounds())
         if camera.mount_pose is not None:

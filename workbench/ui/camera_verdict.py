@@ -20,9 +20,9 @@ from workbench.core.camera_report import DEPTH_EDGES, CameraReport, DepthReport,
 from workbench.core.pictures import Picture
 from workbench.session.camera_studio import MOST_STEPS
 from workbench.session.session import Session
-from workbench.session.studio_view import StudioCamera, StudioView
+from workbench.session.studio_view import Looked, StudioCamera, StudioView
 from workbench.session.view import SessionView
-from workbench.ui.camera_work import Arrival, WorkBar
+from workbench.ui.camera_work import Answer
 from workbench.ui.fragments import counted, render
 from workbench.ui.in_colours import data_address
 from workbench.ui.presses import Presses
@@ -36,26 +36,11 @@ THUMBNAIL = 128
 """Pixels along the longer side of a picture on the sheet."""
 
 
-@dataclass(frozen=True)
-class Standing:
-    """What a report is worth by now."""
-
-    moved: bool = False
-    """The camera was moved since."""
-    before: bool = False
-    """The camera is being judged anew, and nothing is known of that yet."""
-    new: bool = False
-    """It has just come, and is to come into sight."""
-
-
 class CameraVerdict:
     """The folder in the present container."""
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
-        self._drawn: object = None
-        self._drawn_sheet: object = None
-        self._report_arrival, self._sheet_arrival = Arrival(), Arrival()
         with server.gui.add_folder("Judge", expand_by_default=False) as self.folder:
             self._over = server.gui.add_dropdown(
                 "Over",
@@ -82,13 +67,11 @@ class CameraVerdict:
                 hint="How many, each with a seed of its own.",
             )
             self._judge = server.gui.add_button("Judge this camera", icon=viser.Icon.CHECKLIST)
-            self._bar = WorkBar(server, session)
-            self._report = server.gui.add_html("", visible=False)
+            self._report = Answer(server, session)
             self._sheet = server.gui.add_button(
                 "Pictures of all envs", icon=viser.Icon.LAYOUT_GRID, color="gray"
             )
-            self._sheet_bar = WorkBar(server, session)
-            self._pictures = server.gui.add_html("", visible=False)
+            self._pictures = Answer(server, session)
             self._presses = Presses(server)
         self._judge.on_click(lambda _: self._ask())
         self._sheet.on_click(lambda _: self._ask_for_sheet())
@@ -99,8 +82,7 @@ class CameraVerdict:
         key = self._session.view().studio.selected
         if key is None:
             return
-        self._bar.asked()
-        self._report_arrival.asked(self._session.view().studio.looked.report)
+        self._report.asked(self._session.view().studio.looked.report)
         over = self._over.value
         if over == STEPS:
             self._session.studio.judge_steps(key, self._steps.value)
@@ -110,8 +92,7 @@ class CameraVerdict:
     def _ask_for_sheet(self) -> None:
         key = self._session.view().studio.selected
         if key is not None:
-            self._sheet_bar.asked()
-            self._sheet_arrival.asked(self._session.view().studio.looked.sheet)
+            self._pictures.asked(self._session.view().studio.looked.sheet)
             self._session.studio.make_sheet(key)
 
     def _show_moment(self, position: int) -> None:
@@ -138,51 +119,44 @@ class CameraVerdict:
         camera = studio.chosen
         self._resets.visible = self._over.value == FRESH
         self._steps.visible = self._over.value == STEPS
-        self._bar.draw(studio.progress)
-        self._sheet_bar.draw(studio.progress)
         self._draw_report(studio, camera)
         self._draw_sheet(view, camera)
 
     def _draw_report(self, studio: StudioView, camera: StudioCamera | None) -> None:
         looked = studio.looked
         report = looked.report if camera is not None and looked.report_of == camera.key else None
-        new = self._report_arrival.just_came(report)
-        now = None if camera is None else camera.now
-        wanted = (id(report), studio.report_stale, looked.judging, new, now)
-        if wanted == self._drawn:
-            return
-        self._drawn = wanted
-        self._report.visible = report is not None
-        if report is None or camera is None:
-            return
-        uses = {
-            plane: self._presses.id_of(plane, lambda _, p=plane: self._use(p)) for plane in ("near", "far")
-        }
-        seen_at = [
-            {
-                "words": f"step {moment.step}",
-                "press": self._presses.id_of(("moment", i), lambda _, i=i: self._show_moment(i)),
+
+        def html(new: bool) -> str:
+            assert camera is not None and report is not None, "drawn only then"
+            seen_at = [
+                {
+                    "words": f"step {moment.step}",
+                    "press": self._presses.id_of(("moment", i), lambda _, i=i: self._show_moment(i)),
+                }
+                for i, moment in enumerate(looked.report_moments)
+            ]
+            uses = {
+                plane: self._presses.id_of(plane, lambda _, p=plane: self._use(p))
+                for plane in ("near", "far")
             }
-            for i, moment in enumerate(looked.report_moments)
-        ]
-        how = Standing(studio.report_stale, looked.judging, new)
-        self._report.content = report_html(report, camera, how, looked.report_seeds, uses, seen_at)
+            return report_html(report, camera, looked, studio.report_stale, new, uses, seen_at)
+
+        told = studio.report_stale, looked.judging, None if camera is None else camera.now
+        self._report.draw(studio.progress, report, told, html)
 
     def _draw_sheet(self, view: SessionView, camera: StudioCamera | None) -> None:
-        looked = view.studio.looked
+        looked, env = view.studio.looked, view.selected_env
         sheet = looked.sheet
         mine = camera is not None and bool(sheet) and (sheet[0].kind, sheet[0].camera) == camera.key
-        new = self._sheet_arrival.just_came(sheet)
-        wanted = (id(sheet) if mine else None, id(looked.report), view.selected_env, new)
-        if wanted == self._drawn_sheet:
-            return
-        self._drawn_sheet = wanted
-        self._pictures.visible = mine
-        if not mine or camera is None:
-            return
-        judged = looked.report_of == camera.key and not looked.report_seeds and not looked.report_moments
-        report = looked.report if judged else None
-        self._pictures.content = self._sheet_html(sheet, report, view.selected_env, new)
+        judged = camera is not None and looked.report_of == camera.key
+        report = looked.report if judged and not looked.report_seeds and not looked.report_moments else None
+        told = id(report), env
+        self._pictures.draw(
+            view.studio.progress,
+            sheet if mine else None,
+            told,
+            lambda new: self._sheet_html(sheet, report, env, new),
+        )
 
     def _sheet_html(
         self, sheet: tuple[Picture, ...], report: CameraReport | None, selected: int, new: bool
@@ -194,7 +168,7 @@ class CameraVerdict:
                 "words": ""
                 if report is None or picture.env not in places
                 else env_words(report, places[picture.env]),
-                "picture": self._thumbnail(picture),
+                "picture": data_address(picture.rgb, THUMBNAIL),
                 "selected": picture.env == selected,
                 "press": self._presses.id_of(("env", picture.env), lambda _, env=picture.env: self._go(env)),
             }
@@ -206,9 +180,6 @@ class CameraVerdict:
             note = f"{MOST_PICTURES} of {len(sheet)}; {note}"
         return render("camera_sheet", cells=cells, note=note, new=new)
 
-    def _thumbnail(self, picture: Picture) -> str:
-        return "" if picture.rgb is None else data_address(picture.rgb, THUMBNAIL)
-
     def _go(self, env: int) -> None:
         task = self._session.view().task
         if task is not None and env < task.num_envs:  # a version with fewer envs may have been loaded since
@@ -218,14 +189,19 @@ class CameraVerdict:
 def report_html(
     report: CameraReport,
     camera: StudioCamera,
-    standing: Standing,
-    resets: int,
+    looked: Looked,
+    moved: bool,
+    new: bool,
     uses: dict[str, str],
     moments: Sequence[dict[str, str]] = (),
 ) -> str:
     """The table, the bars and the planes that would fit.
 
     Args:
+        looked: what it is of.
+        moved: the camera stands otherwise by now.
+        new: it is to come into sight.
+        uses: what takes a near or far plane that would fit.
         moments: where the report is over an episode's steps, ``words`` and ``press`` of each.
     """
     depth, info = report.depth, camera.info
@@ -243,7 +219,7 @@ def report_html(
             }
         )
     count = len(report.envs)
-    over = counted(count, "fresh reset") if resets else f"{counted(count, 'env')} as they are"
+    over = counted(count, "fresh reset") if looked.report_seeds else f"{counted(count, 'env')} as they are"
     unit = "envs"
     if moments:
         span = moments[0]["words"] if count == 1 else f"{moments[0]['words']} to {moments[-1]['words']}"
@@ -254,9 +230,9 @@ def report_html(
     width, height = report.judged_size
     return render(
         "camera_report",
-        stale=standing.moved,
-        before=standing.before,
-        new=standing.new,
+        stale=moved,
+        before=looked.judging,
+        new=new,
         over=over,
         how=f"{counted(report.pictures, 'picture')} of {width} × {height} in {report.milliseconds / 1000:.1f} s: each as it is, "
         "without the robot if that is in it, and of each object alone",

@@ -8,6 +8,8 @@ push the pressed button away, one at the end is not seen. A result is brought in
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from typing import ClassVar
 
 import viser
 
@@ -40,24 +42,44 @@ SHORT = 0.5
 """Seconds that something may take without a bar."""
 
 
-class WorkBar:
-    """A bar and a button in the present container, hidden until something runs that was asked for here."""
+class Answer:
+    """What is asked for with the button above, in the present container: a bar while it runs, and then what came of it."""
 
-    _asked_last: WorkBar | None = None
+    _asked_last: ClassVar[Answer | None] = None
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
-        self._bar = server.gui.add_html("", visible=False)
-        self._stop = server.gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
+        gui = server.gui
+        self._bar = gui.add_html("", visible=False)
+        self._stop = gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
         self._stop.on_click(lambda _: session.studio.stop())
+        self._html = gui.add_html("", visible=False)
         self._began: float | None = None
+        self._arrival = Arrival()
+        self._drawn: object = None
 
-    def asked(self) -> None:
-        """What runs from now on was asked for here."""
-        WorkBar._asked_last = self
+    def asked(self, now: object) -> None:
+        """What runs from now on was asked for here, and is to come in place of what there is now."""
+        Answer._asked_last = self
+        self._arrival.asked(now)
 
-    def draw(self, running: Progress | None) -> None:
-        """Draw what is new."""
-        if running is None or WorkBar._asked_last is not self:
+    def draw(self, running: Progress | None, came: object, told: object, html: Callable[[bool], str]) -> None:
+        """Draw what is new.
+
+        Args:
+            came: what is to be shown, if anything.
+            told: what else is to be seen in its HTML; compared.
+            html: makes that of it, given whether it came a moment ago.
+        """
+        self._draw_bar(running)
+        new = self._arrival.just_came(came)
+        if (wanted := (id(came), told, new)) != self._drawn:
+            self._drawn = wanted
+            self._html.visible = bool(came)
+            if came:
+                self._html.content = html(new)
+
+    def _draw_bar(self, running: Progress | None) -> None:
+        if running is None or Answer._asked_last is not self:
             self._began = None
         elif self._began is None:
             self._began = time.monotonic()

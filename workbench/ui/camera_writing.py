@@ -151,39 +151,37 @@ FromViewer = Callable[[viser.ClientHandle, CameraSettings], CameraSettings]
 
 
 class CameraWriting:
-    """
+    """The folder that adds, copies, renames and removes, in the present container.
+
     Args:
+        above: takes what writes where the chosen camera was placed.
         from_viewer: these settings at the place from which a page's own view looks, in the env's frame.
     """
 
     def __init__(
-        self, server: viser.ViserServer, session: Session, placing: Placing, from_viewer: FromViewer
+        self,
+        server: viser.ViserServer,
+        session: Session,
+        placing: Placing,
+        from_viewer: FromViewer,
+        above: viser.GuiFolderHandle,
     ) -> None:
-        self._server, self._session = server, session
-        self._placing, self._from_viewer = placing, from_viewer
+        self._session, self._placing, self._from_viewer = session, placing, from_viewer
         gui = server.gui
         self._planned: tuple[CameraKey, CameraSettings | None] | None = None
         """Whose plan it is, and how that camera was placed then."""
         self._about = ""
         """What is said of the plan beside."""
-        # Always there: one that came with the first movement would push what is under it out of the hand.
-        self._plan = gui.add_button("Show the change", icon=viser.Icon.FILE_DIFF, visible=False)
-        self._change = CameraChange(server, session)
-        self._plan.on_click(lambda _: self._plan_write())
-        self._name: viser.GuiTextHandle | None = None
-        self._with_chosen: viser.GuiButtonGroupHandle | None = None
-        self._member_change: CameraChange | None = None
-        self._why_not: viser.GuiHtmlHandle | None = None
         self._before: Writing | None = None
         """What there was when something was asked for, which is not to be shown as its answer."""
         self._named: Writing | None = None
         """The last change after which the field for a name was emptied."""
         self._sight: tuple[Picture, str] | None = None
         """The last picture of a camera to be added, and its address."""
-
-    def add_members(self) -> None:
-        """The folder that adds, copies, renames and removes: last in the tab, since it is wanted least."""
-        gui = self._server.gui
+        with above:
+            # Always there: one that came with the first movement would push what is under it out of the hand.
+            self._plan = gui.add_button("Show the change", icon=viser.Icon.FILE_DIFF, visible=False)
+            self._change = CameraChange(server, session)
         with gui.add_folder("Add, copy, rename, remove", expand_by_default=False):
             self._name = gui.add_text(
                 "New name",
@@ -195,7 +193,8 @@ class CameraWriting:
             add = gui.add_button_group("", (ADD_SENSOR, ADD_HUMAN))
             self._why_not = gui.add_html("", visible=False)
             gui.add_html(render("aside", text=WHERE))
-            self._member_change = CameraChange(self._server, self._session)
+            self._member_change = CameraChange(server, session)
+        self._plan.on_click(lambda _: self._plan_write())
         self._with_chosen.on_click(self._on_member)
         add.on_click(self._on_member)
 
@@ -212,8 +211,7 @@ class CameraWriting:
         self._before = self._session.view().studio.writing
         self._say("")
         change = self._change if wish.what == "edit" else self._member_change
-        if change is not None:
-            change.arrival.asked(self._before)
+        change.arrival.asked(self._before)
         self._session.studio.plan(wish)
 
     def _on_member(self, event: viser.GuiEvent) -> None:
@@ -224,9 +222,8 @@ class CameraWriting:
 
     def _say(self, why_not: str) -> None:
         """Beside the buttons that were pressed, where one looks."""
-        if self._why_not is not None:
-            self._why_not.visible = bool(why_not)
-            self._why_not.content = render("warning", text=why_not) if why_not else ""
+        self._why_not.visible = bool(why_not)
+        self._why_not.content = render("warning", text=why_not) if why_not else ""
 
     def _plan_member(self, what: object, client: viser.ClientHandle | None) -> None:
         view = self._session.view()
@@ -254,7 +251,7 @@ class CameraWriting:
 
     def _checked_name(self, view: StudioView, kind: CameraKind, like: str) -> str:
         """The name that was typed, or a free one like another; `ValueError` where neither is there."""
-        name = "" if self._name is None else self._name.value.strip()
+        name = self._name.value.strip()
         if not name and like:
             return free_name(view, kind, like)
         if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_-]*", name):
@@ -282,17 +279,12 @@ class CameraWriting:
         self._plan.visible = can_plan
         self._plan.disabled = not wants_plan
         for change, here in ((self._change, not of_members), (self._member_change, of_members)):
-            if change is not None:
-                shown = here and self._before is None
-                change.draw(
-                    writing if shown else Writing(), stale and shown, self._about, self._address(studio)
-                )
+            shown = here and self._before is None
+            change.draw(writing if shown else Writing(), stale and shown, self._about, self._address(studio))
         if writing.stage == "checked" and of_members and writing is not self._named:
             self._named = writing
-            if self._name is not None and self._name.value:
-                self._name.value = ""  # it is taken now
-        if self._with_chosen is not None:
-            self._with_chosen.visible = chosen is not None
+            self._name.value = ""  # it is taken now
+        self._with_chosen.visible = chosen is not None
 
     def _address(self, studio: StudioView) -> str:
         """Of the picture of the camera that is to be added; empty while there is none."""

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from workbench.core.geometry import Mesh, SceneGeometry, Visual
+from workbench.core.geometry import SceneGeometry, Visual
 
 FLOOR_WIDTH = 8.0
 """Metres. A flat static thing wider than this in both directions is a floor: ManiSkill's ground is
@@ -71,7 +71,7 @@ def plane_normal(visual: Visual, geometry: SceneGeometry, poses: NDArray) -> NDA
     """
     if any(geometry.body_kinds[b] not in ("static", "kinematic") for b in np.unique(visual.bodies)):
         return None
-    extent = _extent(visual.mesh)
+    extent = np.ptp(visual.mesh.vertices, axis=0)
     thin = int(extent.argmin())
     if extent[thin] > FLOOR_THICKNESS or np.sort(extent)[1] < FLOOR_WIDTH:
         return None
@@ -184,12 +184,6 @@ def env_under_ray(layout: EnvLayout, origin: NDArray, direction: NDArray) -> int
     if not hit.any():
         return None
     return int(np.where(hit, enters, np.inf).argmin())
-
-
-def _extent(mesh: Mesh) -> NDArray:
-    if not len(mesh.vertices):
-        return np.zeros(3)
-    return np.ptp(mesh.vertices, axis=0)
 
 
 def _corners_in_env(visual: Visual, poses: NDArray) -> NDArray:

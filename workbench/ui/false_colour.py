@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import colorsys
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,11 +84,7 @@ def segment_colour(identity: int) -> tuple[int, int, int]:
     hue = (identity * 0.6180339887) % 1.0
     value = (0.95, 0.78, 0.62)[identity % 3]
     saturation = (0.62, 0.75, 0.5)[(identity // 3) % 3]
-    sector = hue * 6.0
-    red, green, blue = (
-        value * (1 - saturation * float(np.clip(1 - abs((sector + turn) % 6 - 3) + 1, 0, 1)))
-        for turn in (0, 4, 2)
-    )
+    red, green, blue = colorsys.hsv_to_rgb(hue, saturation, value)
     return round(red * 255), round(green * 255), round(blue * 255)
 
 

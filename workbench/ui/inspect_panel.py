@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,8 @@ from workbench.session.number_text import number_text
 from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.fragments import counted, render
-from workbench.ui.parts import Clock, DrawDue, Part
+from workbench.ui.parts import Clock, DrawDue, PagePart
+from workbench.ui.selection_mark import InView
 
 NEAR_A_LIMIT = 0.02
 """Part of a joint's range."""
@@ -160,7 +162,7 @@ CHOICES: dict[str, Section | None] = {
 }
 
 
-class InspectPanel(Part[SessionView]):
+class InspectPanel(PagePart[SessionView]):
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
         self._session, self._clock = session, clock
         self._show = server.gui.add_dropdown(
@@ -314,8 +316,9 @@ class ForceArrows:
     """
 
     def __init__(self, server: viser.ViserServer) -> None:
-        self._server = server
-        self._handle: viser.ArrowsHandle | None = None
+        look = {"shaft_radius": SHAFT, "head_radius": HEAD, "head_length": HEAD_LENGTH}
+        add = partial(server.scene.add_arrows, "/forces", colors=FORCE_COLOUR, **look)
+        self._arrows = InView(add, "points")
         self._drawn: tuple[int, bytes] | None = None
 
     def draw(self, inspection: Inspection | None, offset: NDArray[np.float32]) -> None:
@@ -328,17 +331,11 @@ class ForceArrows:
         if wanted == self._drawn:
             return
         self._drawn = wanted
-        arrows = np.zeros((0, 2, 3), np.float32) if inspection is None else arrows_of(inspection) + offset
-        if not len(arrows):
-            if self._handle is not None:
-                self._handle.remove()
-                self._handle = None
-        elif self._handle is None:
-            self._handle = self._server.scene.add_arrows(
-                "/forces", arrows, FORCE_COLOUR, shaft_radius=SHAFT, head_radius=HEAD, head_length=HEAD_LENGTH
-            )
+        arrows = () if inspection is None else arrows_of(inspection)
+        if len(arrows):
+            self._arrows.draw(arrows + offset)
         else:
-            self._handle.points = arrows
+            self._arrows.draw()
 
 
 def arrows_of(inspection: Inspection) -> NDArray[np.float32]:

@@ -19,7 +19,7 @@ from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.session.studio_view import StudioCamera
 from workbench.ui.camera_moves import Floats, Frame, fov_that_shows_all, picture_corners, viewer_pose
 from workbench.ui.placing import Placing
-from workbench.ui.selection_mark import LineSet
+from workbench.ui.selection_mark import line_set
 from workbench.ui.viewpoint import USUAL_ASPECT
 
 WIDEST = math.radians(150)
@@ -46,7 +46,7 @@ class LookThrough:
         self._server, self._placing = server, placing
         self._lock = threading.Lock()
         self._looking: dict[int, _Looking] = {}
-        self._border = LineSet(server, "/studio/border", BORDER_COLOUR, 2.0)
+        self._border = line_set(server, "/studio/border", BORDER_COLOUR, 2.0)
 
     @property
     def any(self) -> bool:
@@ -85,7 +85,7 @@ class LookThrough:
     def _draw_border(self, camera: StudioCamera | None) -> None:
         """A view is wider than the picture; what is inside of this line is in it."""
         if camera is None or camera.now is None:
-            self._border.draw(None)
+            self._border.draw()
             return
         corners = picture_corners(camera.now, self._placing.frame(camera).to_view(camera.now), BORDER_AT)
         self._border.draw(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from workbench.core.step import OtherEntry, StepResult
 from workbench.session.number_text import lost_text, mean_text, number_text
 from workbench.session.view import SessionView
-from workbench.ui.fragments import render
-from workbench.ui.parts import Part
+from workbench.ui.fragments import render, short_text
+from workbench.ui.parts import PagePart
 
 LONGEST_VECTOR = 4
 LONGEST_TEXT = 160
@@ -65,13 +65,11 @@ def number_rows(step: StepResult, selected_env: int, max_episode_steps: int | No
 def _other_row(name: str, entry: OtherEntry, env: int) -> NumberRow:
     hint = entry.what if entry.whole else f"{entry.what}; only a part of it is shown, and recorded"
     if entry.per_env:
-        return NumberRow(name, _short(entry.texts[env]) if env < len(entry.texts) else "—", "", hint=hint)
-    value = _short("".join(entry.texts)) if entry.numbers is None else _value(entry.numbers)
+        return NumberRow(
+            name, short_text(entry.texts[env], LONGEST_TEXT) if env < len(entry.texts) else "—", "", hint=hint
+        )
+    value = short_text("".join(entry.texts), LONGEST_TEXT) if entry.numbers is None else _value(entry.numbers)
     return NumberRow(name, "", "", whole=value, hint=f"not per env: {hint}")
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= LONGEST_TEXT else text[: LONGEST_TEXT - 1] + "…"
 
 
 def _reward_row(step: StepResult, env: int) -> NumberRow:
@@ -131,7 +129,7 @@ def _batch(values: NDArray) -> str:
     return ""
 
 
-class NumbersPanel(Part[SessionView]):
+class NumbersPanel(PagePart[SessionView]):
     every = 0.12
 
     def __init__(self, server: viser.ViserServer) -> None:

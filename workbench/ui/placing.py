@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 import threading
 import time
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,6 +85,17 @@ class Placing:
             self._hand, self._moved_at = hand, now
             gesture = self._gesture if gesture is None else gesture
         self._session.studio.place(key, settings, gesture)
+
+    def change(self, hand: str, change: Callable[[CameraSettings], CameraSettings]) -> None:
+        """Place the chosen camera as `change` makes of it; `hand` as in `place`.
+
+        Raises:
+            ValueError: no camera can be placed, or not so.
+        """
+        camera, now, _ = self.require()
+        changed = change(now)
+        if changed != now:
+            self.place(camera.key, changed, hand)
 
     # --- the target: a camera has a direction; how far it looks is said by its look_at, or known to the page ----
 

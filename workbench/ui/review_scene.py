@@ -24,7 +24,7 @@ from workbench.session.review_compare import distances
 from workbench.session.review_view import Opened, ReviewView
 from workbench.ui.camera_frustums import SMALL, CameraFrustums, without_the_viewpoint
 from workbench.ui.env_layout import EnvLayout, acting_box, env_under_ray, lay_out
-from workbench.ui.selection_mark import SelectionMark, ViewLabel
+from workbench.ui.selection_mark import SelectionMark, view_label
 from workbench.ui.timeline_panel import HEIGHT as TIMELINE_HEIGHT
 from workbench.ui.viewpoint import Stage, Viewpoint, frame_all, frame_one
 
@@ -180,7 +180,7 @@ class ReviewIn3D:
         self._review = review
         self.bodies, self._framing = stage.scene, stage.framing
         self._mark = SelectionMark(server)
-        self._names = [ViewLabel(server, f"/names {index}", "top-center") for index in range(MOST_NAMED)]
+        self._names = [view_label(server, f"/names {index}", "top-center") for index in range(MOST_NAMED)]
         self._frustums = CameraFrustums(server)
         self._scene: ReviewScene | None = None
         self._view = ReviewView()
@@ -264,7 +264,7 @@ class ReviewIn3D:
         few = scene is not None and len(view.opened) <= MOST_NAMED
         for index, label in enumerate(self._names):
             if scene is None or not few or index >= len(view.opened) or index == view.selected:
-                label.draw(None)
+                label.draw()
             else:
                 layout = scene.layout
                 front = np.array([layout.high[0], (layout.low[1] + layout.high[1]) / 2, layout.floor_height])

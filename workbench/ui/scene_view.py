@@ -13,6 +13,8 @@ What a browser can draw is limited by triangles, so the fewer envs are shown the
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import viser
 from numpy.typing import NDArray
@@ -22,6 +24,7 @@ from workbench.core.mesh_detail import reduce_mesh
 from workbench.core.shared_shapes import fingerprint
 from workbench.ui.env_layout import EnvLayout, place_of_plane, plane_normal
 from workbench.ui.meshes_as_glb import WornTogether, as_glb, face_limit, group_by_wearers
+from workbench.ui.selection_mark import InView
 
 NAMES = ("/envs", "/floor")
 """Below which all of it is in viser's tree."""
@@ -34,7 +37,10 @@ class SceneView:
         self._server = server
         self._drawn: dict[tuple[str, int, int], _DrawnGroup] = {}
         self._number = 0
-        self._floor_grid: viser.GridHandle | None = None
+        look = {"cell_size": 0.5, "section_size": 1.0}
+        colours = {"cell_color": (150, 150, 150), "section_color": (120, 120, 120)}
+        add = partial(server.scene.add_grid, "/floor", **look, **colours)
+        self._grid = InView(add, "width", "height", "position")
 
     def build(
         self,
@@ -72,21 +78,12 @@ class SceneView:
             self._drawn[key] = drawn
         for drawn in before.values():
             drawn.handle.remove()
-        if self._floor_grid is not None:
-            self._floor_grid.remove()
-            self._floor_grid = None
-        if not layout.has_floor:
+        if layout.has_floor:
+            self._grid.draw()
+        else:
             low, high = layout.box_of_all()
-            self._floor_grid = self._server.scene.add_grid(
-                "/floor",
-                width=float(high[0] - low[0]) + 4.0,
-                height=float(high[1] - low[1]) + 4.0,
-                cell_size=0.5,
-                section_size=1.0,
-                position=(0.0, 0.0, layout.floor_height),
-                cell_color=(150, 150, 150),
-                section_color=(120, 120, 120),
-            )
+            wide, deep = float(high[0] - low[0]) + 4.0, float(high[1] - low[1]) + 4.0
+            self._grid.draw(wide, deep, (0.0, 0.0, layout.floor_height))
         self.move(poses, layout, only_env)
 
     def move(self, poses: NDArray[np.float32], layout: EnvLayout, only_env: int | None) -> None:
@@ -104,9 +101,7 @@ class SceneView:
         for group in self._drawn.values():
             group.handle.remove()
         self._drawn.clear()
-        if self._floor_grid is not None:
-            self._floor_grid.remove()
-            self._floor_grid = None
+        self._grid.draw()
 
     @property
     def handles(self) -> tuple[viser.BatchedGlbHandle, ...]:

@@ -5,70 +5,59 @@ Level and round the bodies, never over them, so that nothing of the task is cove
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import viser
-from numpy.typing import NDArray
 
 from workbench.ui.env_layout import MARGIN, EnvLayout
 
 COLOUR = (34, 139, 230)
 
 
-class LineSet:
-    """Line segments in the 3-D view, `thickness` pixels wide, that come, change and go."""
+class InView:
+    """Something in the 3-D view that comes, changes and goes.
 
-    def __init__(
-        self, server: viser.ViserServer, name: str, colour: tuple[int, int, int], thickness: float
-    ) -> None:
-        self._server, self._name, self._colour, self._thickness = server, name, colour, thickness
-        self._handle: viser.LineSegmentsHandle | None = None
+    Args:
+        add: of viser's scene; makes it of the values of `names`.
+        names: of what changes of it.
+    """
 
-    def draw(self, points: NDArray | None) -> None:
-        """Draw these (K, 2, 3), metres in the view; None takes them away."""
-        if points is None:
-            if self._handle is not None:
-                self._handle.remove()
-                self._handle = None
-        elif self._handle is None:
-            self._handle = self._server.scene.add_line_segments(
-                self._name,
-                np.asarray(points, np.float32),
-                self._colour,
-                thickness=self._thickness,
-                thickness_units="screen",
-            )
+    def __init__(self, add: Callable[..., Any], *names: str) -> None:
+        self._add, self._names = add, names
+        self.handle: Any = None
+        """Of viser's, while it is shown."""
+
+    def draw(self, *values: Any) -> None:
+        """Show it with these values; none of them takes it away."""
+        if not values:
+            if self.handle is not None:
+                self.handle.remove()
+            self.handle = None
+        elif self.handle is None:
+            self.handle = self._add(**dict(zip(self._names, values, strict=True)))
         else:
-            self._handle.points = np.asarray(points, np.float32)
+            for name, value in zip(self._names, values, strict=True):
+                setattr(self.handle, name, value)
 
 
-class ViewLabel:
-    """A text in the 3-D view that comes, changes and goes; `anchor` says which part of it is at its place."""
+def line_set(server: viser.ViserServer, name: str, colour: tuple[int, int, int], thickness: float) -> InView:
+    """Line segments (K, 2, 3), metres in the view, `thickness` pixels wide."""
+    more = {"colors": colour, "thickness": thickness, "thickness_units": "screen"}
+    return InView(partial(server.scene.add_line_segments, name, **more), "points")
 
-    def __init__(
-        self, server: viser.ViserServer, name: str, anchor: Literal["top-center", "bottom-left"]
-    ) -> None:
-        self._add = partial(server.scene.add_label, name, anchor=anchor)
-        self._handle: viser.LabelHandle | None = None
 
-    def draw(self, text: str | None, place: NDArray | None = None) -> None:
-        """Write this at (3,), metres in the view; None takes it away."""
-        if text is None or place is None:
-            if self._handle is not None:
-                self._handle.remove()
-                self._handle = None
-        elif self._handle is None:
-            self._handle = self._add(text, position=place)
-        else:
-            self._handle.text, self._handle.position = text, place
+def view_label(server: viser.ViserServer, name: str, anchor: Literal["top-center", "bottom-left"]) -> InView:
+    """A text, and (3,) metres in the view where it is; `anchor` says which part of it is there."""
+    return InView(partial(server.scene.add_label, name, anchor=anchor), "text", "position")
 
 
 class SelectionMark:
     def __init__(self, server: viser.ViserServer) -> None:
-        self._frame = LineSet(server, "/selected/frame", COLOUR, 3.0)
-        self._label = ViewLabel(server, "/selected/label", "top-center")
+        self._frame = line_set(server, "/selected/frame", COLOUR, 3.0)
+        self._label = view_label(server, "/selected/label", "top-center")
         self._drawn: tuple[int, int, str] | None = None
 
     def draw(self, layout: EnvLayout, env: int, shown: bool, name: str | None = None) -> None:
@@ -96,5 +85,5 @@ class SelectionMark:
 
     def clear(self) -> None:
         self._drawn = None
-        self._frame.draw(None)
-        self._label.draw(None)
+        self._frame.draw()
+        self._label.draw()

@@ -40,9 +40,9 @@ from workbench.ui.camera_writing import CameraWriting
 from workbench.ui.cameras_panel import KIND_NAMES, StudioPicture
 from workbench.ui.commands import Command
 from workbench.ui.controls import Control, refusals_told
-from workbench.ui.fragments import render
+from workbench.ui.fragments import render, sentence
 from workbench.ui.look_through import LookThrough
-from workbench.ui.parts import Clock, Part
+from workbench.ui.parts import Clock, PagePart
 from workbench.ui.placing import Placing
 from workbench.ui.presses import Presses
 
@@ -76,7 +76,7 @@ class Toggle:
     choose: Callable[[Any], None]
 
 
-class StudioPanel(Part[SessionView]):
+class StudioPanel(PagePart[SessionView]):
     def __init__(self, server: viser.ViserServer, session: Session, clock: Clock = time.monotonic) -> None:
         self._server, self._session = server, session
         self._placing = Placing(session)
@@ -99,11 +99,11 @@ class StudioPanel(Part[SessionView]):
         self._facts = gui.add_html("", visible=False)
         self._tools = gui.add_html("", visible=False)
         self._look = LookThrough(server, self._placing)
-        self._writing = CameraWriting(server, session, self._placing, self._new_from_viewer)
+        above = gui.add_folder(None)
         self._handles = gui.add_html("", visible=False)
         self._numbers = CameraNumbers(server, self._placing, look_at=lambda: self._look_at)
         self._lens = CameraLens(server, self._placing)
-        self._writing.add_members()
+        self._writing = CameraWriting(server, session, self._placing, self._new_from_viewer, above)
         verdict, compare = CameraVerdict(server, session), CameraCompare(server, session)
         self._suggest = CameraSuggest(server, session)
         self._folders = verdict, compare, self._suggest, CameraExport(server, session)
@@ -223,7 +223,7 @@ class StudioPanel(Part[SessionView]):
         info = camera.info
         return render(
             "studio_facts",
-            refused=camera.refused and f"{camera.refused[0].upper()}{camera.refused[1:].rstrip('.')}.",
+            refused=sentence(camera.refused),
             moved=camera.moved,
             file="" if info.site is None else PurePath(info.site.file).name,
             line=None if info.site is None else info.site.line,
