@@ -18,8 +18,6 @@ opens at the first moment, which the panel's heading then still tells apart.
 from __future__ import annotations
 
 import gzip
-import html
-import json
 import logging
 import secrets
 import threading
@@ -38,6 +36,7 @@ from workbench.ui.file_reply import FileReply
 from workbench.ui.fragments import render
 from workbench.ui.offers import Offers
 from workbench.ui.presses import Presses
+from workbench.web_assets import web_assets_folder
 
 log = logging.getLogger(__name__)
 
@@ -51,63 +50,6 @@ Moments = Mapping[Path, int]
 _SHOW = "/rerun/show/"
 _BLUEPRINT = ".rbl"
 _VIEWER = f"/rerun/viewer-{version('rerun-sdk')}/"
-_GO_ON = """<!doctype html><meta charset="utf-8"><title>Workbench: {title}</title>
-<style>body {{ background: #0d1011; color: #cad8de; font: 14px system-ui, sans-serif; margin: 2em }}</style>
-<p>Opening {title} in rerun&hellip;</p>
-<script>
-const query = new URLSearchParams([["hide_welcome_screen", "1"], ["persist", "0"]]);
-// A recording's blueprint is at its end, and until rerun has it, it arranges things as it likes.
-for (const name of {blueprints}) query.append("url", new URL(name, location.href).href);
-for (const path of {paths}) query.append("url", location.origin + path);
-for (const moment of {moments}) query.append("at", moment);
-query.append("title", {title_text});
-// Dark or light as the page that this is in.
-let theme = "dark";
-try {{ theme = parent.document.documentElement.dataset.mantineColorScheme || theme; }} catch {{ }}
-query.append("theme", theme);
-// rerun's own look-ups of a fast graphics driver end in a dialog where there is none.
-if (!navigator.gpu) query.append("renderer", "webgl");
-location.replace({viewer} + "index.html?" + query);
-</script>
-"""
-
-_IN_ITS_PAGE = b"""<script>
-// rerun fetches recordings without cookies (0.41), and the door lets nobody in without.
-const fetch_as_told = window.fetch;
-window.fetch = (what, how) => fetch_as_told(what, { ...how, credentials: "same-origin" });
-{
-  const asked = new URLSearchParams(location.search);
-  const varint = (n) => { const out = []; for (; n > 127; n = Math.floor(n / 128)) out.push((n % 128) | 128); return [...out, n]; };
-  const field = (number, bytes) => [number * 8 + 2, ...varint(bytes.length), ...bytes];
-  const text = (string) => [...new TextEncoder().encode(string)];
-  // ViewerControlRequest.set_time_cursor = 6: store_id = 1, timeline.name = 2.1, time.time = 3.1, play_state = 5 (paused).
-  const set_time = (recording, step) => new Uint8Array(field(6, [
-    ...field(1, text(recording)), ...field(2, field(1, text("step"))), ...field(3, [8, ...varint(step)]), 40, 1]));
-  const go = async (recording, step) => {
-    // It is refused until the recording has been read so far.
-    for (let tries = 0; tries < 300; tries++) {
-      await new Promise((done) => setTimeout(done, 200));
-      try {
-        await window._handle.viewer_control(set_time(recording, step));
-        return;
-      } catch { }
-    }
-    console.warn("rerun was not told to open at step " + step);
-  };
-  for (const moment of asked.getAll("at")) {
-    const end = moment.lastIndexOf("@");
-    go(moment.slice(0, end), Number(moment.slice(end + 1)));
-  }
-  if (parent !== window) {
-    // It takes the keyboard when it starts; in a panel the keys are the page's until somebody presses into it.
-    const focus = HTMLElement.prototype.focus;
-    let pressed = false;
-    addEventListener("pointerdown", () => { pressed = true; }, true);
-    HTMLElement.prototype.focus = function (...how) { if (pressed) focus.apply(this, how); };
-  }
-  addEventListener("load", () => { document.title = asked.get("title") || document.title; });
-}
-</script>"""
 
 
 class RerunPages:
@@ -147,13 +89,13 @@ class RerunPages:
         names = ", ".join(path.stem for path in paths)
         # The first moment too: rerun follows what it reads until it reads, at the end of a file, that it is to pause.
         begins = {**dict.fromkeys(paths, 0), **{path.resolve(): step for path, step in moments().items()}}
-        page = _GO_ON.format(
-            title=html.escape(names),
-            title_text=_in_script(names),
-            blueprints=_in_script([f"{n}{_BLUEPRINT}" for n, path in enumerate(paths) if _blueprint(path)]),
-            paths=_in_script([self._offers.address(path) for path in paths]),
-            moments=_in_script([f"{store}@{step}" for store, step in _stores(begins)]),
-            viewer=_in_script(_VIEWER),
+        page = render(
+            "rerun_go_on",
+            names=names,
+            blueprints=[f"{n}{_BLUEPRINT}" for n, path in enumerate(paths) if _blueprint(path)],
+            paths=[self._offers.address(path) for path in paths],
+            moments=[f"{store}@{step}" for store, step in _stores(begins)],
+            viewer=_VIEWER,
         )
         return 200, "text/html; charset=utf-8", page.encode()
 
@@ -164,11 +106,6 @@ def _blueprint(path: Path) -> bytes | None:
     except (ValueError, OSError) as error:
         log.info("%s shows no blueprint of its own before it is read: %s", path.name, error)
         return None
-
-
-def _in_script(value: object) -> str:
-    # "</script>" in a file's name would end the script.
-    return json.dumps(value).replace("<", "\\u003c")
 
 
 def _stores(moments: Moments) -> Iterator[tuple[str, int]]:
@@ -188,7 +125,8 @@ def _viewer_file(name: str) -> tuple[int, str, bytes] | FileReply:
     if name == "index.html":
         page = gzip.decompress(viewer_file(name).read_bytes())
         before, head, after = page.partition(b"<head>")
-        return 200, VIEWER_FILES[name], before + head + _IN_ITS_PAGE + after
+        ours = b"<script>" + (web_assets_folder() / "in_rerun.js").read_bytes() + b"</script>"
+        return 200, VIEWER_FILES[name], before + head + ours + after
     return FileReply(viewer_file(name), VIEWER_FILES[name], gzipped=True)
 
 

@@ -1,0 +1,37 @@
+// In rerun's own page, before anything of its own.
+"use strict";
+// rerun fetches recordings without cookies (0.41), and the door lets nobody in without.
+const fetch_as_told = window.fetch;
+window.fetch = (what, how) => fetch_as_told(what, { ...how, credentials: "same-origin" });
+{
+  const asked = new URLSearchParams(location.search);
+  const varint = (n) => { const out = []; for (; n > 127; n = Math.floor(n / 128)) out.push((n % 128) | 128); return [...out, n]; };
+  const field = (number, bytes) => [number * 8 + 2, ...varint(bytes.length), ...bytes];
+  const text = (string) => [...new TextEncoder().encode(string)];
+  // ViewerControlRequest.set_time_cursor = 6: store_id = 1, timeline.name = 2.1, time.time = 3.1, play_state = 5 (paused).
+  const set_time = (recording, step) => new Uint8Array(field(6, [
+    ...field(1, text(recording)), ...field(2, field(1, text("step"))), ...field(3, [8, ...varint(step)]), 40, 1]));
+  const go = async (recording, step) => {
+    // It is refused until the recording has been read so far.
+    for (let tries = 0; tries < 300; tries++) {
+      await new Promise((done) => setTimeout(done, 200));
+      try {
+        await window._handle.viewer_control(set_time(recording, step));
+        return;
+      } catch { }
+    }
+    console.warn("rerun was not told to open at step " + step);
+  };
+  for (const moment of asked.getAll("at")) {
+    const end = moment.lastIndexOf("@");
+    go(moment.slice(0, end), Number(moment.slice(end + 1)));
+  }
+  if (parent !== window) {
+    // It takes the keyboard when it starts; in a panel the keys are the page's until somebody presses into it.
+    const focus = HTMLElement.prototype.focus;
+    let pressed = false;
+    addEventListener("pointerdown", () => { pressed = true; }, true);
+    HTMLElement.prototype.focus = function (...how) { if (pressed) focus.apply(this, how); };
+  }
+  addEventListener("load", () => { document.title = asked.get("title") || document.title; });
+}
