@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from tests.drive.panels import Clock
-from workbench.ui.parts import DrawDue, Part, Parts
+from workbench.ui.parts import DrawDue, PagePart, Parts
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def test_what_somebody_waits_for_is_drawn_at_once_and_counts_as_drawn(due: DrawD
     assert due.is_due(3, urgent="pressed")
 
 
-class Halves(Part[int]):
+class Halves(PagePart[int]):
     """Shows half of a number, and is in a hurry about large ones."""
 
     every = 0.5
@@ -55,7 +55,7 @@ class Halves(Part[int]):
         self.drawn.append(view)
 
 
-class Plain(Part[int]):
+class Plain(PagePart[int]):
     def __init__(self) -> None:
         self.drawn: list[int] = []
 

@@ -18,7 +18,7 @@ from workbench.authoring.problem import Problem
 from workbench.session.last_words import Busy
 from workbench.session.view import SessionView
 from workbench.ui.fragments import render
-from workbench.ui.parts import Part
+from workbench.ui.parts import PagePart
 from workbench.ui.timeline_panel import GAP
 
 WIDEST, BUSY_WIDEST = 520, 460
@@ -58,7 +58,7 @@ def is_busy_for_long(view: SessionView) -> bool:
     return busy is not None and busy.seconds >= SHOWN_AFTER and not (busy.getting_ready or busy.held)
 
 
-class Banner(Part[SessionView]):
+class Banner(PagePart[SessionView]):
     """A floating panel that is there only while a problem stands.
 
     Args:
@@ -126,7 +126,7 @@ def _kept(view: SessionView) -> str:
     return "The last good version stays on the page."
 
 
-class BusyBanner(Part[SessionView]):
+class BusyBanner(PagePart[SessionView]):
     """A floating panel that is there only while the worker is busy for long.
 
     Args:

@@ -17,7 +17,7 @@ from workbench.session.number_text import lost_text, number_text
 from workbench.session.view import SessionView
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import LONGEST, YES_OR_NO, Line, LineChart
-from workbench.ui.parts import Part
+from workbench.ui.parts import PagePart
 
 HEIGHT, TERMS_HEIGHT = 150, 170
 BATCH_COLOUR = "#868e96"
@@ -33,7 +33,7 @@ HOW_TO = (
 )
 
 
-class CurvesPanel(Part[SessionView]):
+class CurvesPanel(PagePart[SessionView]):
     """
     Args:
         term_curves: The parts of the reward; None while there is no task.

@@ -21,7 +21,7 @@ from workbench.session.printed import PLAIN, SWITCHES, Printed, Run
 from workbench.session.view import SessionView
 from workbench.ui.control_values import limit_text
 from workbench.ui.fragments import render
-from workbench.ui.parts import Part
+from workbench.ui.parts import PagePart
 
 Rgb = tuple[int, int, int]
 LIGHT_PAGE: Rgb = (241, 243, 245)
@@ -128,7 +128,7 @@ LINES_SHOWN = 200
 LONGEST_FILTER = 200
 
 
-class LogPanel(Part[SessionView]):
+class LogPanel(PagePart[SessionView]):
     """
     Args:
         server: The page.

@@ -24,7 +24,7 @@ from workbench.recording.scene_eye import Eye
 from workbench.recording.scene_film import scene_frames
 from workbench.recording.sources import Source
 from workbench.ui.fragments import counted
-from workbench.ui.scene_html import write_scene_html
+from workbench.ui.scene_html import seconds_a_step, write_scene_html
 
 What = Literal["film", "scene", "page", "sheet", "lerobot"]
 MOST_SAID = 5
@@ -74,10 +74,7 @@ def make(wanted: Wanted, on_progress: OnProgress = lambda done, doing: None) -> 
     paths: list[Path] = []
     not_made: list[str] = []
     for number, source in enumerate(wanted.sources):
-
-        def part_done(done: float, doing: str, number: int = number) -> None:
-            on_progress((number + done) / len(wanted.sources), doing)
-
+        part_done = _part(on_progress, number, len(wanted.sources))
         part_done(0.0, source.stem)
         try:
             paths += _of_readable(wanted, source, part_done)
@@ -120,10 +117,7 @@ def _of_one(wanted: Wanted, source: Source, episode: Episode, on_progress: OnPro
         for number, camera in enumerate(cameras):
             path = wanted.folder / file_name("film", name, camera)
             seen = (enlarged(picture) for picture in frames(episode, camera_of(episode, camera)))
-
-            def told(done: float, doing: str, number: int = number) -> None:
-                on_progress((number + done) / len(cameras), doing)
-
+            told = _part(on_progress, number, len(cameras))
             write_mp4(path, _counted(seen, episode, f"{name}: {camera}", told), fps)
             paths.append(path)
         return paths
@@ -157,8 +151,13 @@ def _dataset(wanted: Wanted, on_progress: OnProgress) -> Made:
     return Made((made.folder,), " ".join([words + ".", *made.not_fitting[:MOST_SAID], *made.notes]))
 
 
+def _part(on_progress: OnProgress, number: int, count: int) -> OnProgress:
+    """Of one of several."""
+    return lambda done, doing: on_progress((number + done) / count, doing)
+
+
 def _rate(episode: Episode) -> float:
-    return 1.0 / episode.info.control_dt if episode.info.control_dt > 0 else 20.0
+    return 1.0 / seconds_a_step(episode)
 
 
 def _counted(

@@ -29,7 +29,7 @@ from workbench.ui.inspect_panel import ForceArrows, InspectPanel
 from workbench.ui.judgement_panel import JudgedAbove, JudgementPanel
 from workbench.ui.log_panel import LogPanel
 from workbench.ui.numbers_panel import NumbersPanel
-from workbench.ui.parts import Clock, Part, Parts
+from workbench.ui.parts import Clock, PagePart, Parts
 from workbench.ui.record_panel import RecordPanel
 from workbench.ui.redraw_loop import RedrawLoop, draw_apart
 from workbench.ui.run_panel import RunPanel
@@ -107,7 +107,7 @@ class Page:
             server.gui.add_html(render("keys", commands=commands))
         server.scene.on_click()(self._on_scene_click)
 
-    def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[Part[SessionView]]]:
+    def _add_tabs(self, dark: bool) -> tuple[viser.GuiTabHandle, list[PagePart[SessionView]]]:
         """Returns the Run tab, which other parts put something into, and what is in all of them."""
         server, session, clock, on_review = self._server, self._session, self._clock, self._on_review
         tabs = server.gui.add_tab_group()
@@ -284,10 +284,7 @@ class Page:
             Command("Reset all envs", session.reset, "R"),
             Command("Reset the selected env", run.reset_this, "R", "shift"),
             Command("Take back the last reset or going back", session.past.undo, "U"),
-            Command("A step back in time", lambda: timeline.step_by(-1), "arrowleft"),
-            Command("A step on in time", lambda: timeline.step_by(1), "arrowright"),
-            Command("To the event before", lambda: timeline.to_event(-1), "arrowleft", "shift"),
-            Command("To the next event", lambda: timeline.to_event(1), "arrowright", "shift"),
+            *timeline.commands(),
             Command("The first moment", timeline.go_to_the_first, "home"),
             Command("What is live", timeline.go_live, "end"),
             Command("Go on from here, in the selected env", timeline.go_on, "G"),

@@ -15,7 +15,7 @@ Clock = Callable[[], float]
 View = TypeVar("View", contravariant=True)
 
 
-class Part(Generic[View]):
+class PagePart(Generic[View]):
     """One part of a page, drawn from an immutable view.
 
     It is drawn again when its `key` is another, `every` seconds after the last time at the soonest; and at once when
@@ -64,7 +64,7 @@ class DrawDue:
 class Parts(Generic[View]):
     """The parts of a page, in the order in which they are drawn."""
 
-    def __init__(self, parts: Iterable[Part[View]], clock: Clock = time.monotonic) -> None:
+    def __init__(self, parts: Iterable[PagePart[View]], clock: Clock = time.monotonic) -> None:
         self._parts = [(part, DrawDue(part.every, clock)) for part in parts]
 
     def draw(self, view: View) -> None:

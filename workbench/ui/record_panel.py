@@ -15,7 +15,7 @@ from workbench.session.record_live import recovered_in_words
 from workbench.session.session import Session
 from workbench.session.view import RecordingStatus, SessionView
 from workbench.ui.fragments import counted, render
-from workbench.ui.parts import Part
+from workbench.ui.parts import PagePart
 
 THIS_ENV, ALL_ENVS = "the selected env", "all envs"
 RECORD, NEXT, KEEP = "Record", "Record the next episode", "Keep what I just saw"
@@ -23,7 +23,7 @@ KEEP_BEFORE = "Keep the episode before"
 STOP, STOP_WAITING, STOP_KEEPING = "Stop recording", "Stop waiting", "Stop keeping"
 
 
-class RecordPanel(Part[SessionView]):
+class RecordPanel(PagePart[SessionView]):
     every = 0.2
 
     def __init__(self, server: viser.ViserServer, session: Session) -> None:

@@ -19,7 +19,7 @@ from workbench.session.review_compare import (
 )
 from workbench.session.review_view import Opened, ReviewView
 from workbench.ui.fragments import render
-from workbench.ui.parts import Part
+from workbench.ui.parts import PagePart
 from workbench.ui.presses import Presses
 from workbench.ui.review_scene import COLOURS, letter
 
@@ -27,7 +27,7 @@ TOLERANCE_NAMES = {length(way): way for way in TOLERANCES}
 MOST_ROWS = 30
 
 
-class ReviewComparePanel(Part[ReviewView]):
+class ReviewComparePanel(PagePart[ReviewView]):
     def __init__(self, server: viser.ViserServer, review: Review) -> None:
         self._review = review
         gui = server.gui

@@ -24,7 +24,7 @@ from workbench.ui.curves_panel import COLOURS as LINE_COLOURS
 from workbench.ui.fragments import render
 from workbench.ui.line_chart import LONGEST, Line, LineChart, span_of
 from workbench.ui.numbers_panel import NumberRow, number_rows
-from workbench.ui.parts import Part
+from workbench.ui.parts import PagePart
 from workbench.ui.review_scene import COLOURS, letter
 
 CHARTS = {"reward": 150, "also": 150, "terms": 150, "action": 190}
@@ -32,7 +32,7 @@ CHARTS = {"reward": 150, "also": 150, "terms": 150, "action": 190}
 Lines = dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]]
 
 
-class ReviewNumbers(Part[ReviewView]):
+class ReviewNumbers(PagePart[ReviewView]):
     every = 0.09
 
     def __init__(self, server: viser.ViserServer) -> None:
@@ -46,22 +46,17 @@ class ReviewNumbers(Part[ReviewView]):
         if chosen is None:
             self._html.content = render("note", text="Numbers and curves appear when a recording is open.")
             return
-        together = shown_together(view)
-        steps = [step_of(view.opened[i].episode, view.states[i]) for i in together]
-        own = step_of(chosen.episode, view.states[view.selected])
-        rows = number_rows(own, 0, chosen.length)
-        beside = [
-            (number_rows(step, 0, None), view.states[i]) for step, i in zip(steps, together, strict=True)
-        ]
-        heads = [letter(i) for i in together] if len(steps) > 1 else ["value"]
-        table = compared(rows, beside if len(steps) > 1 else [(rows, view.states[view.selected])])
-        colours = [COLOURS[i % 4] for i in shown_together(view)] if len(steps) > 1 else [""]
-        self._html.content = render(
-            "review_numbers", rows=table, heads=list(zip(heads, colours, strict=True))
-        )
+        own = number_rows(step_of(chosen.episode, view.states[view.selected]), 0, chosen.length)
+        beside = [(own, view.states[view.selected])]
+        heads = [("value", "")]
+        if len(together := shown_together(view)) > 1:
+            steps = [(step_of(view.opened[i].episode, view.states[i]), view.states[i]) for i in together]
+            beside = [(number_rows(step, 0, None), state) for step, state in steps]
+            heads = [(letter(i), COLOURS[i % 4]) for i in together]
+        self._html.content = render("review_numbers", rows=compared(own, beside), heads=heads)
 
 
-class ReviewCurves(Part[ReviewView]):
+class ReviewCurves(PagePart[ReviewView]):
     every = 0.15
 
     def __init__(self, server: viser.ViserServer) -> None:
@@ -102,9 +97,7 @@ class ReviewCurves(Part[ReviewView]):
     # --- charts --------------------------------------------------------------------------------------
 
     def _choose(self) -> None:
-        value = self._entry.value
-        if value in self._entry.options:
-            self._wish = value
+        self._wish = self._entry.value
 
     def _offer(self, view: ReviewView, shown: Sequence[int]) -> None:
         found = [self._found[view.opened[index].id] for index in shown]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import datetime
 import shlex
 from collections.abc import Callable
+from functools import partial
 
 import viser
 
@@ -19,8 +20,8 @@ from workbench.session.review import MOST_COMPARED, SPEEDS, Review
 from workbench.session.review_events import success_words
 from workbench.session.review_view import Opened, ReviewView
 from workbench.ui.controls import Control
-from workbench.ui.fragments import render
-from workbench.ui.parts import Part
+from workbench.ui.fragments import render, short_text
+from workbench.ui.parts import PagePart
 from workbench.ui.presses import Presses
 from workbench.ui.review_scene import COLOURS, letter
 
@@ -29,7 +30,7 @@ GHOSTS, GRID = "over each other", "side by side"
 GO_LIVE, STAY = "Go on live from here", "Stay here"
 
 
-class ReviewPanel(Part[ReviewView]):
+class ReviewPanel(PagePart[ReviewView]):
     """
     Args:
         server: The page.
@@ -142,26 +143,17 @@ class ReviewPanel(Part[ReviewView]):
             return ""
         rows = []
         for index, one in enumerate(view.opened):
-            words, mood = success_words(one.episode)
+            select = partial(lambda index, _: self._review.select(index), index)
+            close = partial(lambda index, _: self._review.close_one(index), index)
             rows.append(
                 {
+                    "of": one,
                     "letter": letter(index),
                     "colour": COLOURS[index % len(COLOURS)],
-                    "task": one.episode.info.task,
-                    "seed": "" if one.episode.info.seed < 0 else one.episode.info.seed,
-                    "steps": one.length,
-                    "total": f"{float(one.episode.reward.sum()):.2f}",
-                    "ended": words,
-                    "mood": mood,
-                    "scene": one.scene,
-                    "name": one.name,
+                    "ended": success_words(one.episode),
                     "selected": index == view.selected,
-                    "press": self._presses.id_of(
-                        ("select", index), lambda _, index=index: self._review.select(index)
-                    ),
-                    "close": self._presses.id_of(
-                        ("close", index), lambda _, index=index: self._review.close_one(index)
-                    ),
+                    "press": self._presses.id_of(("select", index), select),
+                    "close": self._presses.id_of(("close", index), close),
                 }
             )
         return render("review_opened", rows=rows)
@@ -217,10 +209,6 @@ def short(values: dict[str, object], longest: int = 120) -> str:
     return short_text(
         ", ".join(f"{name}={shlex.quote(str(value))}" for name, value in values.items()), longest
     )
-
-
-def short_text(text: str, longest: int = 120) -> str:
-    return text if len(text) <= longest else text[: longest - 1] + "…"
 
 
 def local_time(written: str) -> str:

@@ -16,7 +16,7 @@ from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.control_values import limit_text
 from workbench.ui.controls import Control
-from workbench.ui.parts import Part
+from workbench.ui.parts import PagePart
 
 UNBOUNDED = 1.0
 """A dimension without bounds gets a slider from -1 to 1."""
@@ -112,7 +112,7 @@ PREVIOUS, NEXT = "‹ previous", "next ›"
 LARGEST_SEED = 2**31 - 1
 
 
-class RunPanel(Part[SessionView]):
+class RunPanel(PagePart[SessionView]):
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
         self._scene_serial = -1

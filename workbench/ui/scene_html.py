@@ -70,7 +70,7 @@ def write_scene_html(
     on_progress(1.0)
 
 
-def _seconds_a_step(episode: Episode) -> float:
+def seconds_a_step(episode: Episode) -> float:
     return episode.info.control_dt if episode.info.control_dt > 0 else 0.05
 
 
@@ -78,7 +78,7 @@ def _caption(episode: Episode) -> str:
     info = episode.info
     about = f"{info.task}, seed {info.seed}" if info.seed >= 0 else info.task
     ended, mood = success_words(episode)
-    dt = _seconds_a_step(episode)
+    dt = seconds_a_step(episode)
     return render("scene_caption", about=about, ended=ended if mood else "", dt=dt, steps=episode.length)
 
 
@@ -103,7 +103,7 @@ def _recorded(
     for state, now in enumerate(poses):
         batch[env] = now
         scene.move(batch, layout, env)
-        recording.insert_sleep(_seconds_a_step(episode))
+        recording.insert_sleep(seconds_a_step(episode))
         on_progress(0.9 * state / len(poses))
     # It begins anew by itself; without a pause one does not see how it ended.
     recording.insert_sleep(PAUSE)

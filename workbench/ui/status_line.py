@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import viser
@@ -16,8 +15,8 @@ from workbench.session.last_words import Busy
 from workbench.session.messages import RulesBroken
 from workbench.session.view import SessionView
 from workbench.ui.env_panel import first_flagged, mask
-from workbench.ui.fragments import counted, place, render
-from workbench.ui.parts import Clock, Part
+from workbench.ui.fragments import place, render
+from workbench.ui.parts import Clock, PagePart
 from workbench.ui.presses import Presses
 from workbench.ui.timeline_panel import step_in_words
 from workbench.ui.version_panel import took
@@ -38,17 +37,7 @@ WORDS = {
 }
 
 
-@dataclass(frozen=True)
-class Mark:
-    """What stands in the status line for as long as it is so; a press leads to it."""
-
-    text: str
-    hint: str
-    press: str
-    """As `Presses.id_of` gives it."""
-
-
-class StatusLine(Part[SessionView]):
+class StatusLine(PagePart[SessionView]):
     """
     Args:
         env_rows: The envs as they stand; None before there is a task.
@@ -89,20 +78,16 @@ class StatusLine(Part[SessionView]):
         return self._clock() - self._loaded_at < NEWS
 
     def draw(self, view: SessionView) -> None:
-        marks = self._marks()
-        self._handle.content = render(
-            "status_line", **status_values(view, self._is_fresh(view), marked=bool(marks))
-        )
-        if marks:
-            self._standing.content = render("standing_marks", marks=marks)
-        self._standing.visible = bool(marks)
-
-    def _marks(self) -> list[Mark]:
         rows = self._env_rows()
         flagged = None if rows is None else flagged_text(rows)
-        if flagged is None:
-            return []
-        return [Mark(*flagged, self._presses.id_of("flagged", lambda _: self._on_flagged()))]
+        self._handle.content = render(
+            "status_line", **status_values(view, self._is_fresh(view), marked=flagged is not None)
+        )
+        self._standing.visible = flagged is not None
+        if flagged is not None:
+            text, hint = flagged
+            press = self._presses.id_of("flagged", lambda _: self._on_flagged())
+            self._standing.content = render("standing_mark", text=text, hint=hint, press_id=press)
 
 
 def flagged_text(rows: EnvRows) -> tuple[str, str] | None:
@@ -130,29 +115,17 @@ def status_values(view: SessionView, fresh: bool = False, marked: bool = False) 
     # While the renderer is at work, what the session says of it is more than that it is busy.
     busy = None if view.busy is not None and view.busy.drawing and view.activity else view.busy
     moving = view.playing and view.state in ("running", "error") and task is not None and busy is None
+    slow = view.real_time_factor < 0.85 * view.settings.speed and view.settings.speed != float("inf")
     return {
+        "view": view,
         "state": view.state if busy is None else "loading",
         "word": WORDS[_state(view, busy)],
-        "problem": view.problem is not None,
         "stale": view.stale and task is not None and view.state not in ("starting", "loading"),
-        "ago": None if view.timeline.shown is None else view.timeline.last - view.timeline.shown,
         "activity": view.activity if busy is None else _doing(busy),
         "news": _news(view) if fresh else "",
-        "task": None if task is None else task.env_id,
-        "backend": "" if task is None else task.backend,
-        "device": "" if task is None else task.device,
         "at": step_in_words(view),
-        "envs": "" if task is None else counted(task.num_envs, "env"),
         "moving": moving,
-        "steps_per_second": f"{view.steps_per_second:.0f}",
-        "env_steps_per_second": ""
-        if task is None
-        else f"{view.steps_per_second * task.num_envs:,.0f}".replace(",", " "),
-        "real_time_factor": f"{view.real_time_factor:.2f}",
-        "behind": moving
-        and view.settings.speed != float("inf")
-        and view.real_time_factor < 0.85 * view.settings.speed,
-        "speed": f"{view.settings.speed:g}",
+        "behind": moving and slow,
         "marked": marked,
     }
 
@@ -183,7 +156,7 @@ def _news(view: SessionView) -> str:
     return f"{report.level} in {took(report.milliseconds)}" + (f": {report.reason}" if report.reason else "")
 
 
-class RulesMark(Part[SessionView]):
+class RulesMark(PagePart[SessionView]):
     """The standing mark below the status line: what the task breaks of the rules of GPU simulation, a press from the list.
 
     A rule that only warns stops nothing, so whatever tells of it must not pass: the mark stays until the file is mended.

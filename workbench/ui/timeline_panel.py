@@ -26,10 +26,11 @@ from workbench.session.history import FAIL, NOT_A_NUMBER, RESET, SUCCESS, TRUNCA
 from workbench.session.session import Session
 from workbench.session.timeline import Scope, Strip
 from workbench.session.view import SessionView
+from workbench.ui.commands import Command
 from workbench.ui.control_values import name_control
 from workbench.ui.controls import Control
 from workbench.ui.fragments import counted, render
-from workbench.ui.parts import Clock, DrawDue, Part
+from workbench.ui.parts import Clock, DrawDue, PagePart
 
 GAP = 12
 """Pixels between what lies over the view and its edges; as ``view_width.js`` has it."""
@@ -59,7 +60,7 @@ class Seeks(Protocol):
     def seek_event(self, direction: int, /) -> None: ...
 
 
-class TimeBar(Part[View]):
+class TimeBar(PagePart[View]):
     """A slider over time, a strip under it and a row of buttons, across the bottom of the view.
 
     Args:
@@ -105,12 +106,21 @@ class TimeBar(Part[View]):
     def _add_rows(self, gui: viser.GuiApi) -> None:
         """Between the strip and the buttons."""
 
-    def step_by(self, steps: int) -> None:
+    def commands(self) -> list[Command]:
+        """Of the arrow keys."""
+        return [
+            Command("A step back in time", lambda: self._step_by(-1), "arrowleft"),
+            Command("A step on in time", lambda: self._step_by(1), "arrowright"),
+            Command("To the event before", lambda: self._to_event(-1), "arrowleft", "shift"),
+            Command("To the next event", lambda: self._to_event(1), "arrowright", "shift"),
+        ]
+
+    def _step_by(self, steps: int) -> None:
         """An arrow key."""
         if not Control.took_the_key():
             self._seeks.seek_by(steps)
 
-    def to_event(self, direction: int) -> None:
+    def _to_event(self, direction: int) -> None:
         """An arrow key with shift; what a slider that has the focus made of it is taken back."""
         if Control.took_the_key():
             self._seeks.seek(self._before_slider)

@@ -8,7 +8,6 @@ otherwise. Where a file has several tasks, this is where one of them is chosen.
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import viser
@@ -19,7 +18,7 @@ from workbench.session.session import Session
 from workbench.session.view import SessionView
 from workbench.ui.controls import Control
 from workbench.ui.fragments import render
-from workbench.ui.parts import Part
+from workbench.ui.parts import PagePart
 
 AS_NEEDED, PATCHED, CAMERAS, REBUILT = "Load again", "Patch", "Cameras", "Rebuild"
 LEVELS: dict[str, LoadLevel] = {
@@ -32,7 +31,7 @@ MOST_SHOWN = 8
 """Things not carried that are named; the rest is counted."""
 
 
-class VersionPanel(Part[SessionView]):
+class VersionPanel(PagePart[SessionView]):
     def __init__(self, server: viser.ViserServer, session: Session) -> None:
         self._session = session
         self._names: tuple[str, ...] = ("",)
@@ -83,29 +82,15 @@ def version_html(
         refused: why what is in the file does not.
         notices: what the author should know of it besides.
     """
-    where = "" if refused is None or refused.file is None else Path(refused.file).name
-    line = "" if refused is None or refused.line is None else f", line {refused.line}"
-    shown = [
-        *notices[:MOST_SHOWN],
-        *([f"And {len(notices) - MOST_SHOWN} more."] if len(notices) > MOST_SHOWN else []),
-    ]
-    told = {
-        "loaded": loaded,
-        "refused": refused,
-        "where": f"{where}{line}" if where else "",
-        "notices": shown,
-    }
-    if report is None:
-        return render("version", report=None, **told)
-    missing = list(report.not_carried.items())
+    more = [f"And {len(notices) - MOST_SHOWN} more."] if len(notices) > MOST_SHOWN else []
     return render(
         "version",
         report=report,
-        **told,
-        took=took(report.milliseconds),
-        carried=len(report.carried),
-        missing=missing[:MOST_SHOWN],
-        more=max(0, len(missing) - MOST_SHOWN),
+        loaded=loaded,
+        refused=refused,
+        notices=[*notices[:MOST_SHOWN], *more],
+        most=MOST_SHOWN,
+        took=took,
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import viser
 
 from workbench.session.view import SessionView
-from workbench.ui.parts import Part
+from workbench.ui.parts import PagePart
 
 DETAILS = {"fine": 1_000_000, "normal": 200_000, "coarse": 50_000}
 """Triangles in the view. A browser without a graphics card wants the fewest."""
@@ -14,7 +14,7 @@ DARK, LIGHT = "dark", "light"
 BRAND = (28, 112, 190)
 
 
-class ViewPanel(Part[SessionView]):
+class ViewPanel(PagePart[SessionView]):
     def __init__(self, server: viser.ViserServer, dark: bool = True) -> None:
         self._server = server
         with server.gui.add_folder("View"):
