@@ -14,7 +14,7 @@ import pytest
 
 from tests.drive.waiting import until
 from workbench.machine.child_python import child_environment, python_command
-from workbench.machine.family import end_family
+from workbench.machine.family import describe_exit, end_family
 from workbench.machine.process_tree import (
     children,
     family,
@@ -204,3 +204,16 @@ def test_a_main_thread_that_ended_below_others_is_seen(begin: Callable[..., subp
     assert keeper.poll() is None
     end_family(keeper)
     assert not main_thread_ended(worker)
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (-signal.SIGSEGV, "was killed by SIGSEGV"),
+        (-40, "was killed by signal 40"),  # a real-time one, which Python has no name for
+        (3, "ended with exit code 3"),
+        (None, "stopped answering"),
+    ],
+)
+def test_an_end_is_said_in_words(code: int | None, words: str) -> None:
+    assert describe_exit(code) == words

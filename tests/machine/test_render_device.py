@@ -36,7 +36,7 @@ def test_a_driver_that_kills_the_process_is_an_answer(
     _let_python_be(tmp_path, monkeypatch, "kill -SEGV $$")
     probe = probe_render_device()
     assert not probe.ok
-    assert probe.error == "SAPIEN crashed (SIGSEGV)"
+    assert probe.error == "SAPIEN was killed by SIGSEGV"
 
 
 def test_a_driver_that_hangs_is_an_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,12 +7,12 @@ moment, and must never pretend: without root it installs nothing and hands back 
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 LOCK_WAIT_S = 180
 
@@ -38,12 +38,12 @@ def can_install_packages() -> bool:
     return has_apt() and os.geteuid() == 0
 
 
-def os_release(path: Path = Path("/etc/os-release")) -> dict[str, str]:
-    """The fields of os-release(5): ``ID`` ("debian"), ``VERSION_CODENAME`` ("bookworm") and so on."""
-    if not path.is_file():
+def os_release() -> dict[str, str]:
+    """The fields of os-release(5): ``ID`` ("debian"), ``VERSION_CODENAME`` ("bookworm") and so on; empty without it."""
+    try:
+        return platform.freedesktop_os_release()
+    except OSError:
         return {}
-    pairs = (line.partition("=") for line in path.read_text().splitlines() if "=" in line)
-    return {name.strip(): value.strip().strip("\"'") for name, _, value in pairs}
 
 
 def apt_get(arguments: Sequence[str], options: Sequence[str] = (), timeout_s: float = 900) -> None:

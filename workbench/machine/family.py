@@ -81,7 +81,9 @@ def describe_exit(code: int | None) -> str:
     if code is None:
         return "stopped answering"
     if code < 0:
-        return f"was killed by {signal.Signals(-code).name}"
+        # Not every signal has a name: of the real-time ones only the first and the last.
+        named = -code in set(signal.Signals)
+        return f"was killed by {signal.Signals(-code).name if named else f'signal {-code}'}"
     return f"ended with exit code {code}"
 
 

@@ -15,7 +15,6 @@ from __future__ import annotations
 import ctypes
 import json
 import os
-import signal
 import struct
 import subprocess
 from collections.abc import Mapping
@@ -23,6 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from workbench.machine.child_python import child_environment, python_command
+from workbench.machine.family import describe_exit
 
 ANSWER = "render-device-answer:"
 DRIVER_VARIABLES = ("VK_DRIVER_FILES", "VK_ICD_FILENAMES")
@@ -78,17 +78,13 @@ def probe_render_device(env: Mapping[str, str] | None = None, timeout_s: float =
         if line.startswith(ANSWER):
             found = json.loads(line[len(ANSWER) :])
             return RenderProbe(**{**found, "missing_libraries": tuple(found["missing_libraries"])}, env=added)
-    if child.returncode < 0:
-        return RenderProbe(ok=False, error=f"SAPIEN crashed ({_signal_name(-child.returncode)})", env=added)
-    last = (child.stderr.strip().splitlines() or ["it said nothing"])[-1]
-    return RenderProbe(ok=False, error=f"the probe ended with {child.returncode}: {last}", env=added)
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
+    how, last = (
+        describe_exit(child.returncode),
+        (child.stderr.strip().splitlines() or ["it said nothing"])[-1],
+    )
+    return RenderProbe(
+        ok=False, error=f"SAPIEN {how}" + (f": {last}" if child.returncode > 0 else ""), env=added
+    )
 
 
 def driver_files() -> list[Path]:

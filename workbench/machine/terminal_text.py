@@ -22,14 +22,15 @@ COLOURS = re.compile("\x1b\\[([0-9;:]{0,64})m")
 """What changes them, and with which numbers."""
 HARMLESS = frozenset((0, 1, 2, 3, 4, 7, 9, 22, 23, 24, 27, 29, *range(30, 50), *range(90, 108)))
 """Codes of colours and styles that hide nothing and do not blink."""
-_SHORT = {"\n": "\\n", "\r": "\\r", "\t": "\\t"}
 
 
 def plain_text(text: str, keep: str = "") -> str:
     """`text` with every control, unseen and direction character shown escaped, but for those in `keep`."""
     if not _SHOWN.search(text):
         return text
-    return _SHOWN.sub(lambda found: found[0] if found[0] in keep else _escaped(found[0]), text)
+    return _SHOWN.sub(
+        lambda found: found[0] if found[0] in keep else found[0].encode("unicode_escape").decode(), text
+    )
 
 
 def short_line(text: str, longest: int) -> str:
@@ -52,13 +53,6 @@ def only_colours(text: str, keep: str = "\n\t") -> str:
         end = found.end()
     parts.append(plain_text(text[end:], keep))
     return "".join(parts)
-
-
-def _escaped(character: str) -> str:
-    if character in _SHORT:
-        return _SHORT[character]
-    code = ord(character)
-    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
 
 
 def colour_codes(numbers: str) -> Iterator[tuple[int, ...]]:

@@ -62,8 +62,7 @@ class Rate:
 
     def tick(self, now: float) -> None:
         self._times.append(now)
-        while self._times and now - self._times[0] > self.window:
-            self._times.popleft()
+        self.per_second(now)  # forgets what is older
 
     def per_second(self, now: float) -> float:
         while self._times and now - self._times[0] > self.window:
