@@ -11,18 +11,18 @@ from rich.markup import escape
 from rich.text import Text
 
 from workbench.machine.terminal_text import plain_text
-from workbench.session.clearance import Answer, AskedFile, NotTrusted, Question, Since, in_words
+from workbench.session.clearance import AskedFile, Consent, NotTrusted, Since, TrustQuestion, in_words
 
 MOST_NAMED = 20
 """Questions that are listed where nobody can answer them."""
 TAB = "\t"
 _SHOW = ("s", "show")
 _ANSWERS = {
-    "y": Answer.ONCE,
-    "yes": Answer.ONCE,
-    "a": Answer.ALWAYS,
-    "always": Answer.ALWAYS,
-    "q": Answer.NONE,
+    "y": Consent.ONCE,
+    "yes": Consent.ONCE,
+    "a": Consent.ALWAYS,
+    "always": Consent.ALWAYS,
+    "q": Consent.NONE,
 }
 
 
@@ -41,7 +41,7 @@ class TerminalPrompt:
     def __init__(self, out: Console, quiet: Callable[[], AbstractContextManager[None]]) -> None:
         self._out, self._quiet = out, quiet
 
-    def ask(self, question: Question, stopped: Callable[[], bool]) -> Answer:
+    def ask(self, question: TrustQuestion, stopped: Callable[[], bool]) -> Consent:
         with self._quiet():
             print_question(question, self._out)
             choices = (
@@ -54,13 +54,13 @@ class TerminalPrompt:
                 try:
                     typed = input().strip().lower()
                 except EOFError:
-                    return Answer.NO
+                    return Consent.NO
                 if typed not in _SHOW:
-                    return _ANSWERS.get(typed, Answer.NO)
+                    return _ANSWERS.get(typed, Consent.NO)
                 print_texts(question, self._out)
 
 
-def print_question(question: Question, out: Console) -> None:
+def print_question(question: TrustQuestion, out: Console) -> None:
     """What would run."""
 
     def tell(text: str, style: str = "") -> None:
@@ -89,7 +89,7 @@ def print_question(question: Question, out: Console) -> None:
     )
 
 
-def print_texts(question: Question, out: Console) -> None:
+def print_texts(question: TrustQuestion, out: Console) -> None:
     """The texts that would run, with nothing in them that a terminal takes for more than text."""
     for file in question.files:
         out.print(f"[bold]{escape(plain_text(file.name))}[/]  {file.hash}", soft_wrap=True)
@@ -124,7 +124,7 @@ def not_trusted(error: NotTrusted) -> list[str]:
     ]
 
 
-def _about_modules(question: Question) -> str:
+def _about_modules(question: TrustQuestion) -> str:
     if question.recorded_text:
         return "Beside it they hold what it may import:"
     if question.computed:

@@ -25,7 +25,7 @@ from workbench.recording.episode import EpisodeInfo
 from workbench.recording.made_here import KEY_FILE, MadeHere, made_here
 from workbench.recording.read_episode import UnreadableRecording, read_episode
 from workbench.recording.recover import recover
-from workbench.session.clearance import Answer, Clearances, NotCleared, Question, Since, Wanted
+from workbench.session.clearance import Clearances, Consent, NotCleared, Since, TrustQuestion, Wanted
 from workbench.session.recorded_scene import SceneError, SceneProcess
 from workbench.session.step_back import recorded_source, reference_of
 
@@ -35,10 +35,10 @@ TEXT = "import helper\nclass Push: ...\n"
 class Person:
     """Answers as it is told, and keeps what it was asked."""
 
-    def __init__(self, answer: Answer = Answer.NO) -> None:
-        self.answer, self.asked = answer, list[Question]()
+    def __init__(self, answer: Consent = Consent.NO) -> None:
+        self.answer, self.asked = answer, list[TrustQuestion]()
 
-    def __call__(self, question: Question, stopped: Callable[[], bool]) -> Answer:
+    def __call__(self, question: TrustQuestion, stopped: Callable[[], bool]) -> Consent:
         self.asked.append(question)
         return self.answer
 
@@ -85,12 +85,12 @@ def as_recorded(recording: Path) -> Wanted:
     return Wanted(reference_of(info), info, recorded_text=True)
 
 
-def asked(wanted: Wanted, answer: Answer = Answer.NO) -> list[Question]:
+def asked(wanted: Wanted, answer: Consent = Consent.NO) -> list[TrustQuestion]:
     person = Person(answer)
     try:
         Clearances(ask=person).clear(wanted)
     except NotCleared:
-        assert answer is Answer.NO
+        assert answer is Consent.NO
     return person.asked
 
 
@@ -150,12 +150,12 @@ def test_a_file_that_a_person_named_is_not_asked_about(foreign: Path) -> None:
 
 def test_an_answer_is_kept_by_what_the_texts_say(foreign: Path, tmp_path: Path) -> None:
     file, helper = foreign.parents[1] / "push.py", foreign.parents[1] / "helper.py"
-    clearances = Clearances(ask=Person(Answer.ONCE))
+    clearances = Clearances(ask=Person(Consent.ONCE))
     cleared = clearances.clear(todays(foreign))
     assert isinstance(cleared, RecordedTask) and cleared.approved == {str(file): TEXT, str(helper): "A = 1\n"}
     clearances.clear(todays(foreign))
     assert len(asked(todays(foreign))) == 1, "another run asks again"
-    assert len(asked(todays(foreign), Answer.ALWAYS)) == 1
+    assert len(asked(todays(foreign), Consent.ALWAYS)) == 1
     assert asked(todays(foreign)) == [] and asked(as_recorded(foreign)) == [], "the same texts"
     copy = tmp_path / "copy"
     shutil.copytree(file.parent, copy)
@@ -183,15 +183,15 @@ def since(recording: Path) -> dict[str, Since]:
 
 def test_that_a_file_is_followed_is_a_question_of_its_own(foreign: Path, tmp_path: Path) -> None:
     live = replace(todays(foreign), followed=True)
-    (question,) = asked(todays(foreign), Answer.ALWAYS)
+    (question,) = asked(todays(foreign), Consent.ALWAYS)
     assert not question.followed and not question.agreed
     (question,) = asked(live)
     assert question.followed and question.agreed and not question.trusted_before
-    person = Person(Answer.ONCE)
+    person = Person(Consent.ONCE)
     clearances = Clearances(ask=person)
     assert isinstance(clearances.clear(live), RecordedTask) and clearances.clear(live)
     assert len(person.asked) == 1, "until the program ends"
-    assert len(asked(live, Answer.ALWAYS)) == 1 and asked(live) == []
+    assert len(asked(live, Consent.ALWAYS)) == 1 and asked(live) == []
     copy = tmp_path / "copy"
     shutil.copytree(foreign.parents[1], copy)
     there = todays(copy / "recordings" / foreign.name)
@@ -202,9 +202,9 @@ def test_that_a_file_is_followed_is_a_question_of_its_own(foreign: Path, tmp_pat
 def test_an_answer_to_a_file_that_has_changed_meanwhile_runs_nothing(foreign: Path) -> None:
     file = foreign.parents[1] / "push.py"
 
-    def ask(question: Question, stopped: Callable[[], bool]) -> Answer:
+    def ask(question: TrustQuestion, stopped: Callable[[], bool]) -> Consent:
         file.with_name("helper.py").write_text("A = 3\n")
-        return Answer.ONCE
+        return Consent.ONCE
 
     with pytest.raises(NotCleared, match="changed while you were asked about it; try it again"):
         Clearances(ask=ask).clear(todays(foreign))
@@ -238,7 +238,7 @@ def test_arguments_from_elsewhere_name_no_files(
     edit(foreign, **values)
     for wanted in (todays(foreign), as_recorded(foreign), Wanted(str(file), info_of(foreign))):
         with pytest.raises(NotCleared, match="names files for its env to read .* --trust") as refused:
-            Clearances(ask=Person(Answer.ALWAYS)).clear(wanted)
+            Clearances(ask=Person(Consent.ALWAYS)).clear(wanted)
         assert refused.value.trust_helps
         Clearances(all_trusted=True).clear(wanted)
     with pytest.raises(SceneError, match="numbers and curves only"):
@@ -252,11 +252,11 @@ def test_each_text_is_asked_about_once_and_all_can_be_refused_at_once(foreign: P
         other = file.with_name(f"{name}.py")
         other.write_text(f"# {name}\n")
         wanted.append(replace(wanted[0], reference=RecordedTask("Push-v1", str(other))))
-    person = Person(Answer.NONE)
+    person = Person(Consent.NONE)
     cleared = Clearances(ask=person).clear_all(wanted)
     assert [question.more for question in person.asked] == [2]
     assert all(isinstance(one, NotCleared) for one in cleared) and len(cleared) == 4
-    person = Person(Answer.NO)
+    person = Person(Consent.NO)
     Clearances(ask=person).clear_all(wanted)
     assert [Path(question.file).name for question in person.asked] == ["push.py", "a.py", "b.py"]
 
@@ -433,7 +433,7 @@ def test_without_a_folder_to_keep_it_in_it_is_asked_every_run_and_recording_goes
 ) -> None:
     (tmp_path / "file").write_text("")
     another_user(tmp_path / "file" / "below", monkeypatch)
-    person = Person(Answer.ALWAYS)
+    person = Person(Consent.ALWAYS)
     clearances = Clearances(ask=person)
     clearances.clear(todays(foreign))
     clearances.clear(todays(foreign))

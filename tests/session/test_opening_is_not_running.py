@@ -25,7 +25,7 @@ from tests.drive.waiting import until
 from workbench.cli import main
 from workbench.recording.library import Library
 from workbench.recording.sources import sources_among
-from workbench.session.clearance import Answer, Clearances, NotTrusted, Question
+from workbench.session.clearance import Clearances, Consent, NotTrusted, TrustQuestion
 from workbench.session.make_scene import make
 from workbench.session.messages import TaskOptions
 from workbench.session.questions import MakeScene
@@ -241,10 +241,10 @@ def test_in_a_terminal_it_is_asked_and_the_answer_is_kept(
 
 
 def test_on_a_page_it_is_asked_and_a_no_leaves_the_others(foreign: Path, recorded: Path) -> None:
-    asked: list[Question] = []
-    answers = iter([Answer.NO, Answer.ONCE])
+    asked: list[TrustQuestion] = []
+    answers = iter([Consent.NO, Consent.ONCE])
 
-    def ask(question: Question, stopped: object) -> Answer:
+    def ask(question: TrustQuestion, stopped: object) -> Consent:
         asked.append(question)
         return next(answers)
 
@@ -269,10 +269,10 @@ def test_on_a_page_it_is_asked_and_a_no_leaves_the_others(foreign: Path, recorde
 def test_a_question_on_a_page_can_be_withdrawn(foreign: Path) -> None:
     asking = []
 
-    def ask(question: Question, stopped) -> Answer:
+    def ask(question: TrustQuestion, stopped) -> Consent:
         asking.append(question)
         until(stopped, "the withdrawal")
-        return Answer.NO
+        return Consent.NO
 
     rescorer = Rescorer(Clearances(ask=ask))
     try:

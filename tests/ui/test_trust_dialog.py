@@ -11,24 +11,24 @@ import pytest
 
 from tests.drive.panels import Panels
 from tests.drive.waiting import until
-from workbench.session.clearance import Answer, AskedFile, Question, Since
+from workbench.session.clearance import AskedFile, Consent, Since, TrustQuestion
 from workbench.ui import trust_dialog
 from workbench.ui.trust_dialog import ALWAYS, DO_NOT, ONCE, TrustDialog, question_html
 
 PUSH = AskedFile("/home/me/push.py", "0123456789ab", "import helper\n")
 HELPER = AskedFile("helper.py", "ba9876543210", "A = 1\n")
-PLAIN = Question("Push-v1", False, (PUSH, HELPER))
+PLAIN = TrustQuestion("Push-v1", False, (PUSH, HELPER))
 
 
-def about(name: str) -> Question:
+def about(name: str) -> TrustQuestion:
     return replace(PLAIN, files=(replace(PUSH, name=name),))
 
 
 def asked(
-    dialog: TrustDialog, question: Question = PLAIN, stopped: Callable[[], bool] = lambda: False
-) -> Future[Answer]:
+    dialog: TrustDialog, question: TrustQuestion = PLAIN, stopped: Callable[[], bool] = lambda: False
+) -> Future[Consent]:
     """Ask on a thread of its own, as whatever wants to run code does."""
-    future: Future[Answer] = Future()
+    future: Future[Consent] = Future()
     threading.Thread(target=lambda: future.set_result(dialog.ask(question, stopped)), daemon=True).start()
     return future
 
@@ -43,10 +43,10 @@ def dialog(panels: Panels) -> TrustDialog:
 
 
 @pytest.mark.parametrize(
-    ("label", "answer"), [(DO_NOT, Answer.NO), (ONCE, Answer.ONCE), (ALWAYS, Answer.ALWAYS)]
+    ("label", "answer"), [(DO_NOT, Consent.NO), (ONCE, Consent.ONCE), (ALWAYS, Consent.ALWAYS)]
 )
 def test_a_press_is_the_answer_and_the_window_goes(
-    dialog: TrustDialog, panels: Panels, label: str, answer: Answer
+    dialog: TrustDialog, panels: Panels, label: str, answer: Consent
 ) -> None:
     future = asked(dialog)
     window_with(panels, "/home/me/push.py")
@@ -64,20 +64,20 @@ def test_only_the_first_answer_counts_and_none_comes_before_its_question(
     refuse, allow, allow_again = (panels.press_late(label) for label in (DO_NOT, ALWAYS, ALWAYS))
     refuse()
     allow()
-    assert future.result(20) is Answer.NO
+    assert future.result(20) is Consent.NO
     second = asked(dialog, about("/home/me/other.py"))
     window_with(panels, "/home/me/other.py")
     allow_again()
     assert not second.done()
     panels.press(DO_NOT)
-    assert second.result(20) is Answer.NO
+    assert second.result(20) is Consent.NO
 
 
 def test_escape_is_a_no(dialog: TrustDialog, panels: Panels) -> None:
     future = asked(dialog)
     window_with(panels, "/home/me/push.py")
     panels.command(DO_NOT)
-    assert future.result(20) is Answer.NO
+    assert future.result(20) is Consent.NO
 
 
 def test_questions_come_one_after_the_other(dialog: TrustDialog, panels: Panels) -> None:
@@ -88,7 +88,7 @@ def test_questions_come_one_after_the_other(dialog: TrustDialog, panels: Panels)
         order.append(name)
         window_with(panels, name)
         panels.press(ONCE)
-        assert futures[name].result(20) is Answer.ONCE
+        assert futures[name].result(20) is Consent.ONCE
     assert set(order) == set(futures)
 
 
@@ -99,7 +99,7 @@ def test_a_page_that_is_rebuilt_shows_the_question_again(dialog: TrustDialog, pa
         panels.server.gui.reset()
     window_with(panels, "/home/me/push.py")
     panels.press(ONCE)
-    assert future.result(20) is Answer.ONCE
+    assert future.result(20) is Consent.ONCE
 
 
 def test_what_is_withdrawn_and_what_is_asked_at_the_end_is_a_no(dialog: TrustDialog, panels: Panels) -> None:
@@ -107,23 +107,23 @@ def test_what_is_withdrawn_and_what_is_asked_at_the_end_is_a_no(dialog: TrustDia
     future = asked(dialog, PLAIN, stop.is_set)
     window_with(panels, "/home/me/push.py")
     stop.set()
-    assert future.result(20) is Answer.NO and not panels.shows(ALWAYS)
+    assert future.result(20) is Consent.NO and not panels.shows(ALWAYS)
     future = asked(dialog)
     window_with(panels, "/home/me/push.py")
     dialog.close()
-    assert future.result(20) is Answer.NO and asked(dialog).result(20) is Answer.NO
+    assert future.result(20) is Consent.NO and asked(dialog).result(20) is Consent.NO
 
 
 def test_the_window_says_what_would_run_and_escapes_it() -> None:
     many = tuple(AskedFile(f"m{k}.py", f"{k:012}", f"# {k}\n") for k in range(300))
     evil = AskedFile("/w/<script>.py", "0123456789ab", "x = '</pre><script>alert(1)</script>\u202e'\n")
-    said = question_html(Question("Push-v1", False, (evil, *many), ("<b>",)))
+    said = question_html(TrustQuestion("Push-v1", False, (evil, *many), ("<b>",)))
     assert "<script>" not in said and "<b><" not in said and "&lt;script&gt;.py" in said
     assert "&lt;/pre&gt;" in said and "\\u202e" in said, "the text, escaped"
     assert all(one.name in said and one.hash in said and one.text in said for one in many)
     assert "It imports from beside it (300)" in said and "trusted" not in said and "every save" not in said
     held = (AskedFile("push.py", "0" * 12, ""), HELPER)
-    said = question_html(Question("<i>Push</i>-v1", True, held))
+    said = question_html(TrustQuestion("<i>Push</i>-v1", True, held))
     assert "&lt;i&gt;Push" in said and "hold the text of their task" in said
     assert "what it may import (1)" in said and "It imports" not in said
 

@@ -34,7 +34,7 @@ FOLLOWED = (
 """What going live means for a file that a recording names."""
 
 
-class Answer(Enum):
+class Consent(Enum):
     NO = "no"
     NONE = "none"
     """Neither this nor any other of those that are asked about together."""
@@ -65,7 +65,7 @@ class AskedFile:
 
 
 @dataclass(frozen=True)
-class Question:
+class TrustQuestion:
     """What a person is to be asked. Texts out of recordings are printable, and not escaped."""
 
     task: str
@@ -116,7 +116,7 @@ class NotCleared(Exception):
     Where `trust_helps`, nobody is asked, but ``--trust`` agrees.
     """
 
-    def __init__(self, why: str, question: Question | None = None, trust_helps: bool = False) -> None:
+    def __init__(self, why: str, question: TrustQuestion | None = None, trust_helps: bool = False) -> None:
         super().__init__(why)
         self.question, self.trust_helps = question, trust_helps
 
@@ -124,12 +124,12 @@ class NotCleared(Exception):
 class NotTrusted(Exception):
     """Nothing was run, because there is code that nobody agreed to, or, for these `reasons`, without ``--trust``."""
 
-    def __init__(self, questions: Sequence[Question], reasons: Sequence[str] = ()) -> None:
+    def __init__(self, questions: Sequence[TrustQuestion], reasons: Sequence[str] = ()) -> None:
         super().__init__("; ".join((*map(in_words, questions), *reasons)))
         self.questions, self.reasons = tuple(questions), tuple(reasons)
 
 
-Ask = Callable[[Question, Callable[[], bool]], Answer]
+Ask = Callable[[TrustQuestion, Callable[[], bool]], Consent]
 """Puts a question to a person and waits for the answer; gives up, which is a no, when its second argument says so."""
 
 
@@ -202,12 +202,12 @@ class Clearances:
         for place, (hash, (about, its)) in enumerate(open_ones.items()):
             question = replace(self._question(about, its), more=len(open_ones) - place - 1)
             answer = (
-                Answer.NO if none_of_them or self._ask is None or stopped() else self._ask(question, stopped)
+                Consent.NO if none_of_them or self._ask is None or stopped() else self._ask(question, stopped)
             )
-            none_of_them = none_of_them or answer is Answer.NONE
-            if answer in (Answer.NO, Answer.NONE):
+            none_of_them = none_of_them or answer is Consent.NONE
+            if answer in (Consent.NO, Consent.NONE):
                 refused[hash] = NotCleared(f"{in_words(question)} is not trusted", question)
-            elif answer is Answer.ALWAYS:
+            elif answer is Consent.ALWAYS:
                 self._store.trust(its.content, about.followed)
             else:
                 self._store.trust_once(its.content, about.followed)
@@ -270,10 +270,10 @@ class Clearances:
             return _approved(wanted, content)
         return _Open(content, agreed)
 
-    def _question(self, wanted: Wanted, its: _Open) -> Question:
+    def _question(self, wanted: Wanted, its: _Open) -> TrustQuestion:
         content = its.content
         before = None if wanted.recorded_text or its.agreed else self._store.trusted_before(content)
-        return Question(
+        return TrustQuestion(
             _printable(wanted.info.task),
             wanted.recorded_text,
             asked_files(content, before),
@@ -380,7 +380,7 @@ def _is_one_of(file: str, named: Iterable[Path]) -> bool:
     return any(os.path.realpath(one) == real for one in named)
 
 
-def in_words(question: Question) -> str:
+def in_words(question: TrustQuestion) -> str:
     """The code that a question is about, with its hash."""
     if question.recorded_text:
         return f"the text of {question.file} in recordings of {question.task} ({question.hash})"

@@ -13,7 +13,7 @@ from typing import Literal
 
 import viser
 
-from workbench.session.clearance import FOLLOWED, Answer, Question
+from workbench.session.clearance import FOLLOWED, Consent, TrustQuestion
 from workbench.ui.fragments import render
 from workbench.ui.library_edits import Question as Window
 
@@ -31,11 +31,11 @@ _LOOK = 0.1
 
 @dataclass
 class _Pending:
-    question: Question
+    question: TrustQuestion
     answered: threading.Event = field(default_factory=threading.Event)
-    answer: Answer = Answer.NO
+    answer: Consent = Consent.NO
 
-    def take(self, answer: Answer) -> None:
+    def take(self, answer: Consent) -> None:
         """The first answer counts."""
         if not self.answered.is_set():
             self.answer = answer
@@ -61,7 +61,7 @@ class TrustDialog:
             self._asking = asking
             self._asking(bool(self._waiting))
 
-    def ask(self, question: Question, stopped: Callable[[], bool]) -> Answer:
+    def ask(self, question: TrustQuestion, stopped: Callable[[], bool]) -> Consent:
         """Show the question, and wait for the answer. Not to be called on viser's own threads.
 
         Args:
@@ -75,7 +75,7 @@ class TrustDialog:
                 self._keep_shown()
                 if pending.answered.wait(_LOOK):
                     return pending.answer
-            return Answer.NO
+            return Consent.NO
         finally:
             with self._lock:
                 if self._waiting[0] is pending:
@@ -99,16 +99,16 @@ class TrustDialog:
                 self._window = Window(self._server, TITLE, lambda: None)
                 with self._window.modal:
                     # The first has the focus: Enter must not run anything.
-                    self._add_button(DO_NOT, None, viser.Icon.X, pending, Answer.NO)
+                    self._add_button(DO_NOT, None, viser.Icon.X, pending, Consent.NO)
                     if question.more:
                         label = f"Nor the {question.more} more that are asked about"
-                        self._add_button(label, "gray", viser.Icon.X, pending, Answer.NONE)
-                    self._add_button(ONCE, "gray", viser.Icon.PLAYER_PLAY, pending, Answer.ONCE)
-                    self._add_button(ALWAYS, "gray", viser.Icon.SHIELD_CHECK, pending, Answer.ALWAYS)
+                        self._add_button(label, "gray", viser.Icon.X, pending, Consent.NONE)
+                    self._add_button(ONCE, "gray", viser.Icon.PLAYER_PLAY, pending, Consent.ONCE)
+                    self._add_button(ALWAYS, "gray", viser.Icon.SHIELD_CHECK, pending, Consent.ALWAYS)
                     # After them, so that no name in it has the focus; page.css puts it above them.
                     gui.add_html(question_html(question))
                 self._escape = gui.add_command(DO_NOT, hotkey="escape")
-                self._escape.on_trigger(lambda _: pending.take(Answer.NO))
+                self._escape.on_trigger(lambda _: pending.take(Consent.NO))
             self._asking(True)
 
     def _add_button(
@@ -117,7 +117,7 @@ class TrustDialog:
         color: Literal["gray"] | None,
         icon: viser.IconName,
         pending: _Pending,
-        answer: Answer,
+        answer: Consent,
     ) -> None:
         button = self._server.gui.add_button(label, color=color, icon=icon)
         button.on_click(lambda _: pending.take(answer))
@@ -130,7 +130,7 @@ class TrustDialog:
             escape.remove()
 
 
-def question_html(question: Question) -> str:
+def question_html(question: TrustQuestion) -> str:
     """What would run; every value escaped."""
     files: list[dict[str, object]] = []
     left = MOST_OF_ALL
