@@ -33,7 +33,7 @@ from mani_skill.utils.gym_utils import find_max_episode_steps_value
 
 from workbench.authoring.load import task_of_class
 from workbench.core import actions
-from workbench.core.seams import draws_its_own_seeds, open_env, task_class
+from workbench.core.seams import draws_its_own_seeds, last_observation, open_env, task_class
 from workbench.core.state_columns import read_state_columns
 from workbench.core.step import StepResult
 from workbench.core.step_pictures import step_pictures
@@ -117,7 +117,8 @@ class Recorder(gym.Wrapper):
         chosen = (options or {}).get("env_idx")
         mask[slice(None) if chosen is None else np.asarray([int(i) for i in chosen])] = True
         self._seeds[mask] = self._seeds_of_reset(seed)[mask]
-        step = self._task.result_of(info, np.zeros(count), np.zeros(count, bool), np.zeros(count, bool), None)
+        self._task.obs, none = last_observation(self._task.env), np.zeros(count, bool)
+        step = self._task.result(info, np.zeros(count), None, none, none)
         if self._scene is not self._task.env.scene and not self._finished:
             self._begin()
         if self._gatherer is not None:
@@ -148,7 +149,8 @@ class Recorder(gym.Wrapper):
             obs, reward, terminated, truncated, info = given
             if made is None:
                 made = np.zeros((task.num_envs, 0), np.float32)
-            step = task.result_of(info, reward, terminated, truncated, made)
+            task.obs = last_observation(task.env)
+            step = task.result(info, reward, made, terminated, truncated)
             self._take(step, np.zeros(task.num_envs, bool))
         return given  # type: ignore[return-value]
 

@@ -16,10 +16,9 @@ from mani_skill.sensors.camera import CameraConfig
 
 from tests.core.single_env_judge import batch_of
 from tests.core.watched import RENDERED, Watched, pictures
-from workbench.core.camera_configs import settings_of
 from workbench.core.camera_settings import CameraKey, CameraSettings
 from workbench.core.exchange import exchange_cameras
-from workbench.core.place_camera import PlacedCameras
+from workbench.core.place_camera import PlacedCameras, settings_of
 from workbench.core.snapshot import restore_snapshot, take_snapshot
 from workbench.core.take_pictures import list_cameras, segmentation_names, take_pictures
 

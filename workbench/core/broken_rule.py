@@ -12,7 +12,7 @@ import sys
 import warnings
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -67,6 +67,17 @@ def warn_of(finding: Finding) -> None:
         warnings.warn_explicit(finding.message, RuleWarning, finding.file, finding.line)
 
 
+@dataclass(frozen=True)
+class _Row:
+    finding: Finding
+    occasion: Occasion
+    """At what it was last broken."""
+    exact: bool
+    """False where the line is no more than likely."""
+    confirmed: bool = True
+    """False for a row of the version before, which the present one has not broken yet."""
+
+
 class BrokenRules:
     """The rules that one env checks, and where its task broke them."""
 
@@ -79,13 +90,7 @@ class BrokenRules:
             on_finding: called with each place the first time that the task goes on after it.
         """
         self._degrees, self._on_finding = degrees, on_finding
-        self._rows: dict[_Key, Finding] = {}
-        self._occasions: dict[_Key, Occasion] = {}
-        """At what each row was last broken."""
-        self._unconfirmed: set[_Key] = set()
-        """Rows of the version before, which the present one has not broken yet."""
-        self._vague: set[_Key] = set()
-        """Rows whose line is no more than likely."""
+        self._rows: dict[_Key, _Row] = {}
         self._now: Occasion = "reset"
         self.more = 0
         """Times that rules were broken at places for which there is no row left."""
@@ -96,7 +101,7 @@ class BrokenRules:
 
     @property
     def rows(self) -> tuple[Finding, ...]:
-        return tuple(self._rows.values())
+        return tuple(row.finding for row in self._rows.values())
 
     def degree(self, rule: str) -> Degree:
         return self._degrees[rule]
@@ -129,7 +134,9 @@ class BrokenRules:
     def begin(self) -> None:
         """The task was tried, and begins now: steps are counted from here."""
         self.step = 0
-        self._rows = {key: replace(row, first_step=0) for key, row in self._rows.items()}
+        self._rows = {
+            key: replace(row, finding=replace(row.finding, first_step=0)) for key, row in self._rows.items()
+        }
 
     def returned(self, rule: str, hook: str, said: str, place: Place | None) -> None:
         """As `breaks`, of what a hook returned."""
@@ -145,19 +152,16 @@ class BrokenRules:
         if row is None and len(self._rows) >= MOST_ROWS:
             self.more += 1
             return
-        self._occasions[key] = self._now
-        if row is not None:
-            self._unconfirmed.discard(key)
-            if exact and place is not None and key in self._vague:
-                self._vague.discard(key)
-                row = _at(row, place)
-            self._rows[key] = replace(row, count=row.count + 1)
+        if row is None:
+            found = Finding(rule, self._degrees[rule], message, None, None, "", "", 1, self.step)
+            found = found if place is None else _at(found, place)
+            self._rows[key] = _Row(found, self._now, exact)
+            self._on_finding(found)
             return
-        if not exact:
-            self._vague.add(key)
-        row = Finding(rule, self._degrees[rule], message, None, None, "", "", 1, self.step)
-        self._rows[key] = row = row if place is None else _at(row, place)
-        self._on_finding(row)
+        found = replace(row.finding, count=row.finding.count + 1)
+        if exact and place is not None and not row.exact:
+            found, row = _at(found, place), replace(row, exact=True)
+        self._rows[key] = _Row(found, self._now, row.exact)
 
     # --- an edited file ------------------------------------------------------------------------------
 
@@ -173,19 +177,18 @@ class BrokenRules:
             yield
         finally:
             self._now = before
-        if confirms and self._unconfirmed:
-            gone = {key for key in self._unconfirmed if self._occasions[key] == occasion}
-            self._rows = {key: row for key, row in self._rows.items() if key not in gone}
-            self._unconfirmed -= gone
+        kept = {key: row for key, row in self._rows.items() if row.confirmed or row.occasion != occasion}
+        if confirms and len(kept) < len(self._rows):
+            self._rows = kept
             self.serial += 1
 
     def copy(self) -> tuple[Any, ...]:
         """What is known now, for `put_back`."""
-        return dict(self._rows), dict(self._occasions), set(self._unconfirmed), set(self._vague), self.more
+        return dict(self._rows), self.more
 
     def put_back(self, kept: tuple[Any, ...]) -> None:
         """Another version was tried, and is not taken."""
-        self._rows, self._occasions, self._unconfirmed, self._vague, self.more = kept
+        self._rows, self.more = kept
         self.serial += 1
 
     def edited(self, place_now: Callable[[Finding], tuple[str, int] | None]) -> None:
@@ -195,18 +198,16 @@ class BrokenRules:
         Args:
             place_now: file and line of a row in the new version; None where its function is another.
         """
-        rows, occasions = self._rows, self._occasions
-        self._rows, self._occasions = {}, {}
+        rows, self._rows = self._rows, {}
         self.serial += 1
         for (rule, subject), row in rows.items():
-            place = place_now(row)
+            was = row.finding
+            place = place_now(was)
             if place is None:
                 continue
-            there = (*place, row.function)
-            key = rule, there if subject == (row.file, row.line, row.function) else subject
-            self._rows[key] = _at(row, there)
-            self._occasions[key] = occasions[rule, subject]
-        self._unconfirmed = set(self._rows)
+            there = (*place, was.function)
+            key = rule, there if subject == (was.file, was.line, was.function) else subject
+            self._rows[key] = replace(row, finding=_at(was, there), confirmed=False)
 
 
 def _at(row: Finding, place: Place) -> Finding:

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, fields
+from typing import Any, Literal
 
 CameraKind = Literal["sensor", "human"]
 CameraKey = tuple[CameraKind, str]
@@ -58,28 +58,23 @@ of near and far, as a share. A config keeps its pose in single precision."""
 
 def differences(a: CameraSettings, b: CameraSettings, close: float = CLOSE) -> tuple[str, ...]:
     """Which of ``position orientation fov intrinsic width height near far shader_pack`` are not the same."""
-    found: list[str] = []
-    if not _close(a.position, b.position, close):
-        found.append("position")
     turned = tuple(-x for x in b.quaternion)
-    if not _close(a.quaternion, b.quaternion, close) and not _close(a.quaternion, turned, close):
-        found.append("orientation")
-    if (a.fov is None) != (b.fov is None) or (a.fov and b.fov and not _close((a.fov,), (b.fov,), close)):
-        found.append("fov")
-    flat = [None if c.intrinsic is None else tuple(x for row in c.intrinsic for x in row) for c in (a, b)]
-    if (flat[0] is None) != (flat[1] is None) or (
-        flat[0] and flat[1] and not _close(flat[0], flat[1], close)
-    ):
-        found.append("intrinsic")
-    found += [name for name in ("width", "height") if getattr(a, name) != getattr(b, name)]
-    found += [name for name in ("near", "far") if not _close((getattr(a, name),), (getattr(b, name),), close)]
-    if a.shader_pack != b.shader_pack:
-        found.append("shader_pack")
+    found = []
+    for field in fields(a):
+        mine, other = getattr(a, field.name), getattr(b, field.name)
+        if field.name != "quaternion":
+            found += [] if _alike(mine, other, close) else [field.name]
+        elif not _alike(mine, other, close) and not _alike(mine, turned, close):
+            found.append("orientation")
     return tuple(found)
 
 
-def _close(a: tuple[float, ...], b: tuple[float, ...], close: float) -> bool:
-    return all(abs(x - y) <= close * max(1.0, abs(x), abs(y)) for x, y in zip(a, b, strict=True))
+def _alike(a: Any, b: Any, close: float) -> bool:
+    if isinstance(a, tuple) and isinstance(b, tuple):
+        return all(_alike(x, y, close) for x, y in zip(a, b, strict=True))
+    if isinstance(a, float) and isinstance(b, float):
+        return abs(a - b) <= close * max(1.0, abs(a), abs(b))
+    return a == b
 
 
 MOST_PIXELS = 4096

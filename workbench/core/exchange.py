@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.utils import common
 
 from workbench.core import seams
 from workbench.core.cpu_scene import BatchedCpuMixin, batched_class
@@ -117,4 +118,4 @@ def _simulation(snapshot: Snapshot) -> tuple[tuple[bytes, ...], bytes, bytes]:
 def keep_observation_space(env: BaseEnv, obs: Any) -> None:
     """Let the env's spaces be those of this observation; the edited hook may return another shape."""
     if env.obs_mode != "none":
-        env.update_obs_space(seams.to_cpu(obs))
+        env.update_obs_space(common.to_cpu_tensor(obs))

@@ -14,7 +14,7 @@ body.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,10 +53,13 @@ class Material:
     @property
     def srgb_color(self) -> tuple[float, float, float, float]:
         """`base_color` as a colour picker or CSS would say it: RGB sRGB encoded, alpha unchanged."""
-        r, g, b = (
-            12.92 * c if c <= 0.0031308 else 1.055 * c ** (1 / 2.4) - 0.055 for c in self.base_color[:3]
-        )
+        r, g, b = srgb(np.array(self.base_color[:3])).tolist()
         return r, g, b, self.base_color[3]
+
+
+def srgb(linear: NDArray[Any]) -> NDArray[Any]:
+    """Linear colours in 0..1, sRGB encoded."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 @dataclass(frozen=True)

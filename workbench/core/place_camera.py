@@ -1,4 +1,4 @@
-"""A live camera put elsewhere, or given another lens, size or shader, in all envs at once.
+"""A live camera: what its config says as plain numbers, and that camera put elsewhere, or given another lens, size or shader, in all envs at once.
 
 Where a camera stands and how it sees are properties of SAPIEN's camera components, which can be set at any time;
 its size and its shader are given to a component when it is made, so for those the component alone is exchanged, on
@@ -19,6 +19,9 @@ from typing import Any
 import numpy as np
 import sapien
 import sapien.render
+import torch
+from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
+from mani_skill.utils.structs.pose import Pose
 
 from workbench.core import seams
 from workbench.core.camera_settings import CameraKey, CameraSettings, why_no_camera
@@ -107,13 +110,13 @@ def _config(config: Any, settings: CameraSettings) -> Any:
     wrong = why_no_camera(settings)
     if wrong is not None:
         raise ValueError(wrong)
-    shaders = seams.shader_packs()
+    shaders = PREBUILT_SHADER_CONFIGS
     if settings.shader_pack != config.shader_pack and settings.shader_pack not in shaders:
         raise ValueError(
             f"there is no shader pack {settings.shader_pack!r}; there are {', '.join(sorted(shaders))}"
         )
     placed = copy.copy(config)
-    placed.pose = seams.as_pose(_pose(settings))
+    placed.pose = Pose.create(_pose(settings))
     placed.fov, placed.near, placed.far = settings.fov, settings.near, settings.far
     placed.intrinsic = None if settings.intrinsic is None else np.array(settings.intrinsic)
     placed.width, placed.height = settings.width, settings.height
@@ -136,7 +139,7 @@ def _set(env: Any, key: CameraKey, camera: Any, config: Any, poses: list[sapien.
 
 
 def _exchanged(config: Any, old: list[Any]) -> list[Any]:
-    seams.use_shader(config)
+    set_shader_pack(config.shader_config)
     made = []
     for component in old:
         new = sapien.render.RenderCameraComponent(config.width, config.height)
@@ -163,3 +166,74 @@ def _set_lens(component: Any, config: Any, env_index: int) -> None:
 
 def _of_env(value: Any, env_index: int) -> float:
     return float(value if isinstance(value, (int, float)) else value[env_index])
+
+
+# --- what a config says ---------------------------------------------------------------------------
+
+
+def settings_of(config: Any) -> CameraSettings | None:
+    """A ``CameraConfig`` as plain numbers; of the first env where poses differ.
+
+    A quaternion that is not of unit length (``look_at`` straight down gives one) is made so. None where it cannot
+    be said: a lens, near or far that differs between envs, or a pose that is none.
+    """
+    pose = rows_of_pose(config)[0].astype(np.float64)
+    length = float(np.linalg.norm(pose[3:]))
+    if not np.isfinite(pose).all() or length < 1e-6:
+        return None
+    fov, near, far = (_one(getattr(config, name)) for name in ("fov", "near", "far"))
+    intrinsic = None if config.intrinsic is None else _one_matrix(config.intrinsic)
+    if near is None or far is None or (fov is None) == (intrinsic is None):
+        return None
+    x, y, z = (float(v) for v in pose[:3])
+    w, i, j, k = (float(v) for v in pose[3:] / length)
+    return CameraSettings(
+        position=(x, y, z),
+        quaternion=(w, i, j, k),
+        fov=fov,
+        intrinsic=intrinsic,  # type: ignore[arg-type]
+        width=int(config.width),
+        height=int(config.height),
+        near=near,
+        far=far,
+        shader_pack=str(config.shader_pack),
+    )
+
+
+def target_of(config: Any) -> tuple[float, float, float] | None:
+    """The point that the config's ``look_at`` names, in the frame of its pose, of the first env where it differs.
+
+    None where the pose was not made by ``look_at``, or not noted.
+    """
+    target = seams.camera_target(config)
+    if target is None:
+        return None
+    x, y, z = (float(number) for number in _numbers(target).reshape(-1, 3)[0])
+    return x, y, z
+
+
+def rows_of_pose(config: Any) -> np.ndarray:
+    """(1, 7) or (N, 7) local poses, p then wxyz."""
+    return config.pose.raw_pose.detach().cpu().numpy()
+
+
+def _numbers(value: Any) -> np.ndarray:
+    return np.asarray(value.detach().cpu() if isinstance(value, torch.Tensor) else value, dtype=np.float64)
+
+
+def _one(value: Any) -> float | None:
+    """The number that it is, or that all of its numbers are."""
+    if value is None:
+        return None
+    numbers = _numbers(value).reshape(-1)
+    return float(numbers[0]) if len(numbers) and (numbers == numbers[0]).all() else None
+
+
+def _one_matrix(value: Any) -> tuple[tuple[float, ...], ...] | None:
+    matrices = _numbers(value)
+    if matrices.shape[-2:] != (3, 3):
+        return None
+    matrices = matrices.reshape(-1, 3, 3)
+    if not (matrices == matrices[0]).all():
+        return None
+    return tuple(tuple(float(v) for v in row) for row in matrices[0])

@@ -15,7 +15,8 @@ import sapien.render
 from numpy.typing import NDArray
 
 from workbench.core.backends import find_renderer
-from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
+from workbench.core.geometry import Material, SceneGeometry, Visual
+from workbench.core.mesh_detail import with_normals
 from workbench.core.render_device import keep_render_device
 
 NEAR, FAR = 0.01, 300.0
@@ -86,23 +87,12 @@ class RecordedScene:
 
 
 def _shape(visual: Visual) -> sapien.render.RenderShapeTriangleMesh:
-    mesh, count = visual.mesh, len(visual.mesh.vertices)
-    normals = mesh.normals if mesh.normals is not None else _normals(mesh)
-    uvs = mesh.uvs if mesh.uvs is not None else np.zeros((count, 2), np.float32)
+    mesh = visual.mesh if visual.mesh.normals is not None else with_normals(visual.mesh)
+    normals: Any = mesh.normals
+    uvs = mesh.uvs if mesh.uvs is not None else np.zeros((len(mesh.vertices), 2), np.float32)
     return sapien.render.RenderShapeTriangleMesh(
         mesh.vertices, mesh.faces.astype(np.uint32), normals, uvs, _material(visual.material)
     )
-
-
-def _normals(mesh: Mesh) -> NDArray[np.float32]:
-    """(V, 3) of each vertex, from the faces around it by their area."""
-    corners = mesh.vertices[mesh.faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = np.zeros_like(mesh.vertices)
-    for corner in range(3):
-        np.add.at(normals, mesh.faces[:, corner], across)
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return (normals / np.where(length > 0, length, 1)).astype(np.float32)
 
 
 def _material(material: Material) -> sapien.render.RenderMaterial:

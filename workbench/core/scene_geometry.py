@@ -7,7 +7,8 @@ for a key that is new: 16 envs of a Panda cost little more than one. What is rea
 reduced (`mesh_detail`), for the life of the process, because a hot reload asks for it again.
 
 On a machine without any Vulkan driver there are no render bodies. The collision shapes are still
-there, and a grey robot that moves is worth far more than an empty page (`collision_geometry`).
+there, and a grey robot that moves is worth far more than an empty page. Bodies without collision shapes (goal markers)
+do not appear then.
 """
 
 from __future__ import annotations
@@ -20,12 +21,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import sapien.physx as physx
 import sapien.render
+import trimesh
 from numpy.typing import NDArray
 from PIL import Image
 
-from workbench.core.collision_geometry import collision_parts
-from workbench.core.geometry import BodyKind, Material, Mesh, SceneGeometry, Visual
+from workbench.core.geometry import BodyKind, Material, Mesh, SceneGeometry, Visual, srgb
 from workbench.core.mesh_detail import drop_uvs, flat_rectangle, reduce_mesh, with_normals
 from workbench.core.scene_index import scene_index
 
@@ -36,6 +38,13 @@ MOST_FACES = 800
 """Of a visual: a Panda of 136,000 triangles becomes 14,000 and still looks like one."""
 MOST_TEXELS = 1024
 """On the longest side of a texture."""
+
+
+_GREY: dict[BodyKind, float] = {"link": 0.55, "dynamic": 0.32, "kinematic": 0.22, "static": 0.12}
+"""Linear grey: what moves is lighter than what it stands on."""
+_PLANE_HALF_SIZE = 50.0
+"""PhysX planes have no end; this is half the width that ManiSkill's ground has by default."""
+_X_FROM_Z = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
 
 @dataclass(frozen=True)
@@ -93,8 +102,17 @@ def read_geometry(env: Any, max_faces: int = MOST_FACES, max_texels: int = MOST_
 
 
 def _collision_parts(entity: Any, kind: BodyKind) -> Iterator[Part]:
-    for key, mesh, material in collision_parts(entity, kind):
-        yield Part(key, lambda mesh=mesh, material=material: (mesh(), material))
+    body = entity.find_component_by_type(physx.PhysxRigidBaseComponent)
+    grey = _GREY[kind]
+    material = Material((grey, grey, grey, 1.0), roughness=0.8)
+    for shape in () if body is None else body.collision_shapes:
+        place = _Placement.of(shape)
+        key, make = _collision_shape(shape)
+
+        def read(make: Callable[[], Mesh] = make, place: _Placement = place) -> tuple[Mesh, Material]:
+            return place.apply(with_normals(make())), material
+
+        yield Part((key, place.key, kind), read)
 
 
 class _RenderWalk:
@@ -179,7 +197,10 @@ class _Placement:
         scaled = isinstance(shape, sapien.render.RenderShapeTriangleMesh)
         x, y, z = shape.scale.tolist() if scaled else (1.0, 1.0, 1.0)
         return _Placement(
-            (x, y, z), (p[0], p[1], p[2]), (q[0], q[1], q[2], q[3]), shape.front_face == "clockwise"
+            (x, y, z),
+            (p[0], p[1], p[2]),
+            (q[0], q[1], q[2], q[3]),
+            getattr(shape, "front_face", "") == "clockwise",
         )
 
     @property
@@ -205,7 +226,9 @@ def _source(shape: Any, part: Any, index: int) -> _Source:
     if isinstance(shape, sapien.render.RenderShapeTriangleMesh):
         if shape.filename:
             return _Source(("file", shape.filename, _file_version(shape.filename), index), part, one, True)
-        return _Source(("made", _content_hash(part)), part, one, False)
+        return _Source(
+            ("made", _content_hash(part.vertices, part.triangles, part.get_vertex_uv())), part, one, False
+        )
     if isinstance(shape, sapien.render.RenderShapeBox):
         x, y, z = shape.half_size.tolist()
         return _Source(("box", x, y, z), part, (x, y, z), False)
@@ -232,9 +255,9 @@ def _file_version(filename: str) -> tuple[int, int] | None:
     return stat.st_mtime_ns, stat.st_size
 
 
-def _content_hash(part: Any) -> str:
+def _content_hash(*arrays: NDArray[Any]) -> str:
     digest = hashlib.blake2b(digest_size=16)
-    for array in (part.vertices, part.triangles, part.get_vertex_uv()):
+    for array in arrays:
         digest.update(array.tobytes())
     return digest.hexdigest()
 
@@ -295,8 +318,7 @@ def _rgba(texture: Any, max_size: int) -> NDArray[np.uint8]:
     if values.shape[-1] == 3:
         values = np.concatenate([values, np.ones_like(values[..., :1])], axis=-1)
     if not texture.is_srgb:
-        rgb = values[..., :3]
-        values[..., :3] = np.where(rgb <= 0.0031308, 12.92 * rgb, 1.055 * rgb ** (1 / 2.4) - 0.055)
+        values[..., :3] = srgb(values[..., :3])
     return _at_most(np.round(values * 255).astype(np.uint8), max_size)
 
 
@@ -306,3 +328,55 @@ def _at_most(pixels: NDArray[np.uint8], max_size: int) -> NDArray[np.uint8]:
         return pixels
     height, width = (max(1, round(side * max_size / longest)) for side in pixels.shape[:2])
     return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.BOX))
+
+
+# --- collision shapes --------------------------------------------------------------------------------
+
+
+def _collision_shape(shape: Any) -> tuple[Hashable, Callable[[], Mesh]]:
+    """Key, and what makes the mesh. PhysX's capsules, cylinders and planes lie along x."""
+    if isinstance(shape, physx.PhysxCollisionShapeBox):
+        half = shape.half_size.tolist()
+        return ("box", *half), lambda: _mesh(trimesh.creation.box(extents=2 * np.array(half)))
+    if isinstance(shape, physx.PhysxCollisionShapeSphere):
+        r = shape.radius
+        return ("sphere", r), lambda: _mesh(trimesh.creation.icosphere(subdivisions=3, radius=r))
+    if isinstance(shape, physx.PhysxCollisionShapeCapsule):
+        r, length = shape.radius, 2 * shape.half_length
+        return ("capsule", r, length), lambda: _along_x(
+            trimesh.creation.capsule(height=length, radius=r, count=[24, 12])
+        )
+    if isinstance(shape, physx.PhysxCollisionShapeCylinder):
+        r, length = shape.radius, 2 * shape.half_length
+        return ("cylinder", r, length), lambda: _along_x(trimesh.creation.cylinder(radius=r, height=length))
+    if isinstance(shape, physx.PhysxCollisionShapePlane):
+        return ("plane",), _plane
+    if isinstance(shape, physx.PhysxCollisionShapeConvexMesh | physx.PhysxCollisionShapeTriangleMesh):
+        vertices, triangles, scale = shape.vertices, shape.get_triangles(), shape.scale
+        return ("mesh", _content_hash(vertices, triangles), *scale.tolist()), lambda: _oriented(
+            vertices * scale, triangles
+        )
+    raise TypeError(f"{type(shape).__name__} is a collision shape that the workbench does not know")
+
+
+def _mesh(mesh: trimesh.Trimesh) -> Mesh:
+    return Mesh(np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.uint32))
+
+
+def _along_x(mesh: trimesh.Trimesh) -> Mesh:
+    made = _mesh(mesh)
+    return Mesh((made.vertices @ _X_FROM_Z.T).astype(np.float32), made.faces)
+
+
+def _plane() -> Mesh:
+    s = _PLANE_HALF_SIZE
+    corners = np.array([[0, -s, -s], [0, s, -s], [0, s, s], [0, -s, s]], dtype=np.float32)
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.uint32))
+
+
+def _oriented(vertices: NDArray[np.float32], triangles: NDArray[np.uint32]) -> Mesh:
+    """Triangles turned outwards where the whole says they look in: a mirrored scale turns them round."""
+    corners = vertices[triangles].astype(np.float64)
+    volume = np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))
+    faces = np.asarray(triangles, np.uint32)
+    return Mesh(np.asarray(vertices, np.float32), faces[:, ::-1].copy() if volume < 0 else faces)

@@ -28,9 +28,8 @@ from mani_skill.agents.controllers.pd_ee_pose import PDEEPosController
 from mani_skill.agents.multi_agent import MultiAgent
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.envs.utils.randomization.batched_rng import BatchedRNG
-from mani_skill.render import PREBUILT_SHADER_CONFIGS, set_shader_pack
 from mani_skill.sensors.camera import CameraConfig, parse_camera_configs
-from mani_skill.utils import common, sapien_utils
+from mani_skill.utils import sapien_utils
 from mani_skill.utils.structs.actor import Actor
 from mani_skill.utils.structs.articulation import Articulation
 from mani_skill.utils.structs.articulation_joint import ArticulationJoint
@@ -353,11 +352,6 @@ def flatten_observation(env: Any, obs: Any) -> Any:
     return env._flatten_raw_obs(obs)
 
 
-def to_cpu(obs: Any) -> Any:
-    """``common.to_cpu_tensor``, with which BaseEnv keeps its first observation."""
-    return common.to_cpu_tensor(obs)
-
-
 def camera_components(camera: Any) -> list[Any]:
     """The ``RenderCameraComponent`` of every env behind a ManiSkill camera: ``camera._render_cameras``.
 
@@ -443,21 +437,6 @@ def camera_site(config: Any) -> CallSite | None:
 def camera_target(config: Any) -> Any:
     """What ``look_at`` was given as its target when it made the config's pose; None where another thing made it."""
     return getattr(config, "_workbench_target", None)
-
-
-def shader_packs() -> dict[str, Any]:
-    """ManiSkill's ``ShaderConfig`` objects by the name of their pack."""
-    return PREBUILT_SHADER_CONFIGS
-
-
-def use_shader(config: Any) -> None:
-    """What ``Camera.__init__`` does before its components are made: they get the process's present shader."""
-    set_shader_pack(config.shader_config)
-
-
-def as_pose(pose: Any) -> Pose:
-    """What ``CameraConfig.__post_init__`` makes of a pose."""
-    return Pose.create(pose)
 
 
 def set_up_camera(env: Any, key: CameraKey, camera: Any, config: Any, components: list[Any]) -> None:

@@ -25,11 +25,11 @@ import torch
 from numpy.typing import NDArray
 
 from workbench.core import seams
-from workbench.core.camera_configs import rows_of_pose, settings_of, target_of
 from workbench.core.camera_settings import CameraKey
 from workbench.core.drawn_poses import NOWHERE_ELSE, Places, drawn_at, temporarily
 from workbench.core.env_numbers import require_env
 from workbench.core.pictures import CameraInfo, CameraKind, Picture
+from workbench.core.place_camera import rows_of_pose, settings_of, target_of
 from workbench.core.scene_index import hidden_poses, scene_index
 
 _MODALITIES = ("rgb", "depth", "segmentation", "position", "normal", "albedo")

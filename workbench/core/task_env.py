@@ -34,7 +34,6 @@ from workbench.core.seams import (
     episode_seeds,
     flatten_observation,
     keep_observation,
-    last_observation,
 )
 from workbench.core.snapshot import (
     RestoreReport,
@@ -203,7 +202,7 @@ class TaskEnv:
         info = {key: value for key, value in info.items() if key != "reconfigure"}
         if self._check is not None:
             self._check(info, None)
-        return self._result(info, np.zeros(self.num_envs), None)
+        return self.result(info, np.zeros(self.num_envs), None)
 
     def _partial_reset(
         self, chosen: list[int], seeds: list[int] | None, further: Mapping[str, Any]
@@ -221,7 +220,7 @@ class TaskEnv:
         self.obs, reward, terminated, _, info = self.env.step(env_action)
         if self._check is not None:
             self._check(info, reward)
-        return self._result(info, reward, action, terminated)
+        return self.result(info, reward, action, terminated)
 
     def snapshot(self, env_idx: Sequence[int] | None = None) -> Snapshot:
         """Everything that decides how the episodes of these envs (None: of all) go on; see `snapshot`."""
@@ -260,19 +259,7 @@ class TaskEnv:
             keep_observation(self.env, self.obs)
         if self._check is not None:
             self._check(info, reward)
-        return self._result(info, np.zeros(self.num_envs) if reward is None else reward, action)
-
-    def result_of(
-        self,
-        info: Mapping[str, Any],
-        reward: Any,
-        terminated: Any,
-        truncated: Any,
-        action: NDArray[np.float32] | None,
-    ) -> StepResult:
-        """What somebody else's ``env.step`` (or ``env.reset``: no action) gave, who went past this object."""
-        self.obs = last_observation(self.env)
-        return self._result(info, reward, action, terminated, truncated)
+        return self.result(info, np.zeros(self.num_envs) if reward is None else reward, action)
 
     @property
     def observes_pictures(self) -> bool:
@@ -296,7 +283,7 @@ class TaskEnv:
     def close(self) -> None:
         self.env.close()
 
-    def _result(
+    def result(
         self,
         info: Mapping[str, Any],
         reward: Any,
@@ -304,7 +291,10 @@ class TaskEnv:
         terminated: Any = None,
         truncated: Any = None,
     ) -> StepResult:
-        """Where it is not said which episodes ended, `info` and the time limit say it."""
+        """What a step or a reset (no action) gave, also one that went past this object.
+
+        Where it is not said which episodes ended, `info` and the time limit say it.
+        """
         count = self.num_envs
         elapsed = to_numpy(self.env.elapsed_steps).astype(np.int32)
         if terminated is None:

@@ -286,76 +286,75 @@ def measure(
     """
     began = time.perf_counter()
     shown = [thing for thing in objects if not (thing.robot or thing.name == "ground")]
-    ids = [[entity.per_scene_id for entity in entities_of(thing, e, index)] for thing in shown]
+    ids = [{entity.per_scene_id for entity in entities_of(thing, e, index)} for thing in shown]
     segmentation, depth = view.look(pose)
-    pictures = 1
     height, width = segmentation.shape
     scale = np.float32(settings.width * settings.height / (width * height))
     # Comparing with few numbers is ten times faster than np.isin, and this is done for hundreds of pictures.
     here = set(np.unique(segmentation).tolist())
-    pixels = [_mask(segmentation, here.intersection(row)).sum() for row in ids]
+    pixels = [_one(_mask(segmentation, here & own).sum()) * scale for own in ids]
     robot = [entity for thing in objects if thing.robot for entity in entities_of(thing, e, index)]
-    found: list[ObjectSeen] = []
+    pictures = 1
     if bare is not None:
-        found = [
-            replace(thing, pixels=_one(count) * scale)
-            for thing, count in zip(bare.objects, pixels, strict=True)
-        ]
+        found = [replace(thing, pixels=count) for thing, count in zip(bare.objects, pixels, strict=True)]
     else:
         without = segmentation
-        if any(entity.per_scene_id in here for entity in robot):
+        if here & {entity.per_scene_id for entity in robot}:
             with undrawn(robot):
                 without, _ = view.look(pose)
             pictures += 1
-        left = set(np.unique(without).tolist())
-        every = [entity for entity in index.entities[e] if entity is not None]
-        for thing, row, count in zip(shown, ids, pixels, strict=True):
+        found, left = [], set(np.unique(without).tolist())
+        for thing, own, count in zip(shown, ids, pixels, strict=True):
             never_drawn = thing.hidden and camera[0] == "sensor"
-            mask = _mask(without, left.intersection(row))
-            unhindered = mask.sum()
+            alone = mask = _mask(without, left & own)
             if not (thing.scenery or never_drawn):
-                own = set(row)
-                with undrawn([entity for entity in every if entity.per_scene_id not in own]):
-                    mask = view.look(pose)[0] != 0
+                with undrawn([x for x in index.entities[e] if x is not None and x.per_scene_id not in own]):
+                    alone = view.look(pose)[0] != 0
                 pictures += 1
-            margin = _one(_margin(mask))
+            margin = _one(_margin(alone))
             found.append(
                 ObjectSeen(
                     name=thing.name,
                     never_drawn=never_drawn,
                     scenery=thing.scenery,
-                    present=np.array([bool(row)]),
-                    pixels=_one(count) * scale,
-                    unhindered=_one(unhindered) * scale,
-                    alone=_one(mask.sum()) * scale,
-                    cut=mask.any() & (margin == 0),
+                    present=np.array([bool(own)]),
+                    pixels=count,
+                    unhindered=_one(mask.sum()) * scale,
+                    alone=_one(alone.sum()) * scale,
+                    cut=alone.any() & (margin == 0),
                     margin=margin,
                 )
             )
-    counted = [entity.per_scene_id for entity in robot]
-    counted += [number for thing, row in zip(shown, ids, strict=True) if not thing.scenery for number in row]
-    something = segmentation != 0
-    far = depth[something]
-    of_objects = depth[_mask(segmentation, here.intersection(counted))]
-    limit = float(of_objects.max()) if len(of_objects) else np.nan
-    counts, _ = np.histogram(np.clip(far, DEPTH_EDGES[0], DEPTH_EDGES[-1]), DEPTH_EDGES)
+    counted = {entity.per_scene_id for entity in robot}.union(
+        *(own for thing, own in zip(shown, ids, strict=True) if not thing.scenery)
+    )
     return CameraReport(
         camera=camera,
         size=(settings.width, settings.height),
         judged_size=(width, height),
         envs=(e,),
         objects=tuple(found),
-        depth=DepthReport(
-            counts=counts.astype(np.int64)[None],
-            background=_one(1 - something.mean()),
-            # Where nothing counts is in view, all of it is room.
-            beyond=_one((far > np.nan_to_num(limit, nan=-1.0)).sum() / depth.size),
-            nearest=_one(far.min() if len(far) else np.nan),
-            farthest=_one(far.max() if len(far) else np.nan),
-            farthest_object=_one(limit),
-        ),
+        depth=_depths(depth, segmentation != 0, _mask(segmentation, here & counted)),
         pictures=pictures,
         milliseconds=1000 * (time.perf_counter() - began),
+    )
+
+
+def _depths(
+    depth: NDArray[np.float32], something: NDArray[np.bool_], counts: NDArray[np.bool_]
+) -> DepthReport:
+    """Of one picture (H, W); `something` where it is no background, `counts` where it is the robot or an object."""
+    far, of_objects = depth[something], depth[counts]
+    limit = float(of_objects.max()) if len(of_objects) else np.nan
+    histogram, _ = np.histogram(np.clip(far, DEPTH_EDGES[0], DEPTH_EDGES[-1]), DEPTH_EDGES)
+    return DepthReport(
+        counts=histogram.astype(np.int64)[None],
+        background=_one(1 - something.mean()),
+        # Where nothing counts is in view, all of it is room.
+        beyond=_one((far > np.nan_to_num(limit, nan=-1.0)).sum() / depth.size),
+        nearest=_one(far.min() if len(far) else np.nan),
+        farthest=_one(far.max() if len(far) else np.nan),
+        farthest_object=_one(limit),
     )
 
 

@@ -28,8 +28,8 @@ import torch
 
 from workbench.authoring.problem import TaskError, nobody_presses_ctrl_c
 from workbench.authoring.reference import named_file
-from workbench.core.camera_configs import note_camera_sites
 from workbench.core.inspect_env import inspect_env
+from workbench.core.seams import mark_camera_configs
 from workbench.core.step import StepResult
 from workbench.jobs.wire import Call, pack
 from workbench.machine.current_folder import CurrentFolder
@@ -516,6 +516,6 @@ def work(connection: int, pulse: PulseWriter) -> None:
     # The tensors hold a few thousand numbers: threads over them only wait for each other (measured:
     # 16 PickCube envs ran 2.8 times faster with one thread than with two).
     torch.set_num_threads(1)
-    note_camera_sites()
+    mark_camera_configs()
     nobody_presses_ctrl_c()
     Worker(Connection(connection), pulse).run()

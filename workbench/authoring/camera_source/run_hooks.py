@@ -15,8 +15,8 @@ from workbench.authoring.source.names import Project
 from workbench.authoring.source.read_values import trace_call
 from workbench.authoring.source.trace import Trace
 from workbench.core import seams
-from workbench.core.camera_configs import settings_of
 from workbench.core.camera_settings import CameraSettings
+from workbench.core.place_camera import settings_of
 
 Noted = dict[int, tuple[Any, CameraSettings | None, Trace | None]]
 """By identity of a config: it, what it was made with, and its call."""
