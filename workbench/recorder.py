@@ -36,8 +36,7 @@ from workbench.core import actions
 from workbench.core.seams import draws_its_own_seeds, last_observation, open_env, task_class
 from workbench.core.state_columns import read_state_columns
 from workbench.core.step import StepResult
-from workbench.core.step_pictures import step_pictures
-from workbench.core.take_pictures import Request
+from workbench.core.take_pictures import Request, step_pictures
 from workbench.core.task_env import TaskEnv
 from workbench.recording.episode import NO_SEED
 from workbench.recording.episode_writer import EpisodeFiles

@@ -21,8 +21,7 @@ import workbench
 from tests.core.drawn_envs import batched
 from workbench.core.camera_report import join_reports
 from workbench.core.scene_index import read_poses, scene_index
-from workbench.core.step_pictures import step_pictures
-from workbench.core.take_pictures import take_pictures
+from workbench.core.take_pictures import step_pictures, take_pictures
 from workbench.core.task_env import TaskEnv
 from workbench.core.visibility import judge_camera
 

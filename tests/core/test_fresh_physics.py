@@ -18,7 +18,7 @@ from mani_skill.utils.building import actors
 from mani_skill.utils.structs.pose import Pose
 
 from tests.drive.envs import PICK_CUBE, batched
-from workbench.core.fresh_physics import renew_physics
+from workbench.core.cpu_state import renew_physics
 from workbench.core.snapshot import restore_snapshot, take_snapshot
 
 

@@ -20,8 +20,7 @@ from mani_skill.utils.structs.pose import Pose
 
 from tests.core import draws_goals
 from tests.drive.envs import PICK_CUBE, batched
-from workbench.core.assignments import find_assignment
-from workbench.core.broken_rule import BrokenRule
+from workbench.core.broken_rule import BrokenRule, find_assignment
 from workbench.core.rules import Finding
 
 pytestmark = pytest.mark.thorough

@@ -14,8 +14,8 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.structs import Pose
 
 from tests.core.drawn_envs import batched, stock
+from workbench.core.backends import keep_render_device
 from workbench.core.pictures import Picture
-from workbench.core.render_device import keep_render_device
 from workbench.core.scene_index import scene_index
 from workbench.core.take_pictures import list_cameras, segmentation_names, take_pictures
 

@@ -7,7 +7,7 @@ import pytest
 import sapien.physx as physx
 
 from tests.drive.envs import batched
-from workbench.core.scene_limit import free_thread_keys, require_scenes
+from workbench.core.cpu_scene import free_thread_keys, require_scenes
 
 
 def test_each_physx_scene_takes_a_key_and_gives_it_back() -> None:

@@ -23,8 +23,7 @@ from mani_skill.vector.wrappers.gymnasium import ManiSkillVectorEnv
 
 import workbench
 from tests.drive.envs import CPU, PICK_CUBE, batched, stock
-from workbench.core.cpu_state import CpuState, plan_cpu_state
-from workbench.core.fresh_physics import renew_physics
+from workbench.core.cpu_state import CpuState, plan_cpu_state, renew_physics
 from workbench.core.gpu_state import read_gpu_state, write_gpu_state
 from workbench.core.snapshot import begin_anew, in_this_state, restore_snapshot, take_snapshot
 from workbench.core.task_env import TaskEnv

@@ -11,8 +11,8 @@ import torch
 from mani_skill.utils import common
 
 from tests.drive.envs import batched
+from workbench.core.recorded_run import states_of
 from workbench.core.state_columns import read_state_columns
-from workbench.core.state_names import states_of
 from workbench.core.task_env import TaskEnv
 
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from tests.core.drawn_envs import batched
-from workbench.core import step_pictures as module
-from workbench.core.step_pictures import step_pictures
-from workbench.core.take_pictures import take_pictures
+from workbench.core import take_pictures as module
+from workbench.core.take_pictures import step_pictures, take_pictures
 from workbench.core.task_env import TaskEnv
 
 pytestmark = pytest.mark.usefixtures("renderer")

@@ -35,7 +35,7 @@ def child_process() -> None:
 @pytest.fixture(scope="session")
 def renderer() -> None:
     """For whatever renders in the tests' process. The device is kept: with the last one go its shaders, 5 s an env."""
-    from workbench.core.render_device import keep_render_device
+    from workbench.core.backends import keep_render_device
 
     keep_render_device("cpu")
 

@@ -15,7 +15,7 @@ from rerun.chunk import RrdReader
 
 from tests.drive.episodes import made, write
 from tests.recording.refused_calls import descriptors
-from workbench.core.shared_shapes import SharedShapes
+from workbench.core.geometry import SharedShapes
 from workbench.recording import layout, rerun_pictures
 from workbench.recording.episode import CameraTrack, Episode
 from workbench.recording.read_episode import read_episode

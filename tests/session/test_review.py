@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from tests.drive.episodes import made, poses_of, write
 from tests.drive.waiting import until
-from workbench.core.shared_shapes import SharedShapes
+from workbench.core.geometry import SharedShapes
 from workbench.recording.episode import Episode
 from workbench.recording.library import Library
 from workbench.recording.read_episode import UnreadableRecording

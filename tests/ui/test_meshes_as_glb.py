@@ -8,8 +8,7 @@ import numpy as np
 import trimesh
 
 from tests.ui.scenes import box_mesh, table_scene
-from workbench.core.geometry import Material, Mesh
-from workbench.core.shared_shapes import fingerprint
+from workbench.core.geometry import Material, Mesh, fingerprint
 from workbench.ui.meshes_as_glb import (
     LAYER,
     as_glb,

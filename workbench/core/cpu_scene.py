@@ -7,10 +7,18 @@ author's class is used as it is, and stock ``gym.make`` stays stock.
 
 Each env gets its own ``PhysxCpuSystem`` and its own ``RenderSystem``: exact (nothing of a neighbour can
 reach it), and a picture of env i renders env i alone.
+
+How many PhysX scenes a process can hold, told before it is too late.
+
+Each PhysX scene takes one of the process's thread-local keys (``PxTlsAlloc`` in PhysX's NpScene), of which Linux
+has 1024 (``PTHREAD_KEYS_MAX``); some twenty are taken once SAPIEN and torch are imported. Who takes the last one
+kills the process in native code, at whatever asks for a key next: "Couldn't create autoTSSkey mapping". So
+the free keys are counted, by taking all and giving them back, before the scenes of a batch are made.
 """
 
 from __future__ import annotations
 
+import ctypes
 import sys
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -39,7 +47,6 @@ from workbench.core.partial_reset import (
     told_whose_fault,
 )
 from workbench.core.rules import Degree, Finding, degrees_of
-from workbench.core.scene_limit import require_scenes
 from workbench.core.seams import asks_for_a_gpu, install_index_seams, substeps_are_unwatched
 from workbench.core.snapshot import begin_anew
 from workbench.core.strict import StrictMixin
@@ -315,3 +322,38 @@ def batched_class(
         return type(task.__name__, (BatchedCpuMixin, task), namespace)
     namespace |= {"_rule_choice": rules, "_on_finding": staticmethod(on_finding)}
     return type(task.__name__, (StrictMixin, BatchedCpuMixin, task), namespace)
+
+
+# --- how many scenes a process can hold --------------------------------------------------------------
+
+
+_SPARE = 8
+"""For threads, drivers and libraries that start later, and the scene that a restore makes beside the old one."""
+
+
+def require_scenes(count: int) -> None:
+    """Raise if this process cannot hold `count` PhysX scenes more.
+
+    Raises:
+        ValueError: says how many it can.
+    """
+    free = free_thread_keys()
+    if free is not None and count > free - _SPARE:
+        raise ValueError(
+            f"num_envs={count} is more than this process has room for: PhysX takes one of Linux's 1024 thread-local "
+            f"keys for each env, and {max(free - _SPARE, 0)} are left here. Use fewer envs, close envs that "
+            "are not needed, or divide the envs among processes."
+        )
+
+
+def free_thread_keys() -> int | None:
+    """How many more ``pthread_key_create`` would give; None where there is no such limit to find out."""
+    if not sys.platform.startswith("linux"):
+        return None
+    library = ctypes.CDLL(None)
+    key, taken = ctypes.c_uint(), []
+    while library.pthread_key_create(ctypes.byref(key), None) == 0:
+        taken.append(key.value)
+    for value in taken:
+        library.pthread_key_delete(ctypes.c_uint(value))
+    return len(taken)

@@ -55,7 +55,7 @@ def exchange_cameras(env: BaseEnv) -> None:
     for camera in seams.cameras(env).values():
         for component in seams.camera_components(camera):
             # The entity stays, empty: with one fewer, SAPIEN would number the others anew in a scene that a
-            # restored snapshot makes (see `fresh_physics`), and segmentation pictures name bodies by number.
+            # restored snapshot makes (see `cpu_state`), and segmentation pictures name bodies by number.
             component.entity.remove_component(component)
     seams.forget_cameras(env)
     with torch.random.fork_rng(devices=[]):

@@ -30,8 +30,7 @@ from mani_skill.agents.controllers.base_controller import BaseController, Combin
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.structs import Pose
 
-from workbench.core.assignments import find_assignment
-from workbench.core.broken_rule import BrokenRule
+from workbench.core.broken_rule import BrokenRule, find_assignment
 from workbench.core.env_numbers import env_numbers, envs_of_batch
 from workbench.core.kept_rows import rows_of_tensors
 from workbench.core.seams import agents, drawing_from, files_of_task, set_episode_seeds, task_class

@@ -2,10 +2,13 @@
 
 Whoever reads a recording need not know an env, and the env need not know files: between them goes this. State 0 is
 the reset; action t leads to state t + 1.
+
+How the state columns of a batch are named (`state_columns` makes them), for whoever takes them apart without torch.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -72,3 +75,16 @@ def pose_distances(a: NDArray, b: NDArray) -> tuple[NDArray[np.float64], NDArray
     found = (np.where(lacks[0] | lacks[1], np.inf, way) for way in (metres, radians))
     metres, radians = (np.where(lacks[0] & lacks[1], 0.0, way) for way in found)
     return metres, radians
+
+
+# --- names of columns --------------------------------------------------------------------------------
+
+
+STATE, OBS = "state/", "obs/"
+"""What the names of columns begin with: ``state/actors/cube``, ``obs/agent/qpos``."""
+
+
+def states_of(columns: Mapping[str, NDArray], env: int) -> dict[str, NDArray]:
+    """One env's states. Those of what it does not have, which is NaN in the columns, are left out."""
+    rows = {name[len(STATE) :]: column[env] for name, column in columns.items() if name.startswith(STATE)}
+    return {name: row for name, row in rows.items() if not np.isnan(row).all()}

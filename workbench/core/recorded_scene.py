@@ -14,10 +14,9 @@ import sapien
 import sapien.render
 from numpy.typing import NDArray
 
-from workbench.core.backends import find_renderer
+from workbench.core.backends import find_renderer, keep_render_device
 from workbench.core.geometry import Material, SceneGeometry, Visual
 from workbench.core.mesh_detail import with_normals
-from workbench.core.render_device import keep_render_device
 
 NEAR, FAR = 0.01, 300.0
 

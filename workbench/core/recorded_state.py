@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 from workbench.core import seams
-from workbench.core.fresh_physics import renew_physics
+from workbench.core.cpu_state import renew_physics
 from workbench.core.partial_reset import active_controllers
 from workbench.core.recorded_run import pose_distances
 from workbench.core.scene_index import present_states, scene_index

@@ -6,7 +6,7 @@ elapsed, and the random generators (`episode_rng`). All of it is copied a row an
 can be put back where it was, into another env, into all, or by name into an env that was built anew.
 
 How exact that is. *Two restores of a snapshot go on alike*, to the last bit, whatever the env did in between,
-because a restored env gets a PhysX scene without a past (`fresh_physics`); so who wants a run that can be gone back
+because a restored env gets a PhysX scene without a past (`cpu_state`); so who wants a run that can be gone back
 to exactly restores each snapshot right after it was taken. *A restore goes on as the uninterrupted run did* except
 for what PhysX keeps to itself: contact caches, the order in which it solves contacts, and the last bit of an
 articulation's root, which it holds by its centre of mass and rounds when it is set. Nothing else is missing: an
@@ -17,6 +17,16 @@ hand holds or pushes, 2e-2 rad for a humanoid that lies, and no bound where a fa
 steps again before it is written does not help: what is written takes the contacts with it. What helps is to write only
 at an *exact point* (`begin_anew`, or right after a restore), and to make every step since then again: that gives
 the moment to the last bit. The session goes back so (`session.go_back`).
+
+Control steps of some envs of a batch, while the others stand still and notice nothing.
+
+The task's code is batched: its hooks run for all envs or for none. But PhysX has a scene an env on the CPU, and those
+of the envs that are to stand still are simply not stepped. What the hooks did to them meanwhile (a step more
+counted, targets of a robot, a buffer) is put back from a snapshot that was taken before. Their physics is only put
+back where somebody wrote to it: a state that is written, even the one that is there, wakes what slept and goes on
+otherwise in the last bits.
+
+In GPU simulation all envs are in one scene and all step; there the others are put back from the snapshot.
 """
 
 from __future__ import annotations
@@ -132,7 +142,7 @@ def restore_snapshot(
             each its own; or if the snapshot has a single env, that one.
         fresh_physics: whether the envs get a PhysX scene without a past, and so go on in the same way to the
             last bit, whatever they did before. Without, a restore is several times as fast, and contacts that
-            an env has or gets later may be solved in another order (see `fresh_physics`).
+            an env has or gets later may be solved in another order (see `cpu_state`).
 
     Raises:
         IndexError, ValueError: `env_idx` or `source` names envs that are not there, or the numbers differ.
@@ -267,3 +277,42 @@ def _pairs(
             f"the snapshot was taken of envs {list(snapshot.env_idx)}: it has no state of {missing}"
         )
     return targets, [position[i] for i in sources]
+
+
+# --- some envs alone ---------------------------------------------------------------------------------
+
+
+@contextmanager
+def only_these_move(env: Any, env_idx: Sequence[int], others: Snapshot | None) -> Iterator[None]:
+    """Within this, control steps are of these envs.
+
+    Args:
+        others: all other envs as they are now, which they are at the end again; None for a batch in which nobody
+            asks for what the others were.
+    """
+    px = seams.batched_system(env.scene)
+    if px is None:
+        try:
+            yield
+        finally:
+            if others is not None:
+                restore_snapshot(env, others)
+        return
+    before = px.packs()
+    flags = [flag.copy() for flag in px.drive_flags]
+    px.hold_still(set(range(env.num_envs)) - {int(i) for i in env_idx})
+    try:
+        yield
+    finally:
+        now = px.packs()
+        px.hold_still(())
+        if others is not None:
+            still = [i for i in others.env_idx if now[i] == before[i]]
+            moved = [i for i in others.env_idx if now[i] != before[i]]
+            if moved:
+                restore_snapshot(env, others, moved, moved, fresh_physics=False)
+            if still:
+                positions = [others.env_idx.index(i) for i in still]
+                restore_memory(env, others.memory, still, positions, whole=False)
+            px.keep_drives(still, flags)
+            env.scene._gpu_fetch_all()

@@ -26,8 +26,8 @@ from mani_skill.envs.sapien_env import BaseEnv
 from numpy.typing import NDArray
 
 from workbench.core.inspect_env import names_of_flat
+from workbench.core.recorded_run import OBS, STATE
 from workbench.core.scene_index import in_every_env, present_states, scene_index
-from workbench.core.state_names import OBS, STATE
 from workbench.core.task_env import TaskEnv, flat_entries, to_numpy
 
 _PICTURES = ("sensor_data", "sensor_param", "pointcloud")

@@ -35,8 +35,8 @@ from workbench.core.broken_rule import (
     place_of_hook,
     warn_of,
 )
+from workbench.core.kept_rows import ResetWatch
 from workbench.core.partial_reset import others
-from workbench.core.reset_watch import ResetWatch
 from workbench.core.returns import wrong_evaluate, wrong_observation, wrong_reward
 from workbench.core.rules import Degree, Finding, degrees_of
 from workbench.core.strict_system import StrictCpuSystem

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from workbench.core import actions
 from workbench.core.assets import refuse_downloads, require_assets, robots_of
-from workbench.core.backends import Backend, choose_backend
+from workbench.core.backends import Backend, choose_backend, keep_render_device
 from workbench.core.broken_rule import BrokenRules, warn_of
 from workbench.core.constructors import refuse_unbuilt_env
 from workbench.core.contact_list import Contact, list_contacts
@@ -27,7 +27,6 @@ from workbench.core.cpu_scene import batched_class
 from workbench.core.entries import FLAGS, split_entries
 from workbench.core.env_numbers import envs_of_batch
 from workbench.core.partial_reset import in_ascending_order, seeded
-from workbench.core.render_device import keep_render_device
 from workbench.core.rules import Degree, Finding, degrees_of
 from workbench.core.scene_index import read_poses
 from workbench.core.seams import (

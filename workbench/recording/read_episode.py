@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.geometry import SceneGeometry
-from workbench.core.shared_shapes import SharedShapes
+from workbench.core.geometry import SceneGeometry, SharedShapes
 from workbench.recording.checksums import check
 from workbench.recording.document import (
     CameraWords,

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from workbench.core.shared_shapes import SharedShapes
+from workbench.core.geometry import SharedShapes
 from workbench.recording.document import task_file
 from workbench.recording.encoded_pictures import Modality
 from workbench.recording.episode import Episode

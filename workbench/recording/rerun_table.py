@@ -20,9 +20,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from rerun.chunk import Chunk, LazyStore, RrdReader
 
-from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
+from workbench.core.geometry import Material, Mesh, SceneGeometry, SharedShapes, Visual
 from workbench.core.pictures import CameraInfo
-from workbench.core.shared_shapes import SharedShapes
 from workbench.recording.encoded_pictures import EncodedPictures, Modality
 from workbench.recording.rerun_chunks import STEP
 from workbench.recording.rerun_pictures import PICTURE_COMPONENTS, IdsInFile, OpenFile, PicturesInFile

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 from workbench.recording.unreadable import UnreadableRecording
 
 if TYPE_CHECKING:
-    from workbench.core.shared_shapes import SharedShapes
+    from workbench.core.geometry import SharedShapes
     from workbench.recording.episode import Episode
 
 Kind = Literal["ours", "maniskill", "lerobot"]

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from workbench.core.pictures import Picture
-from workbench.core.state_names import STATE, states_of
+from workbench.core.recorded_run import STATE, states_of
 from workbench.core.step import OtherEntry, StepResult
 from workbench.recording.columns import BatchPacker
 from workbench.recording.episode import EpisodeInfo

@@ -23,10 +23,10 @@ from workbench.core.snapshot import (
     RestoreReport,
     Snapshot,
     in_this_state,
+    only_these_move,
     restore_memory,
     restore_snapshot,
 )
-from workbench.core.stand_still import only_these_move
 from workbench.core.step import StepResult
 from workbench.session.messages import Restore, Restored
 from workbench.session.open_task import OpenedTask, blamed, step_checked

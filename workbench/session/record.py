@@ -19,12 +19,12 @@ import torch
 from workbench.authoring.reference import named_file
 from workbench.core.broken_rule import warn_of
 from workbench.core.pictures import Picture
+from workbench.core.recorded_run import states_of
 from workbench.core.recorded_state import apart, write_states
 from workbench.core.rules import Finding
 from workbench.core.state_columns import read_state_columns
-from workbench.core.state_names import states_of
 from workbench.core.step import StepResult
-from workbench.core.step_pictures import step_pictures
+from workbench.core.take_pictures import step_pictures
 from workbench.jobs.pool import Deal, Executor, Here, Processes, Share, Work, shares
 from workbench.machine.current_folder import CurrentFolder
 from workbench.recording.episode_writer import EpisodeFiles

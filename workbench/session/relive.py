@@ -33,8 +33,7 @@ from workbench.core.recorded_state import (
     settle_robot,
     write_states,
 )
-from workbench.core.snapshot import Snapshot
-from workbench.core.stand_still import only_these_move
+from workbench.core.snapshot import Snapshot, only_these_move
 from workbench.core.step import StepResult
 from workbench.session.open_task import OpenedTask, blamed, reset_checked, step_checked
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from workbench.authoring.problem import TaskError
 from workbench.core.recorded_run import RecordedRun
 from workbench.core.recorded_state import apart, read_states, write_states
-from workbench.core.stand_still import only_these_move
+from workbench.core.snapshot import only_these_move
 from workbench.core.step import StepResult
 from workbench.recording.read_episode import UnreadableRecording
 from workbench.recording.sources import Source

@@ -22,7 +22,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from workbench.core.shared_shapes import SharedShapes
+from workbench.core.geometry import SharedShapes
 from workbench.machine.process_tree import allocated_memory
 from workbench.machine.watched_thread import say_failure
 from workbench.recording.episode import Episode

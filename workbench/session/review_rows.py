@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from workbench.core.shared_shapes import SharedShapes
+from workbench.core.geometry import SharedShapes
 from workbench.recording.episode import Episode
 from workbench.recording.library_row import LibraryRow
 

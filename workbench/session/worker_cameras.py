@@ -16,8 +16,7 @@ from workbench.core.camera_settings import CameraKey
 from workbench.core.exchange import keep_observation_space
 from workbench.core.place_camera import PlacedCameras
 from workbench.core.state_columns import read_state_columns
-from workbench.core.step_pictures import step_pictures
-from workbench.core.take_pictures import list_cameras, take_pictures
+from workbench.core.take_pictures import list_cameras, step_pictures, take_pictures
 from workbench.session.calls import CannotAnswer
 from workbench.session.camera_answers import answer
 from workbench.session.held_task import HeldTask

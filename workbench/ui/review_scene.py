@@ -15,9 +15,8 @@ import viser
 from numpy.typing import NDArray
 
 from workbench.core.camera_settings import CameraKey
-from workbench.core.geometry import BodyKind, Material, SceneGeometry, Visual
+from workbench.core.geometry import BodyKind, Material, SceneGeometry, Visual, fingerprint
 from workbench.core.pictures import CameraInfo, Picture
-from workbench.core.shared_shapes import fingerprint
 from workbench.recording.episode import CameraTrack
 from workbench.session.review import Review
 from workbench.session.review_compare import distances

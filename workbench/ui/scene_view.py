@@ -19,9 +19,8 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
-from workbench.core.geometry import SceneGeometry
+from workbench.core.geometry import SceneGeometry, fingerprint
 from workbench.core.mesh_detail import reduce_mesh
-from workbench.core.shared_shapes import fingerprint
 from workbench.ui.env_layout import EnvLayout, place_of_plane, plane_normal
 from workbench.ui.meshes_as_glb import WornTogether, as_glb, face_limit, group_by_wearers
 from workbench.ui.selection_mark import InView

@@ -15,8 +15,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from workbench.core.geometry import Material, Mesh, SceneGeometry, Visual
-from workbench.core.shared_shapes import SharedShapes
+from workbench.core.geometry import Material, Mesh, SceneGeometry, SharedShapes, Visual
 from workbench.recording.document import CameraWords, SceneWords
 from workbench.recording.encoded_pictures import MODALITIES, MOST_PIXELS, EncodedPictures, Modality
 from workbench.recording.entry_texts import tracks_from, tracks_words
